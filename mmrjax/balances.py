@@ -1,0 +1,192 @@
+"""The balances: the only place where terms are summed, in the order in which an instant is computed.
+
+Each function takes a robot and the `Signals` so far and returns them with its own quantities filled in.
+All three fidelities are compositions of these functions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+
+from mmrjax import contact, ground, power
+from mmrjax import chassis as chassis_room
+from mmrjax.chassis import Chassis
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import GRAVITY, Command, Reading, Signals, State
+
+#: Every balance with its unit and what it closes.
+BALANCES = {
+    "mass": ("kg", "M = robot + payload"),
+    "supply": ("V", "U_e from battery or external source, eqs. (8)-(13)"),
+    "electrical": ("V", "U_e = E + I R + L dI/dt, eq. (15)"),
+    "motor": ("N·m", "C_m I - M_df = M_d, eqs. (14), (17), (18)"),
+    "gearbox": ("N·m", "M_r at the output shaft, eqs. (19)-(23)"),
+    "track": ("N·m", "loss at the pulley, eqs. (24), (26)"),
+    "ground": ("N", "traction = resistance + gravity + m dV/dt, eqs. (1), (5)"),
+    "slip": ("m/s", "V = r_k ω_k - slip speed, eqs. (32), (33)"),
+    "sensor": ("", "what the instruments show, each channel in its unit"),
+}
+
+
+def _effects(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
+    terms = [e.term(robot, signals) for e in robot.effects if e.balance == balance and e.channel == channel]
+    return sum(terms) if terms else 0.0  # type: ignore[return-value]
+
+
+def _fill(signals: Signals, **values: Any) -> Signals:
+    return dataclasses.replace(signals, **values)
+
+
+def begin(robot: Robot, command: Command, state: State, direction: Scalar | None = None) -> Signals:
+    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest.
+
+    The speed within which a direction fades is a tenth of V_s of the friction law, so that friction at
+    rest is resolved on the same scale as sliding.
+    """
+    chassis = robot.chassis(command.wheeled)
+    speed_wheel = state.speed_motor / robot.gearbox.ratio
+    speed_theoretical = chassis.radius * speed_wheel
+    rest = 0.1 * chassis.ground.friction.speed_static
+    signals = Signals(
+        wheeled=command.wheeled,
+        slope=command.slope,
+        payload=command.payload,
+        adhesion=command.adhesion,
+        discharge=state.discharge,
+        current=state.current,
+        speed_motor=state.speed_motor,
+        speed=state.speed,
+        direction=contact.direction(speed_theoretical, rest) if direction is None else direction,
+        direction_travel=contact.direction(state.speed, rest) if direction is None else direction,
+        speed_wheel=speed_wheel,
+        speed_theoretical=speed_theoretical,
+        total_current=robot.sides * state.current,
+    )
+    stated = chassis.mass + command.payload if command.total_mass is None else command.total_mass
+    mass = stated + _effects(robot, signals, "mass")
+    normal = chassis_room.normal_load(mass, command.slope, GRAVITY, robot.sides)
+    return _fill(signals, mass=mass, normal=normal)
+
+
+def supply(robot: Robot, command: Command, signals: Signals) -> Signals:
+    """Voltage at the motors [V]."""
+    source = power.voltage_source(
+        robot.battery, command.voltage, command.battery, signals.total_current, signals.discharge
+    )
+    return _fill(signals, voltage=source - _effects(robot, signals, "supply"))
+
+
+def electrical(robot: Robot, signals: Signals) -> Signals:
+    """What of the supply voltage is left to change the current [V]."""
+    back = robot.motor.voltage_back(signals.speed_motor)
+    drop = robot.motor.voltage_winding(signals.current) + _effects(robot, signals, "electrical")
+    return _fill(signals, voltage_back=back, voltage_drop=drop, voltage_left=signals.voltage - back - drop)
+
+
+def motor(robot: Robot, signals: Signals) -> Signals:
+    """Torque at the motor shaft [N·m]."""
+    electromagnetic = robot.motor.torque_electromagnetic(signals.current)
+    loss = robot.motor.torque_loss(signals.speed_motor, signals.direction)
+    loss = loss + _effects(robot, signals, "motor")
+    return _fill(
+        signals,
+        torque_electromagnetic=electromagnetic,
+        torque_motor_loss=loss,
+        torque_motor=electromagnetic - loss,
+    )
+
+
+def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
+    """Forces along the slope that traction has to overcome [N]."""
+    resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
+    resistance = resistance + _effects(robot, signals, "ground")
+    gravity = ground.force_gravity(signals.mass / robot.sides, signals.slope, GRAVITY)
+    return _fill(
+        signals,
+        resistance=resistance,
+        gravity=gravity,
+        demand=resistance + gravity,
+        adhesion_limit=chassis.ground.force_adhesion(signals.normal, signals.adhesion),
+    )
+
+
+def slip(robot: Robot, signals: Signals) -> Signals:
+    """Speed at which the contact patch slides over the ground [m/s]."""
+    terms = _effects(robot, signals, "slip")
+    return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
+
+
+def track(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
+    """Losses between pulley and ground, at the pulley [N·m]."""
+    loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
+    guide = chassis.track.force_guide(signals.normal, signals.direction)
+    loss = loss + guide * chassis.radius + _effects(robot, signals, "track")
+    return _fill(signals, torque_track_loss=loss)
+
+
+def gearbox(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
+    """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
+
+    With A the motor torque less idle loss and B the load at the output, the torque transmitted has the
+    sign of A J_w + i J_d B whatever the efficiency, which decides which way the load loss acts.
+    """
+    gear, inertia_motor = robot.gearbox, robot.motor.inertia
+    idle = gear.torque_idle(signals.speed_motor, signals.direction)
+    load = signals.torque_track_loss + chassis.radius * signals.traction + _effects(robot, signals, "gearbox")
+    drive = signals.torque_motor - idle
+    side = drive * chassis.inertia + gear.ratio * inertia_motor * load
+    efficiency = gear.efficiency_flow(side, signals.direction)
+    net = gear.ratio * efficiency * drive - load
+    inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, chassis.inertia)
+    acceleration = net / inertia
+    torque_input = signals.torque_motor - inertia_motor * gear.ratio * acceleration
+    return _fill(
+        signals,
+        torque_idle=idle,
+        torque_load=load,
+        torque_net=net,
+        acceleration_wheel=acceleration,
+        torque_input=torque_input,
+        torque_gear=gear.ratio * efficiency * (torque_input - idle),
+    )
+
+
+def moving(robot: Robot, command: Command, state: State) -> Signals:
+    """All signals of a robot in motion: traction follows from sliding by the friction law."""
+    chassis = robot.chassis(command.wheeled)
+    signals = electrical(robot, supply(robot, command, begin(robot, command, state)))
+    signals = slip(robot, travel(robot, chassis, motor(robot, signals)))
+    traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
+    signals = _fill(
+        signals, traction=traction, acceleration=(traction - signals.demand) / (signals.mass / robot.sides)
+    )
+    return gearbox(robot, chassis, track(robot, chassis, signals))
+
+
+def settled(robot: Robot, command: Command, state: State) -> tuple[Signals, Scalar]:
+    """All signals of steady forward travel: traction is the demand.
+
+    Returns:
+        The signals, and the sliding speed at which the friction law carries that demand [m/s], which
+        `signals.speed_sliding` has to meet.
+    """
+    chassis = robot.chassis(command.wheeled)
+    signals = begin(robot, command, state, direction=jnp.ones_like(state.speed_motor))
+    signals = electrical(robot, supply(robot, command, signals))
+    signals = slip(robot, travel(robot, chassis, motor(robot, signals)))
+    signals = _fill(signals, traction=signals.demand)
+    creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
+    return gearbox(robot, chassis, track(robot, chassis, signals)), creep
+
+
+def sensor(robot: Robot, signals: Signals) -> Reading:
+    """What the instruments show of current [A], motor speed [rad/s] and speed [m/s]."""
+    return Reading(
+        total_current=signals.total_current + _effects(robot, signals, "sensor", "total_current"),
+        motor_speed=signals.speed_motor + _effects(robot, signals, "sensor", "motor_speed"),
+        speed=signals.speed + _effects(robot, signals, "sensor", "speed"),
+    )

@@ -1,0 +1,58 @@
+"""Chassis of one configuration: masses, inertias, mass factor, eqs. (1)-(4), (31)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.ground import Ground
+from mmrjax.params import Scalar, parameter
+from mmrjax.track import Track
+
+
+class Chassis(eqx.Module):
+    """The running gear and mass of one configuration, 6T2A or 4W2T."""
+
+    track: Track
+    ground: Ground
+    mass: Scalar = parameter(
+        unit="kg",
+        meaning="mass of the robot without payload",
+        bounds=(0.5, 200.0),
+        relative_sd=0.02,
+        source="Table 7 (Table A2 prints 13.1 for 4W2T; see paper-notes)",
+    )
+    radius: Scalar = parameter(
+        unit="m",
+        meaning="rolling radius of driving pulley or wheel r_k",
+        bounds=(5e-3, 0.5),
+        relative_sd=0.005,
+        source="48 teeth of 5 mm (6T2A; Table 6 prints the diameter over the grousers); D_w/2, Table 6 (4W2T)",
+    )
+    inertia: Scalar = parameter(
+        unit="kg·m^2",
+        meaning="inertia J_w of one side's parts that turn with the driving wheel, eq. (31)",
+        bounds=(0.0, 1.0),
+        relative_sd=0.1,
+        source="Table 7: pulleys, wheels, and the tracks' mass at r_k",
+    )
+
+
+def inertia_reduced(inertia_motor: Scalar, ratio: Scalar, efficiency: Scalar, inertia_wheel: Scalar) -> Scalar:
+    """Rotating masses of one side at the driving wheel J = J_d i² η + J_w [kg·m²], eq. (31)."""
+    return inertia_motor * ratio**2 * efficiency + inertia_wheel
+
+
+def inertia_equivalent(mass_side: Scalar, radius: Scalar, inertia_rotating: Scalar) -> Scalar:
+    """J'_eq = m_i r_k² + J [kg·m²], eq. (3)."""
+    return mass_side * radius**2 + inertia_rotating
+
+
+def mass_factor(mass_side: Scalar, radius: Scalar, inertia_rotating: Scalar) -> Scalar:
+    """Coefficient of rotating masses without sliding δ = J'_eq / (m_i r_k²) [-], eq. (2)."""
+    return inertia_equivalent(mass_side, radius, inertia_rotating) / (mass_side * radius**2)
+
+
+def normal_load(mass: Scalar, slope: Scalar, gravity: float, sides: int) -> Scalar:
+    """Normal load of one side m_i g cos α [N], eq. (5)."""
+    return mass / sides * gravity * jnp.cos(slope)

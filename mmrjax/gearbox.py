@@ -1,0 +1,75 @@
+"""Reduction gear: losses at idle and losses with load, eqs. (19)-(23)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.params import Scalar, parameter
+from mmrjax.signals import quotient
+
+
+class Gearbox(eqx.Module):
+    """M_r = i η_rm (M_d - M_rf_idle) with M_rf_idle = M_rf0 sign ω + K_fr ω.
+
+    Driven from the output (overhauling) the load loss turns round: M_r = (i / η_rm) (M_d - M_rf_idle),
+    which the paper leaves out because it never coasts; without it a descent would gain energy.
+    """
+
+    ratio: Scalar = parameter(
+        48.0,
+        unit="-",
+        meaning="total ratio motor to driving wheel i_r",
+        bounds=(1.0, 1000.0),
+        relative_sd=0.002,
+        source="GP32C 576/25 and a belt stage 25/12; Tables A1, A2 simulated give 47.97-48.04",
+    )
+    efficiency_load: Scalar = parameter(
+        0.74,
+        unit="-",
+        meaning="efficiency for losses proportional to load η_rm, eq. (19)",
+        bounds=(0.05, 1.0),
+        relative_sd=0.03,
+        source="Table 2 (catalogue 0.75)",
+    )
+    friction_coulomb: Scalar = parameter(
+        0.3e-3,
+        unit="N·m",
+        meaning="idle Coulomb torque at the input M_rf0, eq. (20)",
+        bounds=(0.0, 0.1),
+        relative_sd=0.15,
+        source="Table 2",
+    )
+    friction_viscous: Scalar = parameter(
+        1.4e-6,
+        unit="N·m·s",
+        meaning="idle viscous friction at the input K_fr, eq. (20)",
+        bounds=(0.0, 1e-3),
+        relative_sd=0.15,
+        source="Table 2: 1.4e-3 mN·m·s",
+    )
+    speed_limit: float = eqx.field(default=8_000 * 0.10471975511965977, static=True)  # 8000 rpm input, catalogue
+
+    def torque_idle(self, speed: Scalar, direction: Scalar) -> Scalar:
+        """Idle loss torque at the input M_rf_idle [N·m], eq. (20), at input `speed` [rad/s]."""
+        return self.friction_coulomb * direction + self.friction_viscous * speed
+
+    def efficiency_flow(self, transmitted: Scalar, direction: Scalar) -> Scalar:
+        """η_rm where power flows to the wheels, 1/η_rm where it flows back [-].
+
+        `transmitted` is the input torque less the idle torque [N·m].
+        """
+        return jnp.where(transmitted * direction >= 0, self.efficiency_load, 1 / self.efficiency_load)
+
+    def torque_output(self, transmitted: Scalar, direction: Scalar) -> Scalar:
+        """Output torque M_r [N·m], eqs. (22), (23)."""
+        return self.ratio * transmitted * self.efficiency_flow(transmitted, direction)
+
+    def efficiency(self, torque_input: Scalar, speed: Scalar) -> Scalar:
+        """Efficiency η_r [-], eq. (19), driving forward at input torque [N·m] and `speed` [rad/s]."""
+        return (1 - quotient(self.torque_idle(speed, 1.0), torque_input)) * self.efficiency_load
+
+    def torque_loss(self, torque_input: Scalar, speed: Scalar) -> Scalar:
+        """Total loss at the output M_rf [N·m], eq. (22), driving forward."""
+        load = torque_input * self.ratio * (1 - self.efficiency_load)
+        return load + self.torque_idle(speed, 1.0) * self.ratio * self.efficiency_load

@@ -1,0 +1,49 @@
+"""Ground: motion resistance (5), adhesion (6), (7), slip (32), (33)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.contact import Friction
+from mmrjax.params import Scalar, parameter
+from mmrjax.signals import quotient
+
+
+class Ground(eqx.Module):
+    """What the surface does to one mover: it resists, and it holds."""
+
+    friction: Friction
+    rolling_resistance: Scalar = parameter(
+        unit="-",
+        meaning="rolling resistance coefficient f, eq. (5)",
+        bounds=(0.0, 1.0),
+        relative_sd=0.15,
+        source="Table 4",
+    )
+
+    def force_resistance(self, normal: Scalar, direction: Scalar) -> Scalar:
+        """Motion resistance F_f = f N [N], eq. (5), against `direction` (-1..1)."""
+        return self.rolling_resistance * normal * direction
+
+    def force_adhesion(self, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Largest traction φ R_z [N], eqs. (6), (7); `adhesion` is the surface's ratio [-]."""
+        return self.friction.static * adhesion * normal
+
+    def traction(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Traction [N] of a contact that slides at `speed_sliding` [m/s], eq. (25) with Fig. 7."""
+        return self.friction.coefficient(speed_sliding) * adhesion * normal
+
+    def speed_creep(self, demand: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """Sliding speed [m/s] at which the contact carries `demand` [N]."""
+        return self.friction.speed_creep(demand / (adhesion * normal))
+
+
+def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:
+    """Downhill pull m g sin α [N], eq. (1)."""
+    return mass * gravity * jnp.sin(slope)
+
+
+def slip(speed: Scalar, speed_theoretical: Scalar) -> Scalar:
+    """s = 1 - V / V_theoretical [-], eq. (33); 0 at rest."""
+    return quotient(speed_theoretical - speed, speed_theoretical)

@@ -1,0 +1,129 @@
+"""Fidelity `drive`: the ODE of drives and chassis from standstill, with slip, inductance and battery."""
+
+from __future__ import annotations
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax import balances
+from mmrjax.models.result import result
+from mmrjax.models.rosenbrock import Rodas4
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import (
+    BATTERY_EMPTY,
+    CONVERGED,
+    FAILED,
+    NOT_SETTLED,
+    SLIDES,
+    STALLED,
+    Command,
+    Result,
+    Signals,
+    State,
+)
+
+# Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
+_UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
+
+
+class Trajectory(eqx.Module):
+    """A run from standstill.
+
+    Attributes:
+        time: [s], shape (times,).
+        distance: travelled along the slope [m], shape (times,).
+        signals: every signal at those times; each field has shape (times,).
+        result: the state at the end, with the run's status.
+    """
+
+    time: Float[Array, " times"]
+    distance: Float[Array, " times"]
+    signals: Signals
+    result: Result
+
+
+def _state(y: Float[Array, " 5"]) -> State:
+    y = y * jnp.asarray(_UNITS, y.dtype)
+    return State(y[0], y[1], y[2], y[4])
+
+
+def _rates(time: Scalar, y: Float[Array, " 5"], conditions: tuple[Robot, Command]) -> Float[Array, " 5"]:
+    robot, command = conditions
+    signals = balances.moving(robot, command, _state(y))
+    current_battery = robot.battery.current(signals.total_current) * (command.battery > 0.5)  # eq. (11)
+    rates = [
+        signals.voltage_left / robot.motor.inductance,
+        signals.acceleration_wheel * robot.gearbox.ratio,
+        signals.acceleration,
+        signals.speed,
+        current_battery,
+    ]
+    return jnp.stack(rates) / jnp.asarray(_UNITS, y.dtype)
+
+
+def drive(
+    robot: Robot, command: Command, times: Float[Array, " times"], tolerance: float = 1e-6, max_steps: int = 4096
+) -> Trajectory:
+    """Run one robot from standstill under a constant command and keep the given times.
+
+    Args:
+        robot: any robot; its parameters may be tracers.
+        command: one run, scalar fields.
+        times: increasing, from 0 [s]; the last one ends the run.
+        tolerance: relative and (in units of 10 A, 1000 rad/s, 1 m/s) absolute error of a step.
+        max_steps: integration steps after which a run has `failed`.
+
+    Returns:
+        The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
+        tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
+        when the movers spin beyond V_s and the robot gains no speed; `battery_empty` when the charge has
+        run out (numbers up to there are right, later ones are of a battery that went on); `failed` when
+        the integrator gave up. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
+    """
+    dtype = jnp.result_type(command.voltage)
+    y0 = jnp.zeros(len(_UNITS), dtype).at[4].set(command.discharge / _UNITS[4])
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(_rates),
+        Rodas4(),
+        times[0],
+        times[-1],
+        dt0=jnp.asarray(1e-4, dtype),
+        y0=y0,
+        args=(robot, command),
+        saveat=diffrax.SaveAt(ts=times),
+        max_steps=max_steps,
+        throw=False,
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        adjoint=diffrax.ForwardMode(),
+    )
+    assert solution.ys is not None
+    ys = solution.ys
+    signals = jax.vmap(lambda y: balances.moving(robot, command, _state(y)))(ys)
+    end = jax.tree.map(lambda x: x[-1], signals)
+    status = _status(robot, command, end, solution.result == diffrax.RESULTS.successful)
+    return Trajectory(times, ys[:, 3] * _UNITS[3], signals, result(robot, end, status))
+
+
+def _status(robot: Robot, command: Command, end: Signals, done: Array) -> Array:
+    friction = robot.chassis(command.wheeled).ground.friction
+    settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
+    status = jnp.where(settling, NOT_SETTLED, CONVERGED)
+    status = jnp.where(end.direction < 1.0, STALLED, status)
+    spinning = jnp.abs(end.speed_sliding) > friction.speed_static
+    gaining = end.acceleration * end.speed_sliding > 1e-3 * jnp.abs(end.speed_sliding)  # 1 mm/s²
+    status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
+    empty = (command.battery > 0.5) & robot.battery.empty(end.discharge)
+    status = jnp.where(empty, BATTERY_EMPTY, status)
+    return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
+
+
+@eqx.filter_jit
+def drive_batch(
+    robot: Robot, commands: Command, times: Float[Array, " times"], tolerance: float = 1e-6, max_steps: int = 4096
+) -> Trajectory:
+    """`drive` over a batch of commands (leading axis of every field) for one robot, compiled."""
+    return jax.vmap(lambda c: drive(robot, c, times, tolerance, max_steps))(commands)

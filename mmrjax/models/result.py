@@ -1,0 +1,60 @@
+"""The observation that every fidelity returns, made from the signals of one instant."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from mmrjax import balances, ground
+from mmrjax.robot import Robot
+from mmrjax.signals import Result, Signals, quotient
+
+
+def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
+    """Readings, power chain of Fig. 4 and exceeded limits of one instant."""
+    sides = robot.sides
+    power_supply = signals.voltage * signals.total_current
+    power_motor = sides * signals.torque_motor * signals.speed_motor
+    power_gear = sides * signals.torque_gear * signals.speed_wheel
+    power_ground = sides * signals.traction * signals.speed
+    temperature = robot.motor.temperature_winding(signals.current)
+    over = (
+        jnp.abs(signals.speed_motor) > robot.motor.speed_limit,
+        jnp.abs(signals.speed_motor) > robot.gearbox.speed_limit,
+        temperature > robot.motor.temperature_limit,
+    )
+    flags = sum(jnp.where(o, 1 << k, 0) for k, o in enumerate(over))
+    return Result(
+        reading=balances.sensor(robot, signals),
+        theoretical_speed=signals.speed_theoretical,
+        slip=ground.slip(signals.speed, signals.speed_theoretical),
+        voltage=signals.voltage,
+        mass=signals.mass,
+        traction=sides * signals.traction,
+        adhesion_used=signals.demand / signals.adhesion_limit,
+        power_supply=power_supply,
+        power_motor=power_motor,
+        power_gear=power_gear,
+        power_ground=power_ground,
+        power_lift=sides * signals.gravity * signals.speed,
+        efficiency_motor=quotient(power_motor, power_supply),
+        efficiency_gear=quotient(power_gear, power_motor),
+        efficiency_chassis=quotient(power_ground, power_gear),
+        temperature_winding=temperature,
+        status=status,
+        flags=jnp.asarray(flags),
+    )
+
+
+def withhold(answer: Result, there: Array) -> Result:
+    """NaN in every number of `answer` where `there` is false, save mass and adhesion used, which stand.
+
+    The flags of a withheld member are cleared; its status says why it has no numbers.
+    """
+    blank = jax.tree.map(
+        lambda x: jnp.where(there, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer
+    )
+    return dataclasses.replace(blank, mass=answer.mass, adhesion_used=answer.adhesion_used, status=answer.status)

@@ -1,0 +1,70 @@
+"""Rodas4: a stiff integrator for diffrax that solves linear systems only, for small autonomous ODEs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from diffrax import RESULTS
+
+from mmrjax.models.linear import factorise, substitute
+
+_GAMMA = 0.25
+_A = (
+    (1.544000000000000,),
+    (0.9466785280815826, 0.2557011698983284),
+    (3.314825187068521, 2.896124015972201, 0.9986419139977817),
+    (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950),
+)
+_C = (
+    (-5.668800000000000,),
+    (-2.430093356833875, -0.2063599157091915),
+    (-0.1073529058151375, -9.594562251023355, -20.47028614809616),
+    (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160),
+    (8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054),
+)
+
+
+class Rodas4(diffrax.AbstractAdaptiveSolver):
+    """Stiffly accurate, L-stable Rosenbrock method of order 4(3) with six stages.
+
+    Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
+    Only for autonomous right-hand sides of one flat vector: the Jacobian in time is taken to be zero.
+    """
+
+    term_structure: ClassVar[Any] = diffrax.ODETerm
+    interpolation_cls: ClassVar[Callable[..., Any]] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms: Any) -> int:
+        return 4
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        h = t1 - t0
+
+        def rate(y: Any) -> Any:
+            return terms.vf(t0, y, args)
+
+        f0 = rate(y0)
+        matrix = jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jax.jacfwd(rate)(y0)
+        lu = factorise(matrix)
+        u = [substitute(lu, f0)]
+        y = y0
+        for stage in range(1, 6):
+            if stage < 5:
+                y = y0 + sum(a * v for a, v in zip(_A[stage - 1], u, strict=True))
+            else:
+                y = y + u[-1]
+            u.append(substitute(lu, rate(y) + sum(c * v for c, v in zip(_C[stage - 1], u, strict=True)) / h))
+        y1 = y + u[-1]
+        f1 = rate(y1)
+        dense = {"y0": y0, "y1": y1, "k": jnp.stack([h * f0, h * f1])}
+        return y1, u[-1], dense, None, RESULTS.successful

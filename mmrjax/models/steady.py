@@ -1,0 +1,87 @@
+"""Fidelity `steady`: the operating point as a root of the balances, with implicit derivatives."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from mmrjax import balances
+from mmrjax.models.linear import SmallDense
+from mmrjax.models.result import result, withhold
+from mmrjax.robot import Robot
+from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Command, Result, State
+
+# Units of the unknowns and of the torque residual, so that all are of the order of one.
+_CURRENT, _SPEED_MOTOR, _SPEED, _VOLTAGE, _TORQUE = 10.0, 1000.0, 1.0, 10.0, 100.0
+
+
+def _state(unknowns: Float[Array, " 3"], discharge: Float[Array, ""]) -> State:
+    return State(_CURRENT * unknowns[0], _SPEED_MOTOR * unknowns[1], _SPEED * unknowns[2], discharge)
+
+
+def _residual(unknowns: Float[Array, " 3"], conditions: tuple[Robot, Command]) -> Float[Array, " 3"]:
+    robot, command = conditions
+    signals, creep = balances.settled(robot, command, _state(unknowns, command.discharge))
+    # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
+    torque = jnp.minimum(unknowns[1], -signals.torque_net / _TORQUE)
+    return jnp.stack([signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep])
+
+
+def _start(robot: Robot, command: Command) -> Float[Array, " 3"]:
+    nominal = jnp.where(command.battery > 0.5, robot.battery.voltage(0.0, command.discharge), command.voltage)
+    speed = 0.9 * nominal / robot.motor.torque_constant
+    return jnp.stack(
+        [
+            0.1 * nominal / robot.motor.resistance / _CURRENT,
+            speed / _SPEED_MOTOR,
+            robot.chassis(command.wheeled).radius * speed / robot.gearbox.ratio / _SPEED,
+        ]
+    )
+
+
+def steady(robot: Robot, command: Command) -> Result:
+    """Steady forward travel of one run: a root in motor current, motor speed and robot speed.
+
+    Derivatives are implicit (forward and reverse). Vmapped by `steady_batch`.
+
+    Args:
+        robot: any robot; its parameters may be tracers.
+        command: one run, scalar fields.
+
+    Returns:
+        Scalars. `status` is `converged`; `stalled` (the motors cannot turn: stall current, shaft speed 0,
+        the robot creeps back at the sliding speed of the static friction law); `slides` (the demand is
+        above the adhesion limit), `battery_empty` or `failed`, all three with NaN in every number but
+        `mass` and `adhesion_used`. A member that has no numbers has zero derivatives and harms no other.
+    """
+    dtype = jnp.result_type(command.voltage)
+    tolerance = float(jnp.finfo(dtype).eps) ** 0.7
+    solver = optx.Newton(rtol=tolerance, atol=tolerance, linear_solver=SmallDense())
+    start = jax.lax.stop_gradient(_start(robot, command))
+    solution = optx.root_find(
+        _residual,
+        solver,
+        start,
+        args=(robot, command),
+        max_steps=40,
+        throw=False,
+        adjoint=optx.ImplicitAdjoint(linear_solver=SmallDense()),
+    )
+    signals, _ = balances.settled(robot, command, _state(solution.value, command.discharge))
+    solved = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(solution.value))
+    # Ordered by what a person would say first.
+    status = jnp.where(signals.torque_net < -1e-3 * jnp.abs(signals.torque_load), STALLED, CONVERGED)
+    status = jnp.where(jnp.abs(signals.demand) > signals.adhesion_limit, SLIDES, status)
+    status = jnp.where(solved, status, FAILED)
+    empty = (command.battery > 0.5) & robot.battery.empty(command.discharge)
+    status = jnp.where(empty, BATTERY_EMPTY, status)
+    return withhold(result(robot, signals, status), (status == CONVERGED) | (status == STALLED))
+
+
+@eqx.filter_jit
+def steady_batch(robot: Robot, commands: Command) -> Result:
+    """`steady` over a batch of commands (leading axis of every field) for one robot, compiled."""
+    return jax.vmap(steady, in_axes=(None, 0))(robot, commands)

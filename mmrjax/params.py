@@ -1,0 +1,114 @@
+"""Parameter fields: a number with its unit, prior, bounds and source, and the walk that collects them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, "..."]
+
+
+@dataclasses.dataclass(frozen=True)
+class Spec:
+    """What a parameter field declares about its number.
+
+    `relative_sd` is the prior's standard deviation as a share of the prior mean, `sd` the absolute one
+    in the field's unit; one of the two is set. The prior mean is the nominal robot's value.
+    `bounds` are what a file may state and what a fit may reach, never what a constructor checks.
+    """
+
+    unit: str
+    meaning: str
+    bounds: tuple[float, float]
+    source: str
+    relative_sd: float | None = None
+    sd: float | None = None
+    amplitude: bool = False
+
+    def prior_sd(self, mean: float) -> float:
+        """Standard deviation of the prior [the field's unit] around `mean`."""
+        return self.sd if self.sd is not None else abs(mean) * (self.relative_sd or 0.0)
+
+
+def parameter(
+    default: float | None = None,
+    *,
+    unit: str,
+    meaning: str,
+    bounds: tuple[float, float],
+    source: str,
+    relative_sd: float | None = None,
+    sd: float | None = None,
+    amplitude: bool = False,
+) -> Any:
+    """Declare a differentiable scalar of a component; see `Spec` for the arguments."""
+    if (relative_sd is None) == (sd is None):
+        raise ValueError("a parameter states either relative_sd or sd")
+    spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude)
+    keywords: dict[str, Any] = {} if default is None else {"default": default}
+    return eqx.field(converter=_as_float, metadata={"spec": spec}, kw_only=True, **keywords)
+
+
+def _as_float(value: Any) -> Any:
+    # Anything that is already an array (or a tracer, or a placeholder of a tree transformation) passes.
+    return jnp.asarray(value, dtype=float) if isinstance(value, int | float) else value
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """One parameter of a robot: dotted name, its value now, its specification."""
+
+    name: str
+    value: Any
+    spec: Spec
+
+
+def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
+    """Yield every parameter below `component`, depth first, by dotted name.
+
+    A tuple of modules (the effects) is walked by each member's `name`.
+    """
+    for field in dataclasses.fields(component):
+        value = getattr(component, field.name)
+        name = f"{prefix}{field.name}"
+        if "spec" in field.metadata:
+            yield Parameter(name, value, field.metadata["spec"])
+        elif isinstance(value, eqx.Module):
+            yield from walk(value, f"{name}.")
+        elif isinstance(value, tuple):
+            for member in value:
+                if isinstance(member, eqx.Module):
+                    yield from walk(member, f"{name}.{member.name}.")  # type: ignore[attr-defined]
+
+
+def replace(component: eqx.Module, values: dict[str, Any]) -> eqx.Module:
+    """Return `component` with the named parameters replaced; values may be tracers or batches.
+
+    Raises:
+        KeyError: a name is no parameter of `component`.
+    """
+    unknown = set(values) - {p.name for p in walk(component)}
+    if unknown:
+        raise KeyError(f"no such parameter: {', '.join(sorted(unknown))}")
+    return _replace(component, values, "")
+
+
+def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
+    changes: dict[str, Any] = {}
+    for field in dataclasses.fields(component):
+        value = getattr(component, field.name)
+        name = f"{prefix}{field.name}"
+        if not any(key == name or key.startswith(f"{name}.") for key in values):
+            continue
+        if "spec" in field.metadata:
+            changes[field.name] = values[name]
+        elif isinstance(value, tuple):
+            changes[field.name] = tuple(_replace(m, values, f"{name}.{m.name}.") for m in value)
+        else:
+            changes[field.name] = _replace(value, values, f"{name}.")
+    return dataclasses.replace(component, **changes) if changes else component

@@ -1,0 +1,91 @@
+"""Supply and on-board battery: what voltage reaches the motors, eqs. (8)-(13)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.params import Scalar, parameter
+
+COULOMB_PER_MAH = 3.6
+
+
+class Battery(eqx.Module):
+    """Cells in series, each with a parabola over its discharge; Tables 1 and A4.
+
+    U_b = n (A C_b² + B C_b + U'_b0 - I_b R_b), eqs. (9), (12), (13), with I_b = I_s + I_p, eq. (10).
+    """
+
+    curvature: Scalar = parameter(
+        7e-8 / COULOMB_PER_MAH**2,
+        unit="V/C^2",
+        meaning="A of the cell's no-load voltage, eq. (13)",
+        bounds=(0.0, 1e-6),
+        relative_sd=0.1,
+        source="Table 1: 7e-8 V/mAh^2",
+    )
+    slope: Scalar = parameter(
+        -5e-4 / COULOMB_PER_MAH,
+        unit="V/C",
+        meaning="B of the cell's no-load voltage, eq. (13)",
+        bounds=(-1e-2, 0.0),
+        relative_sd=0.1,
+        source="Table 1: -5e-4 V/mAh",
+    )
+    voltage_full: Scalar = parameter(
+        4.17,
+        unit="V",
+        meaning="no-load voltage of a full cell, eq. (13)",
+        bounds=(0.5, 10.0),
+        relative_sd=0.01,
+        source="Table 1",
+    )
+    resistance: Scalar = parameter(
+        0.049,
+        unit="ohm",
+        meaning="self-resistance of a cell, eq. (12)",
+        bounds=(0.0, 5.0),
+        relative_sd=0.2,
+        source="Table 1 (8 cells: 0.392, Table A4 rounds to 0.4)",
+    )
+    current_other: Scalar = parameter(
+        1.5,
+        unit="A",
+        meaning="current of all other consumers I_p, eq. (10)",
+        bounds=(0.0, 50.0),
+        relative_sd=0.2,
+        source="Table A4",
+    )
+    capacity: Scalar = parameter(
+        2200 * COULOMB_PER_MAH,
+        unit="C",
+        meaning="charge at which the battery is empty",
+        bounds=(1.0, 1e6),
+        relative_sd=0.05,
+        source="type designation XP2200SL: 2200 mAh",
+    )
+    cells: int = eqx.field(default=8, static=True)
+
+    def voltage_no_load(self, discharge: Scalar) -> Scalar:
+        """No-load voltage of one cell [V] after `discharge` [C], eq. (13)."""
+        return self.curvature * discharge**2 + self.slope * discharge + self.voltage_full
+
+    def current(self, total_current: Scalar) -> Scalar:
+        """Load current of the battery I_b = I_s + I_p [A], eq. (10); also dC_b/dt, eq. (11)."""
+        return total_current + self.current_other
+
+    def voltage(self, total_current: Scalar, discharge: Scalar) -> Scalar:
+        """Voltage of the whole battery U_b [V], eqs. (9), (12), for the motors' `total_current` [A]."""
+        cell = self.voltage_no_load(discharge) - self.current(total_current) * self.resistance
+        return self.cells * cell
+
+    def empty(self, discharge: Scalar) -> Scalar:
+        """Whether the charge taken [C] has reached the capacity; the parabola (13) turns up past it."""
+        return discharge >= self.capacity
+
+
+def voltage_source(
+    battery: Battery, external: Scalar, on_battery: Scalar, total_current: Scalar, discharge: Scalar
+) -> Scalar:
+    """Voltage of the selected source U_e [V], eq. (8): the battery where `on_battery`, else `external`."""
+    return jnp.where(on_battery > 0.5, battery.voltage(total_current, discharge), external)
