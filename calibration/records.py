@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.doors import BadData, choices, number
+from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
 
 if TYPE_CHECKING:
     from mmrjax.signals import Command
-
-CONFIGURATIONS = ("6T2A", "4W2T")
-SURFACES = ("linoleum", "smooth_concrete_floor", "lacquered_wood", "asphalt", "concrete")
 
 #: Condition columns with the least and greatest value allowed.
 CONDITIONS: dict[str, tuple[float, float]] = {
@@ -91,14 +89,12 @@ class Runs:
         The mass is the stated `total_mass_kg` where the table has that column, else the robot's own mass
         and the payload. `conditions` set what no column says (`battery`, `discharge`).
         """
-        from mmrjax import nominal, signals
+        from mmrjax import signals
 
         wheeled = np.asarray(self["configuration"] == CONFIGURATIONS[1], float)
         adhesion = np.ones(len(self))
         if self.has("surface"):
-            adhesion = np.array(
-                [nominal.adhesion_ratio(s, w > 0.5) for s, w in zip(self["surface"], wheeled, strict=True)]
-            )
+            adhesion = np.array([adhesion_ratio(s, w > 0.5) for s, w in zip(self["surface"], wheeled, strict=True)])
         return signals.command(
             voltage=self["supply_voltage_V"],
             slope=np.radians(self["slope_deg"]),
@@ -179,7 +175,7 @@ def _cell(name: str, row: int, column: str, cell: str) -> Any:
         return BadData(f"{name} row {row}, {column}: got {cell or 'an empty cell'}; expected {allowed}")
 
     if column in WORDS:
-        known = {"configuration": CONFIGURATIONS, "surface": SURFACES}.get(column)
+        known = {"configuration": CONFIGURATIONS, "surface": tuple(SURFACES)}.get(column)
         if known is not None and cell not in known:
             raise refuse(choices(cell, known))
         return cell
