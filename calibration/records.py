@@ -200,3 +200,14 @@ def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
                 f"{name} row {row}, total_mass_kg: got {number(total)}; expected more than the payload of "
                 f"{number(payload)} kg that it includes"
             )
+
+
+def single(cells: dict[str, Any]) -> Runs:
+    """One run from values given by name, checked as a row of a file would be.
+
+    Raises:
+        BadData: as `read`, with «the options» in place of a file.
+    """
+    columns = {column: np.array([_cell("the options", 1, column, str(value))]) for column, value in cells.items()}
+    _check_mass("the options", columns)
+    return Runs("the options", columns)
