@@ -194,9 +194,7 @@ def main() -> None:
         code = app(standalone_mode=False)
     except DoorError as error:
         code = _fail(str(error), error.exit_code)
-    except typer.Abort:
-        code = 130
-    except KeyboardInterrupt:
+    except (typer.Abort, KeyboardInterrupt):
         code = _fail("interrupted; the same command with the same --out goes on where it stopped", 130)
     except OSError as error:
         place = error.filename or "a file"

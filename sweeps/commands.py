@@ -39,8 +39,8 @@ WHY = {
     "failed": "the solver gave up",
 }
 _HISTORY_POINTS = 1001
-_out = Console(highlight=False, soft_wrap=True)
-_err = Console(stderr=True, highlight=False, soft_wrap=True)
+_out = Console(highlight=False, soft_wrap=True, markup=False)
+_err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 
 def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
@@ -65,14 +65,14 @@ def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bo
     robot = load_robot(config)
     folder = _folder("simulate", config, robot, out, force, runs)
     table = _evaluate(robot, runs, config, folder)
-    shown = min(len(runs), 20)
+    shown = min(len(runs), 6)
     print_runs({key: value[:shown] for key, value in table.items()})
     if shown < len(runs):
         _out.print(f"... and {len(runs) - shown} more in runs.csv")
     if config.model == "drive":
         times = jnp.linspace(0.0, config.duration_s, _HISTORY_POINTS)
         command = runs.command(battery=float(config.battery), discharge=run.charge(config))
-        history = history_table(jax.device_get(drive_batch(robot, command, times)), runs)
+        history = history_table(robot, jax.device_get(drive_batch(robot, command, times)), runs)
         folder.write_table("history.csv", history)
     if config.report:
         from sweeps import report
@@ -84,7 +84,7 @@ def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bo
     return _finish(folder, config, robot, table, {"schema": "mmrjax.simulate/1"}, [runs.source])
 
 
-def history_table(trajectory: Trajectory, runs: records.Runs) -> dict[str, np.ndarray]:
+def history_table(robot: Robot, trajectory: Trajectory, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = trajectory.signals
     points = trajectory.time.shape[-1]
@@ -98,7 +98,7 @@ def history_table(trajectory: Trajectory, runs: records.Runs) -> dict[str, np.nd
         "theoretical_speed_mm_s": signals.speed_theoretical.ravel() / records.MM,
         "distance_m": trajectory.distance.ravel(),
         "voltage_V": signals.voltage.ravel(),
-        "traction_N": 2 * signals.traction.ravel(),
+        "traction_N": robot.sides * signals.traction.ravel(),
     }
 
 
@@ -175,21 +175,25 @@ def print_counts(table: dict[str, np.ndarray]) -> None:
 
 
 def print_runs(table: dict[str, np.ndarray]) -> None:
-    """Operating points, one a row."""
-    columns = {
-        "configuration": ("", ""), "supply_voltage_V": ("U [V]", "g"), "total_mass_kg": ("M [kg]", "g"),
-        "slope_deg": ("slope [deg]", "g"), "total_current_A": ("I [A]", ".2f"),
-        "motor_speed_rpm": ("n [rpm]", ".0f"), "speed_mm_s": ("V [mm/s]", ".0f"), "slip": ("slip", ".3f"),
-        "power_supply_W": ("P_e [W]", ".1f"), "power_ground_W": ("N_t [W]", ".1f"),
-        "status": ("status", ""), "flags": ("flags", ""),
+    """Operating points, one a column."""
+    rows = {
+        "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
+        "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
+        "total_current_A": ("total current [A]", ".3f"), "motor_speed_rpm": ("motor speed [rpm]", ".1f"),
+        "speed_mm_s": ("speed [mm/s]", ".1f"), "slip": ("slip", ".4f"),
+        "power_supply_W": ("power from supply P_e [W]", ".2f"), "power_motor_W": ("at motor shafts N_d [W]", ".2f"),
+        "power_gear_W": ("at gearbox outputs N_r [W]", ".2f"), "power_ground_W": ("to the ground N_t [W]", ".2f"),
+        "temperature_winding_C": ("winding, long running [°C]", ".0f"), "adhesion_used": ("adhesion used", ".3f"),
+        "status": ("status", ""), "flags": ("limits exceeded", ""),
     }  # fmt: skip
-    shown = Table()
-    for heading, _ in columns.values():
-        shown.add_column(heading, justify="left" if heading in ("", "status", "flags") else "right")
-    for row in zip(*(table[key] for key in columns), strict=True):
-        cells = zip(row, columns.values(), strict=True)
-        shown.add_row(*("-" if value != value else format(value, form) for value, (_, form) in cells))
+    shown = Table(show_header=False)
+    for key, (heading, form) in rows.items():
+        cells = (str(v).replace(";", "\n") if not form else "-" if v != v else format(v, form) for v in table[key])
+        shown.add_row(heading, *cells)
     _out.print(shown)
+    for status in dict.fromkeys(table["status"]):
+        if status != STATUSES[0]:
+            _out.print(f"{status}: {WHY[status]}")
 
 
 def print_comparison(table: dict[str, np.ndarray], summary: dict[str, dict[str, dict[str, Any]]]) -> None:
@@ -261,5 +265,5 @@ def _finish(
     hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}
     hashes |= {Path(name).name: digest(Path(name).read_bytes()) for name in data if Path(name).is_file()}
     path = folder.finish({"seed": None, "hashes": hashes, "statuses": counts})
-    _out.print(str(path), markup=False)
+    _out.print(str(path))
     return DONE if counts["converged"] == len(table["status"]) else SOME_NOT_CONVERGED
