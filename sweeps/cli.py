@@ -11,6 +11,8 @@ import typer
 from calibration.doors import DoorError
 from mmrjax import __version__
 
+INTERRUPTED = 130
+
 app = typer.Typer(
     name="mmrjax", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -192,10 +194,12 @@ def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
     try:
         code = app(standalone_mode=False)
+        if code == INTERRUPTED:  # the option parser has caught the interrupt
+            raise KeyboardInterrupt
     except DoorError as error:
         code = _fail(str(error), error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
-        code = _fail("interrupted; the same command with the same --out goes on where it stopped", 130)
+        code = _fail("interrupted; the same command with the same --out goes on where it stopped", INTERRUPTED)
     except OSError as error:
         place = error.filename or "a file"
         code = _fail(f"{place}: {error.strerror}; no run folder was left, only its .partial beside it", 2)
