@@ -83,7 +83,7 @@ def test_simulate_drive_leaves_a_history_that_ends_on_its_run(mmrjax, tmp_path):
     code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", "5", "--no-report", "--out", "d")
     assert code == 0 and "total current [A]" in out and "total mass [kg]" in out
     history, (end,) = table(tmp_path / "d" / "history.csv"), table(tmp_path / "d" / "runs.csv")
-    assert float(history[0]["speed_mm_s"]) == 0.0 and float(history[-1]["time_s"]) == 10.0
+    assert float(history[0]["speed_mm_s"]) == 0.0 and float(history[-1]["time_s"]) == 5.0
     for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s", "theoretical_speed_mm_s"):
         assert float(history[-1][column]) == pytest.approx(float(end[column]), rel=1e-6)
 
