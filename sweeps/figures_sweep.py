@@ -22,12 +22,20 @@ _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled
 
 
-def drawn_voltages(voltages: np.ndarray) -> np.ndarray:
-    """The supply voltages that a figure shows: all up to three, else least, middle and greatest."""
+def panels(voltages: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """How a figure splits runs by supply voltage: a title and a mask for each of at most three panels.
+
+    Every voltage up to three; of a grid of more, the least, a middle and the greatest; where nearly every
+    run has a voltage of its own, thirds of the range.
+    """
     levels = np.unique(voltages)
-    if levels.size <= _PANELS:
-        return levels
-    return levels[[0, levels.size // 2, -1]]
+    if levels.size > _PANELS and 4 * levels.size > voltages.size:
+        bounds = np.linspace(levels[0], levels[-1], _PANELS + 1)
+        third = np.clip(np.searchsorted(bounds, voltages, side="right") - 1, 0, _PANELS - 1)
+        return [(f"{bounds[k]:.3g} to {bounds[k + 1]:.3g} V", third == k) for k in range(_PANELS)]
+    if levels.size > _PANELS:
+        levels = levels[[0, levels.size // 2, -1]]
+    return [(f"{v:.4g} V", voltages == v) for v in levels]
 
 
 def is_map(runs: dict[str, np.ndarray]) -> bool:
@@ -47,7 +55,7 @@ def sweep(runs: dict[str, np.ndarray], quantity: str) -> Figure:
     and says why. Where several runs share a cell their median is shown.
     """
     kinds = [c for c in CONFIGURATIONS if (runs["configuration"] == c).any()]
-    volts = drawn_voltages(runs["supply_voltage_V"])
+    volts = panels(runs["supply_voltage_V"])
     if not is_map(runs):
         return _lines(runs, quantity, kinds)
     values = runs[VALUES[quantity][0]]
@@ -58,10 +66,9 @@ def sweep(runs: dict[str, np.ndarray], quantity: str) -> Figure:
     tall = min(0.3 * payloads.size, 2.2) + 1.0
     fig, grid = figure(len(kinds), len(volts), max(2.0, tall) * len(kinds) + 0.5)
     for row, kind in zip(grid, kinds, strict=True):
-        for axes, volt in zip(row, volts, strict=True):
-            pick = (runs["configuration"] == kind) & (runs["supply_voltage_V"] == volt)
-            _map(axes, runs, np.nonzero(pick)[0], quantity, norm)
-            axes.set_title(f"{kind}, {volt:g} V")
+        for axes, (volt, mask) in zip(row, volts, strict=True):
+            _map(axes, runs, np.nonzero((runs["configuration"] == kind) & mask)[0], quantity, norm)
+            axes.set_title(f"{kind}, {volt}")
             axes.set(xlabel="slope [°]", ylabel="payload [kg]")
     from matplotlib.cm import ScalarMappable
 
@@ -100,11 +107,30 @@ def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, quantity: s
             shade = colormaps["viridis"](norm(image[j, i]))
             ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
             axes.text(i, j, form.format(image[j, i]), ha="center", va="center", fontsize=7.5, color=ink)
-    for i, j in missing:
-        axes.add_patch(Rectangle((i - 0.5, j - 0.5), 1, 1, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
+    for i, j, wide, tall in _blocks(set(missing), joined=not labelled):
+        axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
     _say_missing(axes, missing, labelled)
     _ticks(axes.set_xticks, slopes)
     _ticks(axes.set_yticks, payloads)
+
+
+def _blocks(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
+    """Rectangles (i, j, width, height) that cover the cells; joined where they touch, or one a cell."""
+    if not joined:
+        return [(i, j, 1, 1) for i, j in sorted(cells)]
+    blocks = []
+    left = set(cells)
+    while left:
+        i, j = min(left)
+        tall = 1
+        while (i, j + tall) in left:
+            tall += 1
+        wide = 1
+        while all((i + wide, j + k) in left for k in range(tall)):
+            wide += 1
+        left -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
+        blocks.append((i, j, wide, tall))
+    return blocks
 
 
 def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) -> None:
@@ -116,12 +142,14 @@ def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) ->
     for status in sorted(set(missing.values())):
         places = np.array([p for p, s in missing.items() if s == status], float)
         i, j = places[np.argmin(((places - places.mean(0)) ** 2).sum(1))]
-        axes.text(i, j, STATUS_WORDS.get(status, status), ha="center", va="center", fontsize=8.5, bbox=box)
+        edge = axes.get_xlim()[1]
+        side = "right" if i > 0.88 * edge else "left" if i < 0.12 * edge else "center"
+        axes.text(i, j, STATUS_WORDS.get(status, status), ha=side, va="center", fontsize=8.5, bbox=box)
 
 
 def _ticks(setter: Any, levels: np.ndarray) -> None:
-    every = max(1, -(-levels.size // 8))
-    setter(range(0, levels.size, every), [f"{v:.4g}" for v in levels[::every]])
+    every = 1 if levels.size <= 8 else -(-levels.size // 5)
+    setter(range(0, levels.size, every), [f"{v:.3g}" for v in levels[::every]])
 
 
 def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, column: str, norm: Any) -> None:
@@ -133,7 +161,7 @@ def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, column:
         pick = ~there & (runs["status"][index] == status)
         axes.plot(x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=STATUS_WORDS.get(status, status))
     if not there.all():
-        axes.legend(loc="upper right", fontsize=7.5)
+        axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
 
 
 def _lines(runs: dict[str, np.ndarray], quantity: str, kinds: list[str]) -> Figure:
@@ -145,9 +173,9 @@ def _lines(runs: dict[str, np.ndarray], quantity: str, kinds: list[str]) -> Figu
     fig, grid = figure(1, len(kinds), 3.2, sharey=True)
     for axes, kind in zip(grid[0], kinds, strict=True):
         mine = runs["configuration"] == kind
-        volts = [None] if over == "supply_voltage_V" else drawn_voltages(runs["supply_voltage_V"])
-        for k, volt in enumerate(volts):
-            pick = np.nonzero(mine if volt is None else mine & (runs["supply_voltage_V"] == volt))[0]
+        volts = [("", mine)] if over == "supply_voltage_V" else panels(runs["supply_voltage_V"])
+        for k, (volt, mask) in enumerate(volts):
+            pick = np.nonzero(mine & mask)[0]
             pick = pick[np.argsort(runs[over][pick], kind="stable")]
             shade = colormaps["viridis"](0.15 + 0.7 * k / max(1, len(volts) - 1))
             shown = np.where(settled(runs)[pick], runs[column][pick], np.nan)
@@ -157,7 +185,7 @@ def _lines(runs: dict[str, np.ndarray], quantity: str, kinds: list[str]) -> Figu
                 "o-" if pick.size <= 60 else "-",
                 ms=4,
                 color=shade,
-                label=None if volt is None else f"{volt:g} V",
+                label=volt or None,
             )
             gone = pick[~np.isfinite(shown)]
             for status in np.unique(runs["status"][gone]):
@@ -173,7 +201,7 @@ def _lines(runs: dict[str, np.ndarray], quantity: str, kinds: list[str]) -> Figu
                     clip_on=False,
                 )
                 axes.annotate(
-                    f"{STATUS_WORDS.get(str(status), str(status))}, no number",
+                    f"{STATUS_WORDS.get(str(status), str(status))}",
                     (runs[over][at[0]], 0.03 + 0.05 * k),
                     xycoords=axes.get_xaxis_transform(),
                     xytext=(6, 4),
@@ -181,9 +209,11 @@ def _lines(runs: dict[str, np.ndarray], quantity: str, kinds: list[str]) -> Figu
                     fontsize=8,
                 )
         axes.set(xlabel=label, title=kind)
-        axes.set_ylim(bottom=0)
-        if volts[0] is not None:
+        if volts[0][0]:
             axes.legend()
+    drawn = runs[column][settled(runs)]
+    low, high = (float(drawn.min()), float(drawn.max())) if drawn.size else (0.0, 1.0)
+    grid[0, 0].set_ylim(min(0.0, 1.1 * low), max(0.0, 1.1 * high) or 1.0)
     grid[0, 0].set_ylabel(words)
     return fig
 

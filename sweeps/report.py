@@ -72,7 +72,7 @@ def write(
         known["counts"] = report_tables.counts(runs)
         known["volts_drawn"] = _drawn(runs)
         known["single"] = _single(runs) if len(runs["status"]) <= 3 else None
-        if len(runs["status"]) > 1:
+        if known["single"] is None:
             for quantity in figures_sweep.VALUES:
                 album.add(f"sweep_{quantity}", lambda q=quantity: figures_sweep.sweep(runs, q))
     mine, ratio = rows[name], rows[name].ratio
@@ -186,11 +186,10 @@ def _sliding_rows(rows: figures_data.Rows) -> tuple[np.ndarray, ...]:
 
 
 def _drawn(runs: dict[str, np.ndarray]) -> str:
-    levels = np.unique(runs["supply_voltage_V"])
-    drawn = figures_sweep.drawn_voltages(runs["supply_voltage_V"])
-    if drawn.size == levels.size:
+    shown = figures_sweep.panels(runs["supply_voltage_V"])
+    if sum(int(mask.sum()) for _, mask in shown) == len(runs["status"]):
         return ""
-    return f"{', '.join(f'{v:g}' for v in drawn)} V of {levels.size} voltages"
+    return f"{', '.join(words for words, _ in shown)} of {np.unique(runs['supply_voltage_V']).size} voltages"
 
 
 def _single(runs: dict[str, np.ndarray]) -> list[dict[str, Any]]:

@@ -59,8 +59,8 @@ def counts(runs: data.Columns) -> dict[str, Any]:
 def _axes(runs: data.Columns) -> list[dict[str, str]]:
     names = (
         ("configuration", "configuration", ""),
-        ("supply_voltage_V", "supply voltage", "V"),
-        ("payload_kg", "payload", "kg"),
+        ("supply_voltage_V", "supply voltage", " V"),
+        ("payload_kg", "payload", " kg"),
         ("slope_deg", "slope", "°"),
     )
     return [{"name": words, "values": _levels(runs[column], unit)} for column, words, unit in names]
@@ -71,8 +71,8 @@ def _levels(values: np.ndarray, unit: str) -> str:
     if levels.dtype.kind not in "fiu":
         return ", ".join(map(str, levels))
     if levels.size > 8:
-        return f"{levels[0]:g} to {levels[-1]:g} {unit}, {levels.size} values"
-    return ", ".join(f"{v:g}" for v in levels) + f" {unit}"
+        return f"{levels[0]:.3g} to {levels[-1]:.3g}{unit}, {levels.size} values"
+    return ", ".join(f"{v:.4g}" for v in levels) + unit
 
 
 def _where(runs: data.Columns, pick: np.ndarray) -> str:
@@ -85,9 +85,9 @@ def _where(runs: data.Columns, pick: np.ndarray) -> str:
             for column, unit in (("slope_deg", "°"), ("supply_voltage_V", " V")):
                 levels = np.unique(runs[column][mine])
                 if levels.size <= 4:
-                    ranges.append(", ".join(f"{v:g}" for v in levels) + unit)
+                    ranges.append(", ".join(f"{v:.4g}" for v in levels) + unit)
                 else:
-                    ranges.append(f"{levels[0]:g} to {levels[-1]:g}{unit}")
+                    ranges.append(f"{levels[0]:.3g} to {levels[-1]:.3g}{unit}")
             parts.append(f"{kind}: {int(mine.sum())} at {' and '.join(ranges)}")
     return "; ".join(parts)
 
@@ -107,8 +107,8 @@ def _extremes(runs: data.Columns, settled: np.ndarray) -> list[dict[str, str]]:
             continue
         k = int(settled[choose(runs[column][settled])])
         point = (
-            f"{runs['configuration'][k]}, {runs['supply_voltage_V'][k]:g} V, {runs['payload_kg'][k]:g} kg, "
-            f"{runs['slope_deg'][k]:g}°"
+            f"{runs['configuration'][k]}, {runs['supply_voltage_V'][k]:.4g} V, {runs['payload_kg'][k]:.3g} kg, "
+            f"{runs['slope_deg'][k]:.3g}°"
         )
         answer.append({"words": words, "value": form.format(scale * runs[column][k]), "at": point})
     return answer
