@@ -52,6 +52,7 @@ def operating_points(robot: Robot, conditions: Command) -> Columns:
     import jax
 
     from mmrjax.models.steady import steady_batch
+    from sweeps import outputs
 
     rows = conditions.voltage.shape[0]
     parts = []
@@ -60,28 +61,7 @@ def operating_points(robot: Robot, conditions: Command) -> Columns:
         part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], conditions))
         parts.append(jax.tree.map(np.asarray, part))
     answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
-    return columns(answer)
-
-
-def columns(answer: Any) -> Columns:
-    """A `Result` of shape (rows,) in the units and names of `runs.csv`."""
-    from mmrjax.signals import FLAGS, STATUSES
-
-    reading = answer.reading
-    powers = ("supply", "motor", "gear", "ground", "lift")
-    return {
-        "total_current_A": np.asarray(reading.total_current),
-        "motor_speed_rpm": np.asarray(reading.motor_speed) / RPM,
-        "speed_mm_s": np.asarray(reading.speed) / MM,
-        "theoretical_speed_mm_s": np.asarray(answer.theoretical_speed) / MM,
-        "slip": np.asarray(answer.slip),
-        "voltage_V": np.asarray(answer.voltage),
-        "total_mass_kg": np.asarray(answer.mass),
-        "adhesion_used": np.asarray(answer.adhesion_used),
-        **{f"power_{p}_W": np.asarray(getattr(answer, f"power_{p}")) for p in powers},
-        "status": np.array([STATUSES[int(s)] for s in answer.status]),
-        "flags": np.array([";".join(f for k, f in enumerate(FLAGS) if int(m) >> k & 1) for m in answer.flags]),
-    }
+    return {**outputs.columns(answer), "total_mass_kg": np.asarray(answer.mass)}
 
 
 def stacked(table: Columns) -> np.ndarray:

@@ -20,7 +20,7 @@ from mmrjax import params
 from mmrjax.effects import BY_NAME
 from mmrjax.models.steady import steady_batch
 from mmrjax.nominal import ROBOTS
-from sweeps import figures_data, figures_sweep, report, report_tables
+from sweeps import figures_data, figures_sweep, outputs, report, report_tables
 
 PAPER_FIGURES = {
     "rows",
@@ -134,7 +134,7 @@ def test_limits_table_counts_the_flags(small):
 def test_error_table_equals_equation_35(small):
     _, _, tables, _ = small
     measured, paper = (figures_data.stacked(records.read(n).columns) for n in ("measured", "simulated_by_paper"))
-    points = figures_data.columns(steady_batch(ROBOTS["nominal"](), records.read("measured").command()))
+    points = outputs.columns(steady_batch(ROBOTS["nominal"](), records.read("measured").command()))
     ours = residual.relative_error(figures_data.stacked(points), measured)
     kind = records.read("measured")["configuration"]
     rows = tables.tables["errors"][2:]
@@ -158,7 +158,7 @@ def test_error_table_gives_the_papers_own_errors(small):
 def test_row_table_shows_bench_paper_and_own_numbers(small):
     _, _, tables, _ = small
     measured = records.read("measured")
-    points = figures_data.columns(steady_batch(ROBOTS["nominal"](), measured.command()))
+    points = outputs.columns(steady_batch(ROBOTS["nominal"](), measured.command()))
     rows = [r for r in tables.tables["rowtable"][2:] if r[0]]
     assert len(rows) == 20
     for k, row in enumerate(rows):
@@ -308,7 +308,7 @@ def test_report_escapes_a_title(tmp_path):
 
 def _comparison():
     measured = records.read("measured")
-    points = figures_data.columns(steady_batch(ROBOTS["nominal"](), measured.command()))
+    points = outputs.columns(steady_batch(ROBOTS["nominal"](), measured.command()))
     table = {k: measured[k] for k in ("configuration", *records.CONDITIONS, *records.MEASURED)}
     summary = {}
     for channel, column in report.COLUMNS.items():
