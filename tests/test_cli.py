@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -293,10 +292,11 @@ def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
 def test_help_is_quick_and_imports_no_jax():
     def best(arguments):
         spent = []
-        for _ in range(3):
-            start = time.perf_counter()
+        for _ in range(3):  # processor time: what the tests beside this one take does not count
+            start = os.times()
             done = subprocess.run([*MMRJAX, *arguments], capture_output=True, text=True, check=True)
-            spent.append(time.perf_counter() - start)
+            end = os.times()
+            spent.append(end.children_user - start.children_user + end.children_system - start.children_system)
         return min(spent), done.stdout
 
     for command in ([], ["simulate"], ["sweep"], ["compare"]):
