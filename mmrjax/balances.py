@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 import jax.numpy as jnp
 
-from mmrjax import contact, ground, power
 from mmrjax import chassis as chassis_room
+from mmrjax import contact, ground, power
 from mmrjax.chassis import Chassis
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 from mmrjax import params
 from mmrjax.chassis import Chassis
@@ -14,46 +13,29 @@ from mmrjax.ground import Ground
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
 from mmrjax.robot import Robot
+from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V, adhesion_ratio
 from mmrjax.track import Track
+
+__all__ = [
+    "BENCH",
+    "PAYLOADS_KG",
+    "ROBOTS",
+    "SLOPES_DEG",
+    "SURFACES",
+    "VOLTAGES_V",
+    "adhesion_ratio",
+    "nominal",
+    "sm1",
+    "sm2",
+]
 
 TEETH_BELT, TEETH_PULLEY, PITCH_TOOTH = 168, 48, 5e-3  # Section 3.4.4; pitch [m], Section 3.2.4
 PITCH_GROUSER = 35e-3  # [m], Section 3.2.4
 RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 RADIUS_WHEEL = 50e-3  # D_w / 2, Table 6
 
-#: Axes of Table 8.
-SLOPES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
-PAYLOADS_KG = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0)
-VOLTAGES_V = (15.0, 24.0, 33.0)
-
-
-class Surface(NamedTuple):
-    """Adhesion coefficients of Table 5, longitudinal and lateral, for tracks and for wheels [-]."""
-
-    tracked_x: float
-    tracked_y: float
-    wheeled_x: float
-    wheeled_y: float
-
-
-#: Table 5. The bench of the measurements is lacquered wood (type 3).
-SURFACES = {
-    "linoleum": Surface(0.42, 0.55, 0.52, 0.56),
-    "smooth_concrete_floor": Surface(0.45, 0.55, 0.60, 0.62),
-    "lacquered_wood": Surface(0.32, 0.38, 0.38, 0.43),
-    "asphalt": Surface(0.68, 0.70, 0.60, 0.62),
-    "concrete": Surface(0.76, 0.78, 0.72, 0.75),
-}
-BENCH = "lacquered_wood"
-
 DYNAMIC_SHARE = 0.8  # μ_d / μ_s, assumed; the paper prints none
 GUIDE_SHARE = 0.3  # of the weight, between the brackets that Table A1 simulated sets (docs/paper-notes)
-
-
-def adhesion_ratio(surface: str, wheeled: bool) -> float:
-    """Adhesion of `surface` over that of the bench [-], Table 5."""
-    here, bench = SURFACES[surface], SURFACES[BENCH]
-    return here.wheeled_x / bench.wheeled_x if wheeled else here.tracked_x / bench.tracked_x
 
 
 def _friction(adhesion: float) -> Friction:

@@ -12,9 +12,9 @@ from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
 from mmrjax.params import Scalar
 from mmrjax.power import Battery
+from mmrjax.tables import CONFIGURATIONS
 
-#: Configurations in the order of `Command.wheeled`.
-CONFIGURATIONS = ("6T2A", "4W2T")
+__all__ = ["CONFIGURATIONS", "Robot"]
 
 
 class Robot(eqx.Module):

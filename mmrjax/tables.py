@@ -1,0 +1,39 @@
+"""Tables 5 and 8 and the names of the configurations: plain data, importable without jax."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+#: Configurations in the order of `Command.wheeled`.
+CONFIGURATIONS = ("6T2A", "4W2T")
+
+#: Axes of Table 8.
+SLOPES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
+PAYLOADS_KG = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0)
+VOLTAGES_V = (15.0, 24.0, 33.0)
+
+
+class Surface(NamedTuple):
+    """Adhesion coefficients of Table 5, longitudinal and lateral, for tracks and for wheels [-]."""
+
+    tracked_x: float
+    tracked_y: float
+    wheeled_x: float
+    wheeled_y: float
+
+
+#: Table 5. The bench of the measurements is lacquered wood (type 3).
+SURFACES = {
+    "linoleum": Surface(0.42, 0.55, 0.52, 0.56),
+    "smooth_concrete_floor": Surface(0.45, 0.55, 0.60, 0.62),
+    "lacquered_wood": Surface(0.32, 0.38, 0.38, 0.43),
+    "asphalt": Surface(0.68, 0.70, 0.60, 0.62),
+    "concrete": Surface(0.76, 0.78, 0.72, 0.75),
+}
+BENCH = "lacquered_wood"
+
+
+def adhesion_ratio(surface: str, wheeled: bool) -> float:
+    """Adhesion of `surface` over that of the bench [-], Table 5."""
+    here, bench = SURFACES[surface], SURFACES[BENCH]
+    return here.wheeled_x / bench.wheeled_x if wheeled else here.tracked_x / bench.tracked_x
