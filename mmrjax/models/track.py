@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mmrjax import undercarriage
+from mmrjax import contact, undercarriage
+
 from mmrjax.models.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
 from mmrjax.models.result import result, withhold
 from mmrjax.models.stability import refuse
@@ -44,14 +45,12 @@ class Steady(eqx.Module):
         guide_share: of the ground's normal reaction that the lower guides carry [-]: an output here, a
             parameter in the other fidelities.
         periods: grouser periods averaged [-]; 0: the plain window, the belt hardly moved.
-        since: time at which they begin [s].
         change: largest relative change of current, motor speed and speed between the window's halves [-].
     """
 
     signals: Signals
     guide_share: Scalar
     periods: Int[Array, ""]
-    since: Scalar
     change: Scalar
 
 
@@ -77,31 +76,32 @@ class Trajectory(eqx.Module):
 
 
 def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Array]) -> Steady:
-    # Cumulative integrals, interpolated where the belt was a whole number of pitches before its last place.
-    span = time[-1] - time[0]
-    first = jnp.searchsorted(time, time[-1] - WINDOW * span)
-    pitch = run.path.pitch
-    periods = jnp.floor(jax.lax.stop_gradient((travelled[-1] - travelled[first]) / pitch)).astype(int)
-    periods = jnp.where(jnp.isfinite(travelled[-1]), jnp.maximum(periods, 0), 0)
-    integrals = jax.tree.map(lambda x: jnp.concatenate([jnp.zeros(1), jnp.cumsum(x * jnp.diff(time))]), sums)
+    # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step, which
+    # adds up to one with its neighbour a pitch on: the mean of an orbit that repeats with the pitch is exact
+    # and varies smoothly with the place at which the run happens to end.
+    pitch, end = run.path.pitch, travelled[-1]
+    middle = (travelled[1:] + travelled[:-1]) / 2
+    plain = (time[1:] > time[-1] - WINDOW * (time[-1] - time[0])).astype(time.dtype)
+    first = travelled[jnp.searchsorted(time, time[-1] - WINDOW * (time[-1] - time[0]))]
+    periods = jnp.floor(jax.lax.stop_gradient((end - first) / pitch))
+    periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
-    def since(count: Array) -> Array:
-        return jnp.where(periods > 1, jnp.interp(travelled[-1] - count * pitch, travelled, time), time[first])
+    def mean(begin: Array, until: Array, otherwise: Array) -> Any:
+        rise = contact.step(middle, end - begin * pitch, 0.0, end - (begin - 1) * pitch, 1.0)
+        fall = contact.step(middle, end - (until + 1) * pitch, 1.0, end - until * pitch, 0.0)
+        weight = jnp.where(periods > 0, rise * fall, otherwise)
+        return jax.tree.map(lambda x: jnp.sum(weight * x) / jnp.sum(weight), sums)
 
-    def mean(begin: Array, end: Array) -> Any:
-        at = jax.tree.map(lambda c: (jnp.interp(end, time, c) - jnp.interp(begin, time, c)), integrals)
-        return jax.tree.map(lambda x: x / (end - begin), at)
-
-    begin, middle = since(periods), since(periods // 2)
-    middle = jnp.where(periods > 1, middle, (time[first] + time[-1]) / 2)
-    signals, guided = mean(begin, time[-1])
-    early, late = mean(begin, middle)[0], mean(middle, time[-1])[0]
+    half = jnp.floor(periods / 2) + 1
+    early = plain * (jnp.cumsum(plain) <= jnp.sum(plain) / 2)
+    signals, guided = mean(periods, 0.0, plain)
+    earlier, later = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
     changes = [
-        jnp.abs(getattr(late, f) - getattr(early, f)) / jnp.maximum(jnp.abs(getattr(signals, f)), 1e-3)
+        jnp.abs(getattr(later, f) - getattr(earlier, f)) / jnp.maximum(jnp.abs(getattr(signals, f)), 1e-3)
         for f in ("total_current", "speed_motor", "speed")
     ]
     share = guided / jnp.maximum(signals.normal, 1e-9)
-    return Steady(signals, share, periods, begin, jnp.max(jnp.stack(changes)))
+    return Steady(signals, share, periods.astype(int), jnp.max(jnp.stack(changes)))
 
 
 def _status(run: System, steady: Steady, end: Motion) -> Array:
@@ -169,7 +169,8 @@ def track(
     travelled = run.path.radius * jnp.concatenate([start.q[None, 3], motions.q[:, 3]])
     averages = _average(run, time, travelled, means)
     status = _status(run, averages, end)
-    answer = withhold(result(robot, averages.signals, status), (status != FAILED) & (status != TIPS))
+    there = (status != FAILED) & (status != TIPS)
+    answer = withhold(result(robot, averages.signals, status), there, status != FAILED)
     return Trajectory(time[1:], motions.q, motions.v, means[0], reactions, averages, answer)
 
 
