@@ -121,3 +121,10 @@ def test_averages_hardly_depend_on_the_contact_stiffness(averages):
     gear = RunningGear()
     stiffer = params.replace(gear, {"contact_stiffness": 2 * gear.contact_stiffness})
     np.testing.assert_allclose(averages(stiffer, 1e-4), averages(gear, 1e-4), rtol=3e-3)
+
+
+def test_ledger_can_fail(ledger):
+    """Leaving out any one loss of a tracked run upsets the balance, damping of contact and belt apart."""
+    for name in set(ledger) - {"in", "contact", "belt"}:
+        spent = sum(value[0] for key, value in ledger.items() if key not in ("in", name))
+        assert abs(spent / ledger["in"][0] - 1) > 5e-3, name

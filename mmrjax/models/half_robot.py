@@ -181,15 +181,16 @@ def stand(run: System) -> Motion:
 def roll(run: System) -> Motion:
     """Rolling on its contacts at the speed of the steady fidelity, or at no load where that has none.
 
-    Only a start: no derivative passes through it.
+    Derivatives pass through it, so that those of a short run are those of what was run.
     """
     start = stand(run)
-    guess = jax.lax.stop_gradient(steady(run.robot, run.command))
+    guess = steady(run.robot, run.command)
     solved = guess.status == CONVERGED
     ratio, radius = run.robot.gearbox.ratio, run.robot.chassis(run.command.wheeled).radius
     no_load = run.command.voltage / run.robot.motor.torque_constant
-    motor = jnp.where(solved, guess.reading.motor_speed, no_load)
-    speed = jnp.where(solved, guess.reading.speed, radius * no_load / ratio)
-    current = jnp.where(solved, guess.reading.total_current / run.robot.sides, 0.0)
+    shown, speed_wheel = guess.reading, guess.theoretical_speed / radius  # the reading may carry a sensor's error
+    motor = jnp.where(solved, ratio * speed_wheel, no_load)
+    speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)
+    current = jnp.where(solved, shown.total_current / run.robot.sides, 0.0)
     v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor / ratio)
-    return dataclasses.replace(start, v=jax.lax.stop_gradient(v), current=jax.lax.stop_gradient(current))
+    return dataclasses.replace(start, v=v, current=current)
