@@ -187,9 +187,7 @@ class Mover(Protocol):
         ...
 
 
-def resolved(
-    robot: Robot, command: Command, state: State, mover: Mover, inertia: Scalar
-) -> tuple[Signals, Any]:
+def resolved(robot: Robot, command: Command, state: State, mover: Mover, inertia: Scalar) -> tuple[Signals, Any]:
     """All signals of a robot in motion whose normal load, traction and guide load come from its contacts.
 
     Args:

@@ -77,7 +77,10 @@ def masses(robot: Robot, gear: RunningGear, command: Command, mass: Scalar) -> M
 
 
 def text(robot: Robot, gear: RunningGear, command: Command, mass: float, step: float = 1e-4) -> str:
-    """MJCF of half a robot under one command (scalar fields); `mass` total [kg], `step` [s]."""
+    """MJCF of half a robot under one command (scalar fields); `mass` total [kg], `step` [s].
+
+    The shapes are for the eye and show both sides; masses and inertias are stated and are of one side.
+    """
     half = masses(robot, gear, command, jnp.asarray(mass))
     m = {name: float(getattr(half, name)) for name in vars(half)}
     wheeled = bool(command.wheeled > 0.5)
@@ -89,19 +92,24 @@ def text(robot: Robot, gear: RunningGear, command: Command, mass: float, step: f
     if not wheeled:
         for side, angle in ((1.0, gear.lever_front), (-1.0, gear.lever_rear)):
             x, z = (float(c) for c in lever_tip(gear, angle, side))
-            levers += (
-                f'<geom type="capsule" size="0.012" fromto="{side * base / 2:.9g} 0.16 0 {x:.9g} 0.16 {z:.9g}" '
-                f'mass="0" rgba=".35 .4 .45 1"/>\n      '
-            )
+            for y in (-0.15, 0.15):
+                ends = f"{side * base / 2:.9g} {y} 0 {x:.9g} {y} {z:.9g}"
+                levers += f'<geom type="capsule" size="0.012" fromto="{ends}" rgba=".35 .4 .45 1"/>\n      '
     pulleys = ""
     for name, x in (("driving", base / 2), ("driven", -base / 2)):
         pulleys += f"""
       <body name="{name}" pos="{x:.17g} 0 0">
         <inertial pos="0 0 0" mass="{m["pulley"]:.17g}" diaginertia="{_planar(m["inertia_pulley"])}"/>
         <joint name="{name}" type="hinge" axis="0 1 0"/>
-        <geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" pos="0 0.12 0" rgba=".2 .2 .2 1"/>
-        <geom type="box" size="{outer:.9g} 0.0185 0.003" pos="0 0.12 0" rgba=".8 .8 .2 1"/>
+        <geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" pos="0 0.122 0" rgba=".2 .2 .2 1"/>
+        <geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" pos="0 -0.122 0" rgba=".2 .2 .2 1"/>
+        <geom type="box" size="{outer:.9g} 0.141 0.003" rgba=".8 .8 .2 1"/>
       </body>"""
+    belts = "".join(
+        f'<geom type="box" size="{base / 2:.9g} 0.014 0.0015" pos="0 {y} {z:.9g}" rgba=".2 .2 .2 1"/>\n      '
+        for y in (-0.122, 0.122)
+        for z in (-radius, radius)
+    )
     return f"""<mujoco model="half robot {"4W2T" if wheeled else "6T2A"}">
   <compiler inertiafromgeom="false"/>
   <option timestep="{step:.9g}" integrator="Euler" gravity="{-GRAVITY * sin:.17g} 0 {-GRAVITY * cos:.17g}">
@@ -109,6 +117,7 @@ def text(robot: Robot, gear: RunningGear, command: Command, mass: float, step: f
   </option>
   <default><geom contype="0" conaffinity="0"/></default>
   <visual><global offwidth="1280" offheight="720"/></visual>
+  <asset><texture type="skybox" builtin="gradient" rgb1=".9 .95 1" rgb2=".6 .7 .8" width="64" height="64"/></asset>
   <worldbody>
     <light pos="0 -2 3" dir="0 .5 -1" directional="true"/>
     <geom name="ground" type="plane" size="20 2 .1" rgba=".8 .78 .72 1"/>
@@ -119,7 +128,7 @@ def text(robot: Robot, gear: RunningGear, command: Command, mass: float, step: f
       <joint name="height" type="slide" axis="0 0 1" ref="0"/>
       <joint name="pitch" type="hinge" axis="0 1 0"/>
       <geom type="box" size="{base / 2:.9g} 0.104 0.038" pos="0 0 {0.043 - 0.038:.9g}" rgba=".3 .5 .7 1"/>
-      {levers}{pulleys}
+      {belts}{levers}{pulleys}
     </body>
   </worldbody>
   <keyframe><key name="stand" qpos="0 {axle:.9g} 0 0 0"/></keyframe>

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path as File
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mmrjax import params
 from mmrjax.belt import Path, tips
 from mmrjax.models.track import Trajectory
 from mmrjax.robot import Robot
@@ -28,8 +29,8 @@ class Scene(NamedTuple):
     """What the pictures of one run need, as plain arrays.
 
     Attributes:
-        slope: [rad]; wheeled: whether on wheels; axle: half the wheelbase [m]; wheel, pulley: radii [m].
-        grouser: height of a grouser [m]; levers: tips in the chassis frame, empty on wheels.
+        slope: [rad]; wheeled: whether on wheels; axle: half the wheelbase [m]; wheel: its radius [m].
+        path: of the belt; levers: tips in the chassis frame, empty on wheels.
         time, q, total_current, speed, theoretical: over the run.
         place, normal, guided, support: reactions over the run, of one side.
         traction, resistance: of one side [N]; weight: of half the robot [N].
@@ -96,15 +97,9 @@ def _turn(points: Any, angle: float, about: tuple[float, float] = (0.0, 0.0)) ->
 
 def _outline(path: Path, height: float, places: np.ndarray) -> np.ndarray:
     # Points of the belt (height 0) or of grouser tips in the chassis frame.
-    gear = jax.tree.map(lambda x: x, path.gear)
-    at = tips(Path(path.radius, _with_height(gear, height)), jnp.asarray(places))
+    gear = params.replace(path.gear, {"grouser_height": jnp.asarray(height)})
+    at = tips(Path(path.radius, gear), jnp.asarray(places))
     return np.stack([np.asarray(at.forward), np.asarray(at.up)], axis=1)
-
-
-def _with_height(gear: RunningGear, height: float) -> RunningGear:
-    from mmrjax import params
-
-    return params.replace(gear, {"grouser_height": jnp.asarray(height)})  # type: ignore[return-value]
 
 
 def draw(axes: Any, view: Scene, k: int) -> None:
@@ -267,14 +262,17 @@ def render(
     if file.suffix == ".gif":
         from PIL import Image
 
-        images = [Image.fromarray(p).quantize(64) for p in pictures]
+        images = [Image.fromarray(p).quantize(256) for p in pictures]
         images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
         return file
     import imageio_ffmpeg
 
     first = _pixels(figure(view, frames[0]))
     writer = imageio_ffmpeg.write_frames(str(file), (first.shape[1], first.shape[0]), fps=rate, quality=7)
-    writer.send(None)
+    with warnings.catch_warnings():
+        # jax warns of every fork; this one becomes ffmpeg at once and never touches jax's threads
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+        writer.send(None)
     for picture in pictures:
         writer.send(picture.tobytes())
     writer.close()

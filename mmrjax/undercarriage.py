@@ -70,9 +70,7 @@ def _geometry(
     )
 
 
-def touch(
-    path: Path, radius_wheel: Scalar, wheeled: Scalar, q: Float[Array, " 5"], v: Float[Array, " 5"]
-) -> Touch:
+def touch(path: Path, radius_wheel: Scalar, wheeled: Scalar, q: Float[Array, " 5"], v: Float[Array, " 5"]) -> Touch:
     """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
 
     Where the belt hangs free between pulley and guide it yields under the grouser as a string of tension

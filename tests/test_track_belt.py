@@ -63,7 +63,7 @@ def test_mesh_is_the_swing_of_a_polygon(path):
     np.testing.assert_allclose(lever, slope, rtol=1e-12)
     apothem = float(path.radius) * np.cos(np.pi / 48)
     assert float(lever.max() - lever.min()) == pytest.approx(float(path.radius) - apothem, rel=1e-3)
-    assert POLYGON == pytest.approx(0.00107, rel=1e-2)
+    assert pytest.approx(0.00107, rel=1e-2) == POLYGON
 
 
 def test_runs_pull_as_their_energy_falls(path):

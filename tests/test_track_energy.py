@@ -102,9 +102,9 @@ def averages(robot):
 
     @eqx.filter_jit
     def settled(gear, step):
-        reading = jax.vmap(
-            lambda run: track(robot, run, gear, duration=0.8, step=step, rolling=True).result.reading
-        )(runs)
+        reading = jax.vmap(lambda run: track(robot, run, gear, duration=0.8, step=step, rolling=True).result.reading)(
+            runs
+        )
         return jnp.stack([reading.total_current, reading.motor_speed, reading.speed])
 
     return lambda gear, step: np.asarray(settled(gear, step))

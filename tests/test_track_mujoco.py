@@ -32,7 +32,9 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
     run = command(**RUNS[name])
     ours, theirs = system(robot, run, gear, STEP).model, native(robot, gear, run)
     for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
-        np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-12, atol=1e-15, err_msg=field)
+        np.testing.assert_allclose(
+            getattr(ours, field), getattr(theirs, field), rtol=1e-12, atol=1e-15, err_msg=field
+        )
     np.testing.assert_allclose(ours.opt.gravity, theirs.opt.gravity, rtol=1e-12, atol=1e-15)
     assert float(ours.opt.timestep) == theirs.opt.timestep == STEP
     assert [theirs.body(i + 1).name for i in range(3)] == list(mjcf.BODIES)

@@ -62,7 +62,9 @@ def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
     return pitch / (speed_wheel * radius)
 
 
-def touchdowns(time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]) -> Series:
+def touchdowns(
+    time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]
+) -> Series:
     """Times at which a grouser comes to bear, in order [s]; `place` tells the front arc from the rear one.
 
     A grouser that lifts and comes back in the middle of the run does not count: only one whose place is in

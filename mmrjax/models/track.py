@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from mmrjax import contact, undercarriage
-
 from mmrjax.models.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
 from mmrjax.models.result import result, withhold
 from mmrjax.models.stability import refuse
@@ -114,10 +113,11 @@ def _status(run: System, steady: Steady, end: Motion) -> Array:
     status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
     empty = (command.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
-    status = jnp.where((margin(run) < 0) | (jnp.abs(end.q[2]) > 0.5), TIPS, status)
+    status = jnp.where(margin(run) < 0, TIPS, status)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
-    # A run that has left the ground or sunk through it has numbers that mean nothing.
-    sane = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) | (status == TIPS)
+    # A run that has left the ground, sunk through it or turned over has numbers that mean nothing.
+    grounded = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) & (jnp.abs(end.q[2]) < 0.5)
+    sane = grounded | (status == TIPS)
     return jnp.where(finite & sane, status, FAILED)
 
 
@@ -146,8 +146,8 @@ def track(
         The trajectory. Status: `converged` when current and speeds change by less than 0.1 % from one half
         of the averaging window to the other, else `not_settled`; `stalled` the shafts do not turn forward;
         `slides` the movers spin beyond V_s and the robot gains no speed; `tips` the line of gravity passes
-        outside the contacts; `battery_empty`; `failed` the numbers are no longer finite or the robot has
-        left the ground. `failed` and `tips` withhold the result's numbers.
+        outside the contacts; `battery_empty`; `failed` the numbers are no longer finite, or the robot has
+        left the ground or turned over though gravity alone would not turn it. `failed` and `tips` withhold the result's numbers.
     """
     run = system(robot, command, RunningGear() if gear is None else gear, step)
     inner, samples = round(sample / step), round(duration / sample)
