@@ -150,8 +150,8 @@ def _disc(axes: Any, circle: Any, world: Any, x: float, radius: float, angle: fl
     centre = world([(x, 0.0)])[0]
     axes.add_patch(circle(centre, radius, facecolor=colour, edgecolor=_INK, lw=1, zorder=4))
     for turn in (0.0, np.pi / 2):  # spokes turn clockwise when it rolls uphill to the right
-        arm = radius * np.array([[np.cos(turn - angle), np.sin(turn - angle)]])
-        axes.plot(*world(np.concatenate([arm, -arm]) + [(x, 0.0)]).T, color=_INK, lw=0.8, zorder=4)
+        arm = radius * np.array([np.cos(turn - angle), np.sin(turn - angle)])
+        axes.plot(*world(np.array([arm, -arm]) + np.array([x, 0.0])).T, color=_INK, lw=0.8, zorder=4)
 
 
 def _forces(axes: Any, view: Scene, k: int, world: Any, ground: Any) -> None:

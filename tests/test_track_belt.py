@@ -58,7 +58,7 @@ def test_point_of_the_belt_follows_the_pulleys_by_its_weight(path):
 
 def test_mesh_is_the_swing_of_a_polygon(path):
     angle = jnp.linspace(0.0, 0.5, 400)
-    drawn, lever = jax.vmap(lambda a: travel(path.radius, a))(angle)
+    _, lever = jax.vmap(lambda a: travel(path.radius, a))(angle)
     slope = jax.vmap(jax.grad(lambda a: travel(path.radius, a)[0]))(angle)
     np.testing.assert_allclose(lever, slope, rtol=1e-12)
     apothem = float(path.radius) * np.cos(np.pi / 48)

@@ -29,18 +29,20 @@ def scenes(robot):
 @pytest.mark.parametrize("k", [0, 1])
 def test_picture_shows_robot_and_forces(scenes, tmp_path, k):
     file = render(scenes(k), tmp_path / "robot.png", begin=0.03)
-    pixels = np.asarray(Image.open(file).convert("RGB")).reshape(-1, 3).astype(int)
+    with Image.open(file) as image:
+        pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
     for colour in ((0x5B, 0x8D, 0xB8), (0xD1, 0x49, 0x5B), (0x2E, 0x93, 0x3C)):  # body, reactions, traction
         assert (np.abs(pixels - colour).sum(axis=1) < 90).sum() > 50
 
 
 def test_gif_moves(scenes, tmp_path):
-    file = render(scenes(0), tmp_path / "robot.gif", begin=0.02, end=0.035, slow=10, rate=20)
-    film = Image.open(file)
-    assert film.n_frames == 3
-    first = np.asarray(film.convert("RGB")).astype(int)
-    film.seek(2)
-    assert (np.abs(np.asarray(film.convert("RGB")).astype(int) - first).sum(axis=-1) > 60).mean() > 1e-3
+    file = render(scenes(0), tmp_path / "robot.gif", begin=0.02, end=0.034, slow=10, rate=20)
+    with Image.open(file) as film:
+        assert film.n_frames == 3
+        first = np.asarray(film.convert("RGB")).astype(int)
+        film.seek(2)
+        last = np.asarray(film.convert("RGB")).astype(int)
+    assert (np.abs(last - first).sum(axis=-1) > 60).mean() > 1e-3
 
 
 @pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="the extra `video` is not installed")

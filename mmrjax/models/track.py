@@ -147,7 +147,8 @@ def track(
         of the averaging window to the other, else `not_settled`; `stalled` the shafts do not turn forward;
         `slides` the movers spin beyond V_s and the robot gains no speed; `tips` the line of gravity passes
         outside the contacts; `battery_empty`; `failed` the numbers are no longer finite, or the robot has
-        left the ground or turned over though gravity alone would not turn it. `failed` and `tips` withhold the result's numbers.
+        left the ground or turned over though gravity alone would not turn it. `failed` and `tips` withhold
+        the result's numbers.
     """
     run = system(robot, command, RunningGear() if gear is None else gear, step)
     inner, samples = round(sample / step), round(duration / sample)
