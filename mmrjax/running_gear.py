@@ -50,7 +50,7 @@ class RunningGear(eqx.Module):
         meaning="how far the lower guide lies above the line that touches both pulleys",
         bounds=(-2e-3, 5e-3),
         sd=2e-4,
-        source=f"flush; {_ASSUMED}. Decides the guides' share of the weight: benchmarks and docs give the curve",
+        source=f"flush; {_ASSUMED}. Decides the guides' share of the weight: docs/track-model.md gives the curve",
     )
     guide_gap: Scalar = parameter(
         20e-3,

@@ -91,6 +91,6 @@ def refuse(robot: Robot, commands: Command, gear: RunningGear, step: float) -> N
     worst = int(np.argmin(limits))
     if step > limits[worst]:
         raise ValueError(
-            f"step: got {step:g} s; the contacts are too stiff for it, the largest stable step is "
-            f"{limits[worst]:.2g} s (run {worst} of the batch); take that or a softer contact_stiffness"
+            f"step: got {step:g} s; contacts and friction are too stiff for it, the largest stable step is "
+            f"{limits[worst]:.2g} s (run {worst} of the batch); take that, a softer contact or a larger V_s"
         )
