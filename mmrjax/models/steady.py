@@ -57,6 +57,16 @@ def steady(robot: Robot, command: Command) -> Result:
         above the adhesion limit), `battery_empty` or `failed`, all three with NaN in every number but
         `mass` and `adhesion_used`. A member that has no numbers has zero derivatives and harms no other.
     """
+    point = operating_point(robot, command)
+    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED))
+
+
+def operating_point(robot: Robot, command: Command) -> Result:
+    """`steady` with the numbers left in whatever the status, for a fit that has to find its way back.
+
+    Where the robot `slides` they are those of the balances with the contact held at V_s: current and motor
+    speed as if the ground held, the robot V_s slower than r_k ω_k, and no derivative of the speed in μ_s.
+    """
     dtype = jnp.result_type(command.voltage)
     tolerance = float(jnp.finfo(dtype).eps) ** 0.7
     solver = optx.Newton(rtol=tolerance, atol=tolerance, linear_solver=SmallDense())
@@ -78,7 +88,7 @@ def steady(robot: Robot, command: Command) -> Result:
     status = jnp.where(solved, status, FAILED)
     empty = (command.battery > 0.5) & robot.battery.empty(command.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
-    return withhold(result(robot, signals, status), (status == CONVERGED) | (status == STALLED))
+    return result(robot, signals, status)
 
 
 @eqx.filter_jit
