@@ -71,7 +71,7 @@ class Calibration:
         z: the optimum; cost: its objective; converged: whether it is one.
         starts, identifiability, profile: see there; profile is None if not asked for.
         before, after: readings of `base` and of the fitted robot, NaN where it does not reach a row.
-        status_before, status_after: of each row.
+        status_before, status_after: of each row; adhesion_used: of the fitted robot, by row.
         held_out: by kind of block.
         notes: sentences worth saying.
     """
@@ -93,6 +93,7 @@ class Calibration:
     after: np.ndarray
     status_before: np.ndarray
     status_after: np.ndarray
+    adhesion_used: np.ndarray
     held_out: dict[str, holdout.HeldOut]
     notes: tuple[str, ...]
 
@@ -176,6 +177,7 @@ def calibrate(
         after=np.asarray(after.reading),
         status_before=status_before,
         status_after=status_after,
+        adhesion_used=np.asarray(after.adhesion_used),
         held_out=holdout.held_out(posed, jnp.asarray(z), masks),
         notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
     )

@@ -9,7 +9,7 @@ import numpy as np
 from calibration.doors import BadConfiguration, BadData, number
 from calibration.noise import Noise
 from calibration.problem import is_series
-from calibration.records import CHANNELS, CONDITIONS, MEASURED, Runs
+from calibration.records import CONDITIONS, MEASURED, Runs
 
 #: Replicates further apart than this many sds of their difference contradict each other.
 CONTRADICTION = 6.0
@@ -26,8 +26,8 @@ WOULD_MEASURE = {
     ".inertia": "a time history of the start",
     "motor.resistance_thermal": "long runs at high current with the effect winding_heating present",
     "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating present",
-    ".friction.dynamic": "runs in which the movers spin faster than V_d (a start on a slippery slope, as a history)",
-    ".friction.speed_dynamic": "runs in which the movers spin faster than V_s (a start on a slippery slope, as a history)",
+    ".friction.dynamic": "a history in which the movers spin faster than V_d (a start on a slippery slope)",
+    ".friction.speed_dynamic": "a history in which the movers spin faster than V_s (a start on a slippery slope)",
     ".mass": "a scale, or runs whose table does not state total_mass_kg",
 }
 
@@ -64,7 +64,8 @@ def _configurations(runs: Runs, names: Sequence[str]) -> None:
         word = _WORD.get(name.split(".")[0])
         if word is not None and word not in present:
             raise BadConfiguration(
-                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; add {word} runs or leave it fixed"
+                f"--free {name}: {runs.source} has no {word} rows, so nothing measures it; "
+                f"add {word} runs or leave it fixed"
             )
 
 
@@ -160,6 +161,3 @@ def infeasible(
         f"no start is feasible: {runs.source} rows {rows} were measured in steady travel, but the model slides there "
         f"({parameter} = {at} cannot carry the demand); {cure}"
     )
-
-
-__all__ = ["CHANNELS", "check", "infeasible", "unmeasured", "would_measure"]

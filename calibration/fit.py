@@ -7,6 +7,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
@@ -41,7 +42,7 @@ class Optimum(eqx.Module):
 
     Attributes:
         z: coordinates, shape (parameters,).
-        sd: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ there, shape (parameters,).
+        sd: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,).
         cost: objective, half the sum of squares of misfit and prior [-].
         decrement: decrease that the Gauss-Newton step from here still predicts [-].
         converged: whether the decrement is below `DECREMENT`; holds whatever the solver said.
@@ -88,10 +89,18 @@ def residuals(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], Array]:
     return with_jacobian(function)
 
 
+def informing(data: Data) -> np.ndarray:
+    """Indices of the residuals that carry information: readings and priors, not the penalty on adhesion."""
+    readings, rows = data.measured.size, data.measured.shape[0]
+    return np.r_[:readings, readings + rows : readings + rows + data.centre.size]
+
+
 def _finish(function: Callable[[Z], Array], z: Z, data: Data, pin: Pin, steps: Array) -> Optimum:
     jacobian, r = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
-    lower = cholesky(jacobian.T @ jacobian)
+    informed = jacobian[informing(data)]
+    lower = cholesky(informed.T @ informed)
     sd = jnp.linalg.norm(forward(lower, jnp.eye(z.shape[0])), axis=0)
+    lower = cholesky(jacobian.T @ jacobian)
     decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from calibration import fit
 from calibration.fit import Pin
@@ -21,7 +21,7 @@ HELD = 0.5
 #: Correlations reported.
 CORRELATED = 0.9
 #: Steps of a profile, in posterior sds from the optimum.
-PROFILE_STEPS = (0.25, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
+PROFILE_STEPS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Identifiability:
         weak = []
         for s, v in zip(self.singular_values, self.directions, strict=True):
             if s < 1:
-                main = {n: float(x) for n, x in zip(self.names, v, strict=True) if abs(x) > 0.3}
+                main = {n: float(x) for n, x in zip(self.names, v, strict=True) if abs(x) > 0.1}
                 weak.append((float(s), main))
         return weak
 
@@ -82,11 +82,14 @@ class Identifiability:
 def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
     whole = fit.residuals(problem, data, fit.no_pin(z.shape[0]))
     jacobian = jax.jacfwd(whole)(z)
-    return jacobian, jacobian[: data.measured.size]
+    return jacobian[fit.informing(data)], jacobian[: data.measured.size]
 
 
 def analyse(problem: Problem, z: Array, data: Data | None = None) -> Identifiability:
-    """The linear analysis of `problem` at coordinates z; where the adhesion limit holds z, it counts as data."""
+    """The linear analysis of `problem` at coordinates z, from readings and priors alone.
+
+    Where the adhesion limit holds z the limit is one-sided, which is for the profile to show: no sd does.
+    """
     data = problem.data if data is None else data
     whole, readings = (np.asarray(j) for j in _jacobians(problem, z, data))
     _, s, v = np.linalg.svd(whole, full_matrices=False)

@@ -34,7 +34,7 @@ Simulate = Callable[[Robot, Command], Result]
 
 
 def _steady(robot: Robot, commands: Command) -> Result:
-    return jax.vmap(operating_point, in_axes=(None, 0))(robot, commands)
+    return jax.vmap(lambda c: operating_point(robot, c)[0])(commands)
 
 
 def _drive(robot: Robot, commands: Command) -> Result:

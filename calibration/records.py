@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.doors import BadData, choices, number
+from calibration.doors import BadConfiguration, BadData, DoorError, choices, number
 from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
     for j, column in enumerate(header):
         if column in KNOWN_COLUMNS:
             cells = [row[j].strip() for row in rows[1:]]
-            columns[column] = np.array([_cell(name, k, column, cell) for k, cell in enumerate(cells, 1)])
+            columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
     _check_mass(name, columns)
     return Runs(name, columns, tuple(c for c in header if c not in KNOWN_COLUMNS))
 
@@ -170,9 +170,9 @@ def _check_header(name: str, header: list[str], required: tuple[str, ...]) -> No
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
-def _cell(name: str, row: int, column: str, cell: str) -> Any:
-    def refuse(allowed: str) -> BadData:
-        return BadData(f"{name} row {row}, {column}: got {cell or 'an empty cell'}; expected {allowed}")
+def _cell(where: str, column: str, cell: str, kind: type[DoorError] = BadData) -> Any:
+    def refuse(allowed: str) -> DoorError:
+        return kind(f"{where}, {column}: got {cell or 'an empty cell'}; expected {allowed}")
 
     if column in WORDS:
         known = {"configuration": CONFIGURATIONS, "surface": tuple(SURFACES)}.get(column)
@@ -196,7 +196,23 @@ def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
         return
     for row, (total, payload) in enumerate(zip(columns["total_mass_kg"], columns["payload_kg"], strict=True), 1):
         if total <= payload:
-            raise BadData(
-                f"{name} row {row}, total_mass_kg: got {number(total)}; expected more than the payload of "
-                f"{number(payload)} kg that it includes"
-            )
+            raise BadData(_too_light(f"{name} row {row}", total, payload))
+
+
+def _too_light(where: str, total: float, payload: float) -> str:
+    included = f"more than the payload of {number(payload)} kg that it includes"
+    return f"{where}, total_mass_kg: got {number(total)}; expected {included}"
+
+
+def single(cells: dict[str, Any]) -> Runs:
+    """One run from options given by column name, each checked as a cell of a file would be.
+
+    Raises:
+        BadConfiguration: an option that is out of range, not finite or an unknown word.
+    """
+    texts = {column: number(value) if isinstance(value, float) else str(value) for column, value in cells.items()}
+    columns = {column: np.array([_cell("option", column, t, BadConfiguration)]) for column, t in texts.items()}
+    if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
+        raise BadConfiguration(_too_light("option", cells["total_mass_kg"], cells["payload_kg"]))
+    columns = {c: np.array([cells[c]]) if isinstance(cells[c], float) else v for c, v in columns.items()}
+    return Runs("the options", columns)

@@ -1,0 +1,1 @@
+"""The front door: command line, grids of runs, run folders and reports."""

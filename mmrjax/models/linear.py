@@ -57,7 +57,11 @@ def substitute(factors: Factors, vector: Float[Array, " n"]) -> Float[Array, " n
 
 
 class SmallDense(lx.AbstractLinearSolver):
-    """`factorise` and `substitute` as a lineax solver, for square operators of a handful of unknowns."""
+    """`factorise` and `substitute` as a lineax solver, for square operators of a handful of unknowns.
+
+    Where the answer is not finite (a singular matrix) it is zero: lineax would otherwise stop the whole
+    batch for one member's sake. Whoever uses it has to look at its residual.
+    """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
         return operator.as_matrix(), operator.in_structure()
@@ -66,7 +70,9 @@ class SmallDense(lx.AbstractLinearSolver):
         matrix, structure = state
         flat, _ = ravel_pytree(vector)
         _, unravel = ravel_pytree(jnp.zeros(structure.shape, structure.dtype))
-        return unravel(substitute(factorise(matrix), flat)), lx.RESULTS.successful, {}
+        answer = substitute(factorise(matrix), flat)
+        answer = jnp.where(jnp.all(jnp.isfinite(answer)), answer, 0.0)
+        return unravel(answer), lx.RESULTS.successful, {}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> Any:
         matrix, structure = state

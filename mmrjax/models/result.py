@@ -49,12 +49,13 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     )
 
 
-def withhold(answer: Result, there: Array) -> Result:
-    """NaN in every number of `answer` where `there` is false, save mass and adhesion used, which stand.
+def withhold(answer: Result, there: Array, sound: Array) -> Result:
+    """NaN in every number of `answer` where `there` is false; mass and adhesion used stand where `sound`.
 
     The flags of a withheld member are cleared; its status says why it has no numbers.
     """
     blank = jax.tree.map(
         lambda x: jnp.where(there, x, 0 if jnp.issubdtype(x.dtype, jnp.integer) else jnp.nan), answer
     )
-    return dataclasses.replace(blank, mass=answer.mass, adhesion_used=answer.adhesion_used, status=answer.status)
+    stands = {name: jnp.where(sound, getattr(answer, name), jnp.nan) for name in ("mass", "adhesion_used")}
+    return dataclasses.replace(blank, **stands, status=answer.status)

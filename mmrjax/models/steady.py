@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,6 +32,19 @@ def _residual(unknowns: Float[Array, " 3"], conditions: tuple[Robot, Command]) -
     return jnp.stack([signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep])
 
 
+def _sound(robot: Robot, command: Command) -> tuple[Array, Command]:
+    """Whether a run's conditions are finite and its mass positive; where not, all ones in their place.
+
+    A NaN that entered the residual would reach the derivatives of the whole batch, as 0 * NaN.
+    """
+    stated = command.total_mass
+    mass = robot.chassis(command.wheeled).mass + command.payload if stated is None else stated
+    sound = jnp.all(jnp.isfinite(jnp.stack(jax.tree.leaves(command)))) & (mass > 0)
+    command = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), command)
+    # No adhesion at all: the robot slides, but a share of nothing has no value.
+    return sound, dataclasses.replace(command, adhesion=jnp.maximum(command.adhesion, 1e-9))
+
+
 def _start(robot: Robot, command: Command) -> Float[Array, " 3"]:
     nominal = jnp.where(command.battery > 0.5, robot.battery.voltage(0.0, command.discharge), command.voltage)
     speed = 0.9 * nominal / robot.motor.torque_constant
@@ -52,21 +67,27 @@ def steady(robot: Robot, command: Command) -> Result:
         command: one run, scalar fields.
 
     Returns:
-        Scalars. `status` is `converged`; `stalled` (the motors cannot turn: stall current, shaft speed 0,
-        the robot creeps back at the sliding speed of the static friction law); `slides` (the demand is
-        above the adhesion limit), `battery_empty` or `failed`, all three with NaN in every number but
-        `mass` and `adhesion_used`. A member that has no numbers has zero derivatives and harms no other.
+        Scalars. `status` is `converged`; `stalled` (the motors cannot turn: stall current, shaft
+        speed 0, the robot creeps back at the sliding speed of the static friction law); `slides`
+        (the demand is above the adhesion limit), `battery_empty` or `failed`, all three with NaN in
+        every number but `mass` and `adhesion_used` (NaN too where the conditions are no numbers, or
+        the mass not positive). A member that has no numbers has zero derivatives and harms no
+        other.
     """
-    point = operating_point(robot, command)
-    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED))
+    point, sound = operating_point(robot, command)
+    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED), sound)
 
 
-def operating_point(robot: Robot, command: Command) -> Result:
+def operating_point(robot: Robot, command: Command) -> tuple[Result, Array]:
     """`steady` with the numbers left in whatever the status, for a fit that has to find its way back.
 
     Where the robot `slides` they are those of the balances with the contact held at V_s: current and motor
     speed as if the ground held, the robot V_s slower than r_k ω_k, and no derivative of the speed in μ_s.
+
+    Returns:
+        The result, and whether robot and command are sound (see `_sound`).
     """
+    sound, command = _sound(robot, command)
     dtype = jnp.result_type(command.voltage)
     tolerance = float(jnp.finfo(dtype).eps) ** 0.7
     solver = optx.Newton(rtol=tolerance, atol=tolerance, linear_solver=SmallDense())
@@ -81,14 +102,15 @@ def operating_point(robot: Robot, command: Command) -> Result:
         adjoint=optx.ImplicitAdjoint(linear_solver=SmallDense()),
     )
     signals, _ = balances.settled(robot, command, _state(solution.value, command.discharge))
-    solved = (solution.result == optx.RESULTS.successful) & jnp.all(jnp.isfinite(solution.value))
+    solved = (solution.result == optx.RESULTS.successful) & jnp.isfinite(signals.voltage_left + signals.torque_net)
     # Ordered by what a person would say first.
     status = jnp.where(signals.torque_net < -1e-3 * jnp.abs(signals.torque_load), STALLED, CONVERGED)
     status = jnp.where(jnp.abs(signals.demand) > signals.adhesion_limit, SLIDES, status)
     status = jnp.where(solved, status, FAILED)
     empty = (command.battery > 0.5) & robot.battery.empty(command.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
-    return result(robot, signals, status)
+    status = jnp.where(sound, status, FAILED)
+    return result(robot, signals, status), sound
 
 
 @eqx.filter_jit

@@ -1,0 +1,264 @@
+"""The command line `mmrjax`: options only; what a command does is in `commands`, imported when it is needed."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from calibration.doors import DoorError
+from mmrjax import __version__
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="mmrjax", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Simulate a small tracked or wheeled robot's drive and running gear, and set it against measured runs.\n\n"
+    "[bold]Exit codes[/bold]: 0 done; 1 internal error; 2 usage or configuration; 3 done, but some runs did not "
+    "converge (their status says why); 4 bad data; 130 interrupted (the same command takes it up again).",
+)  # fmt: skip
+
+_Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady or drive.  [default: steady]")]
+_Duration = Annotated[
+    float | None,
+    typer.Option("--duration", help="Length of a drive run from standstill [s].  [default: 30; simulate 5]"),
+]
+_Robot = Annotated[
+    str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  [default: nominal]")
+]
+_Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Change a parameter, SI units, repeatable: tracked.ground.friction.static=0.6."),
+]
+_Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  [default: runs/COMMAND-TIME]")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
+_Report = Annotated[bool | None, typer.Option("--report/--no-report", help="Write report.html.  [default: report]")]
+_Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from the on-board battery.")]
+_Discharge = Annotated[
+    float | None, typer.Option("--discharge", help="Charge already taken from the battery [mAh].  [default: 0]")
+]
+_Chunk = Annotated[int | None, typer.Option("--chunk", help="Runs in one vmapped call.  [default: 16384]")]
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        typer.echo(f"mmrjax {__version__}")
+        raise typer.Exit
+
+
+@app.command(epilog="Example: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive")
+def simulate(
+    configuration: Annotated[str, typer.Option(help="6T2A (tracked) or 4W2T (wheeled).")] = "6T2A",
+    voltage: Annotated[float, typer.Option(help="Supply voltage [V].")] = 33.0,
+    slope: Annotated[float, typer.Option(help="Slope, positive uphill [deg].")] = 0.0,
+    payload: Annotated[float, typer.Option(help="Additional load mass [kg].")] = 0.0,
+    mass: Annotated[
+        float | None, typer.Option(help="Total mass [kg].  [default: the robot's own mass and the payload]")
+    ] = None,
+    surface: Annotated[str, typer.Option(help="Surface of Table 5.")] = "lacquered_wood",
+    runs: Annotated[
+        Path | None, typer.Option(help="CSV of runs to simulate instead; the condition columns are enough.")
+    ] = None,
+    model: _Model = None,
+    duration: _Duration = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    battery: _Battery = None,
+    discharge: _Discharge = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+) -> int:
+    """Simulate one run, or the runs of a CSV file, and write a run folder.
+
+    With --model drive the run starts from standstill, and history.csv holds current and speeds over time.
+    """
+    from sweeps import config
+
+    options = _options(model, duration, robot, set_, battery, discharge, None, report)
+    resolved = config.resolve(config.History, None, options)
+    from calibration import records
+    from sweeps import commands
+
+    if runs is not None:
+        table = commands.read_runs(str(runs), measured=False)
+    else:
+        cells: dict[str, Any] = {
+            "configuration": configuration, "supply_voltage_V": voltage, "payload_kg": payload, "slope_deg": slope,
+            "surface": surface,
+        }  # fmt: skip
+        if mass is not None:
+            cells["total_mass_kg"] = mass
+        table = records.single(cells)
+    return commands.simulate(resolved, table, out, force)
+
+
+@app.command(
+    epilog="Example: mmrjax sweep --slopes 0:20:0.5 --payloads 0,4,8 --voltages 24 --configurations 6T2A "
+    "--set tracked.ground.friction.static=0.6"
+)
+def sweep(
+    configurations: Annotated[str | None, typer.Option(help="Comma-separated.  [default: 6T2A,4W2T]")] = None,
+    voltages: Annotated[str | None, typer.Option(help="Supply voltages [V].  [default: 15,24,33]")] = None,
+    payloads: Annotated[
+        str | None, typer.Option(help="Additional load masses [kg].  [default: 0,1.5,3,5,6.5,8]")
+    ] = None,
+    slopes: Annotated[
+        str | None, typer.Option(help="Slopes, positive uphill [deg].  [default: 0,5,10,15,20]")
+    ] = None,
+    surface: Annotated[str | None, typer.Option(help="Surface of Table 5.  [default: lacquered_wood]")] = None,
+    config_file: Annotated[
+        Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
+    ] = None,
+    model: _Model = None,
+    duration: _Duration = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    battery: _Battery = None,
+    discharge: _Discharge = None,
+    chunk: _Chunk = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+) -> int:
+    """Simulate every combination of a grid in vmapped batches: Table 8 in both configurations by default.
+
+    An axis is 0,5,10 or first:last:step as 0:20:0.5. An interrupted sweep goes on with the same command
+    and the same --out.
+    """
+    from sweeps import config
+
+    options = _options(model, duration, robot, set_, battery, discharge, chunk, report) | {
+        "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
+        "voltages_V": config.axis("--voltages", voltages),
+        "payloads_kg": config.axis("--payloads", payloads),
+        "slopes_deg": config.axis("--slopes", slopes),
+        "surface": surface,
+    }
+    resolved = config.resolve(config.Sweep, config_file, options)
+    from sweeps import commands
+
+    return commands.sweep(resolved, out, force)
+
+
+@app.command(epilog="Example: mmrjax compare measured --robot sm1 --set tracked.ground.friction.static=0.6")
+def compare(
+    data: Annotated[
+        str, typer.Argument(help="A CSV of measured runs, or measured, or simulated_by_paper.")
+    ] = "measured",
+    own_mass: Annotated[
+        bool, typer.Option("--own-mass", help="Take the robot's mass and the payload, not the stated total mass.")
+    ] = False,
+    model: _Model = None,
+    duration: _Duration = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+) -> int:
+    """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
+    from sweeps import config
+
+    options = _options(model, duration, robot, set_, None, None, None, report)
+    resolved = config.resolve(config.Simulation, None, options)
+    from sweeps import commands
+
+    return commands.compare(resolved, data, own_mass, out, force)
+
+
+@app.command(epilog="Example: mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted")
+def calibrate(
+    data: Annotated[str, typer.Argument(help="A CSV of measured runs or histories, or measured.")] = "measured",
+    free: Annotated[
+        list[str] | None,
+        typer.Option(help="Parameters to free, comma-separated; default is the default set, motor.* a group."),
+    ] = None,
+    fix: Annotated[list[str] | None, typer.Option(help="Parameters to hold, comma-separated.")] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(help="A prior in SI units, repeatable: tracked.ground.friction.static=0.45±0.05."),
+    ] = None,
+    noise: Annotated[
+        str | None,
+        typer.Option(help="Sd: current=2%,motor_speed=0.5%,speed=1%.  [default: the file's columns; else estimated]"),
+    ] = None,
+    starts: Annotated[int | None, typer.Option(help="Searches at once.  [default: 64]")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the starts.  [default: 0]")] = None,
+    profiles: Annotated[
+        bool | None, typer.Option("--profiles/--no-profiles", help="Profile likelihood of each.  [default: profiles]")
+    ] = None,
+    model: _Model = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+) -> int:
+    """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
+
+    Writes robot.toml, which every command takes with --robot, and result.json.
+    """
+    from sweeps import config
+
+    options = _options(model, None, robot, set_, None, None, None, report) | {
+        "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
+        "noise": noise, "starts": starts, "seed": seed, "profiles": profiles,
+    }  # fmt: skip
+    resolved = config.resolve(config.Calibrate, None, options)
+    from sweeps import calibrate as room
+
+    return room.calibrate(resolved, data, out, force)
+
+
+@app.command()
+def doctor() -> int:
+    """Check this installation: versions, devices, a solved run against its known answer, a writable folder."""
+    from sweeps import doctor as room
+
+    return room.doctor()
+
+
+def _options(
+    model: str | None, duration: float | None, robot: str | None, set_: list[str] | None, battery: bool | None,
+    discharge: float | None, chunk: int | None, report: bool | None,
+) -> dict[str, Any]:  # fmt: skip
+    from sweeps import config
+
+    return {
+        "model": model, "duration_s": duration, "robot": robot, "set": config.settings(set_), "battery": battery,
+        "discharge_mAh": discharge, "chunk": chunk, "report": report,
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Run the command line; every failure is one sentence on stderr and a documented exit code."""
+    try:
+        code = app(standalone_mode=False)
+        if code == INTERRUPTED:  # the option parser has caught the interrupt
+            raise KeyboardInterrupt
+    except DoorError as error:
+        code = _fail(str(error), error.exit_code)
+    except (typer.Abort, KeyboardInterrupt):
+        code = _fail("interrupted; the same command with the same --out goes on where it stopped", INTERRUPTED)
+    except OSError as error:
+        place = error.filename or "a file"
+        code = _fail(f"{place}: {error.strerror}; no run folder was left, only its .partial beside it", 2)
+    except Exception as error:
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of the option parser
+            code = _fail(error.format_message(), error.exit_code)
+        else:
+            import traceback
+
+            traceback.print_exc()
+            code = _fail(f"internal error: {error}", 1)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"mmrjax: {message}", file=sys.stderr)
+    return code

@@ -1,0 +1,198 @@
+"""What a command is told: options and TOML files, checked into one frozen record."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calibration.doors import BadConfiguration, choices
+from calibration.records import CONDITIONS
+from mmrjax.tables import BENCH, CONFIGURATIONS, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+
+Model = Literal["steady", "drive"]
+_VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
+Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
+Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
+Voltage = Annotated[float, Field(gt=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
+
+
+class Simulation(BaseModel):
+    """What every simulating command needs to know.
+
+    Attributes:
+        model: fidelity.
+        duration_s: length of a `drive` run from standstill [s].
+        robot: name of a robot, or path of its TOML file.
+        set: parameters to change, by dotted name, in SI units.
+        battery: run on the on-board battery instead of the external supply.
+        discharge_mAh: charge already taken from the battery.
+        chunk: runs in one vmapped call.
+        report: whether to write report.html.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    model: Model = "steady"
+    duration_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    robot: str = "nominal"
+    set: dict[str, float] = {}
+    battery: bool = False
+    discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
+    chunk: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
+    report: bool = True
+
+
+class History(Simulation):
+    """A few given runs, shown from standstill: short enough that the start is seen."""
+
+    duration_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
+
+
+class Sweep(Simulation):
+    """A grid of runs: every combination of the axes; Table 8 in both configurations by default."""
+
+    configurations: Annotated[tuple[Literal["6T2A", "4W2T"], ...], Field(min_length=1)] = CONFIGURATIONS
+    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] = VOLTAGES_V
+    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] = SLOPES_DEG
+    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]
+
+
+class Calibrate(Simulation):
+    """What a calibration needs to know beside the data.
+
+    Attributes:
+        free, fix: parameters to free (`default` stands for the default set) and to hold, by dotted name.
+        prior: `name=value±sd` in SI units, in place of the fields' priors.
+        noise: `current=2%,motor_speed=0.5%,speed=1%`; empty takes the file's sd columns, or estimates.
+        starts: searches at once; seed: of their draws.
+        profiles: whether to profile every parameter.
+    """
+
+    free: tuple[str, ...] = ()
+    fix: tuple[str, ...] = ()
+    prior: tuple[str, ...] = ()
+    noise: str = ""
+    starts: Annotated[int, Field(ge=1, le=100_000)] = 64
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
+    profiles: bool = True
+
+
+C = TypeVar("C", bound=Simulation)
+
+
+def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
+    """The configuration of a command: defaults, then the file's keys, then the options given (not None).
+
+    Raises:
+        BadConfiguration: unreadable file, unknown key, or a value out of range; one sentence.
+    """
+    values: dict[str, Any] = {}
+    if file is not None:
+        try:
+            values = tomllib.loads(file.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise BadConfiguration(f"{file}: not a readable TOML file ({error})") from error
+    given = {k: v for k, v in options.items() if v is not None}
+    if "set" in given:
+        given["set"] = {**values.get("set", {}), **given["set"]}
+    try:
+        return kind.model_validate({**values, **given})
+    except ValidationError as error:
+        raise BadConfiguration(_sentence(kind, error, file, given)) from None
+
+
+def _sentence(kind: type[Simulation], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
+    first = error.errors()[0]
+    key = str(first["loc"][0])
+    place = ".".join(str(part) for part in first["loc"])
+    where = f"{file.name}, {place}" if file is not None and key not in given else f"option {place}"
+    if first["type"] == "extra_forbidden":
+        return f"{where}: no such key; {choices(key, kind.model_fields)}"
+    limits = {
+        name: first["ctx"][name] for name in ("gt", "ge", "lt", "le", "expected") if name in first.get("ctx", {})
+    }
+    wanted = first["msg"][0].lower() + first["msg"][1:]
+    allowed = {"slopes_deg": _SLOPE, "payloads_kg": _PAYLOAD, "voltages_V": _VOLTAGE}.get(key)
+    if allowed is not None and limits:
+        wanted = f"expected {'more than ' if key == 'voltages_V' else ''}{allowed[0]:g} to {allowed[1]:g}"
+    return f"{where}: got {first['input']!r}; {wanted}"
+
+
+def settings(options: list[str] | None) -> dict[str, float] | None:
+    """The `--set NAME=VALUE` options as a table.
+
+    Raises:
+        BadConfiguration: no equals sign, or a value that is no number.
+    """
+    if not options:
+        return None
+    table: dict[str, float] = {}
+    for option in options:
+        name, equals, value = option.partition("=")
+        try:
+            table[name.strip()] = float(value)
+        except ValueError:
+            raise BadConfiguration(
+                f"--set: got {option}; expected NAME=VALUE with a number, such as motor.resistance=0.9"
+            ) from None
+        if not equals:
+            raise BadConfiguration(f"--set: got {option}; expected NAME=VALUE, such as motor.resistance=0.9")
+    return table
+
+
+def words(options: list[str] | None) -> tuple[str, ...] | None:
+    """Repeated, comma-separated options as one tuple."""
+    return tuple(w.strip() for o in options for w in o.split(",") if w.strip()) if options else None
+
+
+def axis(option: str, text: str | None) -> tuple[float, ...] | None:
+    """An axis of a grid: `0,5,10`, or `0:20:0.5` for first, last and step, or both mixed.
+
+    Raises:
+        BadConfiguration: something that is neither.
+    """
+    if text is None:
+        return None
+    values: list[float] = []
+    for part in text.split(","):
+        try:
+            numbers = [float(n) for n in part.split(":")]
+            if len(numbers) == 1:
+                values += numbers
+                continue
+            first, last, step = numbers
+            count = (last - first) / step
+            if not 0 <= count < 1e6:
+                raise ValueError
+            values += [first + k * step for k in range(round(count - 0.5 + 1e-9) + 1)]
+        except (ValueError, ZeroDivisionError, OverflowError):
+            raise BadConfiguration(
+                f"{option}: got {part or 'nothing'}; expected numbers as 0,5,10 or first:last:step as 0:20:0.5"
+            ) from None
+    return tuple(values)
+
+
+def as_toml(config: Simulation) -> str:
+    """The resolved configuration; `--config` accepts it."""
+    lines = []
+    values = config.model_dump()
+    table = values.pop("set")
+    for key, value in values.items():
+        lines.append(f"{key} = {_toml(value)}")
+    lines += ["", "[set]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    return repr(value)

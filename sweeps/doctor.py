@@ -1,0 +1,95 @@
+"""Whether this installation works: versions, devices, a run with a known answer, a folder to write to."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import platform
+import tempfile
+import time
+from collections.abc import Callable
+
+from rich.console import Console
+from rich.table import Table
+
+from sweeps.store import PACKAGES
+
+
+def doctor() -> int:
+    """Print one line a check; returns 0 when all pass, 1 otherwise."""
+    checks: dict[str, Callable[[], str]] = {
+        "Python": _python, "packages": _packages, "devices": _devices, "a solved run": _run,
+        "derivatives": _derivative, "writing here": _folder,
+    }  # fmt: skip
+    table = Table()
+    for heading in ("check", "", "found"):
+        table.add_column(heading)
+    healthy = True
+    for name, check in checks.items():
+        try:
+            found, passed = check(), True
+        except Exception as error:
+            found, passed = f"{type(error).__name__}: {error}", False
+        healthy &= passed
+        table.add_row(name, "ok" if passed else "[red]fails[/red]", found)
+    Console(highlight=False).print(table)
+    return 0 if healthy else 1
+
+
+def _python() -> str:
+    return f"{platform.python_version()} on {platform.machine()}"
+
+
+def _packages() -> str:
+    return ", ".join(f"{name} {importlib.metadata.version(name)}" for name in ("mmrjax", *PACKAGES))
+
+
+def _devices() -> str:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    return ", ".join(str(d) for d in jax.devices())
+
+
+def _run() -> str:
+    """A drive without losses on the flat turns at U / C_E and draws nothing: an answer known by hand."""
+    import jax.numpy as jnp
+
+    from mmrjax import nominal, params
+    from mmrjax.models.steady import steady_batch
+    from mmrjax.signals import command
+
+    robot = nominal.nominal()
+    losses = [p.name for p in params.walk(robot) if "friction_" in p.name or "loss_" in p.name or "rolling" in p.name]
+    ideal = params.replace(robot, {name: jnp.asarray(0.0) for name in [*losses, "tracked.track.guide_share"]})
+    start = time.perf_counter()
+    answer = steady_batch(ideal, command(voltage=jnp.array([24.0])))  # type: ignore[arg-type]
+    found, known = float(answer.reading.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
+    if not math.isclose(found, known, rel_tol=1e-9):
+        raise ArithmeticError(f"no-load speed {found} rad/s; known {known} rad/s")
+    return f"no-load speed {found:.3f} rad/s = 24 V / C_E ({time.perf_counter() - start:.1f} s with compiling)"
+
+
+def _derivative() -> str:
+    import jax
+
+    from mmrjax import nominal, params
+    from mmrjax.models.steady import steady
+    from mmrjax.signals import command
+
+    robot, run = nominal.nominal(), command()
+
+    def current(resistance: jax.Array) -> jax.Array:
+        return steady(params.replace(robot, {"motor.friction_coulomb": resistance}), run).reading.total_current  # type: ignore[arg-type]
+
+    x, h = robot.motor.friction_coulomb, 1e-6
+    exact, central = float(jax.grad(current)(x)), float((current(x + h) - current(x - h)) / (2 * h))
+    if not math.isclose(exact, central, rel_tol=1e-5):
+        raise ArithmeticError(f"implicit {exact}; central difference {central}")
+    return f"d(current)/d(motor friction) = {exact:.4f} A/(N·m), as by central difference"
+
+
+def _folder() -> str:
+    with tempfile.NamedTemporaryFile(dir=".") as file:
+        file.write(b"mmrjax")
+    return "the working folder can be written"

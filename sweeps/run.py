@@ -1,0 +1,79 @@
+"""Runs many operating points in chunks of one vmapped call, and makes the table of what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.records import Runs
+from mmrjax.models.drive import drive_batch
+from mmrjax.models.steady import steady_batch
+from mmrjax.power import COULOMB_PER_MAH
+from mmrjax.robot import CONFIGURATIONS, Robot
+from mmrjax.signals import STATUSES, Command, Result
+from sweeps import outputs
+from sweeps.config import Simulation
+from sweeps.store import RunFolder
+
+
+def simulate(robot: Robot, command: Command, config: Simulation) -> Result:
+    """One vmapped call of the fidelity that the configuration names."""
+    if config.model == "steady":
+        return steady_batch(robot, command)
+    return drive_batch(robot, command, jnp.array([0.0, config.duration_s])).result
+
+
+def charge(config: Simulation) -> float:
+    """Charge already taken from the battery [C]."""
+    return config.discharge_mAh * COULOMB_PER_MAH
+
+
+def evaluate(
+    robot: Robot, runs: Runs, config: Simulation, folder: RunFolder, advance: Callable[[int], None]
+) -> dict[str, np.ndarray]:
+    """Simulate every run and return the table of conditions and outcomes.
+
+    Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
+    The last chunk is filled up with its last run, so that all chunks share one compilation.
+
+    Args:
+        advance: called with the number of runs done after each chunk.
+    """
+    size = min(config.chunk, len(runs))
+    parts = []
+    for first in range(0, len(runs), size):
+        rows = np.minimum(np.arange(first, first + size), len(runs) - 1)
+        count = min(size, len(runs) - first)
+        name = f"chunk-{first // size:06d}"
+        part = folder.chunk(name)
+        if part is None:
+            command = runs.where(rows).command(battery=float(config.battery), discharge=charge(config))
+            part = outputs.columns(jax.device_get(simulate(robot, command, config)))
+            part = {key: value[:count] for key, value in part.items()}
+            folder.keep_chunk(name, part)
+        parts.append(part)
+        advance(count)
+    outcome = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return {**conditions(robot, runs), **outcome}
+
+
+def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
+    """The condition columns of a table, the total mass taken from the robot where none is stated."""
+    columns = {key: runs[key] for key in ("configuration", "supply_voltage_V")}
+    if runs.has("total_mass_kg"):
+        columns["total_mass_kg"] = runs["total_mass_kg"]
+    else:
+        tracked = runs["configuration"] == CONFIGURATIONS[0]
+        own = np.where(tracked, float(robot.tracked.mass), float(robot.wheeled.mass))
+        columns["total_mass_kg"] = own + runs["payload_kg"]
+    columns |= {key: runs[key] for key in ("payload_kg", "slope_deg")}
+    columns |= {key: runs[key] for key in ("surface", "run_id") if runs.has(key)}
+    return columns
+
+
+def counts(table: dict[str, np.ndarray]) -> dict[str, int]:
+    """How many runs ended in each status; every status is named."""
+    return {status: int(np.sum(table["status"] == status)) for status in STATUSES}

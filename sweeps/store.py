@@ -1,0 +1,162 @@
+"""Run folders: everything that a command leaves, written aside and moved into place when it is whole."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.doors import BadConfiguration
+from mmrjax import __version__
+
+#: Packages whose versions are part of a result.
+PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "numpy")
+
+
+class RunFolder:
+    """A folder that appears at `path` only when `finish` is called.
+
+    Until then everything is in `path` + `.partial`. If the command is stopped, the same command with the
+    same configuration finds its finished chunks there and goes on; with another configuration the partial
+    folder is begun anew.
+    """
+
+    def __init__(self, path: Path, identity: dict[str, Any], *, force: bool = False) -> None:
+        """Begin or take up a run folder.
+
+        Args:
+            path: where the folder is to appear.
+            identity: what makes this run what it is; two runs with the same identity share their chunks.
+            force: replace an existing run folder.
+
+        Raises:
+            BadConfiguration: `path` holds something already, or cannot be written.
+        """
+        self.path = path
+        self.partial = path.with_name(path.name + ".partial")
+        self.started = datetime.datetime.now(datetime.UTC)
+        self._force = force
+        taken = path.is_file() or (path.is_dir() and any(path.iterdir()))
+        if taken and not (force and (path / "manifest.json").is_file()):
+            hint = "--force replaces a run folder" if path.is_dir() else "it is a file"
+            raise BadConfiguration(f"--out: {path} exists already; choose another path ({hint})")
+        self._digest = digest(json.dumps(identity, sort_keys=True, default=str).encode())
+        mark = self.partial / "identity"
+        try:
+            if self.partial.is_dir() and not (mark.is_file() and mark.read_text() == self._digest):
+                shutil.rmtree(self.partial)
+            (self.partial / "chunks").mkdir(parents=True, exist_ok=True)
+            mark.write_text(self._digest)
+        except OSError as error:
+            raise BadConfiguration(
+                f"--out: {path} cannot be written ({error.strerror}); choose another path"
+            ) from error
+
+    def chunk(self, name: str) -> dict[str, np.ndarray] | None:
+        """A chunk that an interrupted run finished, or None."""
+        file = self.partial / "chunks" / f"{name}.npz"
+        if not file.is_file():
+            return None
+        with np.load(file, allow_pickle=False) as arrays:
+            return {key: arrays[key] for key in arrays.files}
+
+    def keep_chunk(self, name: str, columns: dict[str, np.ndarray]) -> None:
+        """Keep a finished chunk for a run that is taken up again."""
+        file = self.partial / "chunks" / f"{name}.npz"
+        aside = file.with_suffix(".writing")
+        with aside.open("wb") as stream:
+            np.savez(stream, **columns)  # type: ignore[arg-type]
+        aside.replace(file)
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file."""
+        (self.partial / name).write_text(text, encoding="utf-8")
+
+    def write_json(self, name: str, content: dict[str, Any]) -> None:
+        """Write a JSON file; what is not finite becomes null."""
+        self.write_text(name, json.dumps(_finite(content), indent=2, ensure_ascii=False) + "\n")
+
+    def write_table(self, name: str, columns: dict[str, np.ndarray]) -> None:
+        """Write a table as CSV; what is not finite becomes an empty cell."""
+        with (self.partial / name).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(zip(*(map(_text, column) for column in columns.values()), strict=True))
+
+    def finish(self, manifest: dict[str, Any]) -> Path:
+        """Write the manifest, drop the chunks, and move the folder into place; returns its path."""
+        now = datetime.datetime.now(datetime.UTC)
+        self.write_json(
+            "manifest.json",
+            {
+                **provenance(),
+                "started": self.started.isoformat(timespec="seconds"),
+                "seconds": round((now - self.started).total_seconds(), 3),
+                **manifest,
+            },
+        )
+        shutil.rmtree(self.partial / "chunks")
+        (self.partial / "identity").unlink()
+        if self.path.is_dir():
+            if self._force and any(self.path.iterdir()):
+                shutil.rmtree(self.path)
+            else:
+                self.path.rmdir()
+        os.replace(self.partial, self.path)
+        return self.path
+
+
+def provenance() -> dict[str, Any]:
+    """Program, versions and devices that made a result."""
+    import jax
+
+    return {
+        "schema": "mmrjax.manifest/1",
+        "program": f"mmrjax {__version__}",
+        "arguments": sys.argv[1:],
+        "python": platform.python_version(),
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "devices": [str(d) for d in jax.devices()],
+        "float": "float64" if jax.config.jax_enable_x64 else "float32",
+    }
+
+
+def digest(content: bytes) -> str:
+    """SHA-256 of some bytes, in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def default_path(command: str) -> Path:
+    """`runs/<command>-<time>`, for a command that was given no `--out`."""
+    now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = Path("runs") / f"{command}-{now}"
+    return path if not path.exists() else path.with_name(f"{path.name}-{os.getpid()}")
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float | np.floating):
+        return f"{value:.9g}" if math.isfinite(value) else ""
+    return str(value)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

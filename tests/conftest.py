@@ -1,0 +1,128 @@
+# ruff: noqa: E402 (double precision is set before anything is imported)
+"""What the tests share: double precision, the runs of Table 8, and compiled functions."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import nominal, params
+from mmrjax.effects import ALL
+from mmrjax.models.drive import drive, drive_batch
+from mmrjax.models.steady import steady, steady_batch
+from mmrjax.signals import Command, Result, command
+
+
+@pytest.fixture(scope="session")
+def robot():
+    return nominal.nominal()
+
+
+@pytest.fixture(scope="session")
+def robot_with_effects():
+    """Nominal, with every effect of the library at zero amplitude."""
+    return dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in ALL))
+
+
+@pytest.fixture(scope="session")
+def grid():
+    """Rows (wheeled, slope [deg], payload [kg], voltage [V]) of Table 8 in both configurations."""
+    axes = (0.0, 1.0), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
+
+
+@pytest.fixture(scope="session")
+def table8(grid) -> Command:
+    wheeled, slope, payload, voltage = grid.T
+    return command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+
+
+@pytest.fixture(scope="session")
+def steady_table8(robot, table8) -> Result:
+    return steady_batch(robot, table8)
+
+
+@pytest.fixture(scope="session")
+def times_fine():
+    """1001 instants of 2 s, close together where the armature's current rises (time constant 0.2 ms)."""
+    early = np.geomspace(1e-5, 0.05, 400, endpoint=False)
+    return jnp.asarray(np.concatenate([[0.0], early, np.linspace(0.05, 2.0, 600)]))
+
+
+@pytest.fixture(scope="session")
+def drive_table8(robot, table8, times_fine):
+    """The 180 runs of Table 8, 2 s from standstill, at the default tolerance."""
+    return drive_batch(robot, table8, times_fine)
+
+
+@pytest.fixture(scope="session")
+def free(robot_with_effects):
+    """Every parameter that can be freed, effects included."""
+    return list(params.walk(robot_with_effects))
+
+
+@pytest.fixture(scope="session")
+def theta(free):
+    return jnp.stack([p.value for p in free])
+
+
+@pytest.fixture(scope="session")
+def scales(free):
+    """By how much a parameter moves: its value, or where that is 0 a hundredth of its prior's deviation.
+
+    Less for the absent because an effect may be strong where it never was meant to be seen: at the 50 A
+    of a start, a winding at its settled temperature would have 46 times its resistance.
+    """
+    return np.array([abs(float(p.value)) or 0.01 * p.spec.prior_sd(0.0) for p in free])
+
+
+@pytest.fixture(scope="session")
+def rebuild(robot_with_effects, free):
+    """The robot with its parameters taken from a vector."""
+    names = [p.name for p in free]
+    return lambda vector: params.replace(robot_with_effects, {n: vector[k] for k, n in enumerate(names)})
+
+
+def numbers(tree) -> jax.Array:
+    """Every floating-point leaf of a result in one vector."""
+    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.concatenate([jnp.ravel(x) for x in leaves])
+
+
+@pytest.fixture(scope="session")
+def steady_numbers(rebuild):
+    """Floats of `steady` over (parameter vector, command), not compiled."""
+    return lambda vector, run: numbers(steady(rebuild(vector), run))
+
+
+@pytest.fixture(scope="session")
+def drive_numbers(rebuild):
+    """Every signal and the distance over time, and every float of the result, of `drive`, not compiled."""
+
+    def outputs(vector, run, times):
+        answer = drive(rebuild(vector), run, times, tolerance=1e-10)
+        series = [jnp.broadcast_to(x, times.shape) for x in jax.tree.leaves((answer.distance, answer.signals))]
+        return jnp.stack(series), numbers(answer.result)
+
+    return outputs
+
+
+@pytest.fixture
+def compilations():
+    """A list that grows by one for each program that XLA compiles while the test runs."""
+    seen: list[str] = []
+
+    def listen(event: str, duration: float, **_: object) -> None:
+        if event.endswith("backend_compile_duration"):
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)

@@ -1,0 +1,72 @@
+"""Masses and inertias, eqs. (1)-(4), (31)."""
+
+import numpy as np
+import pytest
+import reference
+
+from mmrjax import balances, chassis, params
+from mmrjax.signals import State, command
+
+RNG = np.random.default_rng(31)
+
+
+def test_chassis_inertias_match_reference():
+    for _ in range(100):
+        m, r, J_d, i, eta, J_w = RNG.uniform((2, 0.02, 0, 5, 0.3, 0), (20, 0.2, 1e-5, 100, 1, 1e-2))
+        rotating = chassis.inertia_reduced(J_d, i, eta, J_w)
+        np.testing.assert_allclose(rotating, reference.rotating_inertia(J_d, i, eta, J_w), rtol=1e-9)
+        equivalent = reference.equivalent_inertia(m, r, J_d, i, eta, J_w)
+        np.testing.assert_allclose(chassis.inertia_equivalent(m, r, rotating), equivalent, rtol=1e-9)
+        expected = reference.mass_factor(m, r, equivalent)
+        np.testing.assert_allclose(chassis.mass_factor(m, r, rotating), expected, rtol=1e-9)
+
+
+def test_normal_load_matches_reference():
+    for mass, alpha in RNG.uniform((5, -0.7), (40, 0.7), (50, 2)):
+        expected = reference.rolling_force(mass / 2, alpha, 1.0)
+        np.testing.assert_allclose(chassis.normal_load(mass, alpha, reference.G, 2), expected, rtol=1e-9)
+
+
+def test_mass_factor_without_rotating_parts_is_one():
+    assert float(chassis.mass_factor(6.0, 0.04, 0.0)) == 1.0
+
+
+@pytest.mark.parametrize("wheeled", [0.0, 1.0])
+def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
+    """(1) with (2), (4): where wheel and robot accelerate alike, m δ a = M_d i η / r - M_t / r - F_f - G."""
+    run = command(voltage=24.0, slope=0.05, wheeled=wheeled)
+    body = robot.chassis(wheeled)
+    # find by bisection the sliding speed at which V' = r ω_k', at 300 rad/s and 1.5 A
+    low, high = 0.0, float(body.ground.friction.speed_static)
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        state = State(1.5, 300.0, 300.0 / robot.gearbox.ratio * body.radius - middle, 0.0)
+        s = balances.moving(robot, run, state)
+        if float(s.acceleration) < float(body.radius * s.acceleration_wheel):
+            low = middle
+        else:
+            high = middle
+    m, eta = s.mass / 2, robot.gearbox.efficiency_load
+    drive = (s.torque_motor - s.torque_idle) * robot.gearbox.ratio * eta / body.radius
+    free = drive - s.torque_track_loss / body.radius - s.demand
+    rotating = chassis.inertia_reduced(robot.motor.inertia, robot.gearbox.ratio, eta, body.inertia)
+    delta = chassis.mass_factor(m, body.radius, rotating)
+    assert float(delta) > 1.3  # 48 : 1 makes the rotor count
+    np.testing.assert_allclose(s.acceleration, free / (m * delta), rtol=1e-9)
+
+
+def test_total_mass_stated_overrides_robot_and_payload(robot):
+    state = State(0.0, 0.0, 0.0, 0.0)
+    assert float(balances.begin(robot, command(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
+    assert float(balances.begin(robot, command(payload=3.0, total_mass=20.0), state).mass) == 20.0
+
+
+def test_table7_motor_side_is_the_reflected_rotor(robot):
+    # 5760 kg·mm² = 2.5 x 48²; the rotor of the sheet has 3.35 kg·mm²
+    np.testing.assert_allclose(5760e-6 / 48**2, 2.5e-6)
+    assert float(robot.motor.inertia) > 2.5e-6
+
+
+def test_masses_are_table7(robot):
+    values = {p.name: float(p.value) for p in params.walk(robot)}
+    assert (values["tracked.mass"], values["wheeled.mass"]) == (13.1, 11.5)

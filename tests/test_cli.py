@@ -1,0 +1,321 @@
+"""The command line as a user runs it: run folders, exit codes, messages, interruption."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sweeps import cli, config, run
+
+MMRJAX = [sys.executable, "-c", "from sweeps.cli import main; main()"]
+HEADER = (
+    "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
+)
+CLIMBS = ["--set", "tracked.ground.friction.static=0.6", "--set", "wheeled.ground.friction.static=0.6"]
+
+
+@pytest.fixture
+def mmrjax(monkeypatch, capsys, tmp_path):
+    """Run a command in this process; returns exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments):
+        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        out = capsys.readouterr()
+        return end.value.code, out.out, out.err
+
+    return command
+
+
+def table(path):
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_sweep_is_table_8_in_both_configurations(mmrjax, tmp_path):
+    code, out, _ = mmrjax("sweep", "--no-report", "--out", "s")
+    assert code == 3  # some slide on the nominal adhesion
+    assert out.rstrip().splitlines()[-1] == "s"
+    rows = table(tmp_path / "s" / "runs.csv")
+    points = {(r["configuration"], r["supply_voltage_V"], r["payload_kg"], r["slope_deg"]) for r in rows}
+    assert len(rows) == len(points) == 180 == 2 * 3 * 6 * 5
+    for row in rows:  # never a silent NaN: no number only where the status says so
+        assert (row["total_current_A"] == "") == (row["status"] != "converged")
+        assert float(row["total_mass_kg"]) == (13.1 if row["configuration"] == "6T2A" else 11.5) + float(
+            row["payload_kg"]
+        )
+    result = json.loads((tmp_path / "s" / "result.json").read_text())
+    assert result["schema"] == "mmrjax.sweep/1" and sum(result["statuses"].values()) == 180
+    manifest = json.loads((tmp_path / "s" / "manifest.json").read_text())
+    assert manifest["float"] == "float64" and manifest["versions"]["jax"] and "devices" in manifest
+    assert sorted(p.name for p in (tmp_path / "s").iterdir()) == [
+        "config.resolved.toml", "manifest.json", "result.json", "robot.toml", "runs.csv",
+    ]  # fmt: skip
+
+
+def test_sweep_repeats_from_what_it_left(mmrjax, tmp_path):
+    assert mmrjax("sweep", "--slopes", "0:10:5", "--voltages", "24", "--payloads", "0", "--no-report", "--out", "a",
+                  "--set", "motor.resistance=0.9")[0] == 0  # fmt: skip
+    assert mmrjax("sweep", "--config", "a/config.resolved.toml", "--out", "b")[0] == 0
+    assert mmrjax("sweep", "--config", "a/config.resolved.toml", "--robot", "a/robot.toml", "--out", "c")[0] == 0
+    runs = [(tmp_path / k / "runs.csv").read_text() for k in "abc"]
+    assert runs[0] == runs[1] == runs[2] and runs[0].count("\n") == 7
+
+
+def test_drive_sweep_agrees_with_steady(mmrjax, tmp_path):
+    axes = ["--slopes", "0,10", "--payloads", "0,8", "--voltages", "15,33", "--no-report", *CLIMBS]
+    assert mmrjax("sweep", *axes, "--out", "steady")[0] == 0
+    assert mmrjax("sweep", *axes, "--out", "drive", "--model", "drive")[0] == 0
+    for a, b in zip(table(tmp_path / "steady" / "runs.csv"), table(tmp_path / "drive" / "runs.csv"), strict=True):
+        for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s", "power_ground_W", "efficiency_gear"):
+            assert float(b[column]) == pytest.approx(float(a[column]), rel=1e-3)
+
+
+def test_simulate_drive_leaves_a_history_that_ends_on_its_run(mmrjax, tmp_path):
+    code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", "5", "--no-report", "--out", "d")
+    assert code == 0 and "total current [A]" in out and "total mass [kg]" in out
+    history, (end,) = table(tmp_path / "d" / "history.csv"), table(tmp_path / "d" / "runs.csv")
+    assert float(history[0]["speed_mm_s"]) == 0.0 and float(history[-1]["time_s"]) == 5.0
+    for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s", "theoretical_speed_mm_s"):
+        assert float(history[-1][column]) == pytest.approx(float(end[column]), rel=1e-6)
+
+
+def test_simulate_runs_from_a_file_of_conditions(mmrjax, tmp_path):
+    (tmp_path / "plan.csv").write_text(
+        "configuration,supply_voltage_V,payload_kg,slope_deg,run_id,note\n6T2A,24,2,3,a,x\n"
+    )
+    code, _, err = mmrjax("simulate", "--runs", "plan.csv", "--no-report", "--out", "p")
+    assert code == 0 and "not used: note" in err
+    assert table(tmp_path / "p" / "runs.csv")[0]["run_id"] == "a"
+
+
+def test_battery_sags_and_ends_clearly(mmrjax, tmp_path):
+    code, _, _ = mmrjax("simulate", "--battery", "--no-report", "--out", "full")
+    (full,) = table(tmp_path / "full" / "runs.csv")
+    current = float(full["total_current_A"])
+    assert code == 0 and float(full["voltage_V"]) == pytest.approx(8 * (4.17 - 0.049 * (current + 1.5)))
+    code, out, _ = mmrjax("simulate", "--battery", "--discharge", "2300", "--no-report", "--out", "empty")
+    assert code == 3 and "battery_empty: the battery has no charge left" in out
+
+
+def test_compare_gives_equation_35(mmrjax, tmp_path):
+    code, out, _ = mmrjax("compare", "measured", "--no-report", "--out", "c", *CLIMBS)
+    assert code == 0 and "R²" in out
+    rows = table(tmp_path / "c" / "comparison.csv")
+    for row in rows:
+        simulated, measured = float(row["simulated_speed_mm_s"]), float(row["speed_mm_s"])
+        assert float(row["error_speed_percent"]) == pytest.approx(100 * (simulated - measured) / simulated, rel=1e-6)
+    errors = json.loads((tmp_path / "c" / "result.json").read_text())["errors"]
+    rms = np.sqrt(np.mean([float(r["error_total_current_percent"]) ** 2 for r in rows]))
+    assert errors["all"]["total_current"]["rms_percent"] == pytest.approx(rms, rel=1e-6)
+    assert errors["6T2A"]["speed"]["rows"] == 10
+
+
+def test_compare_own_mass_takes_the_robots(mmrjax, tmp_path):
+    mmrjax("compare", "--no-report", "--out", "stated", *CLIMBS)
+    mmrjax("compare", "--no-report", "--own-mass", "--out", "own", *CLIMBS)
+    stated, own = (table(tmp_path / k / "runs.csv")[-1] for k in ("stated", "own"))
+    assert (stated["total_mass_kg"], own["total_mass_kg"]) == ("21.1", "19.5")
+    assert float(own["total_current_A"]) < float(stated["total_current_A"])
+
+
+USAGE = {
+    "misspelt option": (["sweep", "--slope", "5"], r"No such option: --slope"),
+    "unknown command": (["swep"], r"No such command"),
+    "slope of 95": (["sweep", "--slopes", "0,95"], r"option slopes_deg\.1: got 95\.0; expected -45 to 45"),
+    "negative voltage": (["sweep", "--voltages=-3"], r"option voltages_V\.0: got -3\.0; expected more than 0 to 100"),
+    "NaN": (["sweep", "--payloads", "nan"], r"option payloads_kg\.0: got nan"),
+    "no numbers": (
+        ["sweep", "--slopes", "steep"],
+        r"--slopes: got steep; expected numbers as 0,5,10 or first:last:step",
+    ),
+    "step of zero": (["sweep", "--slopes", "0:5:0"], r"--slopes: got 0:5:0"),
+    "unknown configuration": (
+        ["sweep", "--configurations", "8T"],
+        r"configurations\.0: got '8T'; input should be '6T2A' or '4W2T'",
+    ),
+    "unknown model": (
+        ["sweep", "--model", "magic"],
+        r"option model: got 'magic'; input should be 'steady' or 'drive'",
+    ),
+    "unknown surface": (["sweep", "--surface", "ice"], r"option surface: got 'ice'"),
+    "unknown robot": (
+        ["sweep", "--robot", "sm3"],
+        r"--robot: got sm3, no such file and no known robot; did you mean sm",
+    ),
+    "setting without value": (
+        ["sweep", "--set", "motor.resistance"],
+        r"--set: got motor\.resistance; expected NAME=VALUE",
+    ),
+    "setting misspelt": (
+        ["sweep", "--set", "motor.resistanse=1"],
+        r"--set, motor\.resistanse: no such parameter; did you mean motor\.resistance",
+    ),
+    "negative mass set": (
+        ["sweep", "--set", "tracked.mass=-1"],
+        r"--set, tracked\.mass: got -1; expected 0\.5 to 200 kg",
+    ),
+    "no config file": (["sweep", "--config", "none.toml"], r"none\.toml: not a readable TOML file"),
+    "chunk of zero": (["sweep", "--chunk", "0"], r"option chunk: got 0"),
+    "slope of 95 for one run": (["simulate", "--slope", "95"], r"option, slope_deg: got 95; expected -45 to 45"),
+    "mass below payload": (
+        ["simulate", "--mass", "5", "--payload", "8"],
+        r"total_mass_kg: got 5; expected more than",
+    ),
+    "NaN for one run": (["simulate", "--voltage", "nan"], r"option, supply_voltage_V: got nan"),
+    "duration of zero": (["simulate", "--duration", "0"], r"option duration_s: got 0"),
+}
+
+
+@pytest.mark.parametrize("case", USAGE, ids=list(USAGE))
+def test_bad_usage_ends_with_2_and_one_sentence(mmrjax, tmp_path, case):
+    arguments, sentence = USAGE[case]
+    code, out, err = mmrjax(*arguments, "--out", "x") if arguments[0] != "swep" else mmrjax(*arguments)
+    assert code == 2 and out == ""
+    assert re.search(sentence, err), err
+    assert len(err.strip().splitlines()) == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_bad_config_files_name_file_and_key(mmrjax, tmp_path):
+    (tmp_path / "grid.toml").write_text("slops_deg = [5]\n")
+    code, _, err = mmrjax("sweep", "--config", "grid.toml")
+    assert code == 2 and "grid.toml, slops_deg: no such key; did you mean slopes_deg?" in err
+    (tmp_path / "grid.toml").write_text("slopes_deg = [5, 95]\n")
+    code, _, err = mmrjax("sweep", "--config", "grid.toml")
+    assert code == 2 and "grid.toml, slopes_deg.1: got 95; expected -45 to 45" in err
+
+
+BAD_RUNS = {
+    "empty": ("", "runs.csv: the file is empty"),
+    "missing column": (
+        HEADER.replace(",speed_mm_s", "") + "\n6T2A,15,13.1,0,5,2.75,4800",
+        "column speed_mm_s is missing",
+    ),
+    "slope": (f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400", "runs.csv row 1, slope_deg: got 95; expected -45 to 45"),
+    "NaN": (f"{HEADER}\n6T2A,15,13.1,0,5,nan,4800,400", "row 1, total_current_A: got nan"),
+    "configuration": (f"{HEADER}\n5T,15,13.1,0,5,1,4800,400", "row 1, configuration: got 5T"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_RUNS, ids=list(BAD_RUNS))
+def test_bad_data_ends_with_4_and_leaves_nothing(mmrjax, tmp_path, case):
+    text, sentence = BAD_RUNS[case]
+    (tmp_path / "runs.csv").write_text(text)
+    code, out, err = mmrjax("compare", "runs.csv", "--out", "x")
+    assert code == 4 and out == "" and sentence in err and len(err.strip().splitlines()) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["runs.csv"]
+
+
+def test_unwritable_or_taken_folder_is_refused(mmrjax, tmp_path):
+    (tmp_path / "file").write_text("")
+    code, _, err = mmrjax("sweep", "--out", "file/below")
+    assert code == 2 and "--out: file/below cannot be written" in err
+    code, _, err = mmrjax("sweep", "--out", "file")
+    assert code == 2 and "--out: file exists already" in err
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years of work")
+    code, _, err = mmrjax("sweep", "--out", "mine", "--force")
+    assert code == 2 and (tmp_path / "mine" / "thesis.txt").exists()  # --force replaces run folders only
+
+
+def test_run_folder_is_replaced_only_when_told(mmrjax, tmp_path):
+    one = ["simulate", "--no-report", "--out", "r"]
+    assert mmrjax(*one)[0] == 0
+    assert mmrjax(*one)[0] == 2
+    assert mmrjax(*one, "--slope", "5", "--force")[0] == 0
+    assert table(tmp_path / "r" / "runs.csv")[0]["slope_deg"] == "5"
+
+
+def test_full_disk_leaves_no_run_folder(mmrjax, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device", "runs.csv")
+
+    monkeypatch.setattr("sweeps.store.RunFolder.write_table", full)
+    code, _, err = mmrjax("simulate", "--no-report", "--out", "r")
+    assert code == 2 and "runs.csv: No space left on device; no run folder was left" in err
+    assert not (tmp_path / "r").exists()
+
+
+def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatch):
+    arguments = ["sweep", "--slopes", "0:9:1", "--voltages", "24", "--configurations", "6T2A", "--chunk", "10",
+                 "--no-report", "--out", "s"]  # fmt: skip
+    simulated, honest = [], run.simulate
+
+    def interrupted(robot, command, settings):
+        if len(simulated) == 3:
+            raise KeyboardInterrupt
+        simulated.append(command.slope.shape)
+        return honest(robot, command, settings)
+
+    monkeypatch.setattr(run, "simulate", interrupted)
+    code, _, err = mmrjax(*arguments)
+    assert code == 130 and "goes on where it stopped" in err
+    assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
+    monkeypatch.setattr(run, "simulate", lambda *a: (simulated.append(a[1].slope.shape), honest(*a))[1])
+    assert mmrjax(*arguments)[0] == 0
+    assert simulated == [(10,)] * 6  # three before, three after: none twice
+    resumed = (tmp_path / "s" / "runs.csv").read_text()
+    assert mmrjax(*arguments[:-2], "--chunk", "60", "--out", "t")[0] == 0
+    assert resumed == (tmp_path / "t" / "runs.csv").read_text()
+    assert not (tmp_path / "s.partial").exists()
+
+
+def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
+    arguments = ["sweep", "--slopes", "0:9:1", "--chunk", "60", "--no-report", "--out", "s"]
+    honest = run.simulate
+    monkeypatch.setattr(run, "simulate", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert mmrjax(*arguments)[0] == 130
+    monkeypatch.setattr(run, "simulate", honest)
+    mmrjax(*arguments, "--set", "motor.resistance=0.9")
+    mmrjax(*arguments[:-1], "t", "--set", "motor.resistance=0.9")
+    assert (tmp_path / "s" / "runs.csv").read_text() == (tmp_path / "t" / "runs.csv").read_text()
+
+
+def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
+    arguments = ["sweep", "--slopes", "0:4:0.5", "--chunk", "50", "--no-report", "--out", str(tmp_path / "s")]
+    done = subprocess.run(
+        [*MMRJAX, *arguments], capture_output=True, text=True, env={**os.environ, "JAX_PLATFORMS": "cpu"}
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == str(tmp_path / "s")
+    assert "simulating" in done.stderr and "324/324" in done.stderr
+
+
+def test_help_is_quick_and_imports_no_jax():
+    def best(arguments):
+        spent = []
+        for _ in range(3):  # processor time: what the tests beside this one take does not count
+            start = os.times()
+            done = subprocess.run([*MMRJAX, *arguments], capture_output=True, text=True, check=True)
+            end = os.times()
+            spent.append(end.children_user - start.children_user + end.children_system - start.children_system)
+        return min(spent), done.stdout
+
+    for command in ([], ["simulate"], ["sweep"], ["compare"]):
+        spent, text = best([*command, "--help"])
+        assert spent < 0.5
+        assert "Usage" in text
+        if command:
+            assert f"Example: mmrjax {command[0]}" in text.replace("\n", " ")
+    probe = "import sys; import sweeps.cli; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", probe]).returncode == 0
+
+
+def test_doctor_finds_this_installation_healthy(mmrjax):
+    code, out, _ = mmrjax("doctor")
+    assert code == 0 and "fails" not in out and "24 V / C_E" in out
+
+
+def test_axis_takes_values_and_ranges():
+    assert config.axis("--slopes", "0,5,10") == (0.0, 5.0, 10.0)
+    assert config.axis("--slopes", "0:1:0.25") == (0.0, 0.25, 0.5, 0.75, 1.0)
+    assert config.axis("--slopes", "0:1:0.3,9") == (0.0, 0.3, 0.6, pytest.approx(0.9), 9.0)
+    assert len(config.axis("--slopes", "0:20:0.1")) == 201

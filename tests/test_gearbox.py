@@ -1,0 +1,57 @@
+"""Reduction gear, eqs. (19)-(23)."""
+
+import jax
+import numpy as np
+import reference
+
+from mmrjax.gearbox import Gearbox
+
+RNG = np.random.default_rng(19)
+
+
+def test_gearbox_laws_match_reference():
+    for _ in range(100):
+        i, eta, M0, K, torque, w = RNG.uniform((5, 0.3, 0, 0, 0.002, 0), (100, 1, 1e-3, 1e-6, 0.1, 1300))
+        gear = Gearbox(ratio=i, efficiency_load=eta, friction_coulomb=M0, friction_viscous=K)
+        idle = reference.gear_idle(w, M0, K, 1.0)
+        eta_r = reference.gear_efficiency(torque, idle, eta)
+        loss = reference.gear_loss(torque, i, eta_r)
+        np.testing.assert_allclose(loss, reference.gear_loss_split(torque, idle, i, eta), rtol=1e-9)  # (21) = (22)
+        np.testing.assert_allclose(gear.torque_idle(w, 1.0), idle, rtol=1e-9)
+        np.testing.assert_allclose(gear.efficiency(torque, w), eta_r, rtol=1e-9)
+        np.testing.assert_allclose(gear.torque_loss(torque, w), loss, rtol=1e-9)
+        np.testing.assert_allclose(
+            gear.torque_output(torque - idle, 1.0), reference.gear_output(torque, loss, i), rtol=1e-9
+        )
+
+
+def test_gearbox_without_losses_is_a_lever():
+    gear = Gearbox(ratio=30.0, efficiency_load=1.0, friction_coulomb=0.0, friction_viscous=0.0)
+    assert float(gear.torque_output(0.02, 1.0)) == 30.0 * 0.02
+    assert float(gear.torque_loss(0.02, 500.0)) == 0.0
+    assert float(gear.efficiency(0.02, 500.0)) == 1.0
+
+
+def test_gearbox_efficiency_rises_to_its_maximum_with_load():
+    gear = Gearbox()
+    efficiency = np.array([float(gear.efficiency(m, 800.0)) for m in (0.003, 0.01, 0.05, 10.0)])
+    assert (np.diff(efficiency) > 0).all()
+    np.testing.assert_allclose(efficiency[-1], 0.74, rtol=1e-3)
+
+
+def test_gearbox_efficiency_at_zero_torque_is_finite_with_its_gradient():
+    value, gradient = jax.value_and_grad(Gearbox().efficiency)(0.0, 800.0)
+    assert np.isfinite(value) and np.isfinite(gradient)
+
+
+def test_gearbox_load_loss_takes_power_in_both_directions():
+    gear = Gearbox()
+    for direction in (-1.0, 1.0):
+        for transmitted in (-0.05, -0.001, 0.001, 0.05):
+            out = float(gear.torque_output(transmitted, direction))
+            power_in, power_out = transmitted * direction, out * direction / 48.0
+            assert power_in > power_out  # what enters at the motor side exceeds what leaves
+
+
+def test_gearbox_ratio_is_planetary_times_belt():
+    np.testing.assert_allclose(Gearbox().ratio, 576 / 25 * 25 / 12, rtol=1e-12)

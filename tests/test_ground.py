@@ -1,0 +1,67 @@
+"""Motion resistance (5), adhesion (6), (7), slip (32), (33)."""
+
+import jax
+import numpy as np
+import pytest
+import reference
+
+from mmrjax import chassis, ground, nominal
+from mmrjax.contact import Friction
+from mmrjax.ground import Ground
+
+RNG = np.random.default_rng(5)
+G = 9.80665
+
+
+def test_ground_forces_match_reference():
+    for _ in range(100):
+        f, mu, m, alpha, v, ratio = RNG.uniform((0, 0.1, 2, -0.5, -0.5, 0.3), (0.2, 1, 20, 0.5, 0.5, 2))
+        surface = Ground(Friction(static=mu, dynamic=0.8 * mu), rolling_resistance=f)
+        normal = chassis.normal_load(2 * m, alpha, G, 2)
+        np.testing.assert_allclose(
+            surface.force_resistance(normal, 1.0), reference.rolling_force(m, alpha, f), rtol=1e-9
+        )
+        np.testing.assert_allclose(
+            surface.force_adhesion(normal, ratio), reference.adhesion_force(m, alpha, ratio * mu), rtol=1e-9
+        )
+        expected = reference.friction(v, mu, 0.8 * mu, 0.02, 0.2) * ratio * m * G * np.cos(alpha)
+        np.testing.assert_allclose(surface.traction(v, normal, ratio), expected, rtol=1e-9)
+        demand = RNG.uniform(-0.99, 0.99) * ratio * mu * normal
+        expected = reference.friction_speed(demand / normal / ratio, mu, 0.02)
+        np.testing.assert_allclose(surface.speed_creep(demand, normal, ratio), expected, rtol=1e-9)
+        np.testing.assert_allclose(ground.force_gravity(m, alpha, G), m * G * np.sin(alpha), rtol=1e-9)
+
+
+def test_slip_matches_reference():
+    for V, w, r in RNG.uniform((0.1, 1, 0.01), (1, 20, 0.1), (50, 3)):
+        theoretical = reference.theoretical_speed(w, r)
+        np.testing.assert_allclose(ground.slip(V, theoretical), reference.slip(V, theoretical), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("speed", "theoretical", "slip"), [(0.0, 0.0, 0.0), (0.0, 1.0, 1.0), (1.0, 1.0, 0.0)])
+def test_slip_limits_are_finite(speed, theoretical, slip):
+    value, gradient = jax.value_and_grad(ground.slip, argnums=(0, 1))(speed, theoretical)
+    assert float(value) == slip and np.isfinite(gradient).all()
+
+
+def test_ground_traction_equals_adhesion_at_its_largest():
+    surface = nominal.nominal().tracked.ground
+    speeds = np.linspace(0, 0.5, 2001)
+    largest = np.max(surface.traction(speeds, 60.0, 1.0))
+    np.testing.assert_allclose(largest, surface.force_adhesion(60.0, 1.0), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("surface", "tracked", "wheeled"),
+    [
+        ("lacquered_wood", 0.32, 0.38),
+        ("linoleum", 0.42, 0.52),
+        ("smooth_concrete_floor", 0.45, 0.60),
+        ("asphalt", 0.68, 0.60),
+        ("concrete", 0.76, 0.72),
+    ],
+)
+def test_adhesion_ratio_restores_table5(robot, surface, tracked, wheeled):
+    for is_wheeled, body, phi in ((False, robot.tracked, tracked), (True, robot.wheeled, wheeled)):
+        ratio = nominal.adhesion_ratio(surface, is_wheeled)
+        np.testing.assert_allclose(body.ground.force_adhesion(1.0, ratio), phi, rtol=1e-12)

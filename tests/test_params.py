@@ -1,0 +1,91 @@
+"""Parameters: the walk, replacement, and the numbers of Tables 1-7."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+from mmrjax import nominal, params
+from mmrjax.params import parameter
+
+
+def test_nominal_values_are_those_of_the_reference(robot):
+    values = {p.name: float(p.value) for p in params.walk(robot)}
+    assert set(values) == set(reference.NOMINAL)
+    for name, expected in reference.NOMINAL.items():
+        assert values[name] == pytest.approx(expected, rel=1e-12), name
+
+
+@pytest.mark.parametrize("name", sorted(nominal.ROBOTS))
+def test_parameters_lie_within_their_bounds(name):
+    for p in params.walk(nominal.ROBOTS[name]()):
+        low, high = p.spec.bounds
+        assert low < high and low <= float(p.value) <= high, p.name
+
+
+def test_parameters_state_unit_meaning_source_and_prior(free):
+    for p in free:
+        assert p.spec.unit and p.spec.meaning and p.spec.source, p.name
+        assert (p.spec.sd is None) != (p.spec.relative_sd is None), p.name
+        if float(p.value) == 0.0 or p.spec.amplitude:
+            assert p.spec.prior_sd(float(p.value)) > 0, p.name
+
+
+def test_parameter_refuses_two_standard_deviations_and_none():
+    with pytest.raises(ValueError, match="either relative_sd or sd"):
+        parameter(1.0, unit="V", meaning="m", bounds=(0, 2), source="s")
+    with pytest.raises(ValueError, match="either relative_sd or sd"):
+        parameter(1.0, unit="V", meaning="m", bounds=(0, 2), source="s", sd=1.0, relative_sd=1.0)
+
+
+def test_walk_collects_every_differentiable_leaf(robot_with_effects):
+    leaves = jax.tree.leaves(eqx.filter(robot_with_effects, eqx.is_inexact_array))
+    found = list(params.walk(robot_with_effects))
+    assert len(found) == len(leaves) == len({p.name for p in found})
+    assert {id(p.value) for p in found} == {id(leaf) for leaf in leaves}
+
+
+def test_replace_changes_the_named_and_nothing_else(robot_with_effects):
+    before = {p.name: float(p.value) for p in params.walk(robot_with_effects)}
+    for name in before:
+        changed = params.replace(robot_with_effects, {name: jnp.asarray(0.125)})
+        after = {p.name: float(p.value) for p in params.walk(changed)}
+        assert {n for n in before if before[n] != after[n]} <= {name} and after[name] == 0.125
+
+
+def test_replace_unknown_name_is_refused(robot):
+    with pytest.raises(KeyError, match=r"no such parameter: motor\.resistanse"):
+        params.replace(robot, {"motor.resistanse": 1.0})
+
+
+def test_replace_takes_batches_and_tracers(robot):
+    batch = params.replace(robot, {"motor.resistance": jnp.arange(3.0)})
+    assert batch.motor.resistance.shape == (3,)
+    gradient = jax.grad(lambda x: params.replace(robot, {"motor.resistance": x}).motor.voltage_winding(2.0))(1.0)
+    assert float(gradient) == 2.0
+
+
+def test_parameters_have_no_weak_types(robot_with_effects):
+    # A weak type would make one more compilation of each model when a number is replaced.
+    changed = params.replace(robot_with_effects, {p.name: 1.0 for p in params.walk(robot_with_effects)})
+    for tree in (robot_with_effects, changed):
+        assert not any(leaf.weak_type for leaf in jax.tree.leaves(tree))
+
+
+def test_spec_is_frozen(robot):
+    spec = next(params.walk(robot)).spec
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        spec.unit = "kg"
+
+
+@pytest.mark.parametrize(("build", "torque"), [(nominal.sm1, 0.108), (nominal.sm2, 0.300)])
+def test_simplified_robots_are_table_a4(build, torque):
+    robot = build()
+    assert float(robot.motor.torque_loss(0.0, 1.0)) == float(robot.motor.torque_loss(1200.0, 1.0)) == 4.2e-3
+    assert float(robot.gearbox.efficiency(0.03, 900.0)) == 0.75
+    assert float(robot.tracked.track.torque_loss(20.0, 1.0)) == torque
+    np.testing.assert_allclose(robot.battery.voltage(5.0, 3000.0), 33.6, rtol=1e-12)

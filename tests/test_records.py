@@ -1,0 +1,114 @@
+"""Tables of runs: what is read, and the sentence for everything that is refused."""
+
+import numpy as np
+import pytest
+
+from calibration import records
+from calibration.doors import BadData
+
+HEADER = (
+    "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
+)
+ROW = "6T2A,15,13.1,0,5,2.75,4800,400"
+
+
+def write(tmp_path, text):
+    path = tmp_path / "runs.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_packaged_tables_are_tables_a1_and_a2():
+    measured, simulated = records.read("measured"), records.read("simulated_by_paper")
+    assert len(measured) == len(simulated) == 20
+    assert measured["total_current_A"][0] == 2.30 and simulated["speed_mm_s"][-1] == 1241
+    # The paper's own error (35): rms 4.0, 4.5, 4.6 %, worst 6.8 % (design, section 4).
+    errors = 100 * (simulated.measured() - measured.measured()) / simulated.measured()
+    assert np.sqrt(np.mean(errors**2, 0)) == pytest.approx([4.0, 4.5, 4.6], abs=0.05)
+    assert np.abs(errors).max() == pytest.approx(6.8, abs=0.05)
+
+
+def test_command_is_in_si_units(tmp_path):
+    runs = records.read(
+        write(tmp_path, f"{HEADER},surface\n{ROW},linoleum\n4W2T,33,21.1,8,20,4,11000,1200,asphalt\n")
+    )
+    command = runs.command()
+    assert command.slope == pytest.approx(np.radians([5, 20]))
+    assert command.wheeled.tolist() == [0.0, 1.0]
+    assert command.total_mass.tolist() == [13.1, 21.1]
+    assert command.adhesion == pytest.approx([0.42 / 0.32, 0.60 / 0.38])
+    assert runs.measured()[0] == pytest.approx([2.75, 4800 * 2 * np.pi / 60, 0.4])
+
+
+def test_unknown_columns_are_reported_and_kept_out(tmp_path):
+    runs = records.read(write(tmp_path, f"{HEADER},operator\n{ROW},Anna\n"))
+    assert runs.unknown == ("operator",) and not runs.has("operator")
+
+
+def test_conditions_alone_suffice_where_nothing_is_compared(tmp_path):
+    path = write(tmp_path, "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,15,0,5\n")
+    assert records.read(path, measured=False).command().total_mass is None
+    with pytest.raises(BadData, match="column total_mass_kg is missing"):
+        records.read(path)
+
+
+REFUSED = {
+    "empty file": ("", r"runs\.csv: the file is empty; expected a header with configuration"),
+    "blank lines": ("\n\n", r"the file is empty"),
+    "no rows": (HEADER, r"a header and no rows"),
+    "missing column": (
+        HEADER.replace(",slope_deg", "") + "\n6T2A,15,13.1,0,2.75,4800,400",
+        r"runs\.csv: column slope_deg is missing \(required: configuration",
+    ),
+    "misspelt column": (
+        HEADER.replace("slope_deg", "slope_degr") + "\n" + ROW,
+        r"slope_deg is missing; is slope_degr meant",
+    ),
+    "misspelt optional column": (f"{HEADER},total_current_sd_a\n{ROW},1", r"did you mean total_current_sd_A"),
+    "repeated column": (f"{HEADER},slope_deg\n{ROW},5", r"column slope_deg stands 2 times"),
+    "extra cell": (f"{HEADER}\n{ROW},7", r"row 1: got 9 cells; the header has 8"),
+    "missing cell": (f"{HEADER}\n{ROW}\n6T2A,15", r"row 2: got 2 cells"),
+    "slope of 95": (f"{HEADER}\n{ROW.replace(',5,', ',95,')}", r"row 1, slope_deg: got 95; expected -45 to 45"),
+    "speed in m/s is a number, mass negative is not": (
+        f"{HEADER}\n{ROW.replace('13.1', '-13.1')}",
+        r"row 1, total_mass_kg: got -13\.1; expected 0\.1 to 500",
+    ),
+    "zero voltage": (
+        f"{HEADER}\n{ROW.replace(',15,', ',0,')}",
+        r"supply_voltage_V: got 0; expected more than 0 to 100",
+    ),
+    "NaN": (f"{HEADER}\n{ROW.replace('2.75', 'nan')}", r"row 1, total_current_A: got nan; expected -200 to 200"),
+    "infinity": (f"{HEADER}\n{ROW.replace('4800', 'inf')}", r"motor_speed_rpm: got inf"),
+    "no number": (
+        f"{HEADER}\n{ROW.replace('4800', 'fast')}",
+        r"motor_speed_rpm: got fast; expected a number, -30000",
+    ),
+    "empty cell": (f"{HEADER}\n{ROW.replace('400', '', 1).replace('48', '4800')}", r"got an empty cell|row 1"),
+    "unknown configuration": (
+        f"{HEADER}\n{ROW.replace('6T2A', '6T2')}",
+        r"configuration: got 6T2; expected did you mean 6T2A",
+    ),
+    "unknown surface": (f"{HEADER},surface\n{ROW},ice", r"surface: got ice; expected allowed: linoleum"),
+    "sd of zero": (f"{HEADER},speed_sd_mm_s\n{ROW},0", r"speed_sd_mm_s: got 0; expected more than 0"),
+    "payload above total": (
+        f"{HEADER}\n6T2A,15,5,8,5,2.75,4800,400",
+        r"total_mass_kg: got 5; expected more than the payload of 8",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+def test_bad_tables_are_refused_in_one_sentence(tmp_path, case):
+    text, sentence = REFUSED[case]
+    with pytest.raises(BadData, match=sentence) as refusal:
+        records.read(write(tmp_path, text))
+    assert "\n" not in str(refusal.value)
+    assert refusal.value.exit_code == 4
+
+
+def test_missing_and_binary_files_are_refused(tmp_path):
+    with pytest.raises(BadData, match=r"no such file and no packaged table; packaged: measured, simulated_by_paper"):
+        records.read(tmp_path / "none.csv")
+    (tmp_path / "picture.csv").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(BadData, match="cannot be read as a UTF-8"):
+        records.read(tmp_path / "picture.csv")

@@ -1,0 +1,272 @@
+"""Fidelity `steady` against the reference root, in its limits, over a batch, and its statuses."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+from mmrjax import params
+from mmrjax.models.steady import steady, steady_batch
+from mmrjax.signals import FLAGS, STATUSES, Command, command
+
+CHANNELS = ("total_current", "motor_speed", "speed")
+
+
+def readings(answer):
+    return np.stack([np.asarray(getattr(answer.reading, c)) for c in CHANNELS], -1)
+
+
+def expected_readings(side):
+    current, w, speed = side.steady()
+    return np.array([reference.SIDES * current, w, speed])
+
+
+def names(answer):
+    return [STATUSES[k] for k in np.ravel(answer.status)]
+
+
+def test_steady_matches_reference_root_over_table8(grid, steady_table8):
+    got = readings(steady_table8)
+    compared = 0
+    for k, (wheeled, slope, payload, voltage) in enumerate(grid):
+        side = reference.Side(voltage, np.radians(slope), payload, bool(wheeled))
+        if side.steady() is None:
+            assert names(steady_table8)[k] == "slides" and np.isnan(got[k]).all()
+            continue
+        assert names(steady_table8)[k] == "converged"
+        np.testing.assert_allclose(got[k], expected_readings(side), rtol=1e-9)
+        compared += 1
+    assert compared == 126
+
+
+def test_steady_matches_reference_root_on_battery(robot, grid):
+    rows = grid[::3]  # voltage plays no part
+    for charge in (0.0, 3000.0, 7000.0):
+        wheeled, slope, payload, _ = rows.T
+        runs = command(slope=np.radians(slope), payload=payload, wheeled=wheeled, battery=1.0, discharge=charge)
+        answer = steady_batch(robot, runs)
+        got = readings(answer)
+        for k, (w, s, p, _) in enumerate(rows):
+            side = reference.Side(0.0, np.radians(s), p, bool(w), battery=True, discharge=charge)
+            if side.steady() is not None:
+                np.testing.assert_allclose(got[k], expected_readings(side), rtol=1e-9)
+            else:
+                assert names(answer)[k] == "slides"
+
+
+def test_steady_matches_reference_root_for_random_robots(robot):
+    """Every parameter off its nominal value by up to 20 %, uphill, level and downhill."""
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        values = {n: v * rng.uniform(0.8, 1.2) for n, v in reference.NOMINAL.items()}
+        slope, payload, wheeled = rng.uniform(-0.25, 0.12), rng.uniform(0, 8), rng.integers(2)
+        side = reference.Side(24.0, slope, payload, bool(wheeled), p=values)
+        other = params.replace(robot, values)
+        runs = command(voltage=[24.0], slope=slope, payload=payload, wheeled=float(wheeled))
+        answer = steady_batch(other, runs)
+        if side.steady() is not None:
+            np.testing.assert_allclose(readings(answer)[0], expected_readings(side), rtol=1e-9)
+
+
+def test_comparison_with_reference_can_fail(robot, grid, steady_table8):
+    wrong = dict(reference.NOMINAL) | {"motor.resistance": 0.6111}
+    side = reference.Side(15.0, p=wrong)
+    with pytest.raises(AssertionError):
+        np.testing.assert_allclose(readings(steady_table8)[0], expected_readings(side), rtol=1e-9)
+
+
+# --- analytic cases ---------------------------------------------------------------------------------
+
+FRICTIONLESS = {
+    "motor.friction_coulomb": 0.0,
+    "motor.friction_viscous": 0.0,
+    "gearbox.friction_coulomb": 0.0,
+    "gearbox.friction_viscous": 0.0,
+    "gearbox.efficiency_load": 1.0,
+    **{f"{c}.track.loss_{k}": 0.0 for c in ("tracked", "wheeled") for k in ("coulomb", "viscous")},
+    **{f"{c}.track.guide_friction": 0.0 for c in ("tracked", "wheeled")},
+    **{f"{c}.ground.rolling_resistance": 0.0 for c in ("tracked", "wheeled")},
+}
+BOTH = dict(wheeled=[0.0, 1.0])
+
+
+def test_steady_without_friction_runs_at_no_load_speed(robot):
+    answer = steady_batch(params.replace(robot, FRICTIONLESS), command(voltage=24.0, **BOTH))
+    np.testing.assert_allclose(answer.reading.total_current, 0.0, atol=1e-10)
+    np.testing.assert_allclose(answer.reading.motor_speed, 24.0 / 0.0259, rtol=1e-12)
+    np.testing.assert_allclose(answer.slip, 0.0, atol=1e-12)
+
+
+def test_steady_without_friction_lifts_with_all_but_heat_and_creep(robot):
+    answer = steady_batch(params.replace(robot, FRICTIONLESS), command(voltage=24.0, slope=0.1, **BOTH))
+    heat = 0.611 * np.asarray(answer.reading.total_current) ** 2 / 2
+    np.testing.assert_allclose(answer.power_supply, answer.power_motor + heat, rtol=1e-12)
+    np.testing.assert_allclose(answer.power_gear, answer.power_motor, rtol=1e-9)
+    np.testing.assert_allclose(answer.power_ground, answer.power_lift, rtol=1e-9)
+    np.testing.assert_allclose(answer.efficiency_chassis, 1 - np.asarray(answer.slip), rtol=1e-9)
+
+
+def test_steady_power_chain_only_loses(steady_table8):
+    on = np.asarray(steady_table8.status) == 0
+    chain = [
+        np.asarray(getattr(steady_table8, f"power_{p}"))[on] for p in ("supply", "motor", "gear", "ground", "lift")
+    ]
+    for before, after in itertools.pairwise(chain):
+        assert (before > after).all()
+    product = steady_table8.efficiency_motor * steady_table8.efficiency_gear * steady_table8.efficiency_chassis
+    np.testing.assert_allclose(np.asarray(product)[on], chain[3] / chain[0], rtol=1e-12)
+
+
+def test_steady_downhill_gearbox_never_gives_power(robot):
+    slopes = np.linspace(-0.25, 0.0, 26)
+    answer = steady_batch(robot, command(voltage=24.0, slope=slopes, wheeled=1.0))
+    assert set(names(answer)) == {"converged"}
+    assert (np.asarray(answer.power_motor) >= np.asarray(answer.power_gear)).all()
+    assert (np.asarray(answer.power_gear) < 0).any()  # the robot does overhaul its drive
+    assert (np.diff(answer.reading.total_current) > 0).all()
+
+
+# --- statuses and flags -----------------------------------------------------------------------------
+
+
+def one(robot, **conditions):
+    return jax.tree.map(lambda x: x[0], steady_batch(robot, command(**{"voltage": [24.0], **conditions})))
+
+
+@pytest.mark.parametrize(
+    ("conditions", "status"),
+    [
+        (dict(), "converged"),
+        (dict(voltage=[0.5], slope=0.1), "stalled"),
+        (dict(voltage=[0.0]), "stalled"),
+        (dict(slope=np.radians(20.0)), "slides"),
+        (dict(slope=np.radians(-25.0)), "slides"),
+        (dict(battery=1.0, discharge=7920.0), "battery_empty"),
+        (dict(voltage=[np.nan]), "failed"),
+        (dict(payload=np.nan), "failed"),
+        (dict(voltage=[np.inf]), "failed"),
+    ],
+)
+def test_steady_status(robot, conditions, status):
+    answer = one(robot, **conditions)
+    assert STATUSES[int(answer.status)] == status
+    floats = [x for x in jax.tree.leaves((answer.reading, answer.slip, answer.power_supply))]
+    if status in ("converged", "stalled"):
+        assert np.isfinite(floats).all()
+    else:
+        assert np.isnan(floats).all() and int(answer.flags) == 0
+
+
+def test_steady_nominal_adhesion_does_not_hold_20_degrees(robot):
+    answer = one(robot, slope=np.radians(20.0))
+    np.testing.assert_allclose(answer.adhesion_used, (np.tan(np.radians(20)) + 0.06) / 0.32, rtol=1e-12)
+
+
+def test_steady_stall_current_is_voltage_over_resistance(robot):
+    answer = one(robot, voltage=[0.5], slope=0.1)
+    np.testing.assert_allclose(answer.reading.total_current, 2 * 0.5 / 0.611, rtol=1e-12)
+    assert float(answer.reading.motor_speed) == 0.0
+    assert float(answer.efficiency_motor) == 0.0
+
+
+def test_steady_stalls_exactly_below_the_voltage_that_breaks_away(robot):
+    """Break-away torque from the tables by hand, 6T2A on 5 degrees."""
+    m, alpha, r = 13.1 / 2, np.radians(5.0), reference.PULLEY
+    load = 0.350 + r * m * reference.G * (0.2 * 0.3 * np.cos(alpha) + 0.06 * np.cos(alpha) + np.sin(alpha))
+    voltage = 0.611 * (load / (48 * 0.74) + 0.0027 + 0.0003) / 0.0259
+    assert STATUSES[int(one(robot, voltage=[voltage * 0.995], slope=alpha).status)] == "stalled"
+    assert STATUSES[int(one(robot, voltage=[voltage * 1.005], slope=alpha).status)] == "converged"
+
+
+@pytest.mark.parametrize(
+    ("conditions", "flags"),
+    [
+        (dict(voltage=[15.0], wheeled=1.0), set()),
+        (dict(voltage=[24.0], wheeled=1.0), {"gearbox_overspeed"}),
+        (dict(voltage=[36.0], wheeled=1.0), {"motor_overspeed", "gearbox_overspeed"}),
+        (dict(voltage=[15.0], slope=0.17, payload=70.0), {"winding_hot"}),
+    ],
+)
+def test_steady_flags(robot, conditions, flags):
+    mask = int(one(robot, **conditions).flags)
+    assert {name for k, name in enumerate(FLAGS) if mask >> k & 1} == flags
+
+
+# --- batches ----------------------------------------------------------------------------------------
+
+
+def test_steady_batch_equals_loop(robot, table8, steady_table8):
+    single = jax.jit(steady)
+    for k in (0, 37, 64, 90, 131, 179):
+        alone = single(robot, jax.tree.map(lambda x, k=k: x[k], table8))
+        member = jax.tree.map(lambda x, k=k: x[k], steady_table8)
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(member), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_steady_compiles_once_for_other_numbers(robot, table8, compilations):
+    jax.block_until_ready(steady_batch(robot, table8))
+    other = params.replace(robot, {"motor.resistance": 0.9, "tracked.mass": 14})
+    runs = command(voltage=table8.voltage * 0.9, slope=table8.slope, payload=table8.payload, wheeled=table8.wheeled)
+    compilations.clear()
+    jax.block_until_ready(steady_batch(other, runs))
+    assert not compilations
+
+
+BAD = dict(
+    slides=dict(slope=0.5),
+    stalled=dict(voltage=0.3),
+    nan_voltage=dict(voltage=np.nan),
+    zero_voltage=dict(voltage=0.0),
+    nan_payload=dict(payload=np.nan),
+    negative_mass=dict(payload=-20.0),
+    weightless=dict(payload=-13.1),
+    empty=dict(battery=1.0, discharge=1e5),
+    huge=dict(voltage=1e30),
+    vertical=dict(slope=np.pi / 2),
+    no_adhesion=dict(adhesion=0.0),
+)
+
+
+def _join(first: Command, second: Command) -> Command:
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
+
+
+@pytest.fixture(scope="module")
+def speed_and_gradients(robot, rebuild):
+    """Sum of the readings of the members that `keep` marks, with forward and reverse gradients."""
+
+    @jax.jit
+    def evaluate(vector, runs, keep):
+        def total(v):
+            answer = jax.vmap(steady, in_axes=(None, 0))(rebuild(v), runs)
+            parts = sum(jnp.where(keep, r, 0.0).sum() for r in jax.tree.leaves(answer.reading))
+            return parts, answer
+
+        reverse, answer = jax.grad(total, has_aux=True)(vector)
+        forward = jax.jacfwd(lambda v: total(v)[0])(vector)
+        return answer, reverse, forward
+
+    return evaluate
+
+
+def test_steady_bad_members_leave_neighbours_values_and_gradients(theta, speed_and_gradients):
+    fields = ("voltage", "slope", "payload", "wheeled", "battery", "discharge", "adhesion")
+    plain = dict(voltage=24.0, slope=0.05, payload=2.0, wheeled=0.0, battery=0.0, discharge=0.0, adhesion=1.0)
+    bad = [{**plain, **b} for b in BAD.values()]
+    good = [{**plain, "slope": s, "wheeled": w} for s, w in zip(np.linspace(0, 0.15, len(bad)), [0.0, 1.0] * 6)]  # noqa: B905
+    mixed = command(**{f: [row[f] for pair in zip(good, bad, strict=True) for row in pair] for f in fields})
+    clean = command(**{f: [row[f] for row in good for _ in range(2)] for f in fields})
+    keep = jnp.asarray([True, False] * len(bad))
+    answer, reverse, forward = speed_and_gradients(theta, mixed, keep)
+    wanted, reverse_wanted, forward_wanted = speed_and_gradients(theta, clean, keep)
+    np.testing.assert_array_equal(readings(answer)[::2], readings(wanted)[::2])
+    np.testing.assert_allclose(reverse, reverse_wanted, rtol=1e-12)
+    np.testing.assert_allclose(forward, forward_wanted, rtol=1e-12)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-10)
+    status = names(answer)[1::2]
+    for (name, _), got in zip(BAD.items(), status, strict=True):
+        assert got != "converged" or name == "huge", name

@@ -1,0 +1,74 @@
+"""The written-out linear solver against numpy.linalg."""
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+
+from mmrjax.models.linear import SmallDense, factorise, substitute
+
+RNG = np.random.default_rng(1)
+EXCHANGE = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # no pivot on the diagonal at all
+TINY = np.array([[1e-20, 1.0], [1.0, 1.0]])  # without pivoting the answer is 0 instead of 1
+ZERO_LATER = np.array([[1.0, 2, 3], [2, 4, 1], [1, 1, 1]])  # the second pivot vanishes
+
+solve = jax.jit(lambda a, b: substitute(factorise(a), b))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
+def test_substitute_matches_numpy(n):
+    matrices, vectors = RNG.normal(size=(200, n, n)), RNG.normal(size=(200, n))
+    got = jax.vmap(solve)(matrices, vectors)
+    expected = np.linalg.solve(matrices, vectors[..., None])[..., 0]
+    size = np.linalg.cond(matrices)[:, None] * np.abs(expected).max(-1, keepdims=True)
+    assert (np.abs(got - expected) <= 1e-14 * size).all()
+
+
+@pytest.mark.parametrize("matrix", [EXCHANGE, TINY, ZERO_LATER])
+def test_substitute_pivots(matrix):
+    vector = np.arange(1.0, len(matrix) + 1)
+    np.testing.assert_allclose(solve(matrix, vector), np.linalg.solve(matrix, vector), rtol=1e-13)
+
+
+def test_substitute_serves_many_right_hand_sides():
+    matrix = RNG.permutation(np.eye(4)) * 3 + 1e-3 * RNG.normal(size=(4, 4))
+    factors = factorise(jnp.asarray(matrix))
+    columns = [substitute(factors, column) for column in np.eye(4)]
+    np.testing.assert_allclose(np.stack(columns, 1), np.linalg.inv(matrix), rtol=1e-12, atol=1e-14)
+
+
+def test_substitute_derivative_is_that_of_the_inverse():
+    matrix, vector = RNG.normal(size=(3, 3)), RNG.normal(size=3)
+    jacobian = jax.jacfwd(solve)(matrix, vector)
+    x, inverse = np.linalg.solve(matrix, vector), np.linalg.inv(matrix)
+    np.testing.assert_allclose(jacobian, -np.einsum("ij,k->ijk", inverse, x), rtol=1e-9, atol=1e-12)
+
+
+def test_singular_matrix_spoils_no_neighbour():
+    batch = np.stack([np.eye(3), np.ones((3, 3)), 2 * np.eye(3)])
+    answers = np.asarray(jax.vmap(solve)(batch, np.ones((3, 3))))
+    np.testing.assert_array_equal(answers[0], 1.0)
+    np.testing.assert_array_equal(answers[2], 0.5)
+
+
+@pytest.mark.parametrize("matrix", [EXCHANGE, ZERO_LATER, RNG.normal(size=(3, 3))])
+def test_small_dense_solves_operators_and_their_transposes(matrix):
+    operator, vector = lx.MatrixLinearOperator(jnp.asarray(matrix)), jnp.asarray([1.0, -2.0, 0.5])
+    got = lx.linear_solve(operator, vector, SmallDense()).value
+    np.testing.assert_allclose(got, np.linalg.solve(matrix, vector), rtol=1e-12)
+    got = lx.linear_solve(operator.T, vector, SmallDense()).value
+    np.testing.assert_allclose(got, np.linalg.solve(matrix.T, vector), rtol=1e-12)
+    solver = SmallDense()
+    state, _ = solver.transpose(solver.init(operator, {}), {})
+    np.testing.assert_allclose(solver.compute(state, vector, {})[0], np.linalg.solve(matrix.T, vector), rtol=1e-12)
+
+
+def test_small_dense_reverse_derivative_matches_numpy():
+    matrix, vector = RNG.normal(size=(3, 3)), RNG.normal(size=3)
+
+    def first(a):
+        return lx.linear_solve(lx.MatrixLinearOperator(a), jnp.asarray(vector), SmallDense()).value[0]
+
+    x, inverse = np.linalg.solve(matrix, vector), np.linalg.inv(matrix)
+    np.testing.assert_allclose(jax.grad(first)(jnp.asarray(matrix)), -np.outer(inverse[0], x), rtol=1e-9)

@@ -1,0 +1,31 @@
+"""Track losses, eqs. (24), (26)."""
+
+import numpy as np
+import pytest
+import reference
+
+from mmrjax.track import Track
+
+RNG = np.random.default_rng(24)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 0.0, 1.0])
+def test_track_laws_match_reference(sign):
+    for _ in range(50):
+        M0, K, mu, share, size, normal = RNG.uniform((0, 0, 0, 0, 0, 10), (1, 0.1, 1, 1, 30, 200))
+        track = Track(loss_coulomb=M0, loss_viscous=K, guide_friction=mu, guide_share=share)
+        w = sign * size
+        np.testing.assert_allclose(track.torque_loss(w, sign), reference.track_loss(w, M0, K, sign), rtol=1e-9)
+        expected = reference.guide_force(share * normal, mu, sign)
+        np.testing.assert_allclose(track.force_guide(normal, sign), expected, rtol=1e-9)
+
+
+def test_track_loss_of_three_and_one_is_table3(robot):
+    # 350 + 16 ω and 70 + 3 ω mN·m at 20 rad/s
+    np.testing.assert_allclose(robot.tracked.track.torque_loss(20.0, 1.0), 0.670, rtol=1e-12)
+    np.testing.assert_allclose(robot.wheeled.track.torque_loss(20.0, 1.0), 0.130, rtol=1e-12)
+
+
+def test_track_without_friction_loses_nothing():
+    track = Track(loss_coulomb=0.0, loss_viscous=0.0, guide_friction=0.0, guide_share=1.0)
+    assert float(track.torque_loss(20.0, 1.0)) == 0.0 and float(track.force_guide(90.0, 1.0)) == 0.0
