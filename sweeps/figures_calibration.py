@@ -37,8 +37,8 @@ def parameters(found: Calibration) -> Figure:
         axes.plot([low, high], [row, row], color=colour, lw=2.4, solid_capstyle="butt")
         axes.plot(z, row, "o", color=colour, ms=6)
         value = float(coordinates.value(found.z)[row])
-        axes.text(1.01, row, f"{value:.3g} {coordinates.units[row]}".removesuffix(" -"), transform=axes.get_yaxis_transform(),
-                  va="center", fontsize=8.5, color=INK)  # fmt: skip
+        words = f"{value:.3g} {coordinates.units[row]}".removesuffix(" -")
+        axes.text(1.01, row, words, transform=axes.get_yaxis_transform(), va="center", fontsize=8.5, color=INK)
     axes.set_yticks(range(len(names)), [short(n) for n in names])
     axes.set(xlabel="shift from the prior [prior sds]")
     axes.invert_yaxis()
