@@ -235,6 +235,50 @@ def render(
     return commands.render(resolved, table, file, begin, end, slow, force)
 
 
+@app.command(epilog="Example: mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted")
+def calibrate(
+    data: Annotated[str, typer.Argument(help="A CSV of measured runs or histories, or measured.")] = "measured",
+    free: Annotated[
+        list[str] | None,
+        typer.Option(help="Parameters to free, comma-separated; default is the default set, motor.* a group."),
+    ] = None,
+    fix: Annotated[list[str] | None, typer.Option(help="Parameters to hold, comma-separated.")] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(help="A prior in SI units, repeatable: tracked.ground.friction.static=0.45±0.05."),
+    ] = None,
+    noise: Annotated[
+        str | None,
+        typer.Option(help="Sd: current=2%,motor_speed=0.5%,speed=1%.  [default: the file's columns; else estimated]"),
+    ] = None,
+    starts: Annotated[int | None, typer.Option(help="Searches at once.  [default: 64]")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the starts.  [default: 0]")] = None,
+    profiles: Annotated[
+        bool | None, typer.Option("--profiles/--no-profiles", help="Profile likelihood of each.  [default: profiles]")
+    ] = None,
+    model: _Model = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+) -> int:
+    """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
+
+    Writes robot.toml, which every command takes with --robot, and result.json.
+    """
+    from sweeps import config
+
+    options = _options(model=model, robot=robot, set=set_, report=report) | {
+        "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
+        "noise": noise, "starts": starts, "seed": seed, "profiles": profiles,
+    }  # fmt: skip
+    resolved = config.resolve(config.Calibrate, None, options)
+    from sweeps import calibrate as room
+
+    return room.calibrate(resolved, data, out, force)
+
+
 @app.command()
 def doctor() -> int:
     """Check this installation: versions, devices, a solved run against its known answer, a writable folder."""

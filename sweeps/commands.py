@@ -49,7 +49,7 @@ def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
     """Simulate a grid and leave a run folder; returns the exit code."""
     robot = load_robot(config)
     runs = grid(config)
-    folder = _folder("sweep", config, robot, out, force)
+    folder = open_folder("sweep", config, robot, out, force)
     table = _evaluate(robot, runs, config, folder)
     print_counts(table)
     if config.report:
@@ -65,7 +65,7 @@ def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
 def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bool) -> int:
     """Simulate a few given runs; with `drive` also their histories from standstill."""
     robot = load_robot(config)
-    folder = _folder("simulate", config, robot, out, force, runs)
+    folder = open_folder("simulate", config, robot, out, force, runs)
     table = _evaluate(robot, runs, config, folder)
     shown = min(len(runs), 6)
     print_runs({key: value[:shown] for key, value in table.items()})
@@ -172,7 +172,7 @@ def compare(config: Simulation, source: str, own_mass: bool, out: Path | None, f
     stated = runs
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
-    folder = _folder("compare", config, robot, out, force, runs)
+    folder = open_folder("compare", config, robot, out, force, runs)
     table = _evaluate(robot, runs, config, folder)
     comparison, summary = compared(stated, table)
     folder.write_table("comparison.csv", comparison)
@@ -224,6 +224,11 @@ def read_runs(source: str, *, measured: bool) -> records.Runs:
     if runs.unknown:
         _err.print(f"{runs.source}: not used: {', '.join(runs.unknown)}")
     return runs
+
+
+def say(what: Any) -> None:
+    """Print text or a table to stdout."""
+    _out.print(what)
 
 
 def print_counts(table: dict[str, np.ndarray]) -> None:
@@ -289,9 +294,10 @@ def print_comparison(table: dict[str, np.ndarray], summary: dict[str, dict[str, 
         )
 
 
-def _folder(
+def open_folder(
     command: str, config: Simulation, robot: Robot, out: Path | None, force: bool, runs: records.Runs | None = None
 ) -> RunFolder:
+    """The run folder of a command, whose identity is what it was told."""
     identity = {
         "command": command,
         "config": config.model_dump(exclude={"report"}),

@@ -79,6 +79,26 @@ class Sweep(Simulation):
     surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]
 
 
+class Calibrate(Simulation):
+    """What a calibration needs to know beside the data.
+
+    Attributes:
+        free, fix: parameters to free (`default` stands for the default set) and to hold, by dotted name.
+        prior: `name=value±sd` in SI units, in place of the fields' priors.
+        noise: `current=2%,motor_speed=0.5%,speed=1%`; empty takes the file's sd columns, or estimates.
+        starts: searches at once; seed: of their draws.
+        profiles: whether to profile every parameter.
+    """
+
+    free: tuple[str, ...] = ()
+    fix: tuple[str, ...] = ()
+    prior: tuple[str, ...] = ()
+    noise: str = ""
+    starts: Annotated[int, Field(ge=1, le=100_000)] = 64
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
+    profiles: bool = True
+
+
 C = TypeVar("C", bound=Simulation)
 
 
@@ -140,6 +160,11 @@ def settings(options: list[str] | None) -> dict[str, float] | None:
         if not equals:
             raise BadConfiguration(f"--set: got {option}; expected NAME=VALUE, such as motor.resistance=0.9")
     return table
+
+
+def words(options: list[str] | None) -> tuple[str, ...] | None:
+    """Repeated, comma-separated options as one tuple."""
+    return tuple(w.strip() for o in options for w in o.split(",") if w.strip()) if options else None
 
 
 def axis(option: str, text: str | None) -> tuple[float, ...] | None:
