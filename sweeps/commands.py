@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,7 +42,8 @@ WHY = {
     "tips": "the line of gravity passes outside the contacts: the robot turns over",
 }
 _HISTORY_POINTS = 1001
-_out = Console(highlight=False, soft_wrap=True, markup=False)
+_WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
+_out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 
