@@ -23,7 +23,8 @@ app = typer.Typer(
 
 _Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady or drive.  [default: steady]")]
 _Duration = Annotated[
-    float | None, typer.Option("--duration", help="Length of a drive run from standstill [s].  [default: 10]")
+    float | None,
+    typer.Option("--duration", help="Length of a drive run from standstill [s].  [default: 30; simulate 5]"),
 ]
 _Robot = Annotated[
     str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  [default: nominal]")
@@ -79,7 +80,7 @@ def simulate(
     from sweeps import config
 
     options = _options(model, duration, robot, set_, battery, discharge, None, report)
-    resolved = config.resolve(config.Simulation, None, options)
+    resolved = config.resolve(config.History, None, options)
     from calibration import records
     from sweeps import commands
 

@@ -19,7 +19,7 @@ from calibration import records, residual, robot_file
 from mmrjax import params
 from mmrjax.models.drive import Trajectory, drive_batch
 from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
+from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration
 from sweeps import run
 from sweeps.config import Simulation
@@ -259,7 +259,7 @@ def _finish(
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
     robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
     counts = run.counts(table)
-    flags = {name: int(np.sum(np.char.find(table["flags"], name) >= 0)) for name in run.FLAGS}
+    flags = {name: int(np.sum(np.char.find(table["flags"], name) >= 0)) for name in FLAGS}
     folder.write_json("result.json", {**result, "model": config.model, "runs": len(table["status"]),
                                       "statuses": counts, "flags": flags})  # fmt: skip
     hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}

@@ -37,13 +37,19 @@ class Simulation(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: Model = "steady"
-    duration_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
+    duration_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
     robot: str = "nominal"
     set: dict[str, float] = {}
     battery: bool = False
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
     chunk: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
     report: bool = True
+
+
+class History(Simulation):
+    """A few given runs, shown from standstill: short enough that the start is seen."""
+
+    duration_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
 
 
 class Sweep(Simulation):

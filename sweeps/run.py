@@ -3,41 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.records import MM, RPM, Runs
+from calibration.records import Runs
 from mmrjax.models.drive import drive_batch
 from mmrjax.models.steady import steady_batch
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import CONFIGURATIONS, Robot
-from mmrjax.signals import FLAGS, STATUSES, Command, Result
+from mmrjax.signals import STATUSES, Command, Result
+from sweeps import outputs
 from sweeps.config import Simulation
 from sweeps.store import RunFolder
-
-#: Columns that every simulating command adds to a table of runs: name → (number out of a result, unit as a factor).
-OUTPUTS: dict[str, tuple[Callable[[Result], Any], float]] = {
-    "total_current_A": (lambda r: r.reading.total_current, 1.0),
-    "motor_speed_rpm": (lambda r: r.reading.motor_speed, RPM),
-    "speed_mm_s": (lambda r: r.reading.speed, MM),
-    "theoretical_speed_mm_s": (lambda r: r.theoretical_speed, MM),
-    "slip": (lambda r: r.slip, 1.0),
-    "voltage_V": (lambda r: r.voltage, 1.0),
-    "adhesion_used": (lambda r: r.adhesion_used, 1.0),
-    "traction_N": (lambda r: r.traction, 1.0),
-    "power_supply_W": (lambda r: r.power_supply, 1.0),
-    "power_motor_W": (lambda r: r.power_motor, 1.0),
-    "power_gear_W": (lambda r: r.power_gear, 1.0),
-    "power_ground_W": (lambda r: r.power_ground, 1.0),
-    "power_lift_W": (lambda r: r.power_lift, 1.0),
-    "efficiency_motor": (lambda r: r.efficiency_motor, 1.0),
-    "efficiency_gear": (lambda r: r.efficiency_gear, 1.0),
-    "efficiency_chassis": (lambda r: r.efficiency_chassis, 1.0),
-    "temperature_winding_C": (lambda r: r.temperature_winding, 1.0),
-}
 
 
 def simulate(robot: Robot, command: Command, config: Simulation) -> Result:
@@ -72,7 +51,7 @@ def evaluate(
         part = folder.chunk(name)
         if part is None:
             command = runs.where(rows).command(battery=float(config.battery), discharge=charge(config))
-            part = _columns(jax.device_get(simulate(robot, command, config)))
+            part = outputs.columns(jax.device_get(simulate(robot, command, config)))
             part = {key: value[:count] for key, value in part.items()}
             folder.keep_chunk(name, part)
         parts.append(part)
@@ -92,14 +71,6 @@ def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
         columns["total_mass_kg"] = own + runs["payload_kg"]
     columns |= {key: runs[key] for key in ("payload_kg", "slope_deg")}
     columns |= {key: runs[key] for key in ("surface", "run_id") if runs.has(key)}
-    return columns
-
-
-def _columns(result: Result) -> dict[str, np.ndarray]:
-    columns = {name: np.asarray(pick(result)) / unit for name, (pick, unit) in OUTPUTS.items()}
-    columns["status"] = np.array(STATUSES)[np.asarray(result.status)]
-    bits = np.asarray(result.flags)
-    columns["flags"] = np.array([";".join(f for k, f in enumerate(FLAGS) if b >> k & 1) for b in bits], dtype=str)
     return columns
 
 

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -83,7 +82,7 @@ def test_simulate_drive_leaves_a_history_that_ends_on_its_run(mmrjax, tmp_path):
     code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", "5", "--no-report", "--out", "d")
     assert code == 0 and "total current [A]" in out and "total mass [kg]" in out
     history, (end,) = table(tmp_path / "d" / "history.csv"), table(tmp_path / "d" / "runs.csv")
-    assert float(history[0]["speed_mm_s"]) == 0.0 and float(history[-1]["time_s"]) == 10.0
+    assert float(history[0]["speed_mm_s"]) == 0.0 and float(history[-1]["time_s"]) == 5.0
     for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s", "theoretical_speed_mm_s"):
         assert float(history[-1][column]) == pytest.approx(float(end[column]), rel=1e-6)
 
@@ -293,10 +292,11 @@ def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
 def test_help_is_quick_and_imports_no_jax():
     def best(arguments):
         spent = []
-        for _ in range(3):
-            start = time.perf_counter()
+        for _ in range(3):  # processor time: what the tests beside this one take does not count
+            start = os.times()
             done = subprocess.run([*MMRJAX, *arguments], capture_output=True, text=True, check=True)
-            spent.append(time.perf_counter() - start)
+            end = os.times()
+            spent.append(end.children_user - start.children_user + end.children_system - start.children_system)
         return min(spent), done.stdout
 
     for command in ([], ["simulate"], ["sweep"], ["compare"]):

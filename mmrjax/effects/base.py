@@ -29,8 +29,9 @@ class Effect(eqx.Module):
         dissipative: whether a positive amplitude may only take power out.
         channel: for `sensor` alone: the field of `Reading` that it changes.
         transient: whether settled travel shows nothing of it, so that only time series can.
-        memory_unit: size of its memory, in the memory's own unit, for an effect whose term depends on the
-            past of the run (a temperature, a phase); None has none. A run starts with memory 0.
+        memory_size: size of its memory, for an effect whose term depends on the past of the run (a
+            temperature, a phase); None has none. A run starts with memory 0.
+        memory_unit: unit of its memory.
 
     An effect with a memory defines `rate`, and `settled` for the fidelities that keep no memory.
     """
@@ -40,7 +41,8 @@ class Effect(eqx.Module):
     dissipative: ClassVar[bool]
     channel: ClassVar[str] = ""
     transient: ClassVar[bool] = False
-    memory_unit: ClassVar[float | None] = None
+    memory_size: ClassVar[float | None] = None
+    memory_unit: ClassVar[str] = "-"
 
     amplitude: eqx.AbstractVar[Scalar]
 

@@ -24,7 +24,8 @@ class BatterySag(Effect):
     name: ClassVar[str] = "battery_sag"
     balance: ClassVar[str] = "supply"
     dissipative: ClassVar[bool] = False
-    memory_unit: ClassVar[float | None] = 10.0
+    memory_size: ClassVar[float | None] = 10.0
+    memory_unit: ClassVar[str] = "A"
 
     amplitude: Scalar = parameter(
         0.0,

@@ -17,12 +17,12 @@ class BeltCreep(Effect):
 
     Source: Firbank, Mechanics of the belt drive, Int. J. Mech. Sci. 12 (1970) 1053: creep = change of
     tension over the belt's stiffness E A; so a = 1/(E A). The demand stands for the traction, equal to it in
-    steady travel.
+    steady travel; where the two differ in sign it is no loss.
     """
 
     name: ClassVar[str] = "belt_creep"
     balance: ClassVar[str] = "slip"
-    dissipative: ClassVar[bool] = True
+    dissipative: ClassVar[bool] = False
 
     amplitude: Scalar = parameter(
         0.0,

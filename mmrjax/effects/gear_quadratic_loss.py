@@ -26,7 +26,7 @@ class GearQuadraticLoss(Effect):
 
     amplitude: Scalar = parameter(
         0.0,
-        unit="1/(N·m)",
+        unit="1/N/m",
         meaning="loss torque over squared output torque",
         bounds=(-0.05, 0.3),
         sd=0.03,

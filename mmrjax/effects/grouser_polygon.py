@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 
+from mmrjax.effects.base import Effect
 from mmrjax.effects.periodic import Periodic
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
 
-class GrouserPolygon(Periodic):
+class GrouserPolygon(Periodic, Effect):
     """ΔF = a sin(2π r_k θ_k / p + φ) in the tracked configuration, p the pitch of the grousers.
 
     Source: polygonal action of chains (Rao, Mechanical vibration of chain drives; DIN ISO 10823 for its

@@ -1,4 +1,4 @@
-"""What repeats with the angle of a shaft: the base of the effects that a series shows as orders."""
+"""What repeats with the angle of a shaft: shared by the effects that a series shows as orders."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax import power
-from mmrjax.effects.base import Effect
 from mmrjax.params import Scalar
 from mmrjax.signals import Command, Signals
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 STEPS = 8  # integration steps in a period: an error of about 1e-3 in the wave with a method of order 4
 
 
-class Periodic(Effect):
+class Periodic(eqx.Module):
     """term = a w(signals) sin(ψ + φ), with ψ' = k ω_m and k the order per radian of the motor's shaft.
 
     The memory is the phase ψ [rad]. Where none is kept (`steady`, `track`) the wave is its mean, zero.
@@ -27,8 +26,10 @@ class Periodic(Effect):
 
     dissipative: ClassVar[bool] = False
     transient: ClassVar[bool] = True
-    memory_unit: ClassVar[float | None] = 100.0
+    memory_size: ClassVar[float | None] = 100.0
+    memory_unit: ClassVar[str] = "rad"
 
+    name: eqx.AbstractClassVar[str]
     phase: eqx.AbstractVar[Scalar]
 
     @abc.abstractmethod

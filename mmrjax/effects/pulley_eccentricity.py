@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from mmrjax.effects.base import Effect
 from mmrjax.effects.periodic import Periodic
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
 
-class PulleyEccentricity(Periodic):
+class PulleyEccentricity(Periodic, Effect):
     """ΔV = -a r_k ω_k sin(θ_k + φ): the radius that rolls off is r_k (1 + a sin) with a = e / r_k.
 
     Source: order 1 of the driving wheel's angle; total run-out by ISO 1101. The lever arm of the traction

@@ -28,7 +28,8 @@ class StickSlip(Effect):
     balance: ClassVar[str] = "track"
     dissipative: ClassVar[bool] = False
     transient: ClassVar[bool] = True
-    memory_unit: ClassVar[float | None] = 1.0
+    memory_size: ClassVar[float | None] = 1.0
+    memory_unit: ClassVar[str] = "-"
 
     amplitude: Scalar = parameter(
         0.0,

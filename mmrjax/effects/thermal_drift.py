@@ -25,7 +25,8 @@ class ThermalDrift(Effect):
     name: ClassVar[str] = "thermal_drift"
     balance: ClassVar[str] = "electrical"
     dissipative: ClassVar[bool] = True
-    memory_unit: ClassVar[float | None] = 10.0
+    memory_size: ClassVar[float | None] = 10.0
+    memory_unit: ClassVar[str] = "K"
 
     amplitude: Scalar = parameter(
         0.0,

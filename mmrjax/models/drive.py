@@ -49,11 +49,11 @@ class Trajectory(eqx.Module):
 
 
 def _remembering(robot: Robot) -> tuple[Effect, ...]:
-    return tuple(effect for effect in robot.effects if effect.memory_unit is not None)
+    return tuple(effect for effect in robot.effects if effect.memory_size is not None)
 
 
 def _units(robot: Robot) -> tuple[float, ...]:
-    return _UNITS + tuple(effect.memory_unit or 1.0 for effect in _remembering(robot))
+    return _UNITS + tuple(effect.memory_size or 1.0 for effect in _remembering(robot))
 
 
 def _state(robot: Robot, y: Float[Array, " unknowns"]) -> State:

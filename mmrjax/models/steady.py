@@ -67,10 +67,12 @@ def steady(robot: Robot, command: Command) -> Result:
         command: one run, scalar fields.
 
     Returns:
-        Scalars. `status` is `converged`; `stalled` (the motors cannot turn: stall current, shaft speed 0,
-        the robot creeps back at the sliding speed of the static friction law); `slides` (the demand is
-        above the adhesion limit), `battery_empty` or `failed`, all three with NaN in every number but
-        `mass` and `adhesion_used` (NaN too where the conditions are no numbers, or the mass not positive). A member that has no numbers has zero derivatives and harms no other.
+        Scalars. `status` is `converged`; `stalled` (the motors cannot turn: stall current, shaft
+        speed 0, the robot creeps back at the sliding speed of the static friction law); `slides`
+        (the demand is above the adhesion limit), `battery_empty` or `failed`, all three with NaN in
+        every number but `mass` and `adhesion_used` (NaN too where the conditions are no numbers, or
+        the mass not positive). A member that has no numbers has zero derivatives and harms no
+        other.
     """
     sound, command = _sound(robot, command)
     dtype = jnp.result_type(command.voltage)

@@ -1,0 +1,139 @@
+"""What both benchmarks share: the machine in words, timing, memory, and which limit a batch meets."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # the plain reference model
+
+
+def parser(description: str, batches: str) -> argparse.ArgumentParser:
+    """Options that both benchmarks take."""
+    options = argparse.ArgumentParser(description=description)
+    options.add_argument("--batches", default=batches, help="batch sizes, comma separated")
+    options.add_argument("--repeats", type=int, default=20, help="timed calls of each batch")
+    options.add_argument("--no-baseline", action="store_true", help="leave the loop of SciPy out")
+    options.add_argument("--float32", action="store_true", help="single precision (default double)")
+    options.add_argument("--json", type=Path, metavar="FILE", help="write every number there too")
+    return options
+
+
+def machine() -> dict[str, Any]:
+    """Processor, device and versions."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+        cpu = names[0] if names else cpu
+    device = jax.devices()[0]
+    versions = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "diffrax", "optimistix")}
+    versions |= {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "mmrjax")}
+    return {
+        "date": datetime.date.today().isoformat(),
+        "cpu": cpu,
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "device": f"{device.platform}: {device.device_kind}",
+        "precision": "double" if jax.config.jax_enable_x64 else "single",
+        "python": platform.python_version(),
+        "versions": versions,
+    }
+
+
+def seconds(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
+    """Best and median wall time of `call`, which has been compiled before."""
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - start)
+    return min(times), sorted(times)[len(times) // 2]
+
+
+def memory() -> dict[str, int]:
+    """Peak of this process on the device so far and what it may use [bytes]; empty where it cannot say."""
+    stats = jax.devices()[0].memory_stats() or {}
+    wanted = {"peak": "peak_bytes_in_use", "limit": "bytes_limit"}
+    return {name: int(stats[key]) for name, key in wanted.items() if key in stats}
+
+
+def over_batches(
+    batches: list[int], prepare: Callable[[int], Callable[[], Any]], repeats: int
+) -> list[dict[str, Any]]:
+    """Time one batch after another, upward, until one does not fit the device."""
+    rows: list[dict[str, Any]] = []
+    for size in sorted(batches):
+        try:
+            call = prepare(size)
+            start = time.perf_counter()
+            jax.block_until_ready(call())
+            first = time.perf_counter() - start
+            best, median = seconds(call, repeats)
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error) and "out of memory" not in str(error).lower():
+                raise
+            rows.append({"batch": size, "out_of_memory": True, **memory()})
+            break
+        rows.append(
+            {"batch": size, "first_s": first, "best_s": best, "median_s": median, "per_s": size / best, **memory()}
+        )
+        print(row_words(rows[-1]), flush=True)
+    return rows
+
+
+def row_words(row: dict[str, Any]) -> str:
+    """One row of the table that is printed."""
+    if row.get("out_of_memory"):
+        return f"{row['batch']:>10}  does not fit the device"
+    peak = f"  peak {row['peak'] / 2**30:8.2f} GiB" if "peak" in row else ""
+    return (
+        f"{row['batch']:>10}  best {row['best_s'] * 1e3:10.2f} ms  median {row['median_s'] * 1e3:10.2f} ms  "
+        f"{row['per_s']:12.3e} /s  compiled in {row['first_s']:5.1f} s{peak}"
+    )
+
+
+def limit_words(rows: list[dict[str, Any]]) -> str:
+    """Which limit the batches met: memory, arithmetic, or none yet."""
+    timed = [row for row in rows if "per_s" in row]
+    if not timed:
+        return "memory: not even the smallest batch fits"
+    top = max(timed, key=lambda row: row["per_s"])
+    share = f", {top['peak'] / top['limit']:.0%} of the device's memory in use" if "limit" in top else ""
+    words = []
+    if len(timed) < 2:
+        return "one batch size only: no limit looked for"
+    growth = timed[-1]["per_s"] / timed[-2]["per_s"] / (timed[-1]["batch"] / timed[-2]["batch"])
+    gain = timed[-1]["per_s"] / timed[-2]["per_s"]
+    if gain < 1.1:
+        words.append(
+            f"arithmetic: from batch {top['batch']} on, time grows as the batch "
+            f"(last step: {gain:.2f} x the rate for {timed[-1]['batch'] / timed[-2]['batch']:.0f} x the batch){share}"
+        )
+    elif rows[-1].get("out_of_memory"):
+        words.append(f"memory before arithmetic: the rate still rose {gain:.2f} x{share}")
+    else:
+        words.append(f"none yet: the rate still rose {gain:.2f} x ({growth:.0%} of proportional){share}")
+    if rows[-1].get("out_of_memory"):
+        words.append(f"memory: batch {rows[-1]['batch']} does not fit")
+    return "; ".join(words)
+
+
+def finish(record: dict[str, Any], path: Path | None) -> None:
+    """Print the machine and write the record."""
+    m = record["machine"]
+    versions = ", ".join(f"{k} {v}" for k, v in m["versions"].items())
+    print(f"machine: {m['cpu']}, {m['cores']} cores; {m['device']}; {m['precision']} precision; {m['date']}")
+    print(f"versions: Python {m['python']}, {versions}")
+    if path:
+        path.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

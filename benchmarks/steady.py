@@ -1,0 +1,84 @@
+"""Points a second of `steady`, against a loop of scipy.optimize.root on the plain reference model.
+
+python benchmarks/steady.py
+python benchmarks/steady.py --no-baseline --batches 4096,65536,1048576,16777216
+"""
+
+from __future__ import annotations
+
+import time
+
+import jax
+import numpy as np
+from measure import finish, limit_words, machine, over_batches, parser, row_words
+
+options = parser(__doc__.splitlines()[0], "65536")
+options.add_argument("--baseline-points", type=int, default=4000, help="points that the loop of SciPy solves")
+
+
+def conditions(size: int) -> np.ndarray:
+    """Rows (wheeled, slope [rad], payload [kg], voltage [V]) that the nominal adhesion holds, Table 8's ranges."""
+    rng = np.random.default_rng(8)
+    return rng.uniform((0, 0, 0, 15), (1, np.radians(12), 8, 33), (size, 4))
+
+
+def main() -> None:
+    arguments = options.parse_args()
+    jax.config.update("jax_enable_x64", not arguments.float32)
+    import jax.numpy as jnp
+
+    from mmrjax import nominal
+    from mmrjax.models.steady import steady_batch
+    from mmrjax.signals import CONVERGED, command
+
+    robot = nominal.nominal()
+
+    def batch(size: int):
+        wheeled, slope, payload, voltage = conditions(size).T
+        return command(voltage=voltage, slope=slope, payload=payload, wheeled=np.round(wheeled))
+
+    def prepare(size: int):
+        runs = jax.block_until_ready(batch(size))
+        return lambda: steady_batch(robot, runs)
+
+    record = {"benchmark": "steady", "machine": machine()}
+    print("    points")
+    record["batches"] = over_batches([int(b) for b in arguments.batches.split(",")], prepare, arguments.repeats)
+    if record["batches"][-1].get("out_of_memory"):
+        print(row_words(record["batches"][-1]))
+    record["limit"] = limit_words(record["batches"])
+    print(f"limit: {record['limit']}")
+
+    if not arguments.no_baseline:
+        import reference
+
+        count = arguments.baseline_points
+        answer = steady_batch(robot, batch(count))
+        assert bool(jnp.all(answer.status == CONVERGED))
+        ours = np.stack([answer.reading.total_current / 2, answer.reading.motor_speed, answer.reading.speed], -1)
+        rows = [(v, s, p, bool(round(w))) for w, s, p, v in conditions(count)]
+        best, loop = float("inf"), []
+        for _ in range(2):
+            start = time.perf_counter()
+            # SciPy's own default tolerance, 1.5e-8: looser than ours
+            loop = [reference.Side(*row).steady(tolerance=None) for row in rows]
+            best = min(best, time.perf_counter() - start)
+        tight = np.array([reference.Side(*row).steady(tolerance=1e-13) for row in rows])
+        top = max((r for r in record["batches"] if "per_s" in r), key=lambda r: r["per_s"])
+        record["baseline"] = {
+            "points": count,
+            "per_s": count / best,
+            "ratio": top["per_s"] * best / count,
+            "error": float(np.max(np.abs(np.array(loop) / tight - 1))),
+            "error_ours": float(np.max(np.abs(ours / tight - 1))),
+        }
+        b = record["baseline"]
+        print(
+            f"scipy.optimize.root, a loop of {count}: {b['per_s']:.3e} points/s, error {b['error']:.0e} "
+            f"(ours {b['error_ours']:.0e}); ratio {b['ratio']:.0f}"
+        )
+    finish(record, arguments.json)
+
+
+if __name__ == "__main__":
+    main()

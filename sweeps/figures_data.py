@@ -1,0 +1,336 @@
+"""The numbers behind the report's figures and tables: every one asked of mmrjax, none computed here twice."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration import records, residual
+from calibration.records import MM, RPM
+from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+    from mmrjax.signals import Command
+
+Columns = dict[str, np.ndarray]
+
+_CHUNK = 256  # one compiled shape for every question that the report asks of `steady`
+#: Surface of Table 5 that stands for "adhesion raised": the first on which all 20 measured rows climb.
+RAISED_SURFACE = "smooth_concrete_floor"
+RAISED_MARGIN = 1.06  # where that is not enough for a robot: least adhesion over the largest demand
+#: Loading modes of Fig. 28: supply voltage [V], payload [kg].
+MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
+
+
+def command(
+    robot: Robot,
+    *,
+    configuration: Any,
+    voltage: Any = 33.0,
+    payload: Any = 0.0,
+    slope_deg: Any = 0.0,
+    total_mass: Any = None,
+    adhesion: Any = 1.0,
+    battery: Any = 0.0,
+    discharge: Any = 0.0,
+) -> Command:
+    """A batch of conditions in the report's units; the total mass is stated for every row."""
+    from mmrjax import signals
+
+    wheeled = np.asarray(np.asarray(configuration) == CONFIGURATIONS[1], float)
+    own = np.array([float(robot.tracked.mass), float(robot.wheeled.mass)])[wheeled.astype(int)]
+    mass = own + np.asarray(payload) if total_mass is None else total_mass
+    slope = np.radians(slope_deg)
+    return signals.command(voltage, slope, payload, wheeled, battery, discharge, adhesion, mass)
+
+
+def operating_points(robot: Robot, conditions: Command) -> Columns:
+    """Steady operating points of a batch, in the columns of `runs.csv`."""
+    import jax
+
+    from mmrjax.models.steady import steady_batch
+    from sweeps import outputs
+
+    rows = conditions.voltage.shape[0]
+    parts = []
+    for first in range(0, rows, _CHUNK):
+        index = np.minimum(np.arange(first, first + _CHUNK), rows - 1)
+        part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], conditions))
+        parts.append(jax.tree.map(np.asarray, part))
+    answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
+    return {**outputs.columns(answer), "total_mass_kg": np.asarray(answer.mass)}
+
+
+def stacked(table: Columns) -> np.ndarray:
+    """Current [A], motor speed [rpm] and speed [mm/s] of a table, shape (rows, 3)."""
+    return np.stack([np.asarray(table[c], float) for c in records.MEASURED], 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """The 20 rows of Tables A1 and A2 and what a robot says of each.
+
+    Attributes:
+        conditions: the measured table.
+        measured, paper: shape (20, 3), of the bench and of the paper's own simulation.
+        plain: this robot on its own adhesion, mass as printed.
+        raised: the same on the raised adhesion.
+        weighed: raised, and with the robot's own mass instead of the printed one.
+        ratio: raised adhesion over the robot's own, by configuration.
+    """
+
+    conditions: records.Runs
+    measured: np.ndarray
+    paper: np.ndarray
+    plain: Columns
+    raised: Columns
+    weighed: Columns
+    ratio: dict[str, float]
+
+    def adhesion(self) -> np.ndarray:
+        """The raised adhesion's ratio for each row."""
+        return np.array([self.ratio[c] for c in self.conditions["configuration"]])
+
+
+def rows(robot: Robot) -> Rows:
+    """Simulate the 20 measured rows with `robot`: as it is, with adhesion raised, and with its own mass."""
+    table = records.read("measured")
+    paper = records.read("simulated_by_paper")
+    kind = table["configuration"]
+    asked = {
+        "configuration": kind,
+        "voltage": table["supply_voltage_V"],
+        "payload": table["payload_kg"],
+        "slope_deg": table["slope_deg"],
+    }
+    plain = operating_points(robot, command(robot, total_mass=table["total_mass_kg"], **asked))
+    ratio = {}
+    for c in CONFIGURATIONS:
+        largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
+        listed = adhesion_ratio(RAISED_SURFACE, c == CONFIGURATIONS[1])
+        ratio[c] = max(listed, RAISED_MARGIN * largest) if largest > 1 else 1.0
+    adhesion = np.array([ratio[c] for c in kind])
+    raised = operating_points(robot, command(robot, total_mass=table["total_mass_kg"], adhesion=adhesion, **asked))
+    weighed = operating_points(robot, command(robot, adhesion=adhesion, **asked))
+    return Rows(table, stacked(table.columns), stacked(paper.columns), plain, raised, weighed, ratio)
+
+
+def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
+    """The raised coefficients in words, with their source."""
+    own = {c: float(robot.chassis(float(k)).ground.friction.static) for k, c in enumerate(CONFIGURATIONS)}
+    surface = SURFACES[RAISED_SURFACE]
+    listed = (surface.tracked_x, surface.wheeled_x)
+    parts = []
+    for k, c in enumerate(CONFIGURATIONS):
+        if ratio[c] == 1.0:
+            parts.append(f"{c} unchanged at {own[c]:.2f}")
+            continue
+        table = " (Table 5, smooth concrete floor)" if abs(own[c] * ratio[c] - listed[k]) < 1e-6 else ""
+        parts.append(f"{c} from {own[c]:.2f} to {own[c] * ratio[c]:.2f}{table}")
+    return "; ".join(parts)
+
+
+def errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
+    """Errors (35) of the three channels [%], shape (rows, 3); NaN where there is no number."""
+    return residual.relative_error(stacked(simulated), measured)
+
+
+# --- components ---------------------------------------------------------------------------------------
+
+
+def gear_efficiency(robot: Robot, speed_rpm: float, torque_input: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Output torque [N·m] and efficiency [-], eq. (19), over input torque [N·m] at one motor speed."""
+    gear, speed = robot.gearbox, speed_rpm * RPM
+    transmitted = torque_input - gear.torque_idle(speed, 1.0)
+    return np.asarray(gear.torque_output(transmitted, 1.0)), np.asarray(gear.efficiency(torque_input, speed))
+
+
+def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.ndarray:
+    """Voltage of one cell [V] over its load current I_b [A] (12), after a discharge [mAh]."""
+    from mmrjax.power import COULOMB_PER_MAH
+
+    battery = robot.battery
+    total = battery.voltage(current - battery.current_other, discharge_mah * COULOMB_PER_MAH)
+    return np.asarray(total) / battery.cells
+
+
+def cell_no_load(robot: Robot, discharge_mah: np.ndarray) -> np.ndarray:
+    """No-load voltage of one cell [V], eq. (13), over discharge [mAh]."""
+    from mmrjax.power import COULOMB_PER_MAH
+
+    return np.asarray(robot.battery.voltage_no_load(discharge_mah * COULOMB_PER_MAH)) * np.ones_like(discharge_mah)
+
+
+def motor_friction(robot: Robot, speed_rpm: np.ndarray) -> np.ndarray:
+    """Friction torque of the motor M_df [mN·m], eq. (14), over shaft speed [rpm]."""
+    return 1e3 * np.asarray(robot.motor.torque_loss(speed_rpm * RPM, 1.0)) * np.ones_like(speed_rpm)
+
+
+def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> np.ndarray:
+    """Current of one motor [A] that keeps a lifted side turning at pulley speed [rad/s].
+
+    No ground, no weight on the guides: the balances are asked with zero normal load and traction. Their
+    net torque is linear in the current while the motor drives, so two currents give the root.
+    """
+    from mmrjax import balances
+    from mmrjax.signals import State
+
+    conditions = command(robot, configuration=np.full(speed_wheel.shape, configuration))
+    chassis = robot.chassis(float(configuration == CONFIGURATIONS[1]))
+    zero = np.zeros_like(speed_wheel)
+
+    def torque_net(current: float) -> np.ndarray:
+        state = State(zero + current, speed_wheel * robot.gearbox.ratio, chassis.radius * speed_wheel, zero)
+        signals = balances.begin(robot, conditions, state, direction=zero + 1.0)
+        signals = dataclasses.replace(signals, normal=zero, traction=zero)
+        signals = balances.motor(robot, balances.electrical(robot, balances.supply(robot, conditions, signals)))
+        return np.asarray(balances.gearbox(robot, chassis, balances.track(robot, chassis, signals)).torque_net)
+
+    low, high = 5.0, 10.0
+    at_low, at_high = torque_net(low), torque_net(high)
+    return low - at_low * (high - low) / (at_high - at_low)
+
+
+def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
+    """Least-squares line through the points, evaluated at them, and its R² (A1)."""
+    line = np.polyval(np.polyfit(x, y, 1), x)
+    return line, residual.certainty(y, line)
+
+
+# --- runs ---------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """A run from standstill: time [s], total current [A], V and V_theoretical [mm/s], stage limits [s]."""
+
+    configuration: str
+    status: str
+    time: np.ndarray
+    current: np.ndarray
+    speed: np.ndarray
+    theoretical: np.ndarray
+    starting: float  # end of stage I: the slide has reached its maximum, the shafts have spun up
+    slipping: float  # end of stage II: the slide is back within V_s for good; equals `starting` if it never left
+    settled: float  # t': speed within 1 % of its last value
+
+
+def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[Start]:
+    """From standstill on the flat, both configurations, with the stages read from the signals."""
+    from mmrjax.models.drive import drive_batch
+    from mmrjax.signals import STATUSES
+
+    kinds = np.array(CONFIGURATIONS)
+    times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
+    run = drive_batch(robot, command(robot, configuration=kinds, voltage=voltage), times)
+    answer = []
+    for k, kind in enumerate(CONFIGURATIONS):
+        sliding = np.asarray(run.signals.speed_sliding[k])
+        speed = np.asarray(run.signals.speed[k]) / MM
+        static = float(robot.chassis(float(k)).ground.friction.speed_static)
+        beyond = np.nonzero(sliding > static)[0]
+        starting = float(times[int(np.argmax(sliding))])
+        slipping = float(times[min(int(beyond[-1]) + 1, len(times) - 1)]) if beyond.size else starting
+        late = np.nonzero(np.abs(speed - speed[-1]) > 0.01 * np.abs(speed[-1]))[0]
+        settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
+        answer.append(
+            Start(
+                kind,
+                STATUSES[int(run.result.status[k])],
+                times,
+                np.asarray(run.signals.total_current[k]),
+                speed,
+                np.asarray(run.signals.speed_theoretical[k]) / MM,
+                starting,
+                max(slipping, starting),
+                settled,
+            )
+        )
+    return answer
+
+
+def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:
+    """Current [A] over slope for the loading modes: (configuration, mode) → (own adhesion, raised)."""
+    asked = [(c, mode, r) for c in CONFIGURATIONS for mode in MODES for r in (1.0, ratio[c])]
+    kinds, voltage, payload, adhesion = (
+        np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in asked), strict=True)
+    )
+    conditions = command(
+        robot,
+        configuration=kinds,
+        voltage=voltage.astype(float),
+        payload=payload.astype(float),
+        slope_deg=np.tile(slopes, len(asked)),
+        adhesion=adhesion.astype(float),
+    )
+    current = operating_points(robot, conditions)["total_current_A"].reshape(len(asked), len(slopes))
+    return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(asked[::2])}
+
+
+def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> dict[int, np.ndarray]:
+    """Errors (35) over the five slopes of 6T2A in modes 1 and 2 of Fig. 29: mode → shape (5, 3).
+
+    On battery there is mode 2 alone: a full battery of 8 cells gives about the 33 V of the bench.
+    """
+    answer = {}
+    for mode, voltage in ((1, 15.0), (2, 33.0)):
+        table = rows_of.conditions
+        pick = (table["configuration"] == CONFIGURATIONS[0]) & (table["supply_voltage_V"] == voltage)
+        if battery and mode == 1:
+            continue
+        there = table.where(pick)
+        conditions = command(
+            robot,
+            configuration=there["configuration"],
+            voltage=voltage,
+            payload=there["payload_kg"],
+            slope_deg=there["slope_deg"],
+            total_mass=there["total_mass_kg"],
+            adhesion=ratio,
+            battery=float(battery),
+        )
+        answer[mode] = errors(operating_points(robot, conditions), rows_of.measured[pick])
+    return answer
+
+
+#: Where the supply's power goes, from the motor to the ground, with the word on the figure.
+SPLIT = ("winding", "motor friction", "gearbox", "track and guides", "slip", "rolling resistance", "lift")
+
+
+def energy_split(robot: Robot, conditions: Command) -> tuple[Columns, Columns]:
+    """Operating points and the power [W] that each item of `SPLIT` takes of the supply's power.
+
+    Returns:
+        The points, and item → power; `other` is what effects beyond the paper's terms take.
+    """
+    import equinox as eqx
+
+    from mmrjax import balances
+    from mmrjax.signals import State
+
+    points = operating_points(robot, conditions)
+    wheel = points["theoretical_speed_mm_s"] * MM / np.asarray(robot.chassis(conditions.wheeled).radius)
+    current = points["power_supply_W"] / points["voltage_V"] / robot.sides
+    state = State(
+        current,
+        wheel * robot.gearbox.ratio,
+        points["theoretical_speed_mm_s"] * MM * (1 - points["slip"]),
+        conditions.discharge,
+    )
+    at, _ = eqx.filter_jit(balances.settled)(robot, conditions, state)
+    sides = robot.sides
+    split = {
+        "winding": sides * at.voltage_drop * at.current,
+        "motor friction": sides * at.torque_motor_loss * at.speed_motor,
+        "gearbox": points["power_motor_W"] - points["power_gear_W"],
+        "track and guides": sides * at.torque_track_loss * at.speed_wheel,
+        "slip": sides * at.traction * (at.speed_theoretical - at.speed),
+        "rolling resistance": sides * at.resistance * at.speed,
+        "lift": points["power_lift_W"],
+    }
+    split = {k: np.asarray(v) for k, v in split.items()}
+    split["other"] = points["power_supply_W"] - sum(split.values())
+    return points, split

@@ -1,0 +1,109 @@
+"""One look for every figure: sizes, colours that colour-blind readers tell apart, labels at the line's end."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+WIDTH = 10.0  # inches, the width of the page's text
+INK, FAINT = "#222222", "#8a8a8a"
+# Okabe and Ito (2008), without the yellow that white paper swallows.
+BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
+CONFIGURATION = {"6T2A": BLUE, "4W2T": VERMILION}
+MODEL = {"nominal": BLUE, "sm1": ORANGE, "sm2": GREEN}
+MODEL_WORDS = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
+CHANNEL_WORDS = {
+    "total_current": ("total current", "A"),
+    "motor_speed": ("motor speed", "rpm"),
+    "speed": ("speed", "mm/s"),
+}
+#: Statuses on the page and in the figures' hatched cells.
+STATUS_WORDS = {
+    "converged": "settled",
+    "stalled": "stalls",
+    "slides": "slides",
+    "not_settled": "not settled",
+    "battery_empty": "battery empty",
+    "failed": "failed",
+}
+
+_RC = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib
+    "font.size": 9.5,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#666666",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.8,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "hatch.color": "#9a9a9a",
+    "hatch.linewidth": 0.7,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "mmrjax",
+    "figure.facecolor": "white",
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """The settings of every figure, for as long as the block lasts."""
+    with matplotlib.rc_context(_RC):
+        yield
+
+
+def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
+    """A figure of the page's width and its axes, shape (rows, columns)."""
+    fig = Figure(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(fig)
+    fig.get_layout_engine().set(w_pad=0.08, h_pad=0.06)  # type: ignore[union-attr]
+    return fig, fig.subplots(rows, columns, squeeze=False, **keywords)
+
+
+def svg(fig: Figure) -> str:
+    """The figure as an SVG document that refers to nothing outside itself."""
+    buffer = io.StringIO()
+    fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text)
+    return re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S)
+
+
+def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:
+    """Write `words` at the last finite point of a line, in the line's colour."""
+    there = np.nonzero(np.isfinite(y))[0]
+    if there.size:
+        offset = keywords.pop("offset", (5, 0))
+        axes.annotate(
+            words,
+            (x[there[-1]], y[there[-1]]),
+            xytext=offset,
+            textcoords="offset points",
+            color=colour,
+            va="center",
+            fontsize=8.5,
+            annotation_clip=False,
+            **keywords,
+        )
+
+
+def note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: Any) -> None:
+    """A remark in a corner of the axes (axes fractions)."""
+    keywords = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left", **keywords}
+    axes.text(x, y, words, transform=axes.transAxes, **keywords)
