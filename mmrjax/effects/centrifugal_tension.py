@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 class CentrifugalTension(Effect):
     """ΔM_t = a M_t0 v², v = ω_k r_p the belt's speed: dry loss M_t0 in proportion to the tension T_0 + ρ v².
 
-    Source: centrifugal tension ρ v² of a running belt (Eytelwein 1808; Shigley, Mechanical Engineering
-    Design, 2011, eq. (17-9)); so a = ρ / T_0. With the belts of Table 7, ρ = 0.05 kg/m, and T_0 of 1 to 10
-    N. Unlike `churning` it scales with the configuration's own M_t0. r_p is the radius of the pulley, which
-    drives the belt in both.
+    Source: centrifugal tension ρ v² of a running belt (Eytelwein 1808; Budynas and Nisbett, Shigley's
+    Mechanical Engineering Design, 2011, ch. 17); so a = ρ / T_0. With the belts of Table 7, ρ = 0.05 kg/m,
+    and T_0 of 1 to 10 N. Unlike `churning` it scales with the configuration's own M_t0. r_p is the radius of
+    the pulley, which drives the belt in both.
     """
 
     name: ClassVar[str] = "centrifugal_tension"

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 class Cogging(Periodic, Effect):
     """ΔM = a sin(n θ_m + φ) fade(n ω_m), with n ripples a turn; fade falls from 1 at ω_f to 0 at 2 ω_f.
 
-    Source: Kenjo and Nagamori, Permanent-Magnet and Brushless DC Motors (1985), ch. 2: ripple at twice the
-    number of segments. The RE30 has an ironless rotor, hence no reluctance torque, and 13 segments. Above
-    ω_f the rotor's inertia leaves no more than a / (J_d ω_f) of speed, 0.03 rad/s at the prior's size, so
-    the ripple is faded out instead of being integrated at 5 kHz: it acts at a crawl and at the start.
+    Source: Kenjo and Nagamori, Permanent-Magnet and Brushless DC Motors (1985): ripple at twice the number
+    of segments. The RE30 has an ironless rotor, hence no reluctance torque, and 13 segments. Above ω_f the
+    rotor's inertia leaves no more than a / (J_d ω_f) of speed, 0.03 rad/s at the prior's size, so the ripple
+    is faded out instead of being integrated at 5 kHz: it acts at a crawl and at the start.
     """
 
     name: ClassVar[str] = "cogging"

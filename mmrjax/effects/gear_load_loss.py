@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 class GearLoadLoss(Effect):
     """ΔM_r = a |M_load|: a share of the torque at the output shaft.
 
-    Source: Niemann and Winter, Maschinenelemente II (2003), sec. 21.5: load-dependent mesh loss P_Z = P μ_z
-    H_v. It is eq. (19)'s η_rm in another form: look-alike of a change of η_rm by -a η_rm.
+    Source: Niemann and Winter, Maschinenelemente II (2003): load-dependent mesh loss P_Z = P μ_z H_v. It is
+    eq. (19)'s η_rm in another form: look-alike of a change of η_rm by -a η_rm.
     """
 
     name: ClassVar[str] = "gear_load_loss"

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class GrouserPolygon(Periodic, Effect):
     """ΔF = a sin(2π r_k θ_k / p + φ) in the tracked configuration, p the pitch of the grousers.
 
-    Source: polygonal action of chains (Rao, Mechanical vibration of chain drives; DIN ISO 10823 for its
-    order), grousers every 35 mm (Section 3.2.4): 6.9 passages a turn of the pulley. What is lifted comes
-    down again, so it takes no power out over a passage.
+    Source: chordal action of chain drives (Budynas and Nisbett, Shigley's Mechanical Engineering Design,
+    2011, ch. 17), grousers every 35 mm (Section 3.2.4): 6.9 passages a turn of the pulley. What is lifted
+    comes down again, so it takes no power out over a passage.
     """
 
     name: ClassVar[str] = "grouser_polygon"

@@ -16,8 +16,8 @@ class IronLoss(Effect):
     """ΔM_df = a 2x / (1 + x²), x = ω_m / ω_c: the drag of an eddy-current brake.
 
     Source: Wouterse, Critical torque and speed of eddy current brake with widely separated soft iron poles,
-    IEE Proc. B 138 (1991), eq. (1). Below ω_c the drag grows as the speed and is eq. (14)'s viscous term;
-    hysteresis is its dry one: what can be told from them is the bend towards ω_c.
+    IEE Proc. B 138 (1991). Below ω_c the drag grows as the speed and is eq. (14)'s viscous term; hysteresis
+    is its dry one: what can be told from them is the bend towards ω_c.
     """
 
     name: ClassVar[str] = "iron_loss"

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 class LoadSlip(Effect):
     """ΔV = a V_teor N: radius r_k (1 - a N).
 
-    Source: effective rolling radius of a loaded tyre (Wong 2008, sec. 1.3; Pacejka, Tire and Vehicle
-    Dynamics, 2012, eq. (1.9)). Kinematic, so not dissipative by itself.
+    Source: effective rolling radius of a loaded tyre (Wong 2008, ch. 1; Pacejka, Tire and Vehicle Dynamics,
+    2012, ch. 1). Kinematic, so not dissipative by itself.
     """
 
     name: ClassVar[str] = "load_slip"

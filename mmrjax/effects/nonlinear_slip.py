@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 class NonlinearSlip(Effect):
     """ΔV = a V_teor u³, u = demand over the adhesion limit of eq. (6).
 
-    Source: Janosi and Hanamoto (1961) and Wong (2008), sec. 2.4: traction saturates over slip; the cube is
-    the steep part of its inverse. u is held within 2, beyond which the robot slides anyway. A
-    loss where demand and traction agree in sign.
+    Source: Janosi and Hanamoto (1961): traction saturates over slip; the cube is the steep part of its
+    inverse. u is held within 2, beyond which the robot slides anyway. A loss where demand and traction agree
+    in sign.
     """
 
     name: ClassVar[str] = "nonlinear_slip"

@@ -39,6 +39,10 @@ class Periodic(eqx.Module):
     def rate(self, robot: Robot, signals: Signals) -> Scalar:
         return self.order(robot, signals.wheeled) * signals.speed_motor
 
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        """0: a phase does not settle; `wave` is then its mean."""
+        return jnp.zeros_like(signals.speed_motor)
+
     def wave(self, signals: Signals) -> Scalar:
         """sin(ψ + φ), or 0 where no phase is kept [-]."""
         if self.name not in signals.memory:

@@ -39,7 +39,7 @@ class Sinkage(Effect):
         meaning="sinkage exponent n",
         bounds=(0.3, 2.0),
         relative_sd=0.3,
-        source="0.5 clay, 1 sand, felt and lacquer like springs (Wong 2008, table 2.3)",
+        source="0.5 clay, 1 sand, felt and lacquer like springs (Wong 2008, ch. 2)",
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 class SpeedRolling(Effect):
     """ΔF_f = a N V² against the travel: f(V) = f + a V².
 
-    Source: Wong, Theory of Ground Vehicles (2008), eq. (1.36): f = f_0 + f_s V² of rolling tyres; Bekker
-    (1969) for light tracks.
+    Source: Wong, Theory of Ground Vehicles (2008), ch. 1: f = f_0 + f_s V² of rolling tyres; Bekker (1969)
+    for light tracks.
     """
 
     name: ClassVar[str] = "speed_rolling"

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 class SpeedSlip(Effect):
     """ΔV = a V_teor |V_teor|: a share of the speed in proportion to the speed.
 
-    Source: first term of an expansion of the slip in speed; treads that lift off between impacts (Wong 2008,
-    sec. 2.5). The loss is kinematic: on a descent it does not take power out.
+    Source: first term of an expansion of the slip in speed; treads that lift off between impacts. The loss
+    is kinematic: on a descent it does not take power out.
     """
 
     name: ClassVar[str] = "speed_slip"

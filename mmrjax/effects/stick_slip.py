@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 class StickSlip(Effect):
     """ΔM_t = a z, θ_s z' = ω_k exp(-(ω_k/ω_s)²) - |ω_k| z, z(0) = 0: bristles bend over θ_s, then let go.
 
-    Source: Dahl (1968) with the Stribeck curve of Canudas de Wit, Olsson, Åström and Lischinsky, A new
-    model for control of systems with friction, IEEE Trans. Automatic Control 40 (1995), eqs. (1)-(4); the
-    curve stands with the drive of z so that its rate stays finite. Settled: z = exp(-(ω_k/ω_s)²) sign ω_k,
-    nothing at travelling speed. Torque that falls with speed is what lets a crawling drive stick and slip.
-    The memory is z [-]. Bent bristles give energy back, so it is not a pure loss.
+    Source: Dahl (1968) with the Stribeck curve of Canudas de Wit, Olsson, Åström and Lischinsky, A new model
+    for control of systems with friction, IEEE Trans. Automatic Control 40 (1995); the curve stands with the
+    drive of z so that its rate stays finite. Settled: z = exp(-(ω_k/ω_s)²) sign ω_k, nothing at travelling
+    speed. Torque that falls with speed is what lets a crawling drive stick and slip. The memory is z [-].
+    Bent bristles give energy back, so it is not a pure loss.
     """
 
     name: ClassVar[str] = "stick_slip"

@@ -18,7 +18,7 @@ class StribeckGear(Effect):
     """ΔM_r = a exp(-|ω_m| / ω_s) sign ω_m at the output shaft.
 
     Source: Tustin (1947), the exponential law; mixed lubrication of grease-packed planets (Niemann and
-    Winter, 2003, sec. 21.5). With the same ω_s it is `stribeck_motor` times i η_rm.
+    Winter, 2003). With the same ω_s it is `stribeck_motor` times i η_rm.
     """
 
     name: ClassVar[str] = "stribeck_gear"

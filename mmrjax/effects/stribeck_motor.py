@@ -19,7 +19,7 @@ class StribeckMotor(Effect):
 
     Source: Tustin, The effects of backlash and of speed-dependent friction on the stability of closed-cycle
     control systems, J. IEE 94 (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit
-    (1994), eq. (4), with exponent 1.
+    (1994), with exponent 1.
     """
 
     name: ClassVar[str] = "stribeck_motor"

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 class StribeckTrack(Effect):
     """ΔM_t = a exp(-|ω_k| / ω_s) sign ω_k at the pulley, for a side's tracks.
 
-    Source: Tustin (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit (1994), eq.
-    (4).
+    Source: Tustin (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
     """
 
     name: ClassVar[str] = "stribeck_track"

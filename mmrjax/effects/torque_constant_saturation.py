@@ -16,7 +16,7 @@ class TorqueConstantSaturation(Effect):
     """ΔM_d = a C_m I³: C_m(I) = C_m (1 - a I²) in the torque of eq. (17).
 
     Source: demagnetising part of the armature reaction, even in the current (Fitzgerald, Kingsley and Umans,
-    Electric Machinery, 2003, sec. 7.3). It weakens torque and back-EMF alike; it stands in the motor balance
+    Electric Machinery, 2003, ch. 7). It weakens torque and back-EMF alike; it stands in the motor balance
     alone, where its share is the larger: with I R a tenth of U, the back-EMF's part is a second-order one.
     So it is not a loss of power by itself.
     """

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 class WeightTransfer(Effect):
     """ΔF_f = a N tan² α against the travel.
 
-    Source: load transfer (h/L) tan α of the weight (Wong 2008, ch. 1, eq. (1.5)); resistance that is convex
-    in the local pressure gains the square of an antisymmetric transfer (Bekker 1956: compaction as a power
-    of the pressure above 1), so the first-order part cancels and a ~ f (h/L)².
+    Source: load transfer (h/L) tan α of the weight (Wong 2008, ch. 1); resistance that is convex in the
+    local pressure gains the square of an antisymmetric transfer (Bekker 1956: compaction as a power of the
+    pressure above 1), so the first-order part cancels and a ~ f (h/L)².
     """
 
     name: ClassVar[str] = "weight_transfer"
