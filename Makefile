@@ -14,7 +14,7 @@ demo: $(READY)
 	@echo "open runs/demo/table8/report.html and runs/demo/measured/report.html"
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 slow: $(READY)
 	$(BIN)/python -m pytest -m slow

@@ -104,7 +104,7 @@ def row_words(row: dict[str, Any]) -> str:
 
 
 def limit_words(rows: list[dict[str, Any]]) -> str:
-    """Which limit the batches met: memory, arithmetic, or none yet."""
+    """Which limit the batches met: the rate saturates, memory is full, or none yet."""
     timed = [row for row in rows if "per_s" in row]
     if not timed:
         return "memory: not even the smallest batch fits"
@@ -117,11 +117,11 @@ def limit_words(rows: list[dict[str, Any]]) -> str:
     gain = timed[-1]["per_s"] / timed[-2]["per_s"]
     if gain < 1.1:
         words.append(
-            f"arithmetic: from batch {top['batch']} on, time grows as the batch "
+            f"saturated at batch {top['batch']}, by arithmetic or memory traffic and not by memory size "
             f"(last step: {gain:.2f} x the rate for {timed[-1]['batch'] / timed[-2]['batch']:.0f} x the batch){share}"
         )
     elif rows[-1].get("out_of_memory"):
-        words.append(f"memory before arithmetic: the rate still rose {gain:.2f} x{share}")
+        words.append(f"memory, before the rate saturates: it still rose {gain:.2f} x{share}")
     else:
         words.append(f"none yet: the rate still rose {gain:.2f} x ({growth:.0%} of proportional){share}")
     if rows[-1].get("out_of_memory"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+import jax.numpy as jnp
+
 from mmrjax.effects.base import Effect
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
@@ -19,7 +21,8 @@ class WindingHeating(Effect):
 
     Source: IEC 60028 for α; the maker's sheet for R_th = 7.7 K/W. A run shorter than the thermal time
     constants (16 s winding, 593 s housing) reaches only a share of the settled rise: 1 is settled, 0 cold.
-    The rise is taken at the cold resistance (first order in α).
+    The rise is taken at the cold resistance (first order in α) and held at the winding's limit of 125 °C, so
+    that the inrush of a start, which lasts milliseconds, is not taken for a settled current of 50 A.
     """
 
     name: ClassVar[str] = "winding_heating"
@@ -38,5 +41,6 @@ class WindingHeating(Effect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         motor = robot.motor
-        rise = motor.temperature_winding(signals.current) - motor.temperature_ambient
+        rise = jnp.minimum(motor.temperature_winding(signals.current), motor.temperature_limit)
+        rise = rise - motor.temperature_ambient
         return self.amplitude * COPPER * rise * motor.voltage_winding(signals.current)

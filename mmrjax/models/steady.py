@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import balances
 from mmrjax.models.linear import SmallDense
+from mmrjax.models.newton import SmallNewton
 from mmrjax.models.result import result, withhold
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Command, Result, State
@@ -76,8 +77,7 @@ def steady(robot: Robot, command: Command) -> Result:
     """
     sound, command = _sound(robot, command)
     dtype = jnp.result_type(command.voltage)
-    tolerance = float(jnp.finfo(dtype).eps) ** 0.7
-    solver = optx.Newton(rtol=tolerance, atol=tolerance, linear_solver=SmallDense())
+    solver = SmallNewton(atol=float(jnp.finfo(dtype).eps) ** 0.85)
     start = jax.lax.stop_gradient(_start(robot, command))
     solution = optx.root_find(
         _residual,
