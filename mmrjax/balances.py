@@ -7,7 +7,7 @@ All three fidelities are compositions of these functions.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 
@@ -130,23 +130,29 @@ def slip(robot: Robot, signals: Signals) -> Signals:
     return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
 
 
-def track(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
-    """Losses between pulley and ground, at the pulley [N·m]."""
+def track(robot: Robot, chassis: Chassis, signals: Signals, guide: Scalar | None = None) -> Signals:
+    """Losses between pulley and ground, at the pulley [N·m].
+
+    `guide` is the friction on the lower guide [N]; None takes (26) on the guides' stated share.
+    """
     loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
-    guide = chassis.track.force_guide(signals.normal, signals.direction)
+    guide = chassis.track.force_guide(signals.normal, signals.direction) if guide is None else guide
     loss = loss + guide * chassis.radius + _effects(robot, signals, "track")
     return _fill(signals, torque_track_loss=loss)
 
 
-def gearbox(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
+def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | None = None) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
+
+    `mover` is what the mover takes from the shaft beside the track's losses [N·m]; None: the traction.
 
     With A the motor torque less idle loss and B the load at the output, the torque transmitted has the
     sign of A J_w + i J_d B whatever the efficiency, which decides which way the load loss acts.
     """
     gear, inertia_motor = robot.gearbox, robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
-    load = signals.torque_track_loss + chassis.radius * signals.traction + _effects(robot, signals, "gearbox")
+    mover = chassis.radius * signals.traction if mover is None else mover
+    load = signals.torque_track_loss + mover + _effects(robot, signals, "gearbox")
     drive = signals.torque_motor - idle
     inertia_wheel = chassis.inertia + _effects(robot, signals, "inertia")
     side = drive * inertia_wheel + gear.ratio * inertia_motor * load
@@ -159,6 +165,7 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
         signals,
         torque_idle=idle,
         torque_load=load,
+        efficiency_load=efficiency,
         torque_net=net,
         acceleration_wheel=acceleration,
         torque_input=torque_input,
@@ -176,6 +183,42 @@ def moving(robot: Robot, command: Command, state: State) -> Signals:
         signals, traction=traction, acceleration=(traction - signals.demand) / (signals.mass / robot.sides)
     )
     return gearbox(robot, chassis, track(robot, chassis, signals))
+
+
+class Mover(Protocol):
+    """Movers whose contacts are resolved one by one."""
+
+    @property
+    def normal(self) -> Scalar:
+        """Normal load of one side [N]."""
+        ...
+
+    def pull(self, chassis: Chassis, signals: Signals) -> Any:
+        """What the contacts do, with `traction` [N], `guide` [N], and `load` on the driving shaft [N·m]."""
+        ...
+
+
+def resolved(robot: Robot, command: Command, state: State, mover: Mover, inertia: Scalar) -> tuple[Signals, Any]:
+    """All signals of a robot in motion whose normal load, traction and guide load come from its contacts.
+
+    Args:
+        mover: the contacts at this instant.
+        inertia: of what turns rigidly with the driving shaft, in place of `chassis.inertia` [kg·m²].
+
+    Returns:
+        The signals, and what `mover.pull` gave.
+    """
+    chassis = dataclasses.replace(robot.chassis(command.wheeled), inertia=inertia)
+    signals = _fill(begin(robot, command, state), normal=mover.normal)
+    signals = electrical(robot, supply(robot, command, signals))
+    signals = slip(robot, travel(robot, chassis, motor(robot, signals)))
+    pull = mover.pull(chassis, signals)
+    traction, guide = pull.traction, jnp.sum(pull.guide)
+    signals = _fill(
+        signals, traction=traction, acceleration=(traction - signals.demand) / (signals.mass / robot.sides)
+    )
+    signals = track(robot, chassis, signals, guide)
+    return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
 
 
 def settled(robot: Robot, command: Command, state: State) -> tuple[Signals, Scalar]:

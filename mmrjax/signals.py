@@ -11,8 +11,8 @@ from mmrjax.params import Scalar
 GRAVITY = 9.80665  # [m/s²], standard gravity
 
 #: Outcomes of one member of a batch, in the order of their codes.
-STATUSES = ("converged", "stalled", "slides", "not_settled", "battery_empty", "failed")
-CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED = range(len(STATUSES))
+STATUSES = ("converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips")
+CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS = range(len(STATUSES))
 
 #: Limits that a run may exceed; bit k of `Result.flags` is the k-th name.
 FLAGS = ("motor_overspeed", "gearbox_overspeed", "winding_hot")
@@ -125,6 +125,7 @@ class Signals(eqx.Module):
     # track and gearbox
     torque_track_loss: Scalar = 0.0  # eq. (24), (26) at the pulley [N·m]
     torque_load: Scalar = 0.0  # all that the gearbox output carries, inertia apart [N·m]
+    efficiency_load: Scalar = 1.0  # η_rm, or 1/η_rm where power flows back [-]
     torque_idle: Scalar = 0.0  # M_rf_idle at the gearbox input, eq. (20) [N·m]
     torque_input: Scalar = 0.0  # into the gearbox, the armature's share taken off [N·m]
     torque_gear: Scalar = 0.0  # M_r, eq. (23) [N·m]

@@ -12,12 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from calibration import records, residual, robot_file
+from calibration.doors import BadConfiguration
 from mmrjax import params
-from mmrjax.models.drive import Trajectory, drive_batch
+from mmrjax.models.drive import drive_batch
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration
@@ -37,6 +38,7 @@ WHY = {
     "not_settled": "still accelerating at the end of the run; try a longer --duration",
     "battery_empty": "the battery has no charge left",
     "failed": "the solver gave up",
+    "tips": "the line of gravity passes outside the contacts: the robot turns over",
 }
 _HISTORY_POINTS = 1001
 _out = Console(highlight=False, soft_wrap=True, markup=False)
@@ -47,7 +49,7 @@ def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
     """Simulate a grid and leave a run folder; returns the exit code."""
     robot = load_robot(config)
     runs = grid(config)
-    folder = _folder("sweep", config, robot, out, force)
+    folder = open_folder("sweep", config, robot, out, force)
     table = _evaluate(robot, runs, config, folder)
     print_counts(table)
     if config.report:
@@ -63,17 +65,14 @@ def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
 def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bool) -> int:
     """Simulate a few given runs; with `drive` also their histories from standstill."""
     robot = load_robot(config)
-    folder = _folder("simulate", config, robot, out, force, runs)
+    folder = open_folder("simulate", config, robot, out, force, runs)
     table = _evaluate(robot, runs, config, folder)
     shown = min(len(runs), 6)
     print_runs({key: value[:shown] for key, value in table.items()})
     if shown < len(runs):
         _out.print(f"... and {len(runs) - shown} more in runs.csv")
-    if config.model == "drive":
-        times = jnp.linspace(0.0, config.duration_s, _HISTORY_POINTS)
-        command = runs.command(battery=float(config.battery), discharge=run.charge(config))
-        history = history_table(robot, jax.device_get(drive_batch(robot, command, times)), runs)
-        folder.write_table("history.csv", history)
+    if config.model != "steady":
+        _histories(folder, robot, runs, config)
     if config.report:
         from sweeps import report
 
@@ -84,22 +83,86 @@ def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bo
     return _finish(folder, config, robot, table, {"schema": "mmrjax.simulate/1"}, [runs.source])
 
 
-def history_table(robot: Robot, trajectory: Trajectory, runs: records.Runs) -> dict[str, np.ndarray]:
+def _histories(folder: RunFolder, robot: Robot, runs: records.Runs, config: Simulation) -> None:
+    """Write the runs over time, from standstill; of the track model also every reaction."""
+    command = runs.command(battery=float(config.battery), discharge=run.charge(config))
+    if config.model == "drive":
+        times = jnp.linspace(0.0, config.duration, _HISTORY_POINTS)
+        trajectory = jax.device_get(drive_batch(robot, command, times))
+        folder.write_table("history.csv", history_table(robot, trajectory, trajectory.distance, runs))
+        return
+    trajectory = jax.device_get(run.track_runs(robot, command, config, rolling=False))
+    folder.write_table("history.csv", history_table(robot, trajectory, trajectory.q[..., 0], runs))
+    folder.write_table("reactions.csv", reactions_table(trajectory, runs))
+
+
+def _names(runs: records.Runs) -> np.ndarray:
+    return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
+
+
+def history_table(robot: Robot, trajectory: Any, distance: np.ndarray, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = trajectory.signals
-    points = trajectory.time.shape[-1]
-    names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
     return {
-        "run_id": np.repeat(names, points),
+        "run_id": np.repeat(_names(runs), trajectory.time.shape[-1]),
         "time_s": trajectory.time.ravel(),
         "total_current_A": signals.total_current.ravel(),
         "motor_speed_rpm": signals.speed_motor.ravel() / records.RPM,
         "speed_mm_s": signals.speed.ravel() / records.MM,
         "theoretical_speed_mm_s": signals.speed_theoretical.ravel() / records.MM,
-        "distance_m": trajectory.distance.ravel(),
+        "distance_m": distance.ravel(),
         "voltage_V": signals.voltage.ravel(),
         "traction_N": robot.sides * signals.traction.ravel(),
     }
+
+
+def reactions_table(trajectory: Any, runs: records.Runs) -> dict[str, np.ndarray]:
+    """Loads inside one side's running gear over time [N], a row a sample."""
+    loads = trajectory.reactions
+    table = {
+        "run_id": np.repeat(_names(runs), trajectory.time.shape[-1]),
+        "time_s": trajectory.time.ravel(),
+        "guide_N": loads.guided.sum(-1).ravel(),
+        "front_N": loads.support[..., 0].ravel(),
+        "rear_N": loads.support[..., 1].ravel(),
+        "centrifugal_tension_N": loads.centrifugal.ravel(),
+    }
+    for name in ("grouser", "tension"):
+        values = getattr(loads, name)
+        table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
+    return table
+
+
+def render(config: Simulation, runs: records.Runs, file: Path, begin: float, end: float | None, slow: float,
+           force: bool) -> int:  # fmt: skip
+    """Draw one run of the track model from standstill as a picture or a film."""
+    from mmrjax import render as pictures
+
+    if file.suffix not in pictures.FORMATS:
+        raise BadConfiguration(f"FILE: got {file.name}; expected a name that ends in {', '.join(pictures.FORMATS)}")
+    if file.exists() and not force:
+        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
+    if not file.parent.is_dir():
+        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+    robot = load_robot(config)
+    command = runs.command(battery=float(config.battery), discharge=run.charge(config))
+    with _progress(1, quiet=False, doing="simulating"):
+        trajectory = run.track_runs(robot, command, config, rolling=False)
+    first = jax.tree.map(lambda x: x[0], (trajectory, command))
+    aside = file.with_name(f".{file.stem}.writing{file.suffix}")
+    try:
+        view = pictures.scene(robot, first[1], first[0])
+        with _progress(1, quiet=False, doing="drawing"):
+            pictures.render(view, aside, begin, end, slow)
+        aside.replace(file)
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}") from error
+    finally:
+        aside.unlink(missing_ok=True)
+    status = STATUSES[int(first[0].result.status)]
+    _out.print(f"{status}: {WHY[status]}")
+    _out.print(str(file))
+    return DONE if status == STATUSES[0] else SOME_NOT_CONVERGED
 
 
 def compare(config: Simulation, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
@@ -109,7 +172,7 @@ def compare(config: Simulation, source: str, own_mass: bool, out: Path | None, f
     stated = runs
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
-    folder = _folder("compare", config, robot, out, force, runs)
+    folder = open_folder("compare", config, robot, out, force, runs)
     table = _evaluate(robot, runs, config, folder)
     comparison, summary = compared(stated, table)
     folder.write_table("comparison.csv", comparison)
@@ -161,6 +224,11 @@ def read_runs(source: str, *, measured: bool) -> records.Runs:
     if runs.unknown:
         _err.print(f"{runs.source}: not used: {', '.join(runs.unknown)}")
     return runs
+
+
+def say(what: Any) -> None:
+    """Print text or a table to stdout."""
+    _out.print(what)
 
 
 def print_counts(table: dict[str, np.ndarray]) -> None:
@@ -226,9 +294,10 @@ def print_comparison(table: dict[str, np.ndarray], summary: dict[str, dict[str, 
         )
 
 
-def _folder(
+def open_folder(
     command: str, config: Simulation, robot: Robot, out: Path | None, force: bool, runs: records.Runs | None = None
 ) -> RunFolder:
+    """The run folder of a command, whose identity is what it was told."""
     identity = {
         "command": command,
         "config": config.model_dump(exclude={"report"}),
@@ -239,13 +308,14 @@ def _folder(
 
 
 def _evaluate(robot: Robot, runs: records.Runs, config: Simulation, folder: RunFolder) -> dict[str, np.ndarray]:
-    with _progress(len(runs), quiet=len(runs) <= config.chunk) as advance:
+    slow = config.model == "track" or len(runs) > config.runs_at_once
+    with _progress(len(runs), quiet=not slow) as advance:
         return run.evaluate(robot, runs, config, folder, advance)
 
 
 @contextmanager
-def _progress(total: int, quiet: bool) -> Iterator[Any]:
-    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+def _progress(total: int, quiet: bool, doing: str = "simulating") -> Iterator[Any]:
+    columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=_err, disable=quiet) as bar:
         task = bar.add_task("", total=total)
         yield lambda count: bar.advance(task, count)

@@ -13,7 +13,10 @@ from calibration.doors import BadConfiguration, choices
 from calibration.records import CONDITIONS
 from mmrjax.tables import BENCH, CONFIGURATIONS, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 
-Model = Literal["steady", "drive"]
+Model = Literal["steady", "drive", "track"]
+#: Length of a run [s] and runs in one vmapped call, by fidelity, where none is stated.
+DURATION = {"steady": 0.0, "drive": 30.0, "track": 1.5}
+CHUNK = {"steady": 16_384, "drive": 4_096, "track": 512}
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
@@ -25,31 +28,45 @@ class Simulation(BaseModel):
 
     Attributes:
         model: fidelity.
-        duration_s: length of a `drive` run from standstill [s].
+        duration_s: length of a run of `drive` or `track` [s]; None takes `DURATION`.
+        step_s: integration step of `track` [s].
         robot: name of a robot, or path of its TOML file.
         set: parameters to change, by dotted name, in SI units.
         battery: run on the on-board battery instead of the external supply.
         discharge_mAh: charge already taken from the battery.
-        chunk: runs in one vmapped call.
+        chunk: runs in one vmapped call; None takes `CHUNK`.
         report: whether to write report.html.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: Model = "steady"
-    duration_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    duration_s: Annotated[float, Field(gt=0, le=3600)] | None = None
+    step_s: Annotated[float, Field(gt=0, le=0.01)] = 1e-4
     robot: str = "nominal"
     set: dict[str, float] = {}
     battery: bool = False
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
-    chunk: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
+    chunk: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
     report: bool = True
+
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return DURATION[self.model] if self.duration_s is None else self.duration_s
+
+    @property
+    def runs_at_once(self) -> int:
+        """Runs in one vmapped call."""
+        return self.chunk or CHUNK[self.model]
 
 
 class History(Simulation):
     """A few given runs, shown from standstill: short enough that the start is seen."""
 
-    duration_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
+    @property
+    def duration(self) -> float:
+        return min(super().duration, 5.0) if self.duration_s is None else self.duration_s
 
 
 class Sweep(Simulation):
@@ -60,6 +77,26 @@ class Sweep(Simulation):
     payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
     slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] = SLOPES_DEG
     surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]
+
+
+class Calibrate(Simulation):
+    """What a calibration needs to know beside the data.
+
+    Attributes:
+        free, fix: parameters to free (`default` stands for the default set) and to hold, by dotted name.
+        prior: `name=value±sd` in SI units, in place of the fields' priors.
+        noise: `current=2%,motor_speed=0.5%,speed=1%`; empty takes the file's sd columns, or estimates.
+        starts: searches at once; seed: of their draws.
+        profiles: whether to profile every parameter.
+    """
+
+    free: tuple[str, ...] = ()
+    fix: tuple[str, ...] = ()
+    prior: tuple[str, ...] = ()
+    noise: str = ""
+    starts: Annotated[int, Field(ge=1, le=100_000)] = 64
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
+    profiles: bool = True
 
 
 C = TypeVar("C", bound=Simulation)
@@ -125,6 +162,11 @@ def settings(options: list[str] | None) -> dict[str, float] | None:
     return table
 
 
+def words(options: list[str] | None) -> tuple[str, ...] | None:
+    """Repeated, comma-separated options as one tuple."""
+    return tuple(w.strip() for o in options for w in o.split(",") if w.strip()) if options else None
+
+
 def axis(option: str, text: str | None) -> tuple[float, ...] | None:
     """An axis of a grid: `0,5,10`, or `0:20:0.5` for first, last and step, or both mixed.
 
@@ -158,6 +200,8 @@ def as_toml(config: Simulation) -> str:
     values = config.model_dump()
     table = values.pop("set")
     for key, value in values.items():
+        if value is None:  # left to the fidelity
+            continue
         lines.append(f"{key} = {_toml(value)}")
     lines += ["", "[set]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
     return "\n".join(lines) + "\n"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 COLUMNS = {"total_current": "total_current_A", "motor_speed": "motor_speed_rpm", "speed": "speed_mm_s"}
 
 
-class _Album:
+class Album:
     """Draws figures into `folder/figures` and keeps them, encoded, for the page."""
 
     def __init__(self, folder: Path) -> None:
@@ -66,7 +66,7 @@ def write(
     name, changed = _named(robot, robot_name, nominal)
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
     rows = {n: figures_data.rows(r) for n, r in robots.items()}
-    album = _Album(folder)
+    album = Album(folder)
     known: dict[str, Any] = {}
     if runs is not None and len(runs["status"]):
         known["counts"] = report_tables.counts(runs)
@@ -98,7 +98,7 @@ def write(
         "split": figures_data.SPLIT,
         "paper_idle_r2": figures.PAPER_IDLE_R2,
     }
-    return _render(folder, "report.html.j2", album, title=title, robot=_shown(name), model=model, **known)
+    return render(folder, "report.html.j2", album, title=title, robot=words_shown(name), model=model, **known)
 
 
 def write_comparison(
@@ -123,7 +123,7 @@ def write_comparison(
 
     folder = Path(folder)
     name, changed = _named(robot, robot_name, ROBOTS["nominal"]())
-    album = _Album(folder)
+    album = Album(folder)
     album.add("parity", lambda: figures_sweep.parity(table, COLUMNS))
     album.add("errors", lambda: figures_sweep.errors_over(table, COLUMNS))
     shown = min(len(table["status"]), 200)
@@ -132,12 +132,12 @@ def write_comparison(
         {"name": s, "count": int((table["status"] == s).sum()), "meaning": report_tables.STATUS_MEANING.get(s, "")}
         for s in dict.fromkeys(map(str, table["status"]))
     ]
-    return _render(
+    return render(
         folder,
         "comparison.html.j2",
         album,
-        title=f"{_shown(name)} against {Path(data_name).name}",
-        robot=_shown(name),
+        title=f"{words_shown(name)} against {Path(data_name).name}",
+        robot=words_shown(name),
         model=model,
         data_name=Path(data_name).name,
         rows=rows,
@@ -159,7 +159,8 @@ def _named(robot: Robot, robot_name: str, nominal: Robot) -> tuple[str, list[dic
     return name, report_tables.changed_parameters(robot, nominal)
 
 
-def _shown(name: str) -> str:
+def words_shown(name: str) -> str:
+    """A robot's name as the page shows it."""
     return figures.words_robot(name)
 
 
@@ -168,9 +169,9 @@ def _variants(name: str, rows: dict[str, figures_data.Rows]) -> dict[str, np.nda
     mine = rows[name]
     error = figures_data.errors
     answer = {
-        f"{_shown(name)}: own adhesion, mass as printed": error(mine.plain, mine.measured),
-        f"{_shown(name)}: adhesion raised, mass as printed": error(mine.raised, mine.measured),
-        f"{_shown(name)}: adhesion raised, the robot's own mass": error(mine.weighed, mine.measured),
+        f"{words_shown(name)}: own adhesion, mass as printed": error(mine.plain, mine.measured),
+        f"{words_shown(name)}: adhesion raised, mass as printed": error(mine.raised, mine.measured),
+        f"{words_shown(name)}: adhesion raised, the robot's own mass": error(mine.weighed, mine.measured),
     }
     if name != "nominal":
         nominal = rows["nominal"]
@@ -208,7 +209,8 @@ def _grade(value: Any) -> str:
     return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
 
 
-def _render(folder: Path, template: str, album: _Album, **known: Any) -> Path:
+def render(folder: Path, template: str, album: Album, **known: Any) -> Path:
+    """Write `report.html` from a template, the album's pictures and what the template asks for."""
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(lambda n: (resources.files("sweeps") / "templates" / n).read_text("utf-8")),
         autoescape=True,

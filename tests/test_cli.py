@@ -143,7 +143,7 @@ USAGE = {
     ),
     "unknown model": (
         ["sweep", "--model", "magic"],
-        r"option model: got 'magic'; input should be 'steady' or 'drive'",
+        r"option model: got 'magic'; input should be 'steady', 'drive' or 'track'",
     ),
     "unknown surface": (["sweep", "--surface", "ice"], r"option surface: got 'ice'"),
     "unknown robot": (
@@ -305,6 +305,8 @@ def test_help_is_quick_and_imports_no_jax():
         assert "Usage" in text
         if command:
             assert f"Example: mmrjax {command[0]}" in text.replace("\n", " ")
+            assert "(V)" in text if command == ["simulate"] else True
+            assert "(deg)" in text if command != ["compare"] else True
     probe = "import sys; import sweeps.cli; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", probe]).returncode == 0
 

@@ -75,6 +75,19 @@ def steady(robot: Robot, command: Command) -> Result:
         the mass not positive). A member that has no numbers has zero derivatives and harms no
         other.
     """
+    point, sound = operating_point(robot, command)
+    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED), sound)
+
+
+def operating_point(robot: Robot, command: Command) -> tuple[Result, Array]:
+    """`steady` with the numbers left in whatever the status, for a fit that has to find its way back.
+
+    Where the robot `slides` they are those of the balances with the contact held at V_s: current and motor
+    speed as if the ground held, the robot V_s slower than r_k ω_k, and no derivative of the speed in μ_s.
+
+    Returns:
+        The result, and whether robot and command are sound (see `_sound`).
+    """
     sound, command = _sound(robot, command)
     dtype = jnp.result_type(command.voltage)
     solver = SmallNewton(atol=float(jnp.finfo(dtype).eps) ** 0.85)
@@ -97,7 +110,7 @@ def steady(robot: Robot, command: Command) -> Result:
     empty = (command.battery > 0.5) & robot.battery.empty(command.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
-    return withhold(result(robot, signals, status), (status == CONVERGED) | (status == STALLED), sound)
+    return result(robot, signals, status), sound
 
 
 @eqx.filter_jit

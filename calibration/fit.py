@@ -1,0 +1,174 @@
+"""Maximum a posteriori by Levenberg-Marquardt with exact Jacobians, from many starts at once; L-BFGS beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from calibration.normal import Normal, cholesky, forward
+from calibration.problem import Data, Observation, Problem
+from mmrjax.robot import Robot
+
+#: Predicted decrease of the objective, over 1 + objective, below which a point is an optimum.
+DECREMENT = 1e-6
+
+Z = Float[Array, " parameters"]
+
+
+class Pin(eqx.Module):
+    """Coordinates held at a value: `z[k] = at[k]` where `held[k]`."""
+
+    held: Bool[Array, " parameters"]
+    at: Z
+
+    def apply(self, z: Z) -> Z:
+        return jnp.where(self.held, self.at, z)
+
+
+def no_pin(size: int) -> Pin:
+    """Nothing held."""
+    return Pin(jnp.zeros(size, bool), jnp.zeros(size))
+
+
+class Optimum(eqx.Module):
+    """Where one search ended.
+
+    Attributes:
+        z: coordinates, shape (parameters,).
+        sd: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,).
+        cost: objective, half the sum of squares of misfit and prior [-].
+        decrement: decrease that the Gauss-Newton step from here still predicts [-].
+        converged: whether the decrement is below `DECREMENT`; holds whatever the solver said.
+        steps: iterations taken.
+    """
+
+    z: Z
+    sd: Z
+    cost: Float[Array, ""]
+    decrement: Float[Array, ""]
+    converged: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+
+def with_jacobian(function: Callable[[Z], Array]) -> Callable[[Z], Array]:
+    """`function` with its Jacobian computed once, forward, wherever it is differentiated (either mode).
+
+    Exact: implicit through the root of `steady`, through the rollout of `drive`. One evaluation of value
+    and Jacobian together then serves every product with it, which a solver would else recompute.
+    """
+
+    @jax.custom_jvp
+    def value(z: Z) -> Array:
+        return function(z)
+
+    @value.defjvp
+    def derivative(primals: tuple[Z], tangents: tuple[Z]) -> tuple[Array, Array]:
+        (z,), (dz,) = primals, tangents
+        jacobian, out = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
+        return out, jacobian @ dz
+
+    return value
+
+
+def residuals(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], Array]:
+    """Residuals as a function of z: misfit, then prior; a held coordinate has a prior residual that keeps
+    it where it is, so that the Jacobian has full rank."""
+
+    def function(z: Z) -> Array:
+        held = pin.apply(z)
+        prior = jnp.where(pin.held, z - pin.at, z - data.centre)
+        return jnp.concatenate([problem.misfit(held, data), prior])
+
+    return with_jacobian(function)
+
+
+def informing(data: Data) -> np.ndarray:
+    """Indices of the residuals that carry information: readings and priors, not the penalty on adhesion."""
+    readings, rows = data.measured.size, data.measured.shape[0]
+    return np.r_[:readings, readings + rows : readings + rows + data.centre.size]
+
+
+def _finish(function: Callable[[Z], Array], z: Z, data: Data, pin: Pin, steps: Array) -> Optimum:
+    jacobian, r = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
+    informed = jacobian[informing(data)]
+    lower = cholesky(informed.T @ informed)
+    sd = jnp.linalg.norm(forward(lower, jnp.eye(z.shape[0])), axis=0)
+    lower = cholesky(jacobian.T @ jacobian)
+    decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
+    held = jnp.where(pin.held, pin.at - data.centre, 0.0)
+    cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))
+    return Optimum(pin.apply(z), sd, cost, decrement, decrement < DECREMENT * (1 + cost), steps)
+
+
+def levenberg_marquardt(
+    problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
+) -> Optimum:
+    """One search by `optimistix.LevenbergMarquardt`. To be vmapped over starts, data and pins."""
+    pin = no_pin(start.shape[0]) if pin is None else pin
+    function = residuals(problem, data, pin)
+    solution = optx.least_squares(
+        lambda z, _: function(z),
+        optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=Normal()),
+        pin.apply(start),
+        max_steps=max_steps,
+        throw=False,
+    )
+    return _finish(function, solution.value, data, pin, solution.stats["num_steps"])
+
+
+def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) -> Optimum:
+    """One search of the same objective by `optax.lbfgs`; its gradient is Jᵀr with the forward Jacobian.
+
+    For many parameters, or where the Jacobian is too large to factorise.
+    """
+    pin = no_pin(start.shape[0])
+    function = residuals(problem, data, pin)
+
+    def cost(z: Z) -> Array:
+        return 0.5 * jnp.sum(function(z) ** 2)
+
+    solver = optax.lbfgs(memory_size=20)
+    value_and_grad = optax.value_and_grad_from_state(cost)
+
+    def step(carry: tuple) -> tuple:
+        z, state, k, _ = carry
+        value, gradient = value_and_grad(z, state=state)
+        updates, state = solver.update(gradient, state, z, value=value, grad=gradient, value_fn=cost)
+        return optax.apply_updates(z, updates), state, k + 1, jnp.max(jnp.abs(gradient))
+
+    def go_on(carry: tuple) -> Array:
+        return (carry[2] < max_steps) & (carry[3] > 1e-5)
+
+    carry = (start, solver.init(start), jnp.asarray(0), jnp.asarray(jnp.inf))
+    z, _, k, _ = jax.lax.while_loop(go_on, step, carry)
+    return _finish(function, z, data, pin, k)
+
+
+@eqx.filter_jit
+def searches(
+    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
+) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
+    """Levenberg-Marquardt from every start in one vmapped batch.
+
+    Returns:
+        Where each search ended, and the status of every row where it started and where it ended.
+    """
+
+    def search(z: Z) -> tuple[Optimum, Array, Array]:
+        found = levenberg_marquardt(problem, z, data)
+        return found, problem.observation(z).status, problem.observation(found.z).status
+
+    return jax.vmap(search)(starts)
+
+
+@eqx.filter_jit
+def read(problem: Problem, robot: Robot) -> Observation:
+    """What the model says of every row of the problem for any robot, compiled."""
+    return problem.observe(robot)

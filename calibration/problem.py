@@ -1,0 +1,208 @@
+"""The calibration problem: what is observed, what the model says of it, and the whitened residuals of both."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from calibration.doors import BadConfiguration, choices
+from calibration.priors import Coordinates
+from calibration.records import Runs
+from mmrjax import balances
+from mmrjax.models.drive import drive
+from mmrjax.models.steady import operating_point
+from mmrjax.robot import Robot
+from mmrjax.signals import FAILED, SLIDES, Command, Reading, Result
+
+#: Share of the adhesion limit that a measured steady row is taken to leave unused [-].
+MARGIN = 0.02
+#: Demand above that which costs one sigma, as a share of the limit [-]; tightened where a row still slides.
+STIFFNESS = 1e-3
+#: Whitened residual of a reading that the model could not compute [σ].
+MISSING = 1e3
+#: Time after which `drive` is read as settled [s].
+SETTLED = 4.0
+
+Simulate = Callable[[Robot, Command], Result]
+
+
+def _steady(robot: Robot, commands: Command) -> Result:
+    return jax.vmap(lambda c: operating_point(robot, c)[0])(commands)
+
+
+def _drive(robot: Robot, commands: Command) -> Result:
+    times = jnp.asarray([0.0, SETTLED])
+    return jax.vmap(lambda c: drive(robot, c, times).result)(commands)
+
+
+#: Fidelities by name. Each maps a robot and a batch of commands to a batch of results, with numbers
+#: wherever it can give some, whatever the status; forward derivatives suffice.
+FIDELITIES: dict[str, Simulate] = {"steady": _steady, "drive": _drive}
+
+
+def fidelity(name: str) -> Simulate:
+    """A fidelity by its name.
+
+    Raises:
+        BadConfiguration: no such fidelity.
+    """
+    if name not in FIDELITIES:
+        raise BadConfiguration(f"--model {name}: no such fidelity; {choices(name, FIDELITIES)}")
+    return FIDELITIES[name]
+
+
+class Observation(eqx.Module):
+    """What the model says of every row.
+
+    Attributes:
+        reading: current [A], motor speed [rad/s], speed [m/s]; shape (rows, 3).
+        adhesion_used: demand on adhesion over its limit [-], 0 where that is no matter; shape (rows,).
+        status: of the row's run, shape (rows,).
+    """
+
+    reading: Float[Array, "rows 3"]
+    adhesion_used: Float[Array, " rows"]
+    status: Int[Array, " rows"]
+
+
+def _stack(reading: Reading) -> Float[Array, "... 3"]:
+    return jnp.stack([reading.total_current, reading.motor_speed, reading.speed], -1)
+
+
+class Settled(eqx.Module):
+    """Observer of steady rows: one run a row, read when settled."""
+
+    commands: Command
+    simulate: Simulate = eqx.field(static=True)
+
+    def __call__(self, robot: Robot) -> Observation:
+        result = self.simulate(robot, self.commands)
+        return Observation(_stack(result.reading), result.adhesion_used, result.status)
+
+
+class Series(eqx.Module):
+    """Observer of time histories with `drive`: one run from standstill for each `run_id`, one row a sample.
+
+    Sliding during a start is part of the run, so adhesion is not penalised.
+
+    Attributes:
+        commands: of each run, shape (runs,).
+        times: from 0 on, padded beyond a run's last sample, shape (runs, times) [s].
+        run, sample: indices of each row into `times`, shape (rows,).
+    """
+
+    commands: Command
+    times: Float[Array, "runs times"]
+    run: Int[Array, " rows"]
+    sample: Int[Array, " rows"]
+
+    def __call__(self, robot: Robot) -> Observation:
+        runs = jax.vmap(lambda c, t: drive(robot, c, t))(self.commands, self.times)
+        readings = _stack(jax.vmap(jax.vmap(lambda s: balances.sensor(robot, s)))(runs.signals))
+        return Observation(readings[self.run, self.sample], jnp.zeros(self.run.shape), runs.result.status[self.run])
+
+
+def is_series(runs: Runs) -> bool:
+    """Whether the table holds time histories."""
+    return runs.has("time_s")
+
+
+def series(runs: Runs) -> Series:
+    """Observer of a table with `time_s`; rows may come in any order, conditions are those of a run's first row."""
+    identity = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+    names, first, run = np.unique(identity, return_index=True, return_inverse=True)
+    clocks = [np.unique(np.concatenate([[0.0], runs["time_s"][run == k]])) for k in range(len(names))]
+    longest = max(len(c) for c in clocks)
+    times = np.stack([np.concatenate([c, c[-1] + 1e-3 * np.arange(1, longest - len(c) + 1)]) for c in clocks])
+    sample = np.array([np.searchsorted(clocks[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
+    return Series(runs.where(first).command(), jnp.asarray(times), jnp.asarray(run), jnp.asarray(sample))
+
+
+class Data(eqx.Module):
+    """Readings and how much each counts; the part of a problem that varies over refits.
+
+    Attributes:
+        measured, sd: current [A], motor speed [rad/s], speed [m/s], shape (rows, 3).
+        weight: 1 where a reading is fitted, 0 where it is held out, shape (rows, 3).
+        centre: what the priors say z is, shape (parameters,); 0 but in a bootstrap, where the bench
+            values too are drawn anew.
+        stiffness: of the penalty on adhesion, see `Problem`; shape ().
+    """
+
+    measured: Float[Array, "rows 3"]
+    sd: Float[Array, "rows 3"]
+    weight: Float[Array, "rows 3"]
+    centre: Float[Array, " parameters"]
+    stiffness: Float[Array, ""]
+
+
+class Problem(eqx.Module):
+    """Maximum a posteriori over z: minimise half the sum of squared residuals.
+
+    Residuals: (simulated - measured) / sd for each reading; z - centre for each free parameter; and, for a
+    settled row whose demand on adhesion exceeds 1 - MARGIN of its limit, the excess over `stiffness`.
+
+    Steady travel does not exist beyond the limit (the model says `slides`), yet the robot was measured
+    there, and at Table 5's adhesion six of the packaged rows slide. The balances can still be written down
+    with the contact held at V_s, so the objective is finite and continuous everywhere, and the penalty
+    turns the search back: its gradient in μ_s lives where that of the speed has died. The margin keeps it
+    off the limit itself, where the inverse of Fig. 7 has an infinite slope. The penalty is zero, with zero
+    gradient, wherever every row leaves the margin, so it does not move such an optimum; one that it does
+    hold is reported as held by the adhesion limit.
+    """
+
+    base: Robot
+    coordinates: Coordinates
+    observe: Any  # Settled | Series
+    data: Data
+
+    def observation(self, z: Float[Array, " parameters"]) -> Observation:
+        """What the model says of every row at z."""
+        return self.observe(self.coordinates.robot(self.base, z))
+
+    def misfit(self, z: Float[Array, " parameters"], data: Data) -> Float[Array, " residuals"]:
+        """Whitened residuals of the readings, then of adhesion; shape (4 rows,)."""
+        seen = self.observation(z)
+        error = (seen.reading - data.measured) / data.sd
+        error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
+        over = jax.nn.relu(seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
+        return jnp.concatenate([error.ravel(), jnp.where(jnp.isfinite(over), over, 0.0)])
+
+    def robot(self, z: Float[Array, " parameters"]) -> Robot:
+        """The robot at z."""
+        return self.coordinates.robot(self.base, z)
+
+    def unreachable(self, status: np.ndarray) -> np.ndarray:
+        """Whether the model has no such operating point, by row."""
+        return np.isin(status, (SLIDES, FAILED)) & isinstance(self.observe, Settled)
+
+
+def build(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str = "steady") -> Problem:
+    """The problem of these runs: `drive` histories where the table has `time_s`, else settled rows.
+
+    Raises:
+        BadConfiguration: no such fidelity, or one that has no time histories.
+    """
+    simulate = fidelity(model)
+    observe: Any = Settled(runs.command(), simulate)
+    if is_series(runs):
+        if model != "drive":
+            raise BadConfiguration(f"--model {model}: {runs.source} holds time histories; they need --model drive")
+        observe = series(runs)
+    measured = jnp.asarray(runs.measured())
+    data = Data(
+        measured, jnp.asarray(sd), jnp.ones_like(measured), jnp.zeros(len(coordinates)), jnp.asarray(STIFFNESS)
+    )
+    return Problem(base, coordinates, observe, data)
+
+
+def reweighted(data: Data, **changes: Any) -> Data:
+    """`data` with some fields replaced."""
+    return dataclasses.replace(data, **changes)

@@ -1,0 +1,85 @@
+"""The command `calibrate`: from a table of runs to a run folder with the calibrated robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from calibration import outcome, priors, robot_file
+from calibration.calibrate import calibrate as run
+from calibration.doors import BadConfiguration
+from calibration.records import CHANNELS
+from sweeps import commands
+from sweeps import config as configuration
+from sweeps.store import digest
+
+
+def calibrate(config: configuration.Calibrate, source: str, out: Path | None, force: bool) -> int:
+    """Calibrate a robot to a table and leave a run folder; returns the exit code.
+
+    0 done; 3 done, but the search did not converge, or a row or a fit without a block did not.
+    """
+    runs = commands.read_runs(source, measured=True)
+    robot = commands.load_robot(config)
+    stated: dict[str, tuple[float, float]] = {}
+    for text in config.prior:
+        name, mean, sd = priors.parse_prior(text)
+        if name in stated:
+            raise BadConfiguration(f"--prior {name}: given twice; give it once")
+        stated[name] = (mean, sd)
+    folder = commands.open_folder("calibrate", config, robot, out, force, runs)
+    found = run(
+        runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
+        model=config.model, starts=config.starts, seed=config.seed, profiles=config.profiles,
+    )  # fmt: skip
+    document = outcome.document(found)
+    folder.write_json("result.json", document)
+    folder.write_table("rows.csv", outcome.rows_table(found))
+    folder.write_text("config.resolved.toml", configuration.as_toml(config))
+    note = (
+        f"calibrated from {config.robot} with {runs.source}; the free parameters: {', '.join(document['parameters'])}"
+    )
+    robot_file.write(found.robot, folder.partial / "robot.toml", note=note)
+    print_calibration(document)
+    if config.report:
+        from sweeps import report_calibration
+
+        report_calibration.write(folder.partial, found, document, robot_name=config.robot)
+    hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}
+    if Path(source).is_file():
+        hashes[Path(source).name] = digest(Path(source).read_bytes())
+    path = folder.finish({"seed": config.seed, "hashes": hashes, "statuses": document["statuses"]})
+    commands.say(str(path))
+    settled = found.converged and all(h.converged.all() for h in found.held_out.values())
+    reached = document["statuses"]["converged"] == len(runs)
+    return commands.DONE if settled and reached else commands.SOME_NOT_CONVERGED
+
+
+def print_calibration(document: dict[str, Any]) -> None:
+    """Parameters, errors and remarks, for a person."""
+    shown = Table(title=f"{document['rows']} rows, {document['model']}", title_justify="left")
+    for heading in ("parameter", "value", "95 % interval", "shift [σ]", "held by"):
+        side = "left" if heading in ("parameter", "held by") else "right"
+        shown.add_column(heading, justify=side, no_wrap=True, overflow="ignore")
+    for name, p in document["parameters"].items():
+        low, high = (f"{v:.3g}" for v in p["interval"])
+        marks = "> " * p["interval_open"][1] + "< " * p["interval_open"][0]  # the end lies further out
+        shown.add_row(
+            name, f"{p['value']:.4g}", f"{marks}{low} .. {high}", f"{p['shift_in_prior_sd']:+.1f}",
+            "prior" if p["held_by_prior"] else "data",
+        )  # fmt: skip
+    commands.say(shown)
+    errors = Table(title="rms of (simulated - measured) / simulated, eq. (35) [%]", title_justify="left")
+    for heading in ("", "rows", *(c.replace("_", " ") for c in CHANNELS)):
+        errors.add_column(heading, justify="right" if heading else "left")
+    lines = {"before": document["errors"]["before"]["fitted"], "after": document["errors"]["after"]["fitted"]}
+    lines |= {f"after, held out by {k.replace('_', ' and ')}": v["all"] for k, v in document["held_out_by"].items()}
+    for words, by in lines.items():
+        cells = ("-" if by[c]["rows"] == 0 else f"{by[c]['rms_percent']:.1f}" for c in CHANNELS)
+        errors.add_row(words, f"{by['total_current']['rows']}/{document['rows']}", *cells)
+    commands.say(errors)
+    commands.say(document["optimizer"]["agreement"])
+    for note in document["notes"]:
+        commands.say(f"- {note}")

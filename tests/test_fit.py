@@ -1,0 +1,270 @@
+"""The fit: exact Jacobians, both optimizers, many starts, recovered truth, coverage, and what holds what."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration import fit, holdout, identifiability, noise, priors, problem, records
+from calibration.normal import backward, cholesky, forward
+from mmrjax import nominal
+from mmrjax.signals import CONVERGED, SLIDES
+
+solve = eqx.filter_jit(fit.levenberg_marquardt)
+STATED = "current=2%,motor_speed=0.5%,speed=1%"
+
+
+def pose(runs, robot, names=None, model="steady", stated=STATED):
+    names = priors.choose(robot, priors.default_names(runs["configuration"], robot)) if names is None else names
+    return problem.build(runs, robot, priors.coordinates(robot, names), noise.of(runs, stated).sd, model)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return records.read("measured")
+
+
+@pytest.fixture(scope="module")
+def posed(measured):
+    return pose(measured, nominal.nominal())
+
+
+@pytest.fixture(scope="module")
+def truth(posed):
+    """A robot that reaches every row: adhesion 0.6, V_s 0.05 m/s, the others within an sd of nominal."""
+    z = 0.7 * np.random.default_rng(3).standard_normal(len(posed.coordinates))
+    at = {"static": 0.6, "speed_static": 0.05}
+    for k, name in enumerate(posed.coordinates.names):
+        value = at.get(name.rsplit(".", 1)[1])
+        if value is not None:
+            z[k] = (np.log(value) - float(posed.coordinates.location[k])) / float(posed.coordinates.spread[k])
+    return jnp.asarray(z)
+
+
+@pytest.fixture(scope="module")
+def clean(posed, truth):
+    """The same problem with readings of the true robot, without noise, and bench values that are right."""
+    reading = posed.observation(truth).reading
+    return dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=reading, centre=truth))
+
+
+def starts(size, count, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).standard_normal((count, size)))
+
+
+def test_normal_equations_solve():
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((9, 5)), rng.standard_normal(9)
+    lower = cholesky(jnp.asarray(a.T @ a))
+    np.testing.assert_allclose(lower, np.linalg.cholesky(a.T @ a), rtol=1e-10, atol=1e-12)
+    x = backward(lower, forward(lower, jnp.asarray(a.T @ b)))
+    np.testing.assert_allclose(x, np.linalg.lstsq(a, b)[0], rtol=1e-9)
+
+
+def test_jacobian_of_steady_is_the_finite_difference(posed, truth):
+    function = jax.jit(lambda z: posed.misfit(z, posed.data))
+    jacobian = np.asarray(jax.jit(jax.jacfwd(function))(truth))
+    step = 1e-5
+    columns = [
+        (function(truth.at[k].add(step)) - function(truth.at[k].add(-step))) / (2 * step) for k in range(len(truth))
+    ]
+    np.testing.assert_allclose(jacobian, np.stack(columns, 1), rtol=1e-5, atol=1e-5 * np.abs(jacobian).max())
+
+
+def test_the_objective_is_finite_where_the_robot_slides_and_leads_back(posed):
+    nominal_z = jnp.zeros(len(posed.coordinates))
+    seen = posed.observation(nominal_z)
+    assert np.sum(np.asarray(seen.status) == SLIDES) == 6  # Table 5's adhesion against 15 and 20 degrees
+    assert np.all(np.isfinite(np.asarray(seen.reading)))
+    gradient = jax.grad(lambda z: 0.5 * jnp.sum(fit.residuals(posed, posed.data, fit.no_pin(z.size))(z) ** 2))(
+        nominal_z
+    )
+    for name, g in zip(posed.coordinates.names, np.asarray(gradient), strict=True):
+        if name.endswith("friction.static"):
+            assert g < 0  # more adhesion costs less
+    found = solve(posed, nominal_z, posed.data)
+    assert found.converged
+    assert np.all(np.asarray(posed.observation(found.z).status) == CONVERGED)
+
+
+def test_a_penalty_that_holds_nothing_moves_nothing(clean, truth):
+    found = solve(clean, truth + 0.3, clean.data)
+    softer = dataclasses.replace(clean.data, stiffness=clean.data.stiffness * 100)
+    again = solve(clean, truth + 0.3, softer)
+    np.testing.assert_allclose(found.z, again.z, atol=1e-6)
+
+
+def test_truth_is_recovered_from_clean_readings(clean, truth):
+    found, _, _ = fit.searches(clean, starts(len(truth), 16), clean.data)
+    assert np.all(found.converged)
+    np.testing.assert_allclose(found.z, np.broadcast_to(truth, found.z.shape), atol=2e-4)
+
+
+def test_64_starts_on_the_packaged_data_agree(posed):
+    found, _, _ = fit.searches(posed, starts(len(posed.coordinates), 64), posed.data)
+    assert np.all(found.converged)
+    np.testing.assert_allclose(found.cost, np.asarray(found.cost).min(), rtol=1e-6)
+
+
+def test_lbfgs_reaches_the_same_optimum(posed, clean, truth):
+    for problem_, start in ((clean, truth + 0.5), (posed, jnp.zeros(len(truth)))):
+        lm = solve(problem_, start, problem_.data)
+        other = jax.jit(lambda z, p=problem_: fit.quasi_newton(p, z, p.data))(start)
+        assert lm.converged and other.converged
+        np.testing.assert_allclose(other.cost, lm.cost, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(other.z, lm.z, atol=0.02)
+
+
+def test_intervals_cover_the_truth(posed, truth):
+    measured = dataclasses.replace(
+        posed, data=dataclasses.replace(posed.data, measured=posed.observation(truth).reading)
+    )
+    found = identifiability.coverage(measured, truth, draws=500, seed=1, profiles=True)
+    assert found.converged.mean() > 0.99
+    assert np.all((found.profile > 0.92) & (found.profile < 0.98)), found.profile
+
+
+def test_coverage_can_fail(posed, truth):
+    """Intervals made with half the noise that the readings have do not cover."""
+    reading = posed.observation(truth).reading
+    honest = dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=reading))
+    key = jax.random.split(jax.random.key(0), 100)
+
+    def draw(k):
+        one, two = jax.random.split(k)
+        data = dataclasses.replace(
+            honest.data, sd=honest.data.sd / 4, measured=reading + honest.data.sd * jax.random.normal(one, reading.shape),
+            centre=truth + jax.random.normal(two, truth.shape),
+        )  # fmt: skip
+        best = solve(honest, truth, data)
+        return jnp.abs(best.z - truth) < 1.96 * best.sd
+
+    inside = np.asarray(jax.jit(jax.vmap(draw))(key)).mean(0)
+    assert inside.min() < 0.85
+
+
+def test_what_only_its_prior_holds_is_said(measured):
+    robot = nominal.nominal()
+    names = (
+        *priors.default_names(measured["configuration"], robot),
+        "motor.inductance",
+        "tracked.track.guide_friction",
+    )
+    posed = pose(measured, robot, names)
+    z = solve(posed, jnp.zeros(len(names)), posed.data).z
+    about = identifiability.analyse(posed, z)
+    held = dict(zip(names, about.held_by_prior, strict=True))
+    assert held["motor.inductance"] and about.sd[names.index("motor.inductance")] == pytest.approx(1.0)
+    assert about.sensitivity[names.index("motor.inductance")] == 0
+    assert about.rank == len(names) - 2  # inductance, and the product guide_friction x guide_share
+    weakest = [v for s, v in about.weak_directions() if s < 1e-6 and "motor.inductance" not in v]
+    assert set(weakest[0]) == {"tracked.track.guide_friction", "tracked.track.guide_share"}
+
+
+def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
+    """With little noise the model is linear over an interval, so profile and curvature agree."""
+    quiet = dataclasses.replace(clean.data, sd=clean.data.sd / 50)
+    small = dataclasses.replace(clean, data=quiet)
+    best = solve(small, truth, quiet)
+    about = identifiability.analyse(small, best.z)
+    profile = identifiability.profile(small, best.z, float(best.cost), about)
+    assert profile.better < 1e-6 and not profile.open.any()
+    sure = about.sd < 0.2  # the others still reach over a prior sd
+    low = np.asarray(small.coordinates.value(best.z - 1.96 * about.sd))
+    high = np.asarray(small.coordinates.value(best.z + 1.96 * about.sd))
+    assert sure.sum() >= 4
+    np.testing.assert_allclose(profile.low[sure], low[sure], rtol=0.02)
+    np.testing.assert_allclose(profile.high[sure], high[sure], rtol=0.02)
+
+
+def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(posed, measured):
+    best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data)
+    about = identifiability.analyse(posed, best.z)
+    profile = identifiability.profile(posed, best.z, float(best.cost), about)
+    k = posed.coordinates.names.index("wheeled.ground.friction.static")
+    value = float(posed.coordinates.value(best.z)[k])
+    assert value - profile.low[k] < 0.2 * (profile.high[k] - value)
+    assert profile.better < 1e-3
+
+
+def test_blocks_left_out_are_not_seen(posed, measured):
+    masks = {"slope": holdout.blocks(measured, "slope")}
+    best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data).z
+    held = holdout.held_out(posed, best, masks)["slope"]
+    assert held.labels == ("0.0", "5.0", "10.0", "15.0", "20.0") and held.converged.all()
+    # the refit without slope 10, done alone, says the same of those rows
+    rows = masks["slope"]["10.0"]
+    alone = pose(measured.where(~rows), nominal.nominal())
+    z = solve(alone, best, alone.data).z
+    np.testing.assert_allclose(held.reading[rows], np.asarray(posed.observation(z).reading)[rows], rtol=1e-4)
+    # readings of a block do not change what is predicted for it
+    shifted = dataclasses.replace(posed.data, measured=posed.data.measured.at[rows].multiply(1.3))
+    other = holdout.held_out(dataclasses.replace(posed, data=shifted), best, masks)["slope"]
+    np.testing.assert_allclose(other.reading[rows], held.reading[rows], rtol=1e-4)
+
+
+def test_blocks_of_what_does_not_vary_are_none(measured):
+    flat = measured.where(measured["slope_deg"] == 0)
+    assert holdout.blocks(flat, "slope") == {} and len(holdout.blocks(flat, "voltage_configuration")) == 4
+    assert holdout.blocks(flat, "run") == {}
+
+
+def test_drive_and_steady_agree_on_settled_rows(measured, truth, posed):
+    same = pose(measured, nominal.nominal(), model="drive")
+    np.testing.assert_allclose(same.observation(truth).reading, posed.observation(truth).reading, rtol=2e-4)
+
+
+def series_runs(robot, seed=None, noise_share=0.01):
+    """Starts of both configurations as a table of histories, from `drive`."""
+    from mmrjax.models.drive import drive_batch
+
+    times = np.concatenate([np.linspace(0.0002, 0.004, 8), np.linspace(0.02, 0.6, 12)])
+    conditions = records.Runs(
+        "made",
+        {
+            "configuration": np.array(["6T2A", "6T2A", "4W2T"]), "supply_voltage_V": np.array([15.0, 33.0, 24.0]),
+            "total_mass_kg": np.array([13.1, 21.1, 13.1]), "payload_kg": np.array([0.0, 8.0, 0.0]),
+            "slope_deg": np.array([0.0, 10.0, 5.0]),
+        },
+    )  # fmt: skip
+    run = drive_batch(robot, conditions.command(), jnp.asarray(np.concatenate([[0.0], times])))
+    s = jax.tree.map(lambda x: np.asarray(x)[:, 1:], run.signals)
+    n = len(times)
+    columns = {k: np.repeat(v, n) for k, v in conditions.columns.items()}
+    columns |= {
+        "run_id": np.repeat(["a", "b", "c"], n), "time_s": np.tile(times, 3),
+        "total_current_A": s.total_current.ravel(), "motor_speed_rpm": s.speed_motor.ravel() / records.RPM,
+        "speed_mm_s": s.speed.ravel() / records.MM,
+    }  # fmt: skip
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        for column in records.MEASURED:
+            columns[column] = columns[column] * (1 + noise_share * rng.standard_normal(len(columns[column])))
+    return records.Runs("made", columns)
+
+
+def test_histories_calibrate_with_drive():
+    """A start tells the inductance and the rotor's inertia, which no steady row can."""
+    base = nominal.nominal()
+    names = ("motor.inductance", "motor.inertia", "tracked.track.loss_coulomb", "tracked.ground.friction.static")
+    c = priors.coordinates(base, names)
+    truth = jnp.asarray([1.0, -0.8, 1.2, 1.8])
+    runs = series_runs(c.robot(base, truth), seed=5)
+    assert problem.is_series(runs)
+    posed = problem.build(runs, base, c, noise.of(runs, "current=0.1A,motor_speed=20rpm,speed=5mm/s").sd, "drive")
+    best = solve(posed, jnp.zeros(4), posed.data)
+    assert best.converged
+    about = identifiability.analyse(posed, best.z)
+    assert np.all(about.sd[:2] < 0.5)
+    assert np.all(np.abs(np.asarray(best.z - truth)) < 4 * about.sd)
+
+
+def test_series_pads_runs_of_different_length():
+    runs = series_runs(nominal.nominal())
+    short = runs.where((runs["run_id"] != "b") | (runs["time_s"] < 0.3))
+    observer = problem.series(short)
+    seen = observer(nominal.nominal()).reading
+    np.testing.assert_allclose(seen, short.measured(), rtol=1e-4, atol=1e-4)

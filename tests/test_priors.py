@@ -1,0 +1,144 @@
+"""Coordinates of the free parameters: prior, bounds, what is never flat, and names by which they are chosen."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration import priors
+from calibration.doors import BadConfiguration
+from mmrjax import nominal, params
+from mmrjax.effects import ALL
+
+EVERY = [p.name for p in params.walk(dataclasses.replace(nominal.nominal(), effects=tuple(e() for e in ALL)))]
+
+
+@pytest.fixture(scope="module")
+def every(robot_with_effects):
+    """Coordinates of every parameter of the robot with all effects."""
+    return priors.coordinates(robot_with_effects, EVERY)
+
+
+def test_coordinates_start_at_the_nominal_robot(every, robot_with_effects):
+    nominal = np.array([float(p.value) for p in params.walk(robot_with_effects)])
+    value = np.asarray(every.value(jnp.zeros(len(every))))
+    on_bound = np.array([p.name == "wheeled.track.guide_share" for p in params.walk(robot_with_effects)])
+    sd = np.array([p.spec.prior_sd(float(p.value)) for p in params.walk(robot_with_effects)])
+    assert np.all(np.abs(value - nominal)[~on_bound] <= 1e-5 * sd[~on_bound])  # nearest bound: half an sd
+    assert 0 < value[on_bound] < 0.01  # its nominal value is its bound
+
+
+def test_coordinates_never_leave_the_bounds_and_never_die(every, robot_with_effects):
+    bounds = np.array([p.spec.bounds for p in params.walk(robot_with_effects)])
+    for z in np.linspace(-40, 40, 33):
+        value = np.asarray(every.value(jnp.full(len(every), z)))
+        assert np.all(value >= bounds[:, 0] - 1e-12) and np.all(value <= bounds[:, 1] + 1e-12)
+    slope = np.asarray(every.slope(jnp.zeros(len(every))))
+    assert np.all(np.isfinite(slope)) and np.all(slope > 0)
+
+
+def test_amplitudes_have_a_full_gradient_at_zero(every):
+    slope, spread = np.asarray(every.slope(jnp.zeros(len(every)))), np.asarray(every.spread)
+    amplitudes = [k for k, name in enumerate(every.names) if name.endswith(".amplitude")]
+    assert len(amplitudes) == len(ALL)
+    np.testing.assert_allclose(slope[amplitudes], spread[amplitudes], rtol=1e-4)
+
+
+def test_slope_on_a_bound_is_half(robot):
+    c = priors.coordinates(robot, ["wheeled.track.guide_share"])
+    np.testing.assert_allclose(c.slope(jnp.zeros(1)) / c.spread, 0.5, rtol=1e-6)
+    assert c.beyond(np.array([-1.0])) == -1 and c.beyond(np.array([1.0])) == 0 and c.beyond(np.array([9.0])) == 1
+
+
+def test_slope_is_the_finite_difference(every):
+    z = jnp.asarray(np.random.default_rng(0).standard_normal(len(every)))
+    difference = (every.value(z + 1e-6) - every.value(z - 1e-6)) / 2e-6
+    np.testing.assert_allclose(every.slope(z), difference, rtol=1e-6, atol=1e-12)
+
+
+def test_relative_prior_is_log_normal_with_that_spread(robot):
+    c = priors.coordinates(robot, ["tracked.ground.rolling_resistance", "tracked.track.guide_share"])
+    assert c.scale == (True, False)
+    draws = np.asarray(jax.vmap(c.value)(jax.random.normal(jax.random.key(0), (200_000, 2))))
+    np.testing.assert_allclose(draws[:, 0].std() / 0.06, 0.15 * np.sqrt(1.0225), rtol=0.01)
+    np.testing.assert_allclose(np.median(draws, 0), [0.06, 0.3], rtol=0.01)
+
+
+def test_friction_pairs_keep_their_ratio_unless_freed(robot):
+    z = jnp.ones(1)
+    moved = priors.coordinates(robot, ["tracked.ground.friction.static"]).robot(robot, z).tracked.ground.friction
+    np.testing.assert_allclose(moved.dynamic / moved.static, 0.8)
+    assert moved.static > 0.4
+    both = ["tracked.ground.friction.static", "tracked.ground.friction.dynamic"]
+    assert priors.coordinates(robot, both).tied == ()
+
+
+def test_choose_takes_default_groups_and_fixes(robot):
+    default = priors.default_names(("6T2A", "4W2T"), robot)
+    assert len(default) == 11 and len(priors.default_names(("6T2A",), robot)) == 6
+    assert priors.choose(robot, default) == default
+    assert priors.choose(robot, default, ["default", "motor.resistance"]) == (*default, "motor.resistance")
+    assert priors.choose(robot, default, ["motor.*"], ["motor.inertia"]) == tuple(
+        n for n in EVERY if n.startswith("motor.") and n != "motor.inertia"
+    )
+    assert priors.choose(robot, default, fix=["tracked.*"]) == tuple(n for n in default if n.startswith("wheeled"))
+
+
+@pytest.mark.parametrize(
+    ("free", "fix", "says"),
+    [
+        (["tracked.mu"], [], r"--free tracked.mu: no such parameter; .*allowed: tracked\."),
+        (
+            ["rolling_resistance"],
+            [],
+            r"allowed: tracked.ground.rolling_resistance, wheeled.ground.rolling_resistance",
+        ),
+        (["engine.*"], [], r"--free engine.\*: no parameters below it; .*motor.\*"),
+        ([], ["gearbox.raito"], r"--fix gearbox.raito: .*did you mean gearbox.ratio\?"),
+        (["motor.resistance"], ["motor.resistance"], "--free and --fix both name motor.resistance"),
+        ([], ["tracked.*", "wheeled.*"], "--fix leaves no parameter to fit"),
+    ],
+)
+def test_choose_refuses_with_the_choices(robot, free, fix, says):
+    with pytest.raises(BadConfiguration, match=says):
+        priors.choose(robot, priors.default_names(("6T2A", "4W2T"), robot), free, fix)
+
+
+def test_parse_prior_reads_all_forms():
+    name = "tracked.ground.friction.static"
+    assert priors.parse_prior(f"{name}=0.45±0.05") == (name, 0.45, 0.05)
+    assert priors.parse_prior(f"{name}=4.5e-1+-0.05") == (name, 0.45, 0.05)
+    assert priors.parse_prior(f"{name} =0.45 ± 10%".replace(" =", "="))[2] == pytest.approx(0.045)
+
+
+@pytest.mark.parametrize("text", ["a", "a=1", "a=x±1", "a=1±x", "a=1±0", "a=1±-1", "a=1±nan"])
+def test_parse_prior_refuses(text):
+    with pytest.raises(BadConfiguration, match=r"--prior .*name=value±sd"):
+        priors.parse_prior(text)
+
+
+@pytest.mark.parametrize(
+    ("names", "stated", "says"),
+    [
+        (["motor.resistance"], {"motor.resistanse": (1, 1)}, "no such parameter; did you mean motor.resistance"),
+        (["motor.resistance"], {"motor.inertia": (1, 1)}, "is not free; add --free motor.inertia"),
+        (["motor.resistance"], {"motor.resistance": (50.0, 1)}, "got 50; expected 0.01 to 20 ohm"),
+    ],
+)
+def test_coordinates_refuse_stated_priors(robot, names, stated, says):
+    with pytest.raises(BadConfiguration, match=says):
+        priors.coordinates(robot, names, stated)
+
+
+def test_coordinates_refuse_a_prior_without_width():
+
+    with pytest.raises(BadConfiguration, match=r"motor.friction_viscous: its prior has no width"):
+        priors.coordinates(nominal.sm1(), ["motor.friction_viscous"])
+
+
+def test_stated_prior_moves_the_centre(robot):
+    c = priors.coordinates(robot, ["tracked.ground.friction.static"], {"tracked.ground.friction.static": (0.5, 0.05)})
+    np.testing.assert_allclose(c.value(jnp.zeros(1)), 0.5)
+    np.testing.assert_allclose(c.slope(jnp.zeros(1)), 0.05, rtol=0.01)
