@@ -21,6 +21,8 @@ from mmrjax.signals import GRAVITY, Command, Reading, Signals, State
 #: Every balance with its unit and what it closes.
 BALANCES = {
     "mass": ("kg", "M = robot + payload"),
+    "inertia": ("kg·m^2", "J_w of one side's parts that turn with the driving wheel, eq. (31)"),
+    "inductance": ("H", "L of one armature circuit, eq. (15)"),
     "supply": ("V", "U_e from battery or external source, eqs. (8)-(13)"),
     "electrical": ("V", "U_e = E + I R + L dI/dt, eq. (15)"),
     "motor": ("N·m", "C_m I - M_df = M_d, eqs. (14), (17), (18)"),
@@ -56,7 +58,9 @@ def begin(robot: Robot, command: Command, state: State, direction: Scalar | None
         slope=command.slope,
         payload=command.payload,
         adhesion=command.adhesion,
+        battery=command.battery,
         discharge=state.discharge,
+        memory=state.memory,
         current=state.current,
         speed_motor=state.speed_motor,
         speed=state.speed,
@@ -67,7 +71,7 @@ def begin(robot: Robot, command: Command, state: State, direction: Scalar | None
         total_current=robot.sides * state.current,
     )
     stated = chassis.mass + command.payload if command.total_mass is None else command.total_mass
-    mass = stated + _effects(robot, signals, "mass")
+    mass = stated + _effects(robot, _fill(signals, mass=stated), "mass")
     normal = chassis_room.normal_load(mass, command.slope, GRAVITY, robot.sides)
     return _fill(signals, mass=mass, normal=normal)
 
@@ -84,7 +88,13 @@ def electrical(robot: Robot, signals: Signals) -> Signals:
     """What of the supply voltage is left to change the current [V]."""
     back = robot.motor.voltage_back(signals.speed_motor)
     drop = robot.motor.voltage_winding(signals.current) + _effects(robot, signals, "electrical")
-    return _fill(signals, voltage_back=back, voltage_drop=drop, voltage_left=signals.voltage - back - drop)
+    return _fill(
+        signals,
+        voltage_back=back,
+        voltage_drop=drop,
+        voltage_left=signals.voltage - back - drop,
+        inductance=robot.motor.inductance + _effects(robot, signals, "inductance"),
+    )
 
 
 def motor(robot: Robot, signals: Signals) -> Signals:
@@ -144,10 +154,11 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
     mover = chassis.radius * signals.traction if mover is None else mover
     load = signals.torque_track_loss + mover + _effects(robot, signals, "gearbox")
     drive = signals.torque_motor - idle
-    side = drive * chassis.inertia + gear.ratio * inertia_motor * load
+    inertia_wheel = chassis.inertia + _effects(robot, signals, "inertia")
+    side = drive * inertia_wheel + gear.ratio * inertia_motor * load
     efficiency = gear.efficiency_flow(side, signals.direction)
     net = gear.ratio * efficiency * drive - load
-    inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, chassis.inertia)
+    inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, inertia_wheel)
     acceleration = net / inertia
     torque_input = signals.torque_motor - inertia_motor * gear.ratio * acceleration
     return _fill(

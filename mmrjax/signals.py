@@ -68,12 +68,14 @@ class State(eqx.Module):
         speed_motor: motor shaft speed [rad/s].
         speed: speed of the robot along the slope V [m/s].
         discharge: charge taken from the battery C_b [C].
+        memory: of each effect that has one, by the effect's name, in its own unit; empty where none is kept.
     """
 
     current: Scalar
     speed_motor: Scalar
     speed: Scalar
     discharge: Scalar
+    memory: dict[str, Scalar] = eqx.field(default_factory=dict)
 
 
 class Signals(eqx.Module):
@@ -87,7 +89,9 @@ class Signals(eqx.Module):
     slope: Scalar = 0.0
     payload: Scalar = 0.0
     adhesion: Scalar = 1.0
+    battery: Scalar = 0.0  # 1 where the on-board battery feeds the motors
     discharge: Scalar = 0.0
+    memory: dict[str, Scalar] = eqx.field(default_factory=dict)  # of effects, by name; empty: settled
     current: Scalar = 0.0  # I_d of one motor [A]
     speed_motor: Scalar = 0.0  # [rad/s]
     speed: Scalar = 0.0  # V of the robot [m/s]
@@ -97,7 +101,7 @@ class Signals(eqx.Module):
     speed_wheel: Scalar = 0.0  # of driving wheel or pulley [rad/s]
     speed_theoretical: Scalar = 0.0  # r_k ω_k, eq. (32) [m/s]
     # mass
-    mass: Scalar = 0.0  # total M [kg]
+    mass: Scalar = 0.0  # total M [kg]; to effects of balance `mass`, the stated one
     normal: Scalar = 0.0  # normal load of one side [N]
     # supply and electrical
     total_current: Scalar = 0.0  # of all motors I_s, eq. (10) [A]
@@ -105,6 +109,7 @@ class Signals(eqx.Module):
     voltage_back: Scalar = 0.0  # E, eq. (16) [V]
     voltage_drop: Scalar = 0.0  # I R and every further drop [V]
     voltage_left: Scalar = 0.0  # drives L dI/dt, eq. (15) [V]
+    inductance: Scalar = 0.0  # L_d of the armature circuit, eq. (15) [H]
     # motor
     torque_electromagnetic: Scalar = 0.0  # C_m I, eq. (17) [N·m]
     torque_motor_loss: Scalar = 0.0  # M_df, eq. (14) [N·m]

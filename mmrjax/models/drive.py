@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mmrjax import balances
+from mmrjax.effects import Effect
 from mmrjax.models.result import result
 from mmrjax.models.rosenbrock import Rodas4
 from mmrjax.params import Scalar
@@ -27,6 +28,7 @@ from mmrjax.signals import (
 )
 
 # Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
+# The memories of those effects that have one follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
 
 
@@ -46,23 +48,41 @@ class Trajectory(eqx.Module):
     result: Result
 
 
-def _state(y: Float[Array, " 5"]) -> State:
-    y = y * jnp.asarray(_UNITS, y.dtype)
-    return State(y[0], y[1], y[2], y[4])
+def _remembering(robot: Robot) -> tuple[Effect, ...]:
+    return tuple(effect for effect in robot.effects if effect.memory_size is not None)
 
 
-def _rates(time: Scalar, y: Float[Array, " 5"], conditions: tuple[Robot, Command]) -> Float[Array, " 5"]:
+def _units(robot: Robot) -> tuple[float, ...]:
+    return _UNITS + tuple(effect.memory_size or 1.0 for effect in _remembering(robot))
+
+
+def _state(robot: Robot, y: Float[Array, " unknowns"]) -> State:
+    y = y * jnp.asarray(_units(robot), y.dtype)
+    memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(_remembering(robot))}
+    return State(y[0], y[1], y[2], y[4], memory)
+
+
+def _rates(
+    time: Scalar, y: Float[Array, " unknowns"], conditions: tuple[Robot, Command]
+) -> Float[Array, " unknowns"]:
     robot, command = conditions
-    signals = balances.moving(robot, command, _state(y))
+    signals = balances.moving(robot, command, _state(robot, y))
     current_battery = robot.battery.current(signals.total_current) * (command.battery > 0.5)  # eq. (11)
     rates = [
-        signals.voltage_left / robot.motor.inductance,
+        signals.voltage_left / signals.inductance,
         signals.acceleration_wheel * robot.gearbox.ratio,
         signals.acceleration,
         signals.speed,
         current_battery,
+        *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in _remembering(robot)),
     ]
-    return jnp.stack(rates) / jnp.asarray(_UNITS, y.dtype)
+    return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
+
+
+def _step_longest(robot: Robot, command: Command) -> Scalar | None:
+    """The longest step that still resolves every effect with a memory [s]; None where none has one."""
+    limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in _remembering(robot)]
+    return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
 def drive(
@@ -85,7 +105,7 @@ def drive(
         the integrator gave up. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     dtype = jnp.result_type(command.voltage)
-    y0 = jnp.zeros(len(_UNITS), dtype).at[4].set(command.discharge / _UNITS[4])
+    y0 = jnp.zeros(len(_units(robot)), dtype).at[4].set(command.discharge / _UNITS[4])
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(_rates),
         Rodas4(),
@@ -97,12 +117,14 @@ def drive(
         saveat=diffrax.SaveAt(ts=times),
         max_steps=max_steps,
         throw=False,
-        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        stepsize_controller=diffrax.PIDController(
+            rtol=tolerance, atol=tolerance, dtmax=_step_longest(robot, command)
+        ),
         adjoint=diffrax.ForwardMode(),
     )
     assert solution.ys is not None
     ys = solution.ys
-    signals = jax.vmap(lambda y: balances.moving(robot, command, _state(y)))(ys)
+    signals = jax.vmap(lambda y: balances.moving(robot, command, _state(robot, y)))(ys)
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, command, end, solution.result == diffrax.RESULTS.successful)
     return Trajectory(times, ys[:, 3] * _UNITS[3], signals, result(robot, end, status))
