@@ -44,15 +44,11 @@ def _fill(signals: Signals, **values: Any) -> Signals:
 
 
 def begin(robot: Robot, command: Command, state: State, direction: Scalar | None = None) -> Signals:
-    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest.
-
-    The speed within which a direction fades is a tenth of V_s of the friction law, so that friction at
-    rest is resolved on the same scale as sliding.
-    """
+    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(command.wheeled)
     speed_wheel = state.speed_motor / robot.gearbox.ratio
     speed_theoretical = chassis.radius * speed_wheel
-    rest = 0.1 * chassis.ground.friction.speed_static
+    rest = chassis.ground.friction.speed_rest
     signals = Signals(
         wheeled=command.wheeled,
         slope=command.slope,
@@ -154,7 +150,8 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
     mover = chassis.radius * signals.traction if mover is None else mover
     load = signals.torque_track_loss + mover + _effects(robot, signals, "gearbox")
     drive = signals.torque_motor - idle
-    inertia_wheel = chassis.inertia + _effects(robot, signals, "inertia")
+    inertia_added = _effects(robot, signals, "inertia")
+    inertia_wheel = chassis.inertia + inertia_added
     side = drive * inertia_wheel + gear.ratio * inertia_motor * load
     efficiency = gear.efficiency_flow(side, signals.direction)
     net = gear.ratio * efficiency * drive - load
@@ -167,6 +164,7 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
         torque_load=load,
         efficiency_load=efficiency,
         torque_net=net,
+        inertia_added=inertia_added,
         acceleration_wheel=acceleration,
         torque_input=torque_input,
         torque_gear=gear.ratio * efficiency * (torque_input - idle),

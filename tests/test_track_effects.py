@@ -19,6 +19,7 @@ RUNS = command(
     slope=jnp.radians(jnp.asarray([3.0, 5.0])),
     payload=jnp.asarray([3.0, 0.0]),
     wheeled=jnp.asarray([0.0, 1.0]),
+    battery=jnp.asarray([0.0, 1.0]),  # 4W2T on its battery, whose effects act there alone
 )
 
 
@@ -49,7 +50,11 @@ def slopes():
     return np.asarray(ours), np.asarray(theirs)
 
 
-@pytest.mark.parametrize("k", range(len(ALL)), ids=[effect.name for effect in ALL])
+SETTLED = [k for k, effect in enumerate(ALL) if not effect.transient]
+TRANSIENT = [k for k, effect in enumerate(ALL) if effect.transient]
+
+
+@pytest.mark.parametrize("k", SETTLED, ids=[ALL[k].name for k in SETTLED])
 def test_effect_acts_as_in_the_steady_model(slopes, k):
     """To 5 % of its largest action on the same output (ripple, and the share that shifts with the load)."""
     ours, theirs = slopes[0][..., k], slopes[1][..., k]
@@ -57,3 +62,27 @@ def test_effect_acts_as_in_the_steady_model(slopes, k):
     assert np.abs(ours).max() > 0
     scale = np.maximum(np.abs(theirs).max(axis=0), 1e-3 * np.abs(slopes[1]).max(axis=(0, 2)))
     np.testing.assert_allclose(ours / scale, theirs / scale, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def start_slopes():
+    """Derivatives of a start's history by the amplitudes of the effects that only a series shows."""
+    effects = tuple(ALL[k] for k in TRANSIENT)
+    bare = dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in effects))
+    sizes = [
+        dict((p.name, p.spec) for p in params.walk(bare))[f"effects.{e.name}.amplitude"].prior_sd(0.0)
+        for e in effects
+    ]
+
+    def history(theta):
+        amplitudes = {f"effects.{e.name}.amplitude": theta[k] * sizes[k] for k, e in enumerate(effects)}
+        run = track(params.replace(bare, amplitudes), jax.tree.map(lambda x: x[0], RUNS), duration=0.1)
+        return jnp.stack([run.signals.total_current, run.signals.speed_motor, run.signals.speed])
+
+    return np.asarray(jax.jit(jax.jacfwd(history))(jnp.zeros(len(effects))))
+
+
+@pytest.mark.parametrize("k", range(len(TRANSIENT)), ids=[ALL[k].name for k in TRANSIENT])
+def test_transient_effect_is_felt_in_a_start(start_slopes, k):
+    assert np.isfinite(start_slopes[..., k]).all()
+    assert np.abs(start_slopes[..., k]).max() > 1e-6

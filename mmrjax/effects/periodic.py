@@ -21,7 +21,7 @@ STEPS = 8  # integration steps in a period: an error of about 1e-3 in the wave w
 class Periodic(eqx.Module):
     """term = a w(signals) sin(ψ + φ), with ψ' = k ω_m and k the order per radian of the motor's shaft.
 
-    The memory is the phase ψ [rad]. Where none is kept (`steady`, `track`) the wave is its mean, zero.
+    The memory is the phase ψ [rad]. Where none is kept (`steady`) the wave is its mean, zero.
     """
 
     dissipative: ClassVar[bool] = False
