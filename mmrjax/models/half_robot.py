@@ -94,6 +94,7 @@ def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Arra
     """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
     reflected = run.robot.motor.inertia * run.robot.gearbox.ratio**2 * signals.efficiency_load
+    reflected = reflected + signals.inertia_added
     return force, jnp.zeros_like(force).at[3].set(reflected)
 
 
@@ -110,8 +111,8 @@ def current_after(run: System, signals: Signals) -> Scalar:
         return balances.electrical(run.robot, balances.supply(run.robot, run.command, shifted)).voltage_left
 
     voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
-    z = run.step * slope / run.robot.motor.inductance
-    return signals.current + run.step / run.robot.motor.inductance * voltage * jnp.expm1(z) / z
+    z = run.step * slope / signals.inductance
+    return signals.current + run.step / signals.inductance * voltage * jnp.expm1(z) / z
 
 
 def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
