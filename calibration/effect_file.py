@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import inspect
 import math
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 
 from calibration.doors import BadConfiguration, choices
 from mmrjax import effects, nominal, params
-from mmrjax.balances import BALANCES, moving
+from mmrjax.balances import BALANCES, added, moving
 from mmrjax.effects import Effect
 from mmrjax.signals import Reading, Signals, State, command
 
@@ -128,7 +129,8 @@ def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect],
 
     def term(amplitude: jax.Array) -> jax.Array:
         made = params.replace(effect(), {"amplitude": amplitude})
-        return jnp.asarray(made.term(robot, signals), float)  # type: ignore[attr-defined]
+        with_it = dataclasses.replace(robot, effects=(made,))
+        return jnp.asarray(added(with_it, signals, effect.balance, effect.channel), float)
 
     try:
         none, once, twice = (term(jnp.asarray(k * size)) for k in (0.0, 1.0, 2.0))

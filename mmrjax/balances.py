@@ -34,7 +34,8 @@ BALANCES = {
 }
 
 
-def _effects(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
+def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
+    """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit."""
     terms = [e.term(robot, signals) for e in robot.effects if e.balance == balance and e.channel == channel]
     return sum(terms) if terms else 0.0  # type: ignore[return-value]
 
@@ -67,7 +68,7 @@ def begin(robot: Robot, command: Command, state: State, direction: Scalar | None
         total_current=robot.sides * state.current,
     )
     stated = chassis.mass + command.payload if command.total_mass is None else command.total_mass
-    mass = stated + _effects(robot, _fill(signals, mass=stated), "mass")
+    mass = stated + added(robot, _fill(signals, mass=stated), "mass")
     normal = chassis_room.normal_load(mass, command.slope, GRAVITY, robot.sides)
     return _fill(signals, mass=mass, normal=normal)
 
@@ -77,19 +78,19 @@ def supply(robot: Robot, command: Command, signals: Signals) -> Signals:
     source = power.voltage_source(
         robot.battery, command.voltage, command.battery, signals.total_current, signals.discharge
     )
-    return _fill(signals, voltage=source - _effects(robot, signals, "supply"))
+    return _fill(signals, voltage=source - added(robot, signals, "supply"))
 
 
 def electrical(robot: Robot, signals: Signals) -> Signals:
     """What of the supply voltage is left to change the current [V]."""
     back = robot.motor.voltage_back(signals.speed_motor)
-    drop = robot.motor.voltage_winding(signals.current) + _effects(robot, signals, "electrical")
+    drop = robot.motor.voltage_winding(signals.current) + added(robot, signals, "electrical")
     return _fill(
         signals,
         voltage_back=back,
         voltage_drop=drop,
         voltage_left=signals.voltage - back - drop,
-        inductance=robot.motor.inductance + _effects(robot, signals, "inductance"),
+        inductance=robot.motor.inductance + added(robot, signals, "inductance"),
     )
 
 
@@ -97,7 +98,7 @@ def motor(robot: Robot, signals: Signals) -> Signals:
     """Torque at the motor shaft [N·m]."""
     electromagnetic = robot.motor.torque_electromagnetic(signals.current)
     loss = robot.motor.torque_loss(signals.speed_motor, signals.direction)
-    loss = loss + _effects(robot, signals, "motor")
+    loss = loss + added(robot, signals, "motor")
     return _fill(
         signals,
         torque_electromagnetic=electromagnetic,
@@ -109,7 +110,7 @@ def motor(robot: Robot, signals: Signals) -> Signals:
 def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
     """Forces along the slope that traction has to overcome [N]."""
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
-    resistance = resistance + _effects(robot, signals, "ground")
+    resistance = resistance + added(robot, signals, "ground")
     gravity = ground.force_gravity(signals.mass / robot.sides, signals.slope, GRAVITY)
     return _fill(
         signals,
@@ -122,7 +123,7 @@ def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
 
 def slip(robot: Robot, signals: Signals) -> Signals:
     """Speed at which the contact patch slides over the ground [m/s]."""
-    terms = _effects(robot, signals, "slip")
+    terms = added(robot, signals, "slip")
     return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
 
 
@@ -133,7 +134,7 @@ def track(robot: Robot, chassis: Chassis, signals: Signals, guide: Scalar | None
     """
     loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
     guide = chassis.track.force_guide(signals.normal, signals.direction) if guide is None else guide
-    loss = loss + guide * chassis.radius + _effects(robot, signals, "track")
+    loss = loss + guide * chassis.radius + added(robot, signals, "track")
     return _fill(signals, torque_track_loss=loss)
 
 
@@ -148,9 +149,9 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
     gear, inertia_motor = robot.gearbox, robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
     mover = chassis.radius * signals.traction if mover is None else mover
-    load = signals.torque_track_loss + mover + _effects(robot, signals, "gearbox")
+    load = signals.torque_track_loss + mover + added(robot, signals, "gearbox")
     drive = signals.torque_motor - idle
-    inertia_added = _effects(robot, signals, "inertia")
+    inertia_added = added(robot, signals, "inertia")
     inertia_wheel = chassis.inertia + inertia_added
     side = drive * inertia_wheel + gear.ratio * inertia_motor * load
     efficiency = gear.efficiency_flow(side, signals.direction)
@@ -162,9 +163,9 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
         signals,
         torque_idle=idle,
         torque_load=load,
+        inertia_added=inertia_added,
         efficiency_load=efficiency,
         torque_net=net,
-        inertia_added=inertia_added,
         acceleration_wheel=acceleration,
         torque_input=torque_input,
         torque_gear=gear.ratio * efficiency * (torque_input - idle),
@@ -238,7 +239,7 @@ def settled(robot: Robot, command: Command, state: State) -> tuple[Signals, Scal
 def sensor(robot: Robot, signals: Signals) -> Reading:
     """What the instruments show of current [A], motor speed [rad/s] and speed [m/s]."""
     return Reading(
-        total_current=signals.total_current + _effects(robot, signals, "sensor", "total_current"),
-        motor_speed=signals.speed_motor + _effects(robot, signals, "sensor", "motor_speed"),
-        speed=signals.speed + _effects(robot, signals, "sensor", "speed"),
+        total_current=signals.total_current + added(robot, signals, "sensor", "total_current"),
+        motor_speed=signals.speed_motor + added(robot, signals, "sensor", "motor_speed"),
+        speed=signals.speed + added(robot, signals, "sensor", "speed"),
     )

@@ -124,6 +124,7 @@ class Signals(eqx.Module):
     adhesion_limit: Scalar = 0.0  # largest traction of the friction law [N]
     # track and gearbox
     torque_track_loss: Scalar = 0.0  # eq. (24), (26) at the pulley [N·m]
+    inertia_added: Scalar = 0.0  # by effects, of one side at the driving wheel [kg·m²]
     torque_load: Scalar = 0.0  # all that the gearbox output carries, inertia apart [N·m]
     efficiency_load: Scalar = 1.0  # η_rm, or 1/η_rm where power flows back [-]
     torque_idle: Scalar = 0.0  # M_rf_idle at the gearbox input, eq. (20) [N·m]
@@ -131,7 +132,6 @@ class Signals(eqx.Module):
     torque_gear: Scalar = 0.0  # M_r, eq. (23) [N·m]
     torque_net: Scalar = 0.0  # drives the rotating masses, at the pulley [N·m]
     # motion
-    inertia_added: Scalar = 0.0  # of one side at the driving wheel, by effects [kg·m²]
     acceleration_wheel: Scalar = 0.0  # [rad/s²]
     acceleration: Scalar = 0.0  # of the robot [m/s²]
 

@@ -38,7 +38,8 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
         folder.write_json("result.json", document)
         folder.write_table("rows.csv", outcome.rows_table(found))
         folder.write_text("config.resolved.toml", configuration.as_toml(config))
-        note = f"calibrated from {config.robot} with {runs.source}; the free parameters: {', '.join(document['parameters'])}"
+        free = ", ".join(document["parameters"])
+        note = f"calibrated from {config.robot} with {runs.source}; the free parameters: {free}"
         robot_file.write(found.robot, folder.partial / "robot.toml", note=note)
         print_calibration(document)
         if config.report:

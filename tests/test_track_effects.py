@@ -1,4 +1,4 @@
-"""Every effect of the library acts in the track model unchanged, as much as in the steady one."""
+"""Every effect of the library acts in the track model unchanged, as much as in the steady one or in a start."""
 
 import dataclasses
 
@@ -13,6 +13,8 @@ from mmrjax.models.steady import steady
 from mmrjax.models.track import track
 from mmrjax.signals import command
 
+SETTLED = tuple(e for e in ALL if not e.transient)
+TRANSIENT = tuple(e for e in ALL if e.transient)
 OUTPUTS = ("total_current", "motor_speed", "speed")
 RUNS = command(
     voltage=jnp.asarray([33.0, 24.0]),
@@ -26,8 +28,8 @@ RUNS = command(
 @pytest.fixture(scope="module")
 def slopes():
     """Derivatives of the outputs by every amplitude at zero, in the track and in the steady model."""
-    names = [f"effects.{effect.name}.amplitude" for effect in ALL]
-    bare = dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in ALL))
+    names = [f"effects.{effect.name}.amplitude" for effect in SETTLED]
+    bare = dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in SETTLED))
     sizes = [dict((p.name, p.spec) for p in params.walk(bare))[n].prior_sd(0.0) for n in names]
 
     def robot(theta, share):
@@ -44,17 +46,13 @@ def slopes():
     def lumped(theta, run, share):
         return observed(steady(robot(theta, share), run).reading)
 
-    at = jnp.zeros(len(ALL))
+    at = jnp.zeros(len(SETTLED))
     ours, share = jax.jit(jax.vmap(jax.jacfwd(resolved, has_aux=True), in_axes=(None, 0)))(at, RUNS)
     theirs = jax.jit(jax.vmap(jax.jacfwd(lumped), in_axes=(None, 0, 0)))(at, RUNS, share)
     return np.asarray(ours), np.asarray(theirs)
 
 
-SETTLED = [k for k, effect in enumerate(ALL) if not effect.transient]
-TRANSIENT = [k for k, effect in enumerate(ALL) if effect.transient]
-
-
-@pytest.mark.parametrize("k", SETTLED, ids=[ALL[k].name for k in SETTLED])
+@pytest.mark.parametrize("k", range(len(SETTLED)), ids=[effect.name for effect in SETTLED])
 def test_effect_acts_as_in_the_steady_model(slopes, k):
     """To 5 % of its largest action on the same output (ripple, and the share that shifts with the load)."""
     ours, theirs = slopes[0][..., k], slopes[1][..., k]
@@ -67,22 +65,21 @@ def test_effect_acts_as_in_the_steady_model(slopes, k):
 @pytest.fixture(scope="module")
 def start_slopes():
     """Derivatives of a start's history by the amplitudes of the effects that only a series shows."""
-    effects = tuple(ALL[k] for k in TRANSIENT)
-    bare = dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in effects))
+    bare = dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in TRANSIENT))
     sizes = [
         dict((p.name, p.spec) for p in params.walk(bare))[f"effects.{e.name}.amplitude"].prior_sd(0.0)
-        for e in effects
+        for e in TRANSIENT
     ]
 
     def history(theta):
-        amplitudes = {f"effects.{e.name}.amplitude": theta[k] * sizes[k] for k, e in enumerate(effects)}
+        amplitudes = {f"effects.{e.name}.amplitude": theta[k] * sizes[k] for k, e in enumerate(TRANSIENT)}
         run = track(params.replace(bare, amplitudes), jax.tree.map(lambda x: x[0], RUNS), duration=0.1)
         return jnp.stack([run.signals.total_current, run.signals.speed_motor, run.signals.speed])
 
-    return np.asarray(jax.jit(jax.jacfwd(history))(jnp.zeros(len(effects))))
+    return np.asarray(jax.jit(jax.jacfwd(history))(jnp.zeros(len(TRANSIENT))))
 
 
-@pytest.mark.parametrize("k", range(len(TRANSIENT)), ids=[ALL[k].name for k in TRANSIENT])
+@pytest.mark.parametrize("k", range(len(TRANSIENT)), ids=[effect.name for effect in TRANSIENT])
 def test_transient_effect_is_felt_in_a_start(start_slopes, k):
     assert np.isfinite(start_slopes[..., k]).all()
     assert np.abs(start_slopes[..., k]).max() > 1e-6

@@ -53,7 +53,8 @@ class GrouserPolygon(Periodic, Effect):
     )
 
     def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
-        return 2 * jnp.pi * robot.chassis(wheeled).radius / (self.pitch * robot.gearbox.ratio)
+        passages = robot.tracked.radius / (self.pitch * robot.gearbox.ratio)
+        return 2 * jnp.pi * passages * (1 - wheeled)
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * self.wave(signals) * (1 - signals.wheeled)

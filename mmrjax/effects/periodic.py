@@ -15,7 +15,7 @@ from mmrjax.signals import Command, Signals
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
-STEPS = 8  # integration steps in a period: an error of about 1e-3 in the wave with a method of order 4
+STEPS = 12  # integration steps in a period: derivatives at amplitude 0 are then right to 1e-5
 
 
 class Periodic(eqx.Module):
@@ -50,7 +50,7 @@ class Periodic(eqx.Module):
         return jnp.sin(signals.memory[self.name] + self.phase)
 
     def step_longest(self, robot: Robot, command: Command) -> Scalar:
-        """An eighth of the period at the no-load speed [s]."""
+        """A twelfth of the period at the no-load speed [s]."""
         source = power.voltage_source(robot.battery, command.voltage, command.battery, 0.0, command.discharge)
         rate = self.order(robot, command.wheeled) * source / robot.motor.torque_constant
         return 2 * jnp.pi / STEPS / jnp.maximum(jnp.abs(rate), 1.0)
