@@ -301,14 +301,18 @@ def beside(gears: list[RunningGear]) -> list[dict]:
     found = []
     for gear in gears:
         answer = track_batch(nominal(), runs, gear, duration=0.8, rolling=True)
-        normal = np.asarray(answer.signals.normal[0, -300:])
+        normal, fast = np.asarray(answer.signals.normal[0, -300:]), float(answer.v[0, -300:, 3].mean())
+        period = period_pitch(35e-3, fast, float(nominal().tracked.radius))
+        periods = int(0.3 / period)
         found.append(
             {
                 "guide_share": float(answer.steady.guide_share[0]),
                 "normal_std_over_mean": float(normal.std() / normal.mean()),
                 "ripple_amplitude": ripple(np.asarray(answer.time[0, -300:]), normal).amplitude,
                 "ripple_period_s": ripple(np.asarray(answer.time[0, -300:]), normal).period,
-                "speed_wheel": float(answer.v[0, -300:, 3].mean()),
+                "period_34_s": period,
+                "line_of_34": harmonics(normal[-round(periods * period / 1e-3) :], periods),
+                "speed_wheel": fast,
                 "speed_m_s": float(answer.result.reading.speed[0]),
             }
         )
@@ -331,9 +335,11 @@ def main() -> None:
         found[name]["chain"] = measure(gear, chosen.speed, chosen.duration, chosen.step)
         print(name, json.dumps(found[name]), flush=True)
     if chosen.track:
-        for name, one in zip(found, beside(gears), strict=True):
-            found[name]["track"] = one
-            print(name, json.dumps(one), flush=True)
+        wide = [params.replace(g, {"grouser_length": jnp.asarray(10e-3)}) for g in gears]  # the chain's base
+        for label, given in (("track", gears), ("track, grousers' base as the chain's", wide)):
+            for name, one in zip(found, beside(given), strict=True):
+                found[name][label] = one
+                print(name, label, json.dumps(one), flush=True)
     if chosen.json:
         chosen.json.write_text(json.dumps(found, indent=1))
 

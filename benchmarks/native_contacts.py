@@ -32,7 +32,7 @@ MASS, BELT_MASS, PULLEY_MASS, INERTIA = 6.55, 40e-3, 82e-3, 0.1255  # one side, 
 SPEED, ROLLING, GRAVITY = 25.66, 0.06, 9.81  # [rad/s] of the pulleys at 33 V; [-]; [m/s²]
 PRELOAD, TENSIONER = 100.0, 5e3  # the driven wheel is pushed back by [N] on a spring [N/m]
 ADHESION = 0.32  # Table 5, lacquered wood
-STEP = 1e-3  # [s]
+STEP = 5e-4  # [s]; at 1 ms, or with pyramidal friction cones, the belt slips on its wheels
 
 
 def corners() -> list[tuple[float, float]]:
@@ -61,7 +61,7 @@ def chain_text(step: float) -> str:
     at = corners()
     long = min(math.dist(at[k], at[(k + 1) % LINKS]) for k in range(LINKS))
     wheel = math.sqrt(PITCH_RADIUS**2 - long**2 / 4) - HALF
-    links, heading = "", 0.0
+    links, heading, last = "", 0.0, 0.0
     for k, ((xa, za), (xb, zb)) in enumerate(zip(at, at[1:] + at[:1], strict=True)):
         length, angle = math.dist((xa, za), (xb, zb)), math.atan2(za - zb, xb - xa)  # about +y
         if k == 0:
@@ -70,7 +70,7 @@ def chain_text(step: float) -> str:
             joints += '<joint type="hinge" axis="0 1 0"/>'
         else:
             where, turn = f"{last:.9g} 0 0", angle - heading
-            joints = '<joint type="hinge" axis="0 1 0" damping="1e-4" armature="1e-6"/>'
+            joints = '<joint type="hinge" axis="0 1 0" damping="1e-4" armature="1e-5"/>'
         heading, last = angle, length
         links += f"""
 <body name="l{k}" pos="{where}" euler="0 {math.degrees(turn):.9g} 0">{joints}
@@ -85,7 +85,8 @@ def chain_text(step: float) -> str:
     guide = f'<geom class="guide" type="box" size="{BASE / 2 - 0.02} .012 .002" mass="0" pos="0 0 '
     face = PITCH_RADIUS - HALF - 0.002
     return f"""<mujoco model="hinged chain">
-<option timestep="{step}" integrator="implicitfast" iterations="20" ls_iterations="20" gravity="0 0 {-GRAVITY}"/>
+<option timestep="{step}" integrator="implicitfast" cone="elliptic" impratio="10"
+ iterations="20" ls_iterations="20" gravity="0 0 {-GRAVITY}"/>
 <default>
 <geom solref=".004 1" solimp=".95 .99 .0005"/>
 <default class="plate"><geom size="{HALF}" contype="2" conaffinity="0" friction="1 .005 .0001"/></default>
