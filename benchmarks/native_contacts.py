@@ -153,10 +153,12 @@ def native(text: str, duration: float) -> dict:
         data.qfrc_applied[0] = -ROLLING * MASS * GRAVITY  # motion resistance (5), on the chassis
         return data
 
-    data = begin()
-    started = time.perf_counter()
-    mujoco.mj_step(model, data, nstep=steps)
-    wall = time.perf_counter() - started
+    wall = math.inf
+    for _ in range(5):  # the best: a short run on a shared machine is slowed tenfold by others
+        data = begin()
+        started = time.perf_counter()
+        mujoco.mj_step(model, data, nstep=steps)
+        wall = min(wall, time.perf_counter() - started)
     data, wrench = begin(), np.zeros(6)
     normal, travel, contacts = [], [], []
     for _ in range(steps):
