@@ -33,7 +33,7 @@ import numpy as np
 from mmrjax import balances, mjcf, params
 from mmrjax.contact import force_contact, step
 from mmrjax.models.ripple import period_pitch, ripple
-from mmrjax.models.track import track_batch
+from mmrjax.models.track import _batch
 from mmrjax.nominal import nominal
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 from mmrjax.signals import GRAVITY, State, command
@@ -300,7 +300,7 @@ def beside(gears: list[RunningGear]) -> list[dict]:
     runs = command(voltage=np.full(1, 33.0))
     found = []
     for gear in gears:
-        answer = track_batch(nominal(), runs, gear, duration=0.8, rolling=True)
+        answer = _batch(nominal(), runs, gear, 0.8, 1e-4, 1e-3, True)
         normal, fast = np.asarray(answer.signals.normal[0, -300:]), float(answer.v[0, -300:, 3].mean())
         period = period_pitch(35e-3, fast, float(nominal().tracked.radius))
         periods = int(0.3 / period)
@@ -329,7 +329,10 @@ def main() -> None:
     options.add_argument("--json", type=Path)
     chosen = options.parse_args()
     recesses = [float(r) * 1e-3 for r in chosen.recess.split(",")]
-    gears = [params.replace(RunningGear(), {"guide_recess": jnp.asarray(r)}) for r in recesses]
+    gears = [
+        params.replace(RunningGear(), {"guide_recess": jnp.asarray(r), "grouser_length": jnp.asarray(5e-3)})
+        for r in recesses
+    ]
     found = {f"recess {1e3 * r:g} mm": {} for r in recesses}
     for name, gear in zip(found, gears, strict=True):
         found[name]["chain"] = measure(gear, chosen.speed, chosen.duration, chosen.step)

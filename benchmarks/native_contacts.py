@@ -32,7 +32,7 @@ MASS, BELT_MASS, PULLEY_MASS, INERTIA = 6.55, 40e-3, 82e-3, 0.1255  # one side, 
 SPEED, ROLLING, GRAVITY = 25.66, 0.06, 9.81  # [rad/s] of the pulleys at 33 V; [-]; [m/s²]
 PRELOAD, TENSIONER = 100.0, 5e3  # the driven wheel is pushed back by [N] on a spring [N/m]
 ADHESION = 0.32  # Table 5, lacquered wood
-STEP = 5e-4  # [s]; at 1 ms, or with pyramidal friction cones, the belt slips on its wheels
+STEP = 5e-4  # [s]; with pyramidal friction cones the belt slips on its wheels at 0.2 to 1 ms
 
 
 def corners() -> list[tuple[float, float]]:
@@ -153,10 +153,12 @@ def native(text: str, duration: float) -> dict:
         data.qfrc_applied[0] = -ROLLING * MASS * GRAVITY  # motion resistance (5), on the chassis
         return data
 
-    data = begin()
-    started = time.perf_counter()
-    mujoco.mj_step(model, data, nstep=steps)
-    wall = time.perf_counter() - started
+    wall = math.inf
+    for _ in range(5):  # the best: a short run on a shared machine is slowed tenfold by others
+        data = begin()
+        started = time.perf_counter()
+        mujoco.mj_step(model, data, nstep=steps)
+        wall = min(wall, time.perf_counter() - started)
     data, wrench = begin(), np.zeros(6)
     normal, travel, contacts = [], [], []
     for _ in range(steps):
@@ -240,7 +242,7 @@ def main() -> None:
     options.add_argument("--only", default="chain,surface,mjx,ours", help="comma-separated")
     options.add_argument("--duration", type=float, default=1.5, help="simulated [s]; MJX runs its own --steps")
     options.add_argument("--batch", type=int, default=16, help="runs of ours and of MJX at once")
-    options.add_argument("--steps", type=int, default=100, help="of MJX")
+    options.add_argument("--steps", type=int, default=50, help="of MJX")
     options.add_argument("--json", type=Path)
     chosen = options.parse_args()
     names = chosen.only.split(",")
@@ -254,10 +256,10 @@ def main() -> None:
                 again = [sys.executable, __file__, "--only", "mjx", "--batch", str(chosen.batch)]
                 again += ["--steps", str(chosen.steps)]
                 try:
-                    done = subprocess.run(again, capture_output=True, text=True, timeout=180, check=True)
+                    done = subprocess.run(again, capture_output=True, text=True, timeout=300, check=True)
                     found |= json.loads(done.stdout[done.stdout.index("{") :])
                 except subprocess.TimeoutExpired:
-                    found["mjx"] = "not compiled and run within 180 s"
+                    found["mjx"] = "not compiled and run within 300 s"
                 continue
             os.environ["XLA_FLAGS"] = MJX_FLAGS
         import jax
