@@ -175,10 +175,6 @@ USAGE = {
         r"options: duration_s acts with model drive or track only",
     ),
     "discharge without battery": (["sweep", "--discharge", "100"], r"options: discharge_mAh acts with battery only"),
-    "track step too large": (
-        ["simulate", "--model", "track", "--step", "0.001"],
-        r"--model track: step: got 0\.001 s; .*largest stable step",
-    ),
     "duration of zero": (["simulate", "--duration", "0"], r"option duration_s: got 0"),
 }
 

@@ -99,7 +99,7 @@ def drive(
         tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
         when the movers spin beyond V_s and the robot gains no speed; `battery_empty` when the charge has
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
-        the integrator gave up. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
+        the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     dtype = jnp.result_type(command.voltage)
     y0 = jnp.zeros(len(_units(robot)), dtype).at[4].set(command.discharge / _UNITS[4])
@@ -128,8 +128,8 @@ def drive(
     going = (command.battery < 0.5) | ~robot.battery.empty(signals.discharge)
     signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
     time_end = jnp.max(jnp.where(going, times, times[0]))
-    there = status != BATTERY_EMPTY
-    answer = withhold(result(robot, end, status), there, jnp.asarray(True))
+    there = (status != BATTERY_EMPTY) & (status != FAILED)
+    answer = withhold(result(robot, end, status), there, status != FAILED)
     return Trajectory(times, distance, signals, time_end, answer)
 
 
