@@ -53,9 +53,13 @@ def slopes():
 
 @pytest.mark.parametrize("k", range(len(SETTLED)), ids=[effect.name for effect in SETTLED])
 def test_effect_acts_as_in_the_steady_model(slopes, k):
-    """To 5 % of its largest action on the same output (ripple, and the share that shifts with the load)."""
+    """To 5 % of its largest action on the same output (ripple, and the share that shifts with the load).
+
+    A slip that follows the ripple of load or demand moves the current a little, where `steady` has none: the
+    scale of an output is at least 0.5 % of the strongest effect's.
+    """
     ours, theirs = slopes[0][..., k], slopes[1][..., k]
     assert np.isfinite(ours).all()
     assert np.abs(ours).max() > 0
-    scale = np.maximum(np.abs(theirs).max(axis=0), 1e-3 * np.abs(slopes[1]).max(axis=(0, 2)))
+    scale = np.maximum(np.abs(theirs).max(axis=0), 5e-3 * np.abs(slopes[1]).max(axis=(0, 2)))
     np.testing.assert_allclose(ours / scale, theirs / scale, atol=0.05)
