@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,6 +19,8 @@ from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective, over 1 + objective, below which a point is an optimum.
 DECREMENT = 1e-6
+#: Rejected steps in a row after which a search ends.
+PATIENCE = 12
 
 Z = Float[Array, " parameters"]
 
@@ -107,6 +110,20 @@ def _finish(function: Callable[[Z], Array], z: Z, data: Data, pin: Pin, steps: A
     return Optimum(pin.apply(z), sd, cost, decrement, decrement < DECREMENT * (1 + cost), steps)
 
 
+class Search(optx.LevenbergMarquardt):
+    """Levenberg-Marquardt that also ends after `PATIENCE` steps in a row that did not lower the objective.
+
+    Each rejected step is a quarter of the one before, so nothing is left to gain but rounding (or, of a
+    rollout, the integrator's tolerance); `Optimum.converged` says whether that place is an optimum.
+    """
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
+    ) -> tuple[Array, optx.RESULTS]:
+        done, result = super().terminate(fn, y, args, options, state, tags)
+        return done | (state.num_steps_since_acceptance >= PATIENCE), result
+
+
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> Optimum:
@@ -115,7 +132,7 @@ def levenberg_marquardt(
     function = residuals(problem, data, pin)
     solution = optx.least_squares(
         lambda z, _: function(z),
-        optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=Normal()),
+        Search(rtol=1e-6, atol=1e-6, linear_solver=Normal()),
         pin.apply(start),
         max_steps=max_steps,
         throw=False,

@@ -45,15 +45,11 @@ def _fill(signals: Signals, **values: Any) -> Signals:
 
 
 def begin(robot: Robot, command: Command, state: State, direction: Scalar | None = None) -> Signals:
-    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest.
-
-    The speed within which a direction fades is a tenth of V_s of the friction law, so that friction at
-    rest is resolved on the same scale as sliding.
-    """
+    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(command.wheeled)
     speed_wheel = state.speed_motor / robot.gearbox.ratio
     speed_theoretical = chassis.radius * speed_wheel
-    rest = 0.1 * chassis.ground.friction.speed_static
+    rest = chassis.ground.friction.speed_rest
     signals = Signals(
         wheeled=command.wheeled,
         slope=command.slope,

@@ -28,7 +28,7 @@ class Command(eqx.Module):
         wheeled: 0 for 6T2A, 1 for 4W2T.
         battery: 0 external supply (Source Mode 2), 1 on-board battery (Source Mode 1), eq. (8).
         discharge: charge C_b already taken from the battery [C].
-        adhesion: adhesion of this surface as a ratio to the robot's own surface [-].
+        adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
         total_mass: mass of robot and payload as weighed [kg]; None takes the robot's mass and the payload.
     """
 
@@ -166,7 +166,8 @@ class Result(eqx.Module):
         power_gear: N_r at the gearbox outputs [W].
         power_ground: N_t from the movers to the ground [W].
         power_lift: against gravity [W].
-        efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest.
+        efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest
+            and where power does not flow that way.
         temperature_winding: after long running at this current [°C].
         status: code into `STATUSES`.
         flags: bit mask over `FLAGS`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,7 +41,9 @@ _Payload = Annotated[float, typer.Option(help="Additional load mass (kg).")]
 _Mass = Annotated[
     float | None, typer.Option(help="Total mass (kg).  [default: the robot's own mass and the payload]")
 ]
-_Surface = Annotated[str, typer.Option(help="Surface of Table 5.")]
+_Surface = Annotated[
+    str, typer.Option(help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood.")
+]
 _Step = Annotated[
     float | None, typer.Option("--step", help="Integration step of the track model (s).  [default: 1e-4]")
 ]
@@ -308,6 +311,7 @@ def _one_run(configuration: str, voltage: float, slope: float, payload: float, m
 
 def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended or interrupted: both can be taken up again
     try:
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt

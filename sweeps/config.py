@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from calibration.doors import BadConfiguration, choices
 from calibration.records import CONDITIONS
@@ -49,6 +50,14 @@ class Simulation(BaseModel):
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
     chunk: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
     report: bool = True
+
+    @model_validator(mode="after")
+    def _acts(self) -> Self:
+        if self.duration_s is not None and self.model == "steady":
+            raise PydanticCustomError("idle", "duration_s acts with model drive or track only")
+        if self.discharge_mAh and not self.battery:
+            raise PydanticCustomError("idle", "discharge_mAh acts with battery only")
+        return self
 
     @property
     def duration(self) -> float:
@@ -116,7 +125,9 @@ def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
             raise BadConfiguration(f"{file}: not a readable TOML file ({error})") from error
     given = {k: v for k, v in options.items() if v is not None}
     if "set" in given:
-        given["set"] = {**values.get("set", {}), **given["set"]}
+        stated = values.get("set", {})
+        # A file whose table is none is refused below, whatever the options say.
+        given["set"] = {**stated, **given["set"]} if isinstance(stated, dict) else stated
     try:
         return kind.model_validate({**values, **given})
     except ValidationError as error:
@@ -125,6 +136,8 @@ def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
 
 def _sentence(kind: type[Simulation], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
     first = error.errors()[0]
+    if first["type"] == "idle":
+        return f"{file.name if file is not None else 'options'}: {first['msg']}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
     where = f"{file.name}, {place}" if file is not None and key not in given else f"option {place}"

@@ -1,4 +1,4 @@
-"""Every effect that settled travel shows acts in the track model unchanged, as much as in the steady one."""
+"""Every effect of the library acts in the track model unchanged, as much as in the steady one or in a start."""
 
 import dataclasses
 
@@ -13,14 +13,15 @@ from mmrjax.models.steady import steady
 from mmrjax.models.track import track
 from mmrjax.signals import command
 
-#: Settled travel on an external supply shows nothing of the others; see tests/test_generator_series.py.
-SETTLED = tuple(e for e in ALL if not e.transient and e.name != "battery_sag")
+SETTLED = tuple(e for e in ALL if not e.transient)
+TRANSIENT = tuple(e for e in ALL if e.transient)
 OUTPUTS = ("total_current", "motor_speed", "speed")
 RUNS = command(
     voltage=jnp.asarray([33.0, 24.0]),
     slope=jnp.radians(jnp.asarray([3.0, 5.0])),
     payload=jnp.asarray([3.0, 0.0]),
     wheeled=jnp.asarray([0.0, 1.0]),
+    battery=jnp.asarray([0.0, 1.0]),  # 4W2T on its battery, whose effects act there alone
 )
 
 
@@ -63,3 +64,26 @@ def test_effect_acts_as_in_the_steady_model(slopes, k):
     assert np.abs(ours).max() > 0
     scale = np.maximum(np.abs(theirs).max(axis=0), 5e-3 * np.abs(slopes[1]).max(axis=(0, 2)))
     np.testing.assert_allclose(ours / scale, theirs / scale, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def start_slopes():
+    """Derivatives of a start's history by the amplitudes of the effects that only a series shows."""
+    bare = dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in TRANSIENT))
+    sizes = [
+        dict((p.name, p.spec) for p in params.walk(bare))[f"effects.{e.name}.amplitude"].prior_sd(0.0)
+        for e in TRANSIENT
+    ]
+
+    def history(theta):
+        amplitudes = {f"effects.{e.name}.amplitude": theta[k] * sizes[k] for k, e in enumerate(TRANSIENT)}
+        run = track(params.replace(bare, amplitudes), jax.tree.map(lambda x: x[0], RUNS), duration=0.1)
+        return jnp.stack([run.signals.total_current, run.signals.speed_motor, run.signals.speed])
+
+    return np.asarray(jax.jit(jax.jacfwd(history))(jnp.zeros(len(TRANSIENT))))
+
+
+@pytest.mark.parametrize("k", range(len(TRANSIENT)), ids=[effect.name for effect in TRANSIENT])
+def test_transient_effect_is_felt_in_a_start(start_slopes, k):
+    assert np.isfinite(start_slopes[..., k]).all()
+    assert np.abs(start_slopes[..., k]).max() > 1e-6

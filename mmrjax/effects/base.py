@@ -59,7 +59,7 @@ class Effect(eqx.Module):
         raise NotImplementedError(f"{self.name} has a memory and no settled value")
 
     def recall(self, robot: Robot, signals: Signals) -> Scalar:
-        """Its memory: of the run so far where one is kept (`drive`), else settled."""
+        """Its memory: of the run so far where one is kept (`drive`, `track`), else settled."""
         return signals.memory[self.name] if self.name in signals.memory else self.settled(robot, signals)
 
     def step_longest(self, robot: Robot, command: Command) -> Scalar | float:

@@ -21,7 +21,7 @@ STEPS = 12  # integration steps in a period: derivatives at amplitude 0 are then
 class Periodic(eqx.Module):
     """term = a w(signals) sin(ψ + φ), with ψ' = k ω_m and k the order per radian of the motor's shaft.
 
-    The memory is the phase ψ [rad]. Where none is kept (`steady`, `track`) the wave is its mean, zero.
+    The memory is the phase ψ [rad]. Where none is kept (`steady`) the wave is its mean, zero.
     """
 
     dissipative: ClassVar[bool] = False

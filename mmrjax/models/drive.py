@@ -10,8 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
-from mmrjax.effects import Effect
-from mmrjax.models.result import result
+from mmrjax.models.result import result, withhold
 from mmrjax.models.rosenbrock import Rodas4
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -40,26 +39,24 @@ class Trajectory(eqx.Module):
         time: [s], shape (times,).
         distance: travelled along the slope [m], shape (times,).
         signals: every signal at those times; each field has shape (times,).
+        time_end: last of those times before the battery is empty, else of the run [s].
         result: the state at the end, with the run's status.
     """
 
     time: Float[Array, " times"]
     distance: Float[Array, " times"]
     signals: Signals
+    time_end: Float[Array, ""]
     result: Result
 
 
-def _remembering(robot: Robot) -> tuple[Effect, ...]:
-    return tuple(effect for effect in robot.effects if effect.memory_size is not None)
-
-
 def _units(robot: Robot) -> tuple[float, ...]:
-    return _UNITS + tuple(effect.memory_size or 1.0 for effect in _remembering(robot))
+    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering)
 
 
 def _state(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     y = y * jnp.asarray(_units(robot), y.dtype)
-    memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(_remembering(robot))}
+    memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     return State(y[0], y[1], y[2], y[4], memory)
 
 
@@ -75,7 +72,7 @@ def _rates(
         signals.acceleration,
         signals.speed,
         current_battery,
-        *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in _remembering(robot)),
+        *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
     ]
     return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
 
@@ -87,7 +84,7 @@ def _norm(error: Float[Array, " unknowns"]) -> Scalar:
 
 def _step_longest(robot: Robot, command: Command) -> Scalar | None:
     """The longest step that still resolves every effect with a memory [s]; None where none has one."""
-    limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in _remembering(robot)]
+    limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in robot.remembering]
     return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
@@ -107,7 +104,7 @@ def drive(
         The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
         tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
         when the movers spin beyond V_s and the robot gains no speed; `battery_empty` when the charge has
-        run out (numbers up to there are right, later ones are of a battery that went on); `failed` when
+        run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     dtype = jnp.result_type(command.voltage)
@@ -133,14 +130,21 @@ def drive(
     signals = jax.vmap(lambda y: balances.moving(robot, command, _state(robot, y)))(ys)
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, command, end, solution.result == diffrax.RESULTS.successful)
-    return Trajectory(times, ys[:, 3] * _UNITS[3], signals, result(robot, end, status))
+    # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
+    going = (command.battery < 0.5) | ~robot.battery.empty(signals.discharge)
+    signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
+    time_end = jnp.max(jnp.where(going, times, times[0]))
+    there = status != BATTERY_EMPTY
+    answer = withhold(result(robot, end, status), there, jnp.asarray(True))
+    return Trajectory(times, distance, signals, time_end, answer)
 
 
 def _status(robot: Robot, command: Command, end: Signals, done: Array) -> Array:
     friction = robot.chassis(command.wheeled).ground.friction
     settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, CONVERGED)
-    status = jnp.where(end.direction < 1.0, STALLED, status)
+    stands = jnp.minimum(end.direction, end.direction_travel) < 1.0
+    status = jnp.where(stands & (end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
     spinning = jnp.abs(end.speed_sliding) > friction.speed_static
     gaining = end.acceleration * end.speed_sliding > 1e-3 * jnp.abs(end.speed_sliding)  # 1 mm/s²
     status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)

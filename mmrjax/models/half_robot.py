@@ -33,12 +33,14 @@ class Motion(eqx.Module):
         q, v: coordinates and velocities, see `undercarriage`.
         current: of one motor [A].
         discharge: charge taken from the battery [C].
+        memory: of each effect that has one, by its name.
     """
 
     q: Float[Array, " 5"]
     v: Float[Array, " 5"]
     current: Scalar
     discharge: Scalar
+    memory: dict[str, Scalar] = eqx.field(default_factory=dict)
 
 
 class System(eqx.Module):
@@ -84,7 +86,7 @@ class _Mover(eqx.Module):
 def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
     """All signals, contacts and forces of an instant."""
     at = undercarriage.touch(run.path, run.robot.wheeled.radius, run.command.wheeled, motion.q, motion.v)
-    state = State(motion.current, run.robot.gearbox.ratio * motion.v[3], motion.v[0], motion.discharge)
+    state = State(motion.current, run.robot.gearbox.ratio * motion.v[3], motion.v[0], motion.discharge, motion.memory)
     mover = _Mover(run.path, at, motion.q[1])
     signals, pulled = balances.resolved(run.robot, run.command, state, mover, run.half.inertia_pulley)
     return signals, at, pulled
@@ -94,8 +96,7 @@ def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Arra
     """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
     reflected = run.robot.motor.inertia * run.robot.gearbox.ratio**2 * signals.efficiency_load
-    reflected = reflected + signals.inertia_added
-    return force, jnp.zeros_like(force).at[3].set(reflected)
+    return force, jnp.zeros_like(force).at[3].set(reflected + signals.inertia_added)
 
 
 def current_after(run: System, signals: Signals) -> Scalar:
@@ -122,7 +123,12 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
     data = mjx.step(run.model.replace(dof_armature=armature), data)
     charge = run.robot.battery.current(signals.total_current) * (run.command.battery > 0.5)
-    after = Motion(data.qpos, data.qvel, current_after(run, signals), motion.discharge + run.step * charge)
+    memory = {
+        effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
+        for effect in run.robot.remembering
+    }
+    discharge = motion.discharge + run.step * charge
+    after = Motion(data.qpos, data.qvel, current_after(run, signals), discharge, memory)
     return after, signals, pulled
 
 
@@ -176,7 +182,8 @@ def stand(run: System) -> Motion:
     y, _ = jax.lax.scan(newton, y0, None, length=30)
     y = jnp.where(margin(run) > 0, y, jnp.zeros_like(y))
     q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
-    return Motion(q, zeros, jnp.zeros_like(axle), run.command.discharge * jnp.ones_like(axle))
+    memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
+    return Motion(q, zeros, jnp.zeros_like(axle), run.command.discharge * jnp.ones_like(axle), memory)
 
 
 def roll(run: System) -> Motion:
@@ -194,4 +201,7 @@ def roll(run: System) -> Motion:
     speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)
     current = jnp.where(solved, shown.total_current / run.robot.sides, 0.0)
     v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor / ratio)
-    return dataclasses.replace(start, v=v, current=current)
+    start = dataclasses.replace(start, v=v, current=current)
+    signals, _, _ = instant(run, start)  # what effects remember is settled too
+    memory = {e.name: e.settled(run.robot, signals) * jnp.ones_like(current) for e in run.robot.remembering}
+    return dataclasses.replace(start, memory=memory)

@@ -25,9 +25,9 @@ def _slopes(robot: Robot, commands: Command, gear: RunningGear) -> Float[Array, 
         run = system(robot, command, gear, _PROBE)
 
         def rate(y: Float[Array, " 11"], at: Motion) -> Float[Array, " 11"]:
-            motion = Motion(y[:5], y[5:10], y[10], at.discharge)
+            motion = Motion(y[:5], y[5:10], y[10], at.discharge, at.memory)
             after, signals, _ = advance(run, motion)
-            current = signals.voltage_left / robot.motor.inductance
+            current = signals.voltage_left / signals.inductance
             return jnp.concatenate([y[5:10], (after.v - motion.v) / _PROBE, current[None]])
 
         def slope(at: Motion) -> Float[Array, "11 11"]:
