@@ -6,6 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
@@ -76,6 +77,11 @@ def _rates(
     return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
 
 
+def _norm(error: Float[Array, " unknowns"]) -> Scalar:
+    """Root mean square of the drive's own unknowns; memories add to it and never dilute it."""
+    return optx.rms_norm(error) * (error.shape[0] / len(_UNITS)) ** 0.5
+
+
 def _step_longest(robot: Robot, command: Command) -> Scalar | None:
     """The longest step that still resolves every effect with a memory [s]; None where none has one."""
     limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in robot.remembering]
@@ -115,7 +121,7 @@ def drive(
         max_steps=max_steps,
         throw=False,
         stepsize_controller=diffrax.PIDController(
-            rtol=tolerance, atol=tolerance, dtmax=_step_longest(robot, command)
+            rtol=tolerance, atol=tolerance, norm=_norm, dtmax=_step_longest(robot, command)
         ),
         adjoint=diffrax.ForwardMode(),
     )
