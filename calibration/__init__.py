@@ -1,1 +1,1 @@
-"""Measured data and what is done with it: records, errors, and (to come) fit, residual and effects."""
+"""Measured data and what is done with it: tables of runs, errors, and calibration by gradients."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import difflib
+import hashlib
 import math
 from importlib import resources
 from pathlib import Path
@@ -59,11 +60,13 @@ class Runs:
         source: where it came from, for messages.
         columns: name → array of shape (rows,); numbers in the unit of the name, words as str.
         unknown: columns of the file that this program does not know, kept out.
+        digest: SHA-256 of the file, empty for a table that came from none.
     """
 
     source: str
     columns: dict[str, np.ndarray]
     unknown: tuple[str, ...] = ()
+    digest: str = ""
 
     def __len__(self) -> int:
         return len(self.columns["configuration"])
@@ -124,18 +127,21 @@ def read(source: str | Path, *, measured: bool = True) -> Runs:
     path = Path(source)
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-    return _read(path, path.name, measured)
+    return _read(path, path.name or str(source), measured)
 
 
 def _read(path: Path, name: str, measured: bool) -> Runs:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        content = path.read_bytes()
+        text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
     rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     if not rows:
         raise BadData(f"{name}: the file is empty; expected a header with {', '.join(INPUT_COLUMNS)}")
     header = [cell.strip() for cell in rows[0]]
+    if len(header) == 1 and ";" in header[0]:
+        raise BadData(f"{name}: columns are separated by semicolons; expected commas, and points in numbers")
     required = (
         INPUT_COLUMNS if measured else tuple(c for c in INPUT_COLUMNS if c not in MEASURED and c != "total_mass_kg")
     )
@@ -151,7 +157,8 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
             cells = [row[j].strip() for row in rows[1:]]
             columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
     _check_mass(name, columns)
-    return Runs(name, columns, tuple(c for c in header if c not in KNOWN_COLUMNS))
+    unknown = tuple(c for c in header if c not in KNOWN_COLUMNS)
+    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest())
 
 
 def _check_header(name: str, header: list[str], required: tuple[str, ...]) -> None:
@@ -177,7 +184,7 @@ def _cell(where: str, column: str, cell: str, kind: type[DoorError] = BadData) -
     if column in WORDS:
         known = {"configuration": CONFIGURATIONS, "surface": tuple(SURFACES)}.get(column)
         if known is not None and cell not in known:
-            raise refuse(choices(cell, known))
+            raise refuse(f"one of these; {choices(cell, known)}")
         return cell
     low, high = (CONDITIONS | MEASURED | DEVIATIONS | TIME)[column]
     positive = column in DEVIATIONS or column == "supply_voltage_V"

@@ -12,14 +12,15 @@ from typing import Any
 import jax.numpy as jnp
 
 from calibration.doors import BadConfiguration, choices, number
+from calibration.effect_file import Library
 from mmrjax import effects, nominal, params
 from mmrjax.robot import Robot
 
 SCHEMA = "mmrjax.robot/1"
 
 
-def load(name_or_path: str) -> Robot:
-    """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file.
+def load(name_or_path: str, library: Library = effects.BY_NAME) -> Robot:
+    """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
 
     Raises:
         BadConfiguration: no such name or file, or what `read` raises.
@@ -31,11 +32,11 @@ def load(name_or_path: str) -> Robot:
         raise BadConfiguration(
             f"--robot: got {name_or_path}, no such file and no known robot; {choices(name_or_path, nominal.ROBOTS)}"
         )
-    return read(path)
+    return read(path, library)
 
 
-def read(path: Path) -> Robot:
-    """Read a robot file.
+def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
+    """Read a robot file; its effects are looked up in `library` (see `effect_file.library`).
 
     The file states `schema` (optional), `base` (a robot's name, `nominal` if left out), and tables of
     parameters by dotted name in SI units, e.g. `[motor] resistance = 0.9`; an effect is present when its
@@ -60,15 +61,15 @@ def read(path: Path) -> Robot:
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
     for name in present:
-        if name not in effects.BY_NAME:
-            raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, effects.BY_NAME)}")
-    robot = with_effects(robot, tuple(present))
+        if name not in library:
+            raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
+    robot = with_effects(robot, tuple(present), library)
     return change(robot, dict(_flatten(content)), where=path.name)
 
 
-def with_effects(robot: Robot, names: tuple[str, ...]) -> Robot:
-    """The robot with these effects present, each with amplitude 0."""
-    return dataclasses.replace(robot, effects=tuple(effects.BY_NAME[name]() for name in names))
+def with_effects(robot: Robot, names: tuple[str, ...], library: Library = effects.BY_NAME) -> Robot:
+    """The robot with these effects of `library` present, each with amplitude 0."""
+    return dataclasses.replace(robot, effects=tuple(library[name]() for name in names))
 
 
 def change(robot: Robot, values: dict[str, Any], where: str) -> Robot:

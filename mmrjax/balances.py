@@ -7,7 +7,7 @@ All three fidelities are compositions of these functions.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol
 
 import jax.numpy as jnp
 
@@ -21,6 +21,8 @@ from mmrjax.signals import GRAVITY, Command, Reading, Signals, State
 #: Every balance with its unit and what it closes.
 BALANCES = {
     "mass": ("kg", "M = robot + payload"),
+    "inertia": ("kg·m^2", "J_w of one side's parts that turn with the driving wheel, eq. (31)"),
+    "inductance": ("H", "L of one armature circuit, eq. (15)"),
     "supply": ("V", "U_e from battery or external source, eqs. (8)-(13)"),
     "electrical": ("V", "U_e = E + I R + L dI/dt, eq. (15)"),
     "motor": ("N·m", "C_m I - M_df = M_d, eqs. (14), (17), (18)"),
@@ -32,7 +34,8 @@ BALANCES = {
 }
 
 
-def _effects(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
+def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
+    """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit."""
     terms = [e.term(robot, signals) for e in robot.effects if e.balance == balance and e.channel == channel]
     return sum(terms) if terms else 0.0  # type: ignore[return-value]
 
@@ -42,21 +45,19 @@ def _fill(signals: Signals, **values: Any) -> Signals:
 
 
 def begin(robot: Robot, command: Command, state: State, direction: Scalar | None = None) -> Signals:
-    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest.
-
-    The speed within which a direction fades is a tenth of V_s of the friction law, so that friction at
-    rest is resolved on the same scale as sliding.
-    """
+    """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(command.wheeled)
     speed_wheel = state.speed_motor / robot.gearbox.ratio
     speed_theoretical = chassis.radius * speed_wheel
-    rest = 0.1 * chassis.ground.friction.speed_static
+    rest = chassis.ground.friction.speed_rest
     signals = Signals(
         wheeled=command.wheeled,
         slope=command.slope,
         payload=command.payload,
         adhesion=command.adhesion,
+        battery=command.battery,
         discharge=state.discharge,
+        memory=state.memory,
         current=state.current,
         speed_motor=state.speed_motor,
         speed=state.speed,
@@ -67,7 +68,7 @@ def begin(robot: Robot, command: Command, state: State, direction: Scalar | None
         total_current=robot.sides * state.current,
     )
     stated = chassis.mass + command.payload if command.total_mass is None else command.total_mass
-    mass = stated + _effects(robot, signals, "mass")
+    mass = stated + added(robot, _fill(signals, mass=stated), "mass")
     normal = chassis_room.normal_load(mass, command.slope, GRAVITY, robot.sides)
     return _fill(signals, mass=mass, normal=normal)
 
@@ -77,21 +78,27 @@ def supply(robot: Robot, command: Command, signals: Signals) -> Signals:
     source = power.voltage_source(
         robot.battery, command.voltage, command.battery, signals.total_current, signals.discharge
     )
-    return _fill(signals, voltage=source - _effects(robot, signals, "supply"))
+    return _fill(signals, voltage=source - added(robot, signals, "supply"))
 
 
 def electrical(robot: Robot, signals: Signals) -> Signals:
     """What of the supply voltage is left to change the current [V]."""
     back = robot.motor.voltage_back(signals.speed_motor)
-    drop = robot.motor.voltage_winding(signals.current) + _effects(robot, signals, "electrical")
-    return _fill(signals, voltage_back=back, voltage_drop=drop, voltage_left=signals.voltage - back - drop)
+    drop = robot.motor.voltage_winding(signals.current) + added(robot, signals, "electrical")
+    return _fill(
+        signals,
+        voltage_back=back,
+        voltage_drop=drop,
+        voltage_left=signals.voltage - back - drop,
+        inductance=robot.motor.inductance + added(robot, signals, "inductance"),
+    )
 
 
 def motor(robot: Robot, signals: Signals) -> Signals:
     """Torque at the motor shaft [N·m]."""
     electromagnetic = robot.motor.torque_electromagnetic(signals.current)
     loss = robot.motor.torque_loss(signals.speed_motor, signals.direction)
-    loss = loss + _effects(robot, signals, "motor")
+    loss = loss + added(robot, signals, "motor")
     return _fill(
         signals,
         torque_electromagnetic=electromagnetic,
@@ -103,7 +110,7 @@ def motor(robot: Robot, signals: Signals) -> Signals:
 def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
     """Forces along the slope that traction has to overcome [N]."""
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
-    resistance = resistance + _effects(robot, signals, "ground")
+    resistance = resistance + added(robot, signals, "ground")
     gravity = ground.force_gravity(signals.mass / robot.sides, signals.slope, GRAVITY)
     return _fill(
         signals,
@@ -116,38 +123,48 @@ def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
 
 def slip(robot: Robot, signals: Signals) -> Signals:
     """Speed at which the contact patch slides over the ground [m/s]."""
-    terms = _effects(robot, signals, "slip")
+    terms = added(robot, signals, "slip")
     return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
 
 
-def track(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
-    """Losses between pulley and ground, at the pulley [N·m]."""
+def track(robot: Robot, chassis: Chassis, signals: Signals, guide: Scalar | None = None) -> Signals:
+    """Losses between pulley and ground, at the pulley [N·m].
+
+    `guide` is the friction on the lower guide [N]; None takes (26) on the guides' stated share.
+    """
     loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
-    guide = chassis.track.force_guide(signals.normal, signals.direction)
-    loss = loss + guide * chassis.radius + _effects(robot, signals, "track")
+    guide = chassis.track.force_guide(signals.normal, signals.direction) if guide is None else guide
+    loss = loss + guide * chassis.radius + added(robot, signals, "track")
     return _fill(signals, torque_track_loss=loss)
 
 
-def gearbox(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
+def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | None = None) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
+
+    `mover` is what the mover takes from the shaft beside the track's losses [N·m]; None: the traction.
 
     With A the motor torque less idle loss and B the load at the output, the torque transmitted has the
     sign of A J_w + i J_d B whatever the efficiency, which decides which way the load loss acts.
     """
     gear, inertia_motor = robot.gearbox, robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
-    load = signals.torque_track_loss + chassis.radius * signals.traction + _effects(robot, signals, "gearbox")
+    mover = chassis.radius * signals.traction if mover is None else mover
+    load = signals.torque_track_loss + mover + added(robot, signals, "gearbox")
     drive = signals.torque_motor - idle
-    side = drive * chassis.inertia + gear.ratio * inertia_motor * load
+    inertia_added = added(robot, signals, "inertia")
+    inertia_wheel = chassis.inertia + inertia_added
+    side = drive * inertia_wheel + gear.ratio * inertia_motor * load
     efficiency = gear.efficiency_flow(side, signals.direction)
     net = gear.ratio * efficiency * drive - load
-    inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, chassis.inertia)
+    inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, inertia_wheel)
     acceleration = net / inertia
     torque_input = signals.torque_motor - inertia_motor * gear.ratio * acceleration
     return _fill(
         signals,
         torque_idle=idle,
         torque_load=load,
+        inertia_added=inertia_added,
+        efficiency_load=efficiency,
         torque_net=net,
         acceleration_wheel=acceleration,
         torque_input=torque_input,
@@ -165,6 +182,42 @@ def moving(robot: Robot, command: Command, state: State) -> Signals:
         signals, traction=traction, acceleration=(traction - signals.demand) / (signals.mass / robot.sides)
     )
     return gearbox(robot, chassis, track(robot, chassis, signals))
+
+
+class Mover(Protocol):
+    """Movers whose contacts are resolved one by one."""
+
+    @property
+    def normal(self) -> Scalar:
+        """Normal load of one side [N]."""
+        ...
+
+    def pull(self, chassis: Chassis, signals: Signals) -> Any:
+        """What the contacts do, with `traction` [N], `guide` [N], and `load` on the driving shaft [N·m]."""
+        ...
+
+
+def resolved(robot: Robot, command: Command, state: State, mover: Mover, inertia: Scalar) -> tuple[Signals, Any]:
+    """All signals of a robot in motion whose normal load, traction and guide load come from its contacts.
+
+    Args:
+        mover: the contacts at this instant.
+        inertia: of what turns rigidly with the driving shaft, in place of `chassis.inertia` [kg·m²].
+
+    Returns:
+        The signals, and what `mover.pull` gave.
+    """
+    chassis = dataclasses.replace(robot.chassis(command.wheeled), inertia=inertia)
+    signals = _fill(begin(robot, command, state), normal=mover.normal)
+    signals = electrical(robot, supply(robot, command, signals))
+    signals = slip(robot, travel(robot, chassis, motor(robot, signals)))
+    pull = mover.pull(chassis, signals)
+    traction, guide = pull.traction, jnp.sum(pull.guide)
+    signals = _fill(
+        signals, traction=traction, acceleration=(traction - signals.demand) / (signals.mass / robot.sides)
+    )
+    signals = track(robot, chassis, signals, guide)
+    return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
 
 
 def settled(robot: Robot, command: Command, state: State) -> tuple[Signals, Scalar]:
@@ -186,7 +239,7 @@ def settled(robot: Robot, command: Command, state: State) -> tuple[Signals, Scal
 def sensor(robot: Robot, signals: Signals) -> Reading:
     """What the instruments show of current [A], motor speed [rad/s] and speed [m/s]."""
     return Reading(
-        total_current=signals.total_current + _effects(robot, signals, "sensor", "total_current"),
-        motor_speed=signals.speed_motor + _effects(robot, signals, "sensor", "motor_speed"),
-        speed=signals.speed + _effects(robot, signals, "sensor", "speed"),
+        total_current=signals.total_current + added(robot, signals, "sensor", "total_current"),
+        motor_speed=signals.speed_motor + added(robot, signals, "sensor", "motor_speed"),
+        speed=signals.speed + added(robot, signals, "sensor", "speed"),
     )

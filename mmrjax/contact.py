@@ -64,6 +64,14 @@ class Friction(eqx.Module):
         source=_PACKAGE,
     )
 
+    @property
+    def speed_rest(self) -> Scalar:
+        """Speed within which a direction fades and a robot is said to stand, a tenth of V_s [m/s].
+
+        Friction at rest is then resolved on the same scale as sliding.
+        """
+        return 0.1 * self.speed_static
+
     def coefficient(self, speed: Scalar) -> Scalar:
         """Friction coefficient [-] at sliding `speed` [m/s], of the speed's sign."""
         size = jnp.abs(speed)

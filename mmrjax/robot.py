@@ -36,3 +36,8 @@ class Robot(eqx.Module):
     def chassis(self, wheeled: Scalar) -> Chassis:
         """The chassis in use: `tracked` where `wheeled` is 0, else `wheeled`; traceable and batchable."""
         return jax.tree.map(lambda t, w: jnp.where(wheeled > 0.5, w, t), self.tracked, self.wheeled)
+
+    @property
+    def remembering(self) -> tuple[Effect, ...]:
+        """Its effects whose term depends on the past of the run, in order."""
+        return tuple(effect for effect in self.effects if effect.memory_size is not None)

@@ -11,8 +11,8 @@ from mmrjax.params import Scalar
 GRAVITY = 9.80665  # [m/s²], standard gravity
 
 #: Outcomes of one member of a batch, in the order of their codes.
-STATUSES = ("converged", "stalled", "slides", "not_settled", "battery_empty", "failed")
-CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED = range(len(STATUSES))
+STATUSES = ("converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips")
+CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS = range(len(STATUSES))
 
 #: Limits that a run may exceed; bit k of `Result.flags` is the k-th name.
 FLAGS = ("motor_overspeed", "gearbox_overspeed", "winding_hot")
@@ -28,7 +28,7 @@ class Command(eqx.Module):
         wheeled: 0 for 6T2A, 1 for 4W2T.
         battery: 0 external supply (Source Mode 2), 1 on-board battery (Source Mode 1), eq. (8).
         discharge: charge C_b already taken from the battery [C].
-        adhesion: adhesion of this surface as a ratio to the robot's own surface [-].
+        adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
         total_mass: mass of robot and payload as weighed [kg]; None takes the robot's mass and the payload.
     """
 
@@ -68,12 +68,14 @@ class State(eqx.Module):
         speed_motor: motor shaft speed [rad/s].
         speed: speed of the robot along the slope V [m/s].
         discharge: charge taken from the battery C_b [C].
+        memory: of each effect that has one, by the effect's name, in its own unit; empty where none is kept.
     """
 
     current: Scalar
     speed_motor: Scalar
     speed: Scalar
     discharge: Scalar
+    memory: dict[str, Scalar] = eqx.field(default_factory=dict)
 
 
 class Signals(eqx.Module):
@@ -87,7 +89,9 @@ class Signals(eqx.Module):
     slope: Scalar = 0.0
     payload: Scalar = 0.0
     adhesion: Scalar = 1.0
+    battery: Scalar = 0.0  # 1 where the on-board battery feeds the motors
     discharge: Scalar = 0.0
+    memory: dict[str, Scalar] = eqx.field(default_factory=dict)  # of effects, by name; empty: settled
     current: Scalar = 0.0  # I_d of one motor [A]
     speed_motor: Scalar = 0.0  # [rad/s]
     speed: Scalar = 0.0  # V of the robot [m/s]
@@ -97,7 +101,7 @@ class Signals(eqx.Module):
     speed_wheel: Scalar = 0.0  # of driving wheel or pulley [rad/s]
     speed_theoretical: Scalar = 0.0  # r_k ω_k, eq. (32) [m/s]
     # mass
-    mass: Scalar = 0.0  # total M [kg]
+    mass: Scalar = 0.0  # total M [kg]; to effects of balance `mass`, the stated one
     normal: Scalar = 0.0  # normal load of one side [N]
     # supply and electrical
     total_current: Scalar = 0.0  # of all motors I_s, eq. (10) [A]
@@ -105,6 +109,7 @@ class Signals(eqx.Module):
     voltage_back: Scalar = 0.0  # E, eq. (16) [V]
     voltage_drop: Scalar = 0.0  # I R and every further drop [V]
     voltage_left: Scalar = 0.0  # drives L dI/dt, eq. (15) [V]
+    inductance: Scalar = 0.0  # L_d of the armature circuit, eq. (15) [H]
     # motor
     torque_electromagnetic: Scalar = 0.0  # C_m I, eq. (17) [N·m]
     torque_motor_loss: Scalar = 0.0  # M_df, eq. (14) [N·m]
@@ -119,7 +124,9 @@ class Signals(eqx.Module):
     adhesion_limit: Scalar = 0.0  # largest traction of the friction law [N]
     # track and gearbox
     torque_track_loss: Scalar = 0.0  # eq. (24), (26) at the pulley [N·m]
+    inertia_added: Scalar = 0.0  # by effects, of one side at the driving wheel [kg·m²]
     torque_load: Scalar = 0.0  # all that the gearbox output carries, inertia apart [N·m]
+    efficiency_load: Scalar = 1.0  # η_rm, or 1/η_rm where power flows back [-]
     torque_idle: Scalar = 0.0  # M_rf_idle at the gearbox input, eq. (20) [N·m]
     torque_input: Scalar = 0.0  # into the gearbox, the armature's share taken off [N·m]
     torque_gear: Scalar = 0.0  # M_r, eq. (23) [N·m]
@@ -159,7 +166,8 @@ class Result(eqx.Module):
         power_gear: N_r at the gearbox outputs [W].
         power_ground: N_t from the movers to the ground [W].
         power_lift: against gravity [W].
-        efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest.
+        efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest
+            and where power does not flow that way.
         temperature_winding: after long running at this current [°C].
         status: code into `STATUSES`.
         flags: bit mask over `FLAGS`.

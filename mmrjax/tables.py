@@ -34,6 +34,6 @@ BENCH = "lacquered_wood"
 
 
 def adhesion_ratio(surface: str, wheeled: bool) -> float:
-    """Adhesion of `surface` over that of the bench [-], Table 5."""
+    """Adhesion of `surface` over that of the bench [-], Table 5; right for a robot whose friction is the bench's."""
     here, bench = SURFACES[surface], SURFACES[BENCH]
     return here.wheeled_x / bench.wheeled_x if wheeled else here.tracked_x / bench.tracked_x

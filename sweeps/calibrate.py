@@ -21,7 +21,7 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
 
     0 done; 3 done, but the search did not converge, or a row or a fit without a block did not.
     """
-    runs = commands.read_runs(source, measured=True)
+    runs = commands.read_runs(source, measured=True, series=True)
     robot = commands.load_robot(config)
     stated: dict[str, tuple[float, float]] = {}
     for text in config.prior:
@@ -29,32 +29,31 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
         if name in stated:
             raise BadConfiguration(f"--prior {name}: given twice; give it once")
         stated[name] = (mean, sd)
-    folder = commands.open_folder("calibrate", config, robot, out, force, runs)
-    found = run(
-        runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
-        model=config.model, starts=config.starts, seed=config.seed, profiles=config.profiles,
-    )  # fmt: skip
-    document = outcome.document(found)
-    folder.write_json("result.json", document)
-    folder.write_table("rows.csv", outcome.rows_table(found))
-    folder.write_text("config.resolved.toml", configuration.as_toml(config))
-    note = (
-        f"calibrated from {config.robot} with {runs.source}; the free parameters: {', '.join(document['parameters'])}"
-    )
-    robot_file.write(found.robot, folder.partial / "robot.toml", note=note)
-    print_calibration(document)
-    if config.report:
-        from sweeps import report_calibration
+    with commands.open_folder("calibrate", config, robot, out, force, runs) as folder:
+        found = run(
+            runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
+            model=config.model, starts=config.starts, seed=config.seed, profiles=config.profiles,
+        )  # fmt: skip
+        document = outcome.document(found)
+        folder.write_json("result.json", document)
+        folder.write_table("rows.csv", outcome.rows_table(found))
+        folder.write_text("config.resolved.toml", configuration.as_toml(config))
+        free = ", ".join(document["parameters"])
+        note = f"calibrated from {config.robot} with {runs.source}; the free parameters: {free}"
+        robot_file.write(found.robot, folder.partial / "robot.toml", note=note)
+        print_calibration(document)
+        if config.report:
+            from sweeps import report_calibration
 
-        report_calibration.write(folder.partial, found, document, robot_name=config.robot)
-    hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}
-    if Path(source).is_file():
-        hashes[Path(source).name] = digest(Path(source).read_bytes())
-    path = folder.finish({"seed": config.seed, "hashes": hashes, "statuses": document["statuses"]})
-    commands.say(str(path))
-    settled = found.converged and all(h.converged.all() for h in found.held_out.values())
-    reached = document["statuses"]["converged"] == len(runs)
-    return commands.DONE if settled and reached else commands.SOME_NOT_CONVERGED
+            report_calibration.write(folder.partial, found, document, robot_name=config.robot)
+        hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}
+        if runs.digest:
+            hashes[runs.source] = runs.digest
+        path = folder.finish({"seed": config.seed, "hashes": hashes, "statuses": document["statuses"]})
+        commands.say(str(path))
+        settled = found.converged and all(h.converged.all() for h in found.held_out.values())
+        reached = document["statuses"]["converged"] == len(runs)
+        return commands.DONE if settled and reached else commands.SOME_NOT_CONVERGED
 
 
 def print_calibration(document: dict[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,10 +22,10 @@ app = typer.Typer(
     "converge (their status says why); 4 bad data; 130 interrupted (the same command takes it up again).",
 )  # fmt: skip
 
-_Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady or drive.  [default: steady]")]
+_Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady, drive or track.  [default: steady]")]
 _Duration = Annotated[
     float | None,
-    typer.Option("--duration", help="Length of a drive run from standstill [s].  [default: 30; simulate 5]"),
+    typer.Option("--duration", help="Length of a run (s).  [default: drive 30, simulate 5; track 1.5]"),
 ]
 _Robot = Annotated[
     str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  [default: nominal]")
@@ -33,14 +34,30 @@ _Set = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change a parameter, SI units, repeatable: tracked.ground.friction.static=0.6."),
 ]
+_Configuration = Annotated[str, typer.Option(help="6T2A (tracked) or 4W2T (wheeled).")]
+_Voltage = Annotated[float, typer.Option(help="Supply voltage (V).")]
+_Slope = Annotated[float, typer.Option(help="Slope, positive uphill (deg).")]
+_Payload = Annotated[float, typer.Option(help="Additional load mass (kg).")]
+_Mass = Annotated[
+    float | None, typer.Option(help="Total mass (kg).  [default: the robot's own mass and the payload]")
+]
+_Surface = Annotated[
+    str, typer.Option(help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood.")
+]
+_Step = Annotated[
+    float | None, typer.Option("--step", help="Integration step of the track model (s).  [default: 1e-4]")
+]
 _Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  [default: runs/COMMAND-TIME]")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
 _Report = Annotated[bool | None, typer.Option("--report/--no-report", help="Write report.html.  [default: report]")]
 _Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from the on-board battery.")]
 _Discharge = Annotated[
-    float | None, typer.Option("--discharge", help="Charge already taken from the battery [mAh].  [default: 0]")
+    float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  [default: 0]")
 ]
-_Chunk = Annotated[int | None, typer.Option("--chunk", help="Runs in one vmapped call.  [default: 16384]")]
+_Chunk = Annotated[
+    int | None,
+    typer.Option("--chunk", help="Runs in one vmapped call.  [default: steady 16384, drive 4096, track 512]"),
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -52,19 +69,18 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command(epilog="Example: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive")
 def simulate(
-    configuration: Annotated[str, typer.Option(help="6T2A (tracked) or 4W2T (wheeled).")] = "6T2A",
-    voltage: Annotated[float, typer.Option(help="Supply voltage [V].")] = 33.0,
-    slope: Annotated[float, typer.Option(help="Slope, positive uphill [deg].")] = 0.0,
-    payload: Annotated[float, typer.Option(help="Additional load mass [kg].")] = 0.0,
-    mass: Annotated[
-        float | None, typer.Option(help="Total mass [kg].  [default: the robot's own mass and the payload]")
-    ] = None,
-    surface: Annotated[str, typer.Option(help="Surface of Table 5.")] = "lacquered_wood",
+    configuration: _Configuration = "6T2A",
+    voltage: _Voltage = 33.0,
+    slope: _Slope = 0.0,
+    payload: _Payload = 0.0,
+    mass: _Mass = None,
+    surface: _Surface = "lacquered_wood",
     runs: Annotated[
         Path | None, typer.Option(help="CSV of runs to simulate instead; the condition columns are enough.")
     ] = None,
     model: _Model = None,
     duration: _Duration = None,
+    step: _Step = None,
     robot: _Robot = None,
     set_: _Set = None,
     battery: _Battery = None,
@@ -79,21 +95,17 @@ def simulate(
     """
     from sweeps import config
 
-    options = _options(model, duration, robot, set_, battery, discharge, None, report)
+    options = _options(
+        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, battery=battery,
+        discharge_mAh=discharge, report=report,
+    )  # fmt: skip
     resolved = config.resolve(config.History, None, options)
-    from calibration import records
     from sweeps import commands
 
     if runs is not None:
         table = commands.read_runs(str(runs), measured=False)
     else:
-        cells: dict[str, Any] = {
-            "configuration": configuration, "supply_voltage_V": voltage, "payload_kg": payload, "slope_deg": slope,
-            "surface": surface,
-        }  # fmt: skip
-        if mass is not None:
-            cells["total_mass_kg"] = mass
-        table = records.single(cells)
+        table = _one_run(configuration, voltage, slope, payload, mass, surface)
     return commands.simulate(resolved, table, out, force)
 
 
@@ -103,12 +115,12 @@ def simulate(
 )
 def sweep(
     configurations: Annotated[str | None, typer.Option(help="Comma-separated.  [default: 6T2A,4W2T]")] = None,
-    voltages: Annotated[str | None, typer.Option(help="Supply voltages [V].  [default: 15,24,33]")] = None,
+    voltages: Annotated[str | None, typer.Option(help="Supply voltages (V).  [default: 15,24,33]")] = None,
     payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses [kg].  [default: 0,1.5,3,5,6.5,8]")
+        str | None, typer.Option(help="Additional load masses (kg).  [default: 0,1.5,3,5,6.5,8]")
     ] = None,
     slopes: Annotated[
-        str | None, typer.Option(help="Slopes, positive uphill [deg].  [default: 0,5,10,15,20]")
+        str | None, typer.Option(help="Slopes, positive uphill (deg).  [default: 0,5,10,15,20]")
     ] = None,
     surface: Annotated[str | None, typer.Option(help="Surface of Table 5.  [default: lacquered_wood]")] = None,
     config_file: Annotated[
@@ -116,6 +128,7 @@ def sweep(
     ] = None,
     model: _Model = None,
     duration: _Duration = None,
+    step: _Step = None,
     robot: _Robot = None,
     set_: _Set = None,
     battery: _Battery = None,
@@ -132,7 +145,17 @@ def sweep(
     """
     from sweeps import config
 
-    options = _options(model, duration, robot, set_, battery, discharge, chunk, report) | {
+    options = _options(
+        model=model,
+        duration_s=duration,
+        step_s=step,
+        robot=robot,
+        set=set_,
+        battery=battery,
+        discharge_mAh=discharge,
+        chunk=chunk,
+        report=report,
+    ) | {
         "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
         "voltages_V": config.axis("--voltages", voltages),
         "payloads_kg": config.axis("--payloads", payloads),
@@ -155,6 +178,7 @@ def compare(
     ] = False,
     model: _Model = None,
     duration: _Duration = None,
+    step: _Step = None,
     robot: _Robot = None,
     set_: _Set = None,
     out: _Out = None,
@@ -164,11 +188,54 @@ def compare(
     """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
     from sweeps import config
 
-    options = _options(model, duration, robot, set_, None, None, None, report)
+    options = _options(model=model, duration_s=duration, step_s=step, robot=robot, set=set_, report=report)
     resolved = config.resolve(config.Simulation, None, options)
     from sweeps import commands
 
     return commands.compare(resolved, data, own_mass, out, force)
+
+
+@app.command(epilog="Example: mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20")
+def render(
+    file: Annotated[Path, typer.Argument(help="What to write: its suffix is .png, .gif or .mp4.")],
+    begin: Annotated[float, typer.Option(help="Instant of a picture, first one of a film (s).")] = 0.8,
+    end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  [default: begin + 0.1]")] = None,
+    slow: Annotated[float, typer.Option(help="How many times slower than life a film runs.", min=0.01)] = 20.0,
+    configuration: _Configuration = "6T2A",
+    voltage: _Voltage = 33.0,
+    slope: _Slope = 0.0,
+    payload: _Payload = 0.0,
+    mass: _Mass = None,
+    surface: _Surface = "lacquered_wood",
+    duration: _Duration = None,
+    step: _Step = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    battery: _Battery = None,
+    discharge: _Discharge = None,
+    force: _Force = False,
+) -> int:
+    """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
+
+    Needs no display.
+    """
+    from sweeps import config
+
+    options = _options(
+        model="track",
+        duration_s=duration,
+        step_s=step,
+        robot=robot,
+        set=set_,
+        battery=battery,
+        discharge_mAh=discharge,
+    )
+    resolved = config.resolve(config.History, None, options)
+    from sweeps import commands
+
+    table = _one_run(configuration, voltage, slope, payload, mass, surface)
+    end = begin + 0.1 if end is None else end
+    return commands.render(resolved, table, file, begin, end, slow, force)
 
 
 @app.command(epilog="Example: mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted")
@@ -206,7 +273,7 @@ def calibrate(
     """
     from sweeps import config
 
-    options = _options(model, None, robot, set_, None, None, None, report) | {
+    options = _options(model=model, robot=robot, set=set_, report=report) | {
         "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
         "noise": noise, "starts": starts, "seed": seed,
         # A profile is some twenty refits a parameter: seconds with steady, many minutes of rollouts.
@@ -226,20 +293,28 @@ def doctor() -> int:
     return room.doctor()
 
 
-def _options(
-    model: str | None, duration: float | None, robot: str | None, set_: list[str] | None, battery: bool | None,
-    discharge: float | None, chunk: int | None, report: bool | None,
-) -> dict[str, Any]:  # fmt: skip
+def _options(**given: Any) -> dict[str, Any]:
     from sweeps import config
 
-    return {
-        "model": model, "duration_s": duration, "robot": robot, "set": config.settings(set_), "battery": battery,
-        "discharge_mAh": discharge, "chunk": chunk, "report": report,
+    return {**given, "set": config.settings(given["set"])}
+
+
+def _one_run(configuration: str, voltage: float, slope: float, payload: float, mass: float | None,
+             surface: str) -> Any:  # fmt: skip
+    from calibration import records
+
+    cells: dict[str, Any] = {
+        "configuration": configuration, "supply_voltage_V": voltage, "payload_kg": payload, "slope_deg": slope,
+        "surface": surface,
     }  # fmt: skip
+    if mass is not None:
+        cells["total_mass_kg"] = mass
+    return records.single(cells)
 
 
 def main() -> None:
     """Run the command line; every failure is one sentence on stderr and a documented exit code."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ended or interrupted: both can be taken up again
     try:
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,16 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from calibration import records, residual, robot_file
-from mmrjax import params
-from mmrjax.models.drive import Trajectory, drive_batch
+from calibration.doors import BadConfiguration, BadData
+from mmrjax import __version__, balances, params
+from mmrjax.models.drive import drive_batch
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration
-from sweeps import run
+from sweeps import outputs, run
 from sweeps.config import Simulation
 from sweeps.grid import grid
 from sweeps.store import RunFolder, default_path, digest
@@ -37,9 +39,12 @@ WHY = {
     "not_settled": "still accelerating at the end of the run; try a longer --duration",
     "battery_empty": "the battery has no charge left",
     "failed": "the solver gave up",
+    "tips": "the line of gravity passes outside the contacts: the robot turns over",
 }
 _HISTORY_POINTS = 1001
-_out = Console(highlight=False, soft_wrap=True, markup=False)
+_HISTORIES = 1000  # runs of which `simulate` keeps one
+_WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
+_out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 
@@ -47,59 +52,133 @@ def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
     """Simulate a grid and leave a run folder; returns the exit code."""
     robot = load_robot(config)
     runs = grid(config)
-    folder = open_folder("sweep", config, robot, out, force)
-    table = _evaluate(robot, runs, config, folder)
-    print_counts(table)
-    if config.report:
-        from sweeps import report
+    with open_folder("sweep", config, robot, out, force) as folder:
+        table = _evaluate(robot, runs, config, folder)
+        print_counts(table)
+        if config.report:
+            from sweeps import report
 
-        report.write(
-            folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
-            title=f"Sweep of {len(runs)} runs",
-        )  # fmt: skip
-    return _finish(folder, config, robot, table, {"schema": "mmrjax.sweep/1"}, [])
+            report.write(
+                folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
+                title=f"Sweep of {len(runs)} runs",
+            )  # fmt: skip
+        return _finish(folder, config, robot, table, {"schema": "mmrjax.sweep/1"}, runs)
 
 
 def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bool) -> int:
-    """Simulate a few given runs; with `drive` also their histories from standstill."""
+    """Simulate a few given runs; with `drive` and `track` from standstill, with their histories.
+
+    Raises:
+        BadConfiguration: more runs than histories can be kept of.
+    """
     robot = load_robot(config)
-    folder = open_folder("simulate", config, robot, out, force, runs)
-    table = _evaluate(robot, runs, config, folder)
-    shown = min(len(runs), 6)
-    print_runs({key: value[:shown] for key, value in table.items()})
-    if shown < len(runs):
-        _out.print(f"... and {len(runs) - shown} more in runs.csv")
+    if config.model != "steady" and len(runs) > _HISTORIES:
+        raise BadConfiguration(
+            f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
+        )
+    with open_folder("simulate", config, robot, out, force, runs) as folder:
+        with _progress(len(runs), quiet=config.model != "track") as advance:
+            if config.model == "steady":
+                table = run.evaluate(robot, runs, config, folder, advance)
+            else:
+                table = {**run.conditions(robot, runs), **_histories(folder, robot, runs, config)}
+                advance(len(runs))
+        shown = min(len(runs), 6)
+        print_runs({key: value[:shown] for key, value in table.items()})
+        if shown < len(runs):
+            _out.print(f"... and {len(runs) - shown} more in runs.csv")
+        if config.report:
+            from sweeps import report
+
+            report.write(
+                folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
+                title="Simulation of one run" if len(runs) == 1 else f"Simulation of {len(runs)} runs",
+            )  # fmt: skip
+        return _finish(folder, config, robot, table, {"schema": "mmrjax.simulate/1"}, runs)
+
+
+def _histories(folder: RunFolder, robot: Robot, runs: records.Runs, config: Simulation) -> dict[str, np.ndarray]:
+    """Write the runs over time, of the track model with every reaction; returns the columns of their ends."""
+    command = runs.command(battery=float(config.battery), discharge=run.charge(config))
     if config.model == "drive":
-        times = jnp.linspace(0.0, config.duration_s, _HISTORY_POINTS)
-        command = runs.command(battery=float(config.battery), discharge=run.charge(config))
-        history = history_table(robot, jax.device_get(drive_batch(robot, command, times)), runs)
-        folder.write_table("history.csv", history)
-    if config.report:
-        from sweeps import report
-
-        report.write(
-            folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
-            title="Simulation of one run" if len(runs) == 1 else f"Simulation of {len(runs)} runs",
-        )  # fmt: skip
-    return _finish(folder, config, robot, table, {"schema": "mmrjax.simulate/1"}, [runs.source])
+        times = jnp.linspace(0.0, config.duration, _HISTORY_POINTS)
+        trajectory = jax.device_get(drive_batch(robot, command, times))
+        folder.write_table("history.csv", history_table(robot, trajectory, trajectory.distance, runs))
+        return outputs.columns(trajectory.result)
+    trajectory = jax.device_get(run.track_runs(robot, command, config, rolling=False))
+    folder.write_table("history.csv", history_table(robot, trajectory, trajectory.q[..., 0], runs))
+    folder.write_table("reactions.csv", reactions_table(trajectory, runs))
+    return {**outputs.columns(trajectory.result), "guide_share": np.asarray(trajectory.steady.guide_share)}
 
 
-def history_table(robot: Robot, trajectory: Trajectory, runs: records.Runs) -> dict[str, np.ndarray]:
+def _names(runs: records.Runs) -> np.ndarray:
+    return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
+
+
+def history_table(robot: Robot, trajectory: Any, distance: np.ndarray, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = trajectory.signals
-    points = trajectory.time.shape[-1]
-    names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
+    shown = balances.sensor(robot, signals)
     return {
-        "run_id": np.repeat(names, points),
+        "run_id": np.repeat(_names(runs), trajectory.time.shape[-1]),
         "time_s": trajectory.time.ravel(),
-        "total_current_A": signals.total_current.ravel(),
-        "motor_speed_rpm": signals.speed_motor.ravel() / records.RPM,
-        "speed_mm_s": signals.speed.ravel() / records.MM,
+        "total_current_A": np.ravel(shown.total_current),
+        "motor_speed_rpm": np.ravel(shown.motor_speed) / records.RPM,
+        "speed_mm_s": np.ravel(shown.speed) / records.MM,
         "theoretical_speed_mm_s": signals.speed_theoretical.ravel() / records.MM,
-        "distance_m": trajectory.distance.ravel(),
+        "distance_m": distance.ravel(),
         "voltage_V": signals.voltage.ravel(),
         "traction_N": robot.sides * signals.traction.ravel(),
     }
+
+
+def reactions_table(trajectory: Any, runs: records.Runs) -> dict[str, np.ndarray]:
+    """Loads inside one side's running gear over time [N], a row a sample."""
+    loads = trajectory.reactions
+    table = {
+        "run_id": np.repeat(_names(runs), trajectory.time.shape[-1]),
+        "time_s": trajectory.time.ravel(),
+        "guide_N": loads.guided.sum(-1).ravel(),
+        "front_N": loads.support[..., 0].ravel(),
+        "rear_N": loads.support[..., 1].ravel(),
+        "centrifugal_tension_N": loads.centrifugal.ravel(),
+    }
+    for name in ("grouser", "tension"):
+        values = getattr(loads, name)
+        table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
+    return table
+
+
+def render(config: Simulation, runs: records.Runs, file: Path, begin: float, end: float | None, slow: float,
+           force: bool) -> int:  # fmt: skip
+    """Draw one run of the track model from standstill as a picture or a film."""
+    from mmrjax import render as pictures
+
+    if file.suffix not in pictures.FORMATS:
+        raise BadConfiguration(f"FILE: got {file.name}; expected a name that ends in {', '.join(pictures.FORMATS)}")
+    if file.exists() and not force:
+        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
+    if not file.parent.is_dir():
+        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+    robot = load_robot(config)
+    command = runs.command(battery=float(config.battery), discharge=run.charge(config))
+    with _progress(1, quiet=False, doing="simulating"):
+        trajectory = run.track_runs(robot, command, config, rolling=False)
+    first = jax.tree.map(lambda x: x[0], (trajectory, command))
+    aside = file.with_name(f".{file.stem}.writing{file.suffix}")
+    try:
+        view = pictures.scene(robot, first[1], first[0])
+        with _progress(1, quiet=False, doing="drawing"):
+            pictures.render(view, aside, begin, end, slow)
+        aside.replace(file)
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}") from error
+    finally:
+        aside.unlink(missing_ok=True)
+    status = STATUSES[int(first[0].result.status)]
+    _out.print(f"{status}: {WHY[status]}")
+    _out.print(str(file))
+    return DONE if status == STATUSES[0] else SOME_NOT_CONVERGED
 
 
 def compare(config: Simulation, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
@@ -109,19 +188,19 @@ def compare(config: Simulation, source: str, own_mass: bool, out: Path | None, f
     stated = runs
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
-    folder = open_folder("compare", config, robot, out, force, runs)
-    table = _evaluate(robot, runs, config, folder)
-    comparison, summary = compared(stated, table)
-    folder.write_table("comparison.csv", comparison)
-    print_comparison(comparison, summary)
-    if config.report:
-        from sweeps import report
+    with open_folder("compare", config, robot, out, force, runs) as folder:
+        table = _evaluate(robot, runs, config, folder)
+        comparison, summary = compared(stated, table)
+        folder.write_table("comparison.csv", comparison)
+        print_comparison(comparison, summary)
+        if config.report:
+            from sweeps import report
 
-        report.write_comparison(
-            folder.partial, robot=robot, robot_name=config.robot, model=config.model, data_name=runs.source,
-            table=comparison, summary=summary,
-        )  # fmt: skip
-    return _finish(folder, config, robot, table, {"schema": "mmrjax.compare/1", "errors": summary}, [source])
+            report.write_comparison(
+                folder.partial, robot=robot, robot_name=config.robot, model=config.model, data_name=runs.source,
+                table=comparison, summary=summary,
+            )  # fmt: skip
+        return _finish(folder, config, robot, table, {"schema": "mmrjax.compare/1", "errors": summary}, runs)
 
 
 def compared(
@@ -155,9 +234,11 @@ def load_robot(config: Simulation) -> Robot:
     return robot_file.change(robot_file.load(config.robot), config.set, where="--set")
 
 
-def read_runs(source: str, *, measured: bool) -> records.Runs:
+def read_runs(source: str, *, measured: bool, series: bool = False) -> records.Runs:
     """Read a table, and say on stderr which of its columns are not used."""
     runs = records.read(source, measured=measured)
+    if runs.has("time_s") and not series:
+        raise BadData(f"{runs.source}: column time_s: time histories are for calibrate; expected one row a run")
     if runs.unknown:
         _err.print(f"{runs.source}: not used: {', '.join(runs.unknown)}")
     return runs
@@ -237,6 +318,7 @@ def open_folder(
     """The run folder of a command, whose identity is what it was told."""
     identity = {
         "command": command,
+        "program": f"{__version__}, jax {jax.__version__}, {jax.default_backend()}",
         "config": config.model_dump(exclude={"report"}),
         "robot": {p.name: float(p.value) for p in params.walk(robot)},
         "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
@@ -245,13 +327,14 @@ def open_folder(
 
 
 def _evaluate(robot: Robot, runs: records.Runs, config: Simulation, folder: RunFolder) -> dict[str, np.ndarray]:
-    with _progress(len(runs), quiet=len(runs) <= config.chunk) as advance:
+    slow = config.model == "track" or len(runs) > config.runs_at_once
+    with _progress(len(runs), quiet=not slow) as advance:
         return run.evaluate(robot, runs, config, folder, advance)
 
 
 @contextmanager
-def _progress(total: int, quiet: bool) -> Iterator[Any]:
-    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+def _progress(total: int, quiet: bool, doing: str = "simulating") -> Iterator[Any]:
+    columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=_err, disable=quiet) as bar:
         task = bar.add_task("", total=total)
         yield lambda count: bar.advance(task, count)
@@ -259,7 +342,7 @@ def _progress(total: int, quiet: bool) -> Iterator[Any]:
 
 def _finish(
     folder: RunFolder, config: Simulation, robot: Robot, table: dict[str, np.ndarray], result: dict[str, Any],
-    data: list[str],
+    runs: records.Runs,
 ) -> int:  # fmt: skip
     folder.write_table("runs.csv", table)
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
@@ -269,7 +352,8 @@ def _finish(
     folder.write_json("result.json", {**result, "model": config.model, "runs": len(table["status"]),
                                       "statuses": counts, "flags": flags})  # fmt: skip
     hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}
-    hashes |= {Path(name).name: digest(Path(name).read_bytes()) for name in data if Path(name).is_file()}
+    if runs.digest:
+        hashes[runs.source] = runs.digest
     path = folder.finish({"seed": None, "hashes": hashes, "statuses": counts})
     _out.print(str(path))
     return DONE if counts["converged"] == len(table["status"]) else SOME_NOT_CONVERGED

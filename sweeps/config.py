@@ -5,15 +5,19 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from calibration.doors import BadConfiguration, choices
 from calibration.records import CONDITIONS
 from mmrjax.tables import BENCH, CONFIGURATIONS, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 
-Model = Literal["steady", "drive"]
+Model = Literal["steady", "drive", "track"]
+#: Length of a run [s] and runs in one vmapped call, by fidelity, where none is stated.
+DURATION = {"steady": 0.0, "drive": 30.0, "track": 1.5}
+CHUNK = {"steady": 16_384, "drive": 4_096, "track": 512}
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
@@ -25,31 +29,53 @@ class Simulation(BaseModel):
 
     Attributes:
         model: fidelity.
-        duration_s: length of a `drive` run from standstill [s].
+        duration_s: length of a run of `drive` or `track` [s]; None takes `DURATION`.
+        step_s: integration step of `track` [s].
         robot: name of a robot, or path of its TOML file.
         set: parameters to change, by dotted name, in SI units.
         battery: run on the on-board battery instead of the external supply.
         discharge_mAh: charge already taken from the battery.
-        chunk: runs in one vmapped call.
+        chunk: runs in one vmapped call; None takes `CHUNK`.
         report: whether to write report.html.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: Model = "steady"
-    duration_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    duration_s: Annotated[float, Field(gt=0, le=3600)] | None = None
+    step_s: Annotated[float, Field(gt=0, le=0.01)] = 1e-4
     robot: str = "nominal"
     set: dict[str, float] = {}
     battery: bool = False
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
-    chunk: Annotated[int, Field(ge=1, le=10_000_000)] = 16_384
+    chunk: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
     report: bool = True
+
+    @model_validator(mode="after")
+    def _acts(self) -> Self:
+        if self.duration_s is not None and self.model == "steady":
+            raise PydanticCustomError("idle", "duration_s acts with model drive or track only")
+        if self.discharge_mAh and not self.battery:
+            raise PydanticCustomError("idle", "discharge_mAh acts with battery only")
+        return self
+
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return DURATION[self.model] if self.duration_s is None else self.duration_s
+
+    @property
+    def runs_at_once(self) -> int:
+        """Runs in one vmapped call."""
+        return self.chunk or CHUNK[self.model]
 
 
 class History(Simulation):
     """A few given runs, shown from standstill: short enough that the start is seen."""
 
-    duration_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
+    @property
+    def duration(self) -> float:
+        return min(super().duration, 5.0) if self.duration_s is None else self.duration_s
 
 
 class Sweep(Simulation):
@@ -99,7 +125,9 @@ def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
             raise BadConfiguration(f"{file}: not a readable TOML file ({error})") from error
     given = {k: v for k, v in options.items() if v is not None}
     if "set" in given:
-        given["set"] = {**values.get("set", {}), **given["set"]}
+        stated = values.get("set", {})
+        # A file whose table is none is refused below, whatever the options say.
+        given["set"] = {**stated, **given["set"]} if isinstance(stated, dict) else stated
     try:
         return kind.model_validate({**values, **given})
     except ValidationError as error:
@@ -108,6 +136,8 @@ def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
 
 def _sentence(kind: type[Simulation], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
     first = error.errors()[0]
+    if first["type"] == "idle":
+        return f"{file.name if file is not None else 'options'}: {first['msg']}"
     key = str(first["loc"][0])
     place = ".".join(str(part) for part in first["loc"])
     where = f"{file.name}, {place}" if file is not None and key not in given else f"option {place}"
@@ -183,6 +213,8 @@ def as_toml(config: Simulation) -> str:
     values = config.model_dump()
     table = values.pop("set")
     for key, value in values.items():
+        if value is None:  # left to the fidelity
+            continue
         lines.append(f"{key} = {_toml(value)}")
     lines += ["", "[set]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
     return "\n".join(lines) + "\n"

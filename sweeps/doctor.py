@@ -79,8 +79,8 @@ def _derivative() -> str:
 
     robot, run = nominal.nominal(), command()
 
-    def current(resistance: jax.Array) -> jax.Array:
-        return steady(params.replace(robot, {"motor.friction_coulomb": resistance}), run).reading.total_current  # type: ignore[arg-type]
+    def current(friction: jax.Array) -> jax.Array:
+        return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).reading.total_current  # type: ignore[arg-type]
 
     x, h = robot.motor.friction_coulomb, 1e-6
     exact, central = float(jax.grad(current)(x)), float((current(x + h) - current(x - h)) / (2 * h))

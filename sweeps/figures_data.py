@@ -219,22 +219,29 @@ class Start:
 
 
 def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[Start]:
-    """From standstill on the flat, both configurations, with the stages read from the signals."""
+    """From standstill on the flat with `drive`, both configurations, stages read from the signals."""
     from mmrjax.models.drive import drive_batch
+
+    times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
+    run = drive_batch(robot, command(robot, configuration=np.array(CONFIGURATIONS), voltage=voltage), times)
+    return starts_of(robot, run)
+
+
+def starts_of(robot: Robot, run: Any) -> list[Start]:
+    """Two runs from standstill, 6T2A and 4W2T, of either fidelity that has a history."""
     from mmrjax.signals import STATUSES
 
-    kinds = np.array(CONFIGURATIONS)
-    times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    run = drive_batch(robot, command(robot, configuration=kinds, voltage=voltage), times)
     answer = []
     for k, kind in enumerate(CONFIGURATIONS):
+        times = np.asarray(run.time[k])
         sliding = np.asarray(run.signals.speed_sliding[k])
         speed = np.asarray(run.signals.speed[k]) / MM
         static = float(robot.chassis(float(k)).ground.friction.speed_static)
         beyond = np.nonzero(sliding > static)[0]
         starting = float(times[int(np.argmax(sliding))])
         slipping = float(times[min(int(beyond[-1]) + 1, len(times) - 1)]) if beyond.size else starting
-        late = np.nonzero(np.abs(speed - speed[-1]) > 0.01 * np.abs(speed[-1]))[0]
+        last = speed[-max(len(speed) // 10, 1) :].mean()
+        late = np.nonzero(np.abs(speed - last) > 0.01 * np.abs(last))[0]
         settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
         answer.append(
             Start(

@@ -52,7 +52,7 @@ def write(
         folder: an existing run folder.
         robot: the robot that was simulated; the paper's figures are made from it and its nominal fellows.
         robot_name: its name or file; of a file only the last part is shown.
-        model: fidelity of the sweep, `steady` or `drive`.
+        model: fidelity of the sweep; with `track` the page has Figs. 23-27 from that model too.
         runs: the finished runs table, any grid; None leaves the sweep's own section out.
         title: heading of the page.
 
@@ -81,6 +81,8 @@ def write(
     known["model_errors"] = album.add("fig29_model_errors", lambda: figures_runs.model_errors(robots, rows))
     starts = figures_data.starts(robot)
     album.add("fig23_24_from_standstill", lambda: figures_runs.from_standstill(starts))
+    if model == "track":
+        known["gear"] = _running_gear(album, robot)
     known["energy"] = album.add("energy_split", lambda: figures_runs.energy(robot, ratio))
     album.add("fig05a_gearbox_efficiency", lambda: figures.gearbox_efficiency(robots, mine))
     album.add("fig10_battery", lambda: figures.battery(robots))
@@ -99,6 +101,19 @@ def write(
         "paper_idle_r2": figures.PAPER_IDLE_R2,
     }
     return render(folder, "report.html.j2", album, title=title, robot=words_shown(name), model=model, **known)
+
+
+def _running_gear(album: Album, robot: Robot) -> list[dict[str, Any]]:
+    """Figs. 23-27 from the track model, both configurations from standstill on the flat at 33 V."""
+    from sweeps import figures_track
+
+    run = figures_track.runs(robot)
+    starts = figures_data.starts_of(robot, run)
+    album.add("track_fig23_24_from_standstill", lambda: figures_runs.from_standstill(starts))
+    facts = album.add("track_fig25_ripple", lambda: figures_track.ripple_of_current(robot, run))
+    album.add("track_fig26_touchdown", lambda: figures_track.touchdown(robot, run))
+    album.add("track_fig27_reactions", lambda: figures_track.reactions(run))
+    return facts
 
 
 def write_comparison(

@@ -21,6 +21,7 @@ STATUS_MEANING = {
     "slides": "slope and rolling resistance demand more traction than adhesion gives (demand above μ_s N), so the "
     "movers spin and the robot does not climb; an operating point does not exist",
     "not_settled": "still gaining speed when the simulated time ended",
+    "tips": "the line of gravity passes outside the contacts: the robot turns over",
     "battery_empty": "the battery's capacity is used up",
     "failed": "the solver found no answer; please report the conditions",
 }

@@ -8,22 +8,40 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.doors import BadConfiguration
 from calibration.records import Runs
+from mmrjax.models import track
 from mmrjax.models.drive import drive_batch
 from mmrjax.models.steady import steady_batch
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import CONFIGURATIONS, Robot
-from mmrjax.signals import STATUSES, Command, Result
+from mmrjax.signals import STATUSES, Command
 from sweeps import outputs
 from sweeps.config import Simulation
 from sweeps.store import RunFolder
 
 
-def simulate(robot: Robot, command: Command, config: Simulation) -> Result:
-    """One vmapped call of the fidelity that the configuration names."""
+def simulate(robot: Robot, command: Command, config: Simulation) -> dict[str, np.ndarray]:
+    """One vmapped call of the fidelity that the configuration names: the columns that it adds to its runs."""
     if config.model == "steady":
-        return steady_batch(robot, command)
-    return drive_batch(robot, command, jnp.array([0.0, config.duration_s])).result
+        return outputs.columns(jax.device_get(steady_batch(robot, command)))
+    if config.model == "drive":
+        answer = drive_batch(robot, command, jnp.array([0.0, config.duration]))
+        return outputs.columns(jax.device_get(answer.result))
+    run = track_runs(robot, command, config, rolling=True)
+    return {**outputs.columns(jax.device_get(run.result)), "guide_share": np.asarray(run.steady.guide_share)}
+
+
+def track_runs(robot: Robot, command: Command, config: Simulation, *, rolling: bool) -> track.Trajectory:
+    """Runs of the track model, from standstill or rolling at the steady fidelity's speed.
+
+    Raises:
+        BadConfiguration: no whole number of steps, or a step too large for the stiffness.
+    """
+    try:
+        return track.track_batch(robot, command, duration=config.duration, step=config.step_s, rolling=rolling)
+    except ValueError as error:
+        raise BadConfiguration(f"--model track: {error}") from error
 
 
 def charge(config: Simulation) -> float:
@@ -42,7 +60,7 @@ def evaluate(
     Args:
         advance: called with the number of runs done after each chunk.
     """
-    size = min(config.chunk, len(runs))
+    size = min(config.runs_at_once, len(runs))
     parts = []
     for first in range(0, len(runs), size):
         rows = np.minimum(np.arange(first, first + size), len(runs) - 1)
@@ -51,7 +69,7 @@ def evaluate(
         part = folder.chunk(name)
         if part is None:
             command = runs.where(rows).command(battery=float(config.battery), discharge=charge(config))
-            part = outputs.columns(jax.device_get(simulate(robot, command, config)))
+            part = simulate(robot, command, config)
             part = {key: value[:count] for key, value in part.items()}
             folder.keep_chunk(name, part)
         parts.append(part)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.doors import BadConfiguration
+from calibration.doors import BadConfiguration, DoorError
 from mmrjax import __version__
 
 #: Packages whose versions are part of a result.
@@ -43,6 +43,8 @@ class RunFolder:
         Raises:
             BadConfiguration: `path` holds something already, or cannot be written.
         """
+        if not path.name:
+            raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
         self.path = path
         self.partial = path.with_name(path.name + ".partial")
         self.started = datetime.datetime.now(datetime.UTC)
@@ -53,8 +55,11 @@ class RunFolder:
             raise BadConfiguration(f"--out: {path} exists already; choose another path ({hint})")
         self._digest = digest(json.dumps(identity, sort_keys=True, default=str).encode())
         mark = self.partial / "identity"
+        foreign = self.partial.exists() and not mark.is_file()
+        if foreign and not (self.partial.is_dir() and not any(self.partial.iterdir())):
+            raise BadConfiguration(f"--out: {self.partial} is in the way and is no run of ours; choose another path")
         try:
-            if self.partial.is_dir() and not (mark.is_file() and mark.read_text() == self._digest):
+            if mark.is_file() and mark.read_text() != self._digest:
                 shutil.rmtree(self.partial)
             (self.partial / "chunks").mkdir(parents=True, exist_ok=True)
             mark.write_text(self._digest)
@@ -62,6 +67,14 @@ class RunFolder:
             raise BadConfiguration(
                 f"--out: {path} cannot be written ({error.strerror}); choose another path"
             ) from error
+
+    def __enter__(self) -> RunFolder:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
+        """Leave nothing behind where the command was refused; what an interrupt leaves is taken up again."""
+        if kind is not None and issubclass(kind, DoorError):
+            shutil.rmtree(self.partial, ignore_errors=True)
 
     def chunk(self, name: str) -> dict[str, np.ndarray] | None:
         """A chunk that an interrupted run finished, or None."""

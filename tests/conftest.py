@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mmrjax import nominal, params
-from mmrjax.effects import ALL
+from mmrjax.effects import ALL, BY_NAME
 from mmrjax.models.drive import drive, drive_batch
 from mmrjax.models.steady import steady, steady_batch
 from mmrjax.signals import Command, Result, command
@@ -62,10 +62,38 @@ def drive_table8(robot, table8, times_fine):
     return drive_batch(robot, table8, times_fine)
 
 
+#: One effect of each balance, two that only a start shows, one with a memory; tests/test_effects.py and
+#: tests/test_generator_series.py try every one, each by itself.
+REPRESENTATIVE = (
+    "mass_offset",
+    "rotating_inertia",
+    "supply_sag",
+    "winding_heating",
+    "armature_inductance",
+    "windage",
+    "gear_load_loss",
+    "churning",
+    "slope_bias",
+    "belt_creep",
+    "pulley_eccentricity",
+    "ammeter_gain",
+)
+
+
 @pytest.fixture(scope="session")
-def free(robot_with_effects):
-    """Every parameter that can be freed, effects included."""
-    return list(params.walk(robot_with_effects))
+def robot_with_representatives():
+    """Nominal, with the representative effects at zero amplitude."""
+    return dataclasses.replace(nominal.nominal(), effects=tuple(BY_NAME[name]() for name in REPRESENTATIVE))
+
+
+@pytest.fixture(scope="session")
+def free(robot_with_representatives):
+    """Every parameter that can be freed, amplitudes of the representative effects included.
+
+    Shape parameters are not: at amplitude zero nothing depends on them.
+    """
+    every = params.walk(robot_with_representatives)
+    return [p for p in every if p.spec.amplitude or not p.name.startswith("effects.")]
 
 
 @pytest.fixture(scope="session")
@@ -84,10 +112,10 @@ def scales(free):
 
 
 @pytest.fixture(scope="session")
-def rebuild(robot_with_effects, free):
+def rebuild(robot_with_representatives, free):
     """The robot with its parameters taken from a vector."""
     names = [p.name for p in free]
-    return lambda vector: params.replace(robot_with_effects, {n: vector[k] for k, n in enumerate(names)})
+    return lambda vector: params.replace(robot_with_representatives, {n: vector[k] for k, n in enumerate(names)})
 
 
 def numbers(tree) -> jax.Array:

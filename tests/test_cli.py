@@ -143,7 +143,7 @@ USAGE = {
     ),
     "unknown model": (
         ["sweep", "--model", "magic"],
-        r"option model: got 'magic'; input should be 'steady' or 'drive'",
+        r"option model: got 'magic'; input should be 'steady', 'drive' or 'track'",
     ),
     "unknown surface": (["sweep", "--surface", "ice"], r"option surface: got 'ice'"),
     "unknown robot": (
@@ -170,6 +170,15 @@ USAGE = {
         r"total_mass_kg: got 5; expected more than",
     ),
     "NaN for one run": (["simulate", "--voltage", "nan"], r"option, supply_voltage_V: got nan"),
+    "duration without a history": (
+        ["sweep", "--duration", "2"],
+        r"options: duration_s acts with model drive or track only",
+    ),
+    "discharge without battery": (["sweep", "--discharge", "100"], r"options: discharge_mAh acts with battery only"),
+    "track step too large": (
+        ["simulate", "--model", "track", "--step", "0.001"],
+        r"--model track: step: got 0\.001 s; .*largest stable step",
+    ),
     "duration of zero": (["simulate", "--duration", "0"], r"option duration_s: got 0"),
 }
 
@@ -182,6 +191,84 @@ def test_bad_usage_ends_with_2_and_one_sentence(mmrjax, tmp_path, case):
     assert re.search(sentence, err), err
     assert len(err.strip().splitlines()) == 1
     assert not any(tmp_path.iterdir())
+
+
+def test_empty_path_and_a_table_that_is_a_number_are_refused(mmrjax, tmp_path):
+    code, _, err = mmrjax("sweep", "--out", "")
+    assert code == 2 and "--out: got '.'; expected the name of a folder" in err
+    (tmp_path / "grid.toml").write_text("set = 3\n")
+    code, _, err = mmrjax("sweep", "--config", "grid.toml", "--set", "motor.resistance=0.8")
+    assert code == 2 and "set: got 3" in err
+
+
+def test_somebody_elses_partial_folder_is_left_alone(mmrjax, tmp_path):
+    (tmp_path / "mine.partial").mkdir()
+    (tmp_path / "mine.partial" / "thesis.txt").write_text("years of work")
+    code, _, err = mmrjax("simulate", "--no-report", "--out", "mine", "--force")
+    assert code == 2 and "mine.partial is in the way and is no run of ours" in err
+    assert (tmp_path / "mine.partial" / "thesis.txt").read_text() == "years of work"
+
+
+def test_time_histories_are_not_taken_for_steady_runs(mmrjax, tmp_path):
+    (tmp_path / "runs.csv").write_text(f"{HEADER},run_id,time_s\n6T2A,15,13.1,0,5,2.75,4800,400,a,0.1\n")
+    code, _, err = mmrjax("compare", "runs.csv", "--out", "x")
+    assert code == 4 and "column time_s: time histories are for calibrate" in err
+
+
+def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
+    import hashlib
+
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "runs.csv").write_text(f"{HEADER}\n6T2A,15,13.1,0,5,2.75,4800,400\n")
+    assert mmrjax("compare", "sub/runs.csv", "--no-report", "--out", "x")[0] == 0
+    known = hashlib.sha256((tmp_path / "sub" / "runs.csv").read_bytes()).hexdigest()
+    assert json.loads((tmp_path / "x" / "manifest.json").read_text())["hashes"]["runs.csv"] == known
+
+
+def test_drive_ends_clearly_when_the_battery_is_empty(mmrjax, tmp_path):
+    arguments = [
+        "simulate",
+        "--model",
+        "drive",
+        "--battery",
+        "--discharge",
+        "2195",
+        "--duration",
+        "100",
+        "--no-report",
+    ]
+    assert mmrjax(*arguments, "--out", "d")[0] == 3
+    (end,), history = table(tmp_path / "d" / "runs.csv"), table(tmp_path / "d" / "history.csv")
+    assert end["status"] == "battery_empty" and end["speed_mm_s"] == ""
+    ran = [row["speed_mm_s"] != "" for row in history]
+    assert any(ran) and not ran[-1] and ran == sorted(ran, reverse=True)  # numbers up to one instant, none after
+
+
+def test_simulate_track_writes_every_reaction(mmrjax, tmp_path):
+    code, _, _ = mmrjax("simulate", "--model", "track", "--duration", "0.1", "--no-report", "--out", "t")
+    assert code == 3  # still accelerating
+    reactions = table(tmp_path / "t" / "reactions.csv")
+    grousers = sum(float(reactions[-1][f"grouser_{k:02d}_N"]) for k in range(1, 25))
+    assert grousers == pytest.approx(13.1 / 2 * 9.81, rel=0.3)  # half the weight, with its ripple
+    assert table(tmp_path / "t" / "runs.csv")[0]["guide_share"] != ""
+
+
+def test_track_step_that_is_too_large_is_refused_before_the_run(mmrjax, tmp_path):
+    code, out, err = mmrjax("simulate", "--model", "track", "--step", "0.001", "--out", "x")
+    assert code == 2 and out == ""
+    assert re.search(
+        r"--model track: step: got 0\.001 s; .* the largest stable step is 0\.000\d+ s", err.splitlines()[-1]
+    )
+    assert not any(tmp_path.iterdir())
+
+
+def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
+    code, _, err = mmrjax("render", "robot.bmp")
+    assert code == 2 and "expected a name that ends in .png, .gif, .mp4" in err
+    code, out, _ = mmrjax("render", "robot.png", "--duration", "0.05", "--begin", "0.04")
+    assert code == 3 and out.rstrip().endswith("robot.png")
+    assert (tmp_path / "robot.png").read_bytes().startswith(b"\x89PNG")
+    assert [p.name for p in tmp_path.iterdir()] == ["robot.png"]
 
 
 def test_bad_config_files_name_file_and_key(mmrjax, tmp_path):
@@ -305,6 +392,8 @@ def test_help_is_quick_and_imports_no_jax():
         assert "Usage" in text
         if command:
             assert f"Example: mmrjax {command[0]}" in text.replace("\n", " ")
+            assert "(V)" in text if command == ["simulate"] else True
+            assert "(deg)" in text if command != ["compare"] else True
     probe = "import sys; import sweeps.cli; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", probe]).returncode == 0
 

@@ -113,6 +113,9 @@ NOT_IN_STEADY = {
     "tracked.ground.friction.speed_dynamic": "below V_s only static friction acts",
     "wheeled.ground.friction.speed_dynamic": "below V_s only static friction acts",
     "wheeled.track.guide_friction": "times a guide share of 0: the wheels carry the weight",
+    "effects.rotating_inertia.amplitude": "no torque at constant speed",
+    "effects.armature_inductance.amplitude": "no voltage across it at constant current",
+    "effects.pulley_eccentricity.amplitude": "zero on the average of a turn",
 }
 #: Alive only away from the nominal value of another parameter.
 ALIVE_WITH = {"wheeled.track.guide_friction": ("wheeled.track.guide_share", 0.2)}

@@ -49,7 +49,7 @@ SIGNAL_UNITS = {
     "1/s^2": "acceleration_wheel",
     "N·m": "torque_electromagnetic torque_motor_loss torque_motor torque_track_loss torque_load torque_idle "
     "torque_input torque_gear torque_net",
-    "-": "wheeled slope adhesion direction direction_travel",
+    "-": "wheeled slope adhesion direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}

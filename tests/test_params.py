@@ -27,8 +27,8 @@ def test_parameters_lie_within_their_bounds(name):
         assert low < high and low <= float(p.value) <= high, p.name
 
 
-def test_parameters_state_unit_meaning_source_and_prior(free):
-    for p in free:
+def test_parameters_state_unit_meaning_source_and_prior(robot_with_effects):
+    for p in params.walk(robot_with_effects):
         assert p.spec.unit and p.spec.meaning and p.spec.source, p.name
         assert (p.spec.sd is None) != (p.spec.relative_sd is None), p.name
         if float(p.value) == 0.0 or p.spec.amplitude:

@@ -86,9 +86,12 @@ REFUSED = {
     "empty cell": (f"{HEADER}\n{ROW.replace('400', '', 1).replace('48', '4800')}", r"got an empty cell|row 1"),
     "unknown configuration": (
         f"{HEADER}\n{ROW.replace('6T2A', '6T2')}",
-        r"configuration: got 6T2; expected did you mean 6T2A",
+        r"configuration: got 6T2; expected one of these; did you mean 6T2A",
     ),
-    "unknown surface": (f"{HEADER},surface\n{ROW},ice", r"surface: got ice; expected allowed: linoleum"),
+    "unknown surface": (
+        f"{HEADER},surface\n{ROW},ice",
+        r"surface: got ice; expected one of these; allowed: linoleum",
+    ),
     "sd of zero": (f"{HEADER},speed_sd_mm_s\n{ROW},0", r"speed_sd_mm_s: got 0; expected more than 0"),
     "payload above total": (
         f"{HEADER}\n6T2A,15,5,8,5,2.75,4800,400",

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mmrjax import balances
-from mmrjax.models.result import result
+from mmrjax.models.result import result, withhold
 from mmrjax.models.rosenbrock import Rodas4
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -27,6 +27,7 @@ from mmrjax.signals import (
 )
 
 # Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
+# The memories of those effects that have one follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
 
 
@@ -37,32 +38,48 @@ class Trajectory(eqx.Module):
         time: [s], shape (times,).
         distance: travelled along the slope [m], shape (times,).
         signals: every signal at those times; each field has shape (times,).
+        time_end: last of those times before the battery is empty, else of the run [s].
         result: the state at the end, with the run's status.
     """
 
     time: Float[Array, " times"]
     distance: Float[Array, " times"]
     signals: Signals
+    time_end: Float[Array, ""]
     result: Result
 
 
-def _state(y: Float[Array, " 5"]) -> State:
-    y = y * jnp.asarray(_UNITS, y.dtype)
-    return State(y[0], y[1], y[2], y[4])
+def _units(robot: Robot) -> tuple[float, ...]:
+    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering)
 
 
-def _rates(time: Scalar, y: Float[Array, " 5"], conditions: tuple[Robot, Command]) -> Float[Array, " 5"]:
+def _state(robot: Robot, y: Float[Array, " unknowns"]) -> State:
+    y = y * jnp.asarray(_units(robot), y.dtype)
+    memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
+    return State(y[0], y[1], y[2], y[4], memory)
+
+
+def _rates(
+    time: Scalar, y: Float[Array, " unknowns"], conditions: tuple[Robot, Command]
+) -> Float[Array, " unknowns"]:
     robot, command = conditions
-    signals = balances.moving(robot, command, _state(y))
+    signals = balances.moving(robot, command, _state(robot, y))
     current_battery = robot.battery.current(signals.total_current) * (command.battery > 0.5)  # eq. (11)
     rates = [
-        signals.voltage_left / robot.motor.inductance,
+        signals.voltage_left / signals.inductance,
         signals.acceleration_wheel * robot.gearbox.ratio,
         signals.acceleration,
         signals.speed,
         current_battery,
+        *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
     ]
-    return jnp.stack(rates) / jnp.asarray(_UNITS, y.dtype)
+    return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
+
+
+def _step_longest(robot: Robot, command: Command) -> Scalar | None:
+    """The longest step that still resolves every effect with a memory [s]; None where none has one."""
+    limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in robot.remembering]
+    return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
 def drive(
@@ -81,11 +98,11 @@ def drive(
         The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
         tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
         when the movers spin beyond V_s and the robot gains no speed; `battery_empty` when the charge has
-        run out (numbers up to there are right, later ones are of a battery that went on); `failed` when
+        run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     dtype = jnp.result_type(command.voltage)
-    y0 = jnp.zeros(len(_UNITS), dtype).at[4].set(command.discharge / _UNITS[4])
+    y0 = jnp.zeros(len(_units(robot)), dtype).at[4].set(command.discharge / _UNITS[4])
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(_rates),
         Rodas4(),
@@ -97,22 +114,31 @@ def drive(
         saveat=diffrax.SaveAt(ts=times),
         max_steps=max_steps,
         throw=False,
-        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        stepsize_controller=diffrax.PIDController(
+            rtol=tolerance, atol=tolerance, dtmax=_step_longest(robot, command)
+        ),
         adjoint=diffrax.ForwardMode(),
     )
     assert solution.ys is not None
     ys = solution.ys
-    signals = jax.vmap(lambda y: balances.moving(robot, command, _state(y)))(ys)
+    signals = jax.vmap(lambda y: balances.moving(robot, command, _state(robot, y)))(ys)
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, command, end, solution.result == diffrax.RESULTS.successful)
-    return Trajectory(times, ys[:, 3] * _UNITS[3], signals, result(robot, end, status))
+    # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
+    going = (command.battery < 0.5) | ~robot.battery.empty(signals.discharge)
+    signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
+    time_end = jnp.max(jnp.where(going, times, times[0]))
+    there = status != BATTERY_EMPTY
+    answer = withhold(result(robot, end, status), there, jnp.asarray(True))
+    return Trajectory(times, distance, signals, time_end, answer)
 
 
 def _status(robot: Robot, command: Command, end: Signals, done: Array) -> Array:
     friction = robot.chassis(command.wheeled).ground.friction
     settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, CONVERGED)
-    status = jnp.where(end.direction < 1.0, STALLED, status)
+    stands = jnp.minimum(end.direction, end.direction_travel) < 1.0
+    status = jnp.where(stands & (end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
     spinning = jnp.abs(end.speed_sliding) > friction.speed_static
     gaining = end.acceleration * end.speed_sliding > 1e-3 * jnp.abs(end.speed_sliding)  # 1 mm/s²
     status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)

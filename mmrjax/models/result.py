@@ -40,13 +40,19 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         power_gear=power_gear,
         power_ground=power_ground,
         power_lift=sides * signals.gravity * signals.speed,
-        efficiency_motor=quotient(power_motor, power_supply),
-        efficiency_gear=quotient(power_gear, power_motor),
-        efficiency_chassis=quotient(power_ground, power_gear),
+        efficiency_motor=_efficiency(power_motor, power_supply),
+        efficiency_gear=_efficiency(power_gear, power_motor),
+        efficiency_chassis=_efficiency(power_ground, power_gear),
         temperature_winding=temperature,
         status=status,
         flags=jnp.asarray(flags),
     )
+
+
+def _efficiency(out: Array, into: Array) -> Array:
+    # What comes back from a slope is no efficiency of the way there.
+    forward = (out > 0) & (into >= out)
+    return jnp.where(forward, quotient(out, into), 0.0)
 
 
 def withhold(answer: Result, there: Array, sound: Array) -> Result:

@@ -9,8 +9,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 from diffrax import RESULTS
+from jaxtyping import Array, Float
 
 from mmrjax.models.linear import factorise, substitute
+
+#: Unknowns up to which elimination is written out; beyond, its program takes too long to compile.
+_WRITTEN_OUT = 8
 
 _GAMMA = 0.25
 _A = (
@@ -82,13 +86,21 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
 
         f0 = rate(y0)
         matrix = jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jax.jacfwd(rate)(y0)
-        lu = factorise(matrix)
-        u = [substitute(lu, f0)]
+        solve = _solver(matrix)
+        u = [solve(f0)]
         y = y0
         for stage in range(1, 6):
             y = y + u[-1] if stage == 5 else y0 + sum(a * v for a, v in zip(_A[stage - 1], u, strict=True))
-            u.append(substitute(lu, rate(y) + sum(c * v for c, v in zip(_C[stage - 1], u, strict=True)) / h))
+            u.append(solve(rate(y) + sum(c * v for c, v in zip(_C[stage - 1], u, strict=True)) / h))
         y1 = y + u[-1]
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
         return y1, u[-1], dense, None, RESULTS.successful
+
+
+def _solver(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
+    if matrix.shape[0] <= _WRITTEN_OUT:
+        written = factorise(matrix)
+        return lambda vector: substitute(written, vector)
+    factors = jax.scipy.linalg.lu_factor(matrix)
+    return lambda vector: jax.scipy.linalg.lu_solve(factors, vector)

@@ -68,8 +68,10 @@ def steady(robot: Robot, command: Command) -> Result:
         command: one run, scalar fields.
 
     Returns:
-        Scalars. `status` is `converged`; `stalled` (the motors cannot turn: stall current, shaft
-        speed 0, the robot creeps back at the sliding speed of the static friction law); `slides`
+        Scalars. `status` is `converged`; `stalled` (shafts or robot slower than a tenth of V_s, where
+        friction at rest is not resolved: too little torque; where it cannot turn the shafts, stall current,
+        shaft speed 0, and the robot creeps back at the sliding speed of the static friction law; what
+        gravity would drive back is held); `slides`
         (the demand is above the adhesion limit), `battery_empty` or `failed`, all three with NaN in
         every number but `mass` and `adhesion_used` (NaN too where the conditions are no numbers, or
         the mass not positive). A member that has no numbers has zero derivatives and harms no
@@ -103,8 +105,10 @@ def operating_point(robot: Robot, command: Command) -> tuple[Result, Array]:
     )
     signals, _ = balances.settled(robot, command, _state(solution.value, command.discharge))
     solved = (solution.result == optx.RESULTS.successful) & jnp.isfinite(signals.voltage_left + signals.torque_net)
+    rest = robot.chassis(command.wheeled).ground.friction.speed_rest
+    stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest
     # Ordered by what a person would say first.
-    status = jnp.where(signals.torque_net < -1e-3 * jnp.abs(signals.torque_load), STALLED, CONVERGED)
+    status = jnp.where(stands, STALLED, CONVERGED)
     status = jnp.where(jnp.abs(signals.demand) > signals.adhesion_limit, SLIDES, status)
     status = jnp.where(solved, status, FAILED)
     empty = (command.battery > 0.5) & robot.battery.empty(command.discharge)

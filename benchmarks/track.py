@@ -1,0 +1,151 @@
+# ruff: noqa: E402 (double precision is set before anything is imported)
+"""The track model: compile and run time of Table 8, derivatives beside the run, and how its assumptions act.
+
+python benchmarks/track.py
+python benchmarks/track.py --only speed --batches 180,1024
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+
+from mmrjax import nominal, params
+from mmrjax.models.stability import largest_step
+from mmrjax.models.track import _batch, track
+from mmrjax.running_gear import RunningGear
+from mmrjax.signals import STATUSES, command
+
+DERIVED = (
+    "motor.resistance",
+    "tracked.track.guide_friction",
+    "tracked.track.loss_coulomb",
+    "gearbox.efficiency_load",
+)
+ASSUMED = {
+    "guide_recess": (0.0, 5e-5, 1e-4, 2e-4),
+    "guide_gap": (10e-3, 20e-3, 40e-3),
+    "pretension": (50.0, 100.0, 200.0),
+    "span_stiffness": (3e4, 1e5, 3e5),
+    "span_damping": (3.0, 10.0, 30.0),
+    "contact_stiffness": (1.5e7, 3e7, 6e7, 1.2e8),
+    "contact_exponent": (1.3, 1.5, 1.7),
+    "contact_damping": (100.0, 300.0, 1000.0),
+    "contact_depth": (5e-5, 1e-4, 2e-4),
+    "grouser_length": (2.5e-3, 5e-3, 10e-3),
+    "centre_height": (-5e-3, 5e-3, 15e-3),
+}
+
+
+def table8(size: int = 180):
+    axes = (0.0, 1.0), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
+    rows = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
+    wheeled, slope, payload, voltage = np.tile(rows, (-(-size // len(rows)), 1))[:size].T
+    return command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+
+
+def timed(call) -> tuple[float, float]:
+    """Wall and processor seconds of one call."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    jax.block_until_ready(call())
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def speed(batches: list[int]) -> dict:
+    """Compile and run time of `batches` runs of 1.5 s from standstill."""
+    robot, gear, found = nominal.nominal(), RunningGear(), {}
+    for size in batches:
+        commands = table8(size)
+        first = timed(lambda commands=commands: _batch(robot, commands, gear, 1.5, 1e-4, 1e-3, False))
+        again = timed(lambda commands=commands: _batch(robot, commands, gear, 1.5, 1e-4, 1e-3, False))
+        status = np.asarray(_batch(robot, commands, gear, 1.5, 1e-4, 1e-3, False).result.status)
+        found[size] = {
+            "compile_s": first[0] - again[0],
+            "run_s": again[0],
+            "run_cpu_s": again[1],
+            "run_steps_per_s": size * 15_000 / again[0],
+            "memory_GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+            "status": {STATUSES[k]: int(n) for k, n in zip(*np.unique(status, return_counts=True), strict=True)},
+        }
+    return found
+
+
+def derivatives() -> dict:
+    """A forward Jacobian by P parameters, and a gradient, beside the run: 16 runs of 0.5 s, rolling."""
+    robot = nominal.nominal()
+    values = {p.name: p.value for p in params.walk(robot)}
+    commands = table8()
+    commands = jax.tree.map(lambda x: x[:16], commands)
+
+    def current(theta, run):
+        changed = params.replace(robot, {n: values[n] * (1 + theta[k]) for k, n in enumerate(DERIVED)})
+        return track(changed, run, duration=0.5, rolling=True).result.reading.total_current
+
+    at, found = jnp.zeros(len(DERIVED)), {"parameters": len(DERIVED)}
+    for name, call in (("run", current), ("forward", jax.jacfwd(current)), ("reverse", jax.grad(current))):
+        compiled = jax.jit(jax.vmap(call, in_axes=(None, 0)))
+        timed(lambda compiled=compiled: compiled(at, commands))
+        found[f"{name}_s"], found[f"{name}_cpu_s"] = timed(lambda compiled=compiled: compiled(at, commands))
+    return found
+
+
+def assumptions() -> dict:
+    """Guide share, current, speed and ripple of 6T2A at 33 V over each constant that the paper does not print."""
+    robot, found = nominal.nominal(), {}
+    runs = command(voltage=33.0, slope=np.radians([0.0, 5.0]), payload=jnp.asarray([0.0, 8.0]))
+
+    @jax.jit
+    def settled(gears):
+        one = lambda gear, run: track(robot, run, gear, duration=0.8, rolling=True)  # noqa: E731
+        answer = jax.vmap(lambda gear: jax.vmap(lambda run: one(gear, run))(runs))(gears)
+        normal = answer.signals.normal[..., -300:]
+        ripple = (normal.max(-1) - normal.min(-1)) / 2 / normal.mean(-1)
+        reading = answer.result.reading
+        return answer.steady.guide_share, reading.total_current, reading.speed, ripple, answer.result.status
+
+    cases = [(name, value) for name, values in ASSUMED.items() for value in values]
+    gears = [params.replace(RunningGear(), {name: jnp.asarray(value)}) for name, value in cases]
+    answers = settled(jax.tree.map(lambda *x: jnp.stack(x), *gears))
+    for k, (name, value) in enumerate(cases):
+        share, current, fast, ripple, status = (np.asarray(x[k]) for x in answers)
+        found[f"{name} = {value:g}"] = {
+            "guide_share": share.round(4).tolist(),
+            "total_current_A": current.round(4).tolist(),
+            "speed_m_s": fast.round(4).tolist(),
+            "reaction_ripple": ripple.round(3).tolist(),
+            "status": [STATUSES[s] for s in status],
+        }
+    return found
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--only", choices=("speed", "derivatives", "assumptions", "step"))
+    options.add_argument("--batches", default="180")
+    options.add_argument("--json", type=Path)
+    chosen = options.parse_args()
+    batches = [int(b) for b in chosen.batches.split(",")]
+    parts = {
+        "speed": lambda: speed(batches),
+        "derivatives": derivatives,
+        "assumptions": assumptions,
+        "step": lambda: {"largest_step_s": float(largest_step(nominal.nominal(), table8()).min())},
+    }
+    found = {name: call() for name, call in parts.items() if chosen.only in (None, name)}
+    print(json.dumps(found, indent=1))
+    if chosen.json:
+        chosen.json.write_text(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

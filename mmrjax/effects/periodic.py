@@ -1,0 +1,56 @@
+"""What repeats with the angle of a shaft: shared by the effects that a series shows as orders."""
+
+from __future__ import annotations
+
+import abc
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax import power
+from mmrjax.params import Scalar
+from mmrjax.signals import Command, Signals
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+STEPS = 12  # integration steps in a period: derivatives at amplitude 0 are then right to 1e-5
+
+
+class Periodic(eqx.Module):
+    """term = a w(signals) sin(ψ + φ), with ψ' = k ω_m and k the order per radian of the motor's shaft.
+
+    The memory is the phase ψ [rad]. Where none is kept (`steady`) the wave is its mean, zero.
+    """
+
+    dissipative: ClassVar[bool] = False
+    transient: ClassVar[bool] = True
+    memory_size: ClassVar[float | None] = 100.0
+    memory_unit: ClassVar[str] = "rad"
+
+    name: eqx.AbstractClassVar[str]
+    phase: eqx.AbstractVar[Scalar]
+
+    @abc.abstractmethod
+    def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
+        """Radians of the wave per radian of the motor's shaft k [-]."""
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.order(robot, signals.wheeled) * signals.speed_motor
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        """0: a phase does not settle; `wave` is then its mean."""
+        return jnp.zeros_like(signals.speed_motor)
+
+    def wave(self, signals: Signals) -> Scalar:
+        """sin(ψ + φ), or 0 where no phase is kept [-]."""
+        if self.name not in signals.memory:
+            return jnp.zeros_like(signals.speed_motor)
+        return jnp.sin(signals.memory[self.name] + self.phase)
+
+    def step_longest(self, robot: Robot, command: Command) -> Scalar:
+        """A twelfth of the period at the no-load speed [s]."""
+        source = power.voltage_source(robot.battery, command.voltage, command.battery, 0.0, command.discharge)
+        rate = self.order(robot, command.wheeled) * source / robot.motor.torque_constant
+        return 2 * jnp.pi / STEPS / jnp.maximum(jnp.abs(rate), 1.0)

@@ -1,0 +1,179 @@
+"""Half a robot as MJCF for MuJoCo, and as an MJX model whose mass constants follow each batch member.
+
+MJX owns the multibody dynamics alone: contacts and constraints are switched off and every force of the
+running gear enters as a generalized force. The same text loads in C MuJoCo and its viewer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.running_gear import RunningGear
+from mmrjax.signals import GRAVITY, Command
+from mmrjax.undercarriage import lever_tip
+
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    import mujoco
+    from mujoco import mjx  # says on stdout which optional back ends are missing
+
+#: Bodies of the model after the world, in order.
+BODIES = ("chassis", "driving", "driven")
+
+
+class Masses(eqx.Module):
+    """Masses of half a robot [kg, m, kg·m²].
+
+    Attributes:
+        chassis: mass of all that does not turn with the pulleys.
+        forward, up: its centre from the middle of the wheelbase.
+        inertia: its moment of inertia in pitch about that centre.
+        pulley: mass of one pulley, with its wheel in 4W2T.
+        inertia_pulley: about its axle, front and rear alike: half of J_w of eq. (31) each.
+    """
+
+    chassis: Scalar
+    forward: Scalar
+    up: Scalar
+    inertia: Scalar
+    pulley: Scalar
+    inertia_pulley: Scalar
+
+
+def masses(robot: Robot, gear: RunningGear, command: Command, mass: Scalar) -> Masses:
+    """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin` gives it.
+
+    The moment of inertia of Table 7 is the whole robot's in transport posture; from it the levers' share is
+    taken there and put back at their angles, and the pulleys' share is taken out.
+    """
+    wheeled = command.wheeled
+    tracked = 1 - wheeled
+    lever = gear.lever_mass * tracked
+    pulley = gear.pulley_mass + gear.wheel_mass * wheeled
+    payload = command.payload / robot.sides
+    chassis = mass / robot.sides - 2 * pulley
+    bare = chassis - payload - 2 * lever
+    half = gear.wheelbase / 2
+    parts = [(bare, gear.centre_offset, gear.centre_height), (payload, gear.payload_offset, gear.payload_height)]
+    for side, angle in ((1.0, gear.lever_front), (-1.0, gear.lever_rear)):
+        tip = lever_tip(gear, angle, side)
+        parts.append((lever, (side * half + tip[0]) / 2, tip[1] / 2))
+    forward = sum(m * a for m, a, _ in parts) / chassis
+    up = sum(m * c for m, _, c in parts) / chassis
+    inertia_pulley = robot.chassis(wheeled).inertia / 2
+    whole = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
+    folded = half - gear.lever_length / 2  # centre of a folded lever from the middle
+    body = whole - 2 * inertia_pulley - 2 * pulley * half**2 - 2 * lever * folded**2
+    inertia = body + sum(m * ((a - forward) ** 2 + (c - up) ** 2) for m, a, c in parts)
+    return Masses(chassis, forward, up, inertia, pulley, inertia_pulley)
+
+
+def text(robot: Robot, gear: RunningGear, command: Command, mass: float, step: float = 1e-4) -> str:
+    """MJCF of half a robot under one command (scalar fields); `mass` total [kg], `step` [s].
+
+    The shapes are for the eye and show both sides; masses and inertias are stated and are of one side.
+    """
+    half = masses(robot, gear, command, jnp.asarray(mass))
+    m = {name: float(getattr(half, name)) for name in vars(half)}
+    wheeled = bool(command.wheeled > 0.5)
+    radius, base = float(robot.tracked.radius), float(gear.wheelbase)
+    axle = float(robot.wheeled.radius) if wheeled else radius + float(gear.grouser_height)
+    outer = float(robot.wheeled.radius) if wheeled else radius
+    sin, cos = float(jnp.sin(command.slope)), float(jnp.cos(command.slope))
+    levers = ""
+    if not wheeled:
+        for side, angle in ((1.0, gear.lever_front), (-1.0, gear.lever_rear)):
+            x, z = (float(c) for c in lever_tip(gear, angle, side))
+            for y in (-0.15, 0.15):
+                ends = f"{side * base / 2:.9g} {y} 0 {x:.9g} {y} {z:.9g}"
+                levers += f'<geom type="capsule" size="0.012" fromto="{ends}" rgba=".35 .4 .45 1"/>\n      '
+    pulleys = ""
+    for name, x in (("driving", base / 2), ("driven", -base / 2)):
+        pulleys += f"""
+      <body name="{name}" pos="{x:.17g} 0 0">
+        <inertial pos="0 0 0" mass="{m["pulley"]:.17g}" diaginertia="{_planar(m["inertia_pulley"])}"/>
+        <joint name="{name}" type="hinge" axis="0 1 0"/>
+        <geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" pos="0 0.122 0" rgba=".2 .2 .2 1"/>
+        <geom type="cylinder" size="{outer:.9g} 0.018" euler="90 0 0" pos="0 -0.122 0" rgba=".2 .2 .2 1"/>
+        <geom type="box" size="{outer:.9g} 0.141 0.003" rgba=".8 .8 .2 1"/>
+      </body>"""
+    belts = "".join(
+        f'<geom type="box" size="{base / 2:.9g} 0.014 0.0015" pos="0 {y} {z:.9g}" rgba=".2 .2 .2 1"/>\n      '
+        for y in (-0.122, 0.122)
+        for z in (-radius, radius)
+    )
+    return f"""<mujoco model="half robot {"4W2T" if wheeled else "6T2A"}">
+  <compiler inertiafromgeom="false"/>
+  <option timestep="{step:.9g}" integrator="Euler" gravity="{-GRAVITY * sin:.17g} 0 {-GRAVITY * cos:.17g}">
+    <flag contact="disable" constraint="disable" eulerdamp="disable"/>
+  </option>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <visual><global offwidth="1280" offheight="720"/></visual>
+  <asset><texture type="skybox" builtin="gradient" rgb1=".9 .95 1" rgb2=".6 .7 .8" width="64" height="64"/></asset>
+  <worldbody>
+    <light pos="0 -2 3" dir="0 .5 -1" directional="true"/>
+    <geom name="ground" type="plane" size="20 2 .1" rgba=".8 .78 .72 1"/>
+    <body name="chassis" pos="0 0 0">
+      <inertial pos="{m["forward"]:.17g} 0 {m["up"]:.17g}" mass="{m["chassis"]:.17g}"
+        diaginertia="{_planar(m["inertia"])}"/>
+      <joint name="travel" type="slide" axis="1 0 0"/>
+      <joint name="height" type="slide" axis="0 0 1" ref="0"/>
+      <joint name="pitch" type="hinge" axis="0 1 0"/>
+      <geom type="box" size="{base / 2:.9g} 0.104 0.038" pos="0 0 {0.043 - 0.038:.9g}" rgba=".3 .5 .7 1"/>
+      {belts}{levers}{pulleys}
+    </body>
+  </worldbody>
+  <keyframe><key name="stand" qpos="0 {axle:.9g} 0 0 0"/></keyframe>
+</mujoco>
+"""
+
+
+def _planar(inertia: float) -> str:
+    # In the plane only the moment about y counts; the other two only have to satisfy the triangle inequality.
+    return " ".join([f"{inertia:.17g}"] * 3)
+
+
+@functools.cache
+def _template(double: bool) -> tuple[Any, Any]:
+    from mmrjax.nominal import nominal  # topology only: every number is replaced per member
+    from mmrjax.signals import command
+
+    with jax.ensure_compile_time_eval():
+        model = mujoco.MjModel.from_xml_string(text(nominal(), RunningGear(), command(), 13.1))
+        return mjx.put_model(model), mjx.make_data(model)
+
+
+def template() -> tuple[Any, Any]:
+    """The MJX model and data that all members share in structure."""
+    return _template(bool(jax.config.jax_enable_x64))
+
+
+def member(model: Any, half: Masses, slope: Scalar, wheelbase: Scalar, step: float) -> Any:
+    """The MJX `model` with this member's masses, inertias, places, gravity and time step.
+
+    Every constant that the smooth dynamics read and that mass decides is set here (mujoco issue 1607); the
+    derived ones that only the constraint solver and the sensors read are set where they are sums.
+    """
+    zero = jnp.zeros_like(half.chassis)
+    mass = jnp.stack([zero, half.chassis, half.pulley, half.pulley])
+    inertia = jnp.stack([zero, half.inertia, half.inertia_pulley, half.inertia_pulley])
+    total = half.chassis + 2 * half.pulley
+    centre = model.body_ipos.at[1].set(jnp.stack([half.forward, zero, half.up]))
+    place = model.body_pos.at[2, 0].set(wheelbase / 2).at[3, 0].set(-wheelbase / 2)
+    gravity = -GRAVITY * jnp.stack([jnp.sin(slope), zero, jnp.cos(slope)])
+    return model.replace(
+        body_mass=mass,
+        body_subtreemass=jnp.stack([total, total, half.pulley, half.pulley]),
+        body_inertia=jnp.broadcast_to(inertia[:, None], (4, 3)),
+        body_ipos=centre,
+        body_pos=place,
+        opt=model.opt.replace(gravity=gravity, timestep=jnp.asarray(step)),
+    )

@@ -1,0 +1,105 @@
+"""What the running gear's discreteness does to a run: ripple, its period (34), touchdowns, stages I-III.
+
+Read from a finished run, in NumPy, member by member; nothing here is differentiated.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+Series = Float[np.ndarray, " samples"]
+
+
+class Ripple(NamedTuple):
+    """Fluctuation of a signal about its mean.
+
+    Attributes:
+        mean: [the signal's unit].
+        amplitude: half of peak to peak over the mean [-].
+        period: after which it repeats itself [s]; NaN: it does not within half the record.
+    """
+
+    mean: float
+    amplitude: float
+    period: float
+
+
+def ripple(time: Series, values: Series) -> Ripple:
+    """Ripple of evenly sampled `values`; a straight drift is taken off.
+
+    Two events a pitch (a grouser lands in front, another lifts at the rear) make a harmonic the strongest
+    line of the spectrum, so the period is the first lag at which the record agrees with itself nearly as
+    well (0.9) as at the best one, refined by a parabola and by counting on to the last such repetition.
+    """
+    time, values = np.asarray(time, float), np.asarray(values, float)
+    rest = values - np.polyval(np.polyfit(time, values, 1), time)
+    n = len(rest)
+    lags = np.arange(n // 2)
+    agreement = np.array([np.corrcoef(rest[: n - k], rest[k:])[0, 1] for k in lags])
+    inner = agreement[1:-1]
+    peaks = 1 + np.nonzero((inner > agreement[:-2]) & (inner >= agreement[2:]))[0]
+    period = float("nan")
+    if len(peaks):
+        good = peaks[agreement[peaks] >= 0.9 * agreement[peaks].max()]
+        first = _vertex(agreement, good[0])
+        count = np.round(good / first)
+        near = np.abs(good / first - count) < 0.2
+        last = good[near][-1]
+        period = float(_vertex(agreement, last) / np.round(last / first) * (time[1] - time[0]))
+    return Ripple(float(values.mean()), float(np.ptp(rest) / 2 / abs(values.mean())), period)
+
+
+def _vertex(values: Series, k: int) -> float:
+    below, here, above = values[k - 1 : k + 2]
+    return float(k + (below - above) / (2 * (below - 2 * here + above)))
+
+
+def period_pitch(pitch: float, speed_wheel: float, radius: float) -> float:
+    """T = S / (ω_k r_k) [s], eq. (34), with S_g for tracks, S_t for the tooth mesh; `radius` of the pulley."""
+    return pitch / (speed_wheel * radius)
+
+
+def touchdowns(
+    time: Series, grouser: Float[np.ndarray, "samples 24"], place: Float[np.ndarray, "samples 24"]
+) -> Series:
+    """Times at which a grouser comes to bear, in order [s]; `place` tells the front arc from the rear one.
+
+    A grouser that lifts and comes back in the middle of the run does not count: only one whose place is in
+    the second half of the path, or has just begun it anew.
+    """
+    bears = np.asarray(grouser) > 0
+    lands = ~bears[:-1] & bears[1:]
+    length = np.asarray(place).max()
+    front = (np.asarray(place)[1:] > length / 2) | (np.asarray(place)[1:] < 0.02 * length)
+    return np.sort(np.asarray(time)[1:][np.nonzero(lands & front)[0]])
+
+
+class Stages(NamedTuple):
+    """Stages of Fig. 23: I starting, II acceleration with slipping, III uniform travel.
+
+    Attributes:
+        slipping: time at which the movers begin to slide beyond V_s [s]; NaN: they never do.
+        uniform: time from which the speed stays within 1 % of its last mean and nothing slides [s].
+        slip: mean of 1 - V / V_theoretical in stage II, eq. (33) [-].
+    """
+
+    slipping: float
+    uniform: float
+    slip: float
+
+
+def stages(time: Series, speed: Series, theoretical: Series, speed_static: float) -> Stages:
+    """Stages of a run from standstill, from its speed V, r_k ω_k and V_s [m/s]."""
+    time, speed, theoretical = (np.asarray(x, float) for x in (time, speed, theoretical))
+    slides = theoretical - speed > speed_static
+    last = speed[-max(len(speed) // 10, 1) :].mean()
+    apart = np.nonzero(slides | (np.abs(speed - last) > 0.01 * abs(last)))[0]
+    uniform = time[min(apart[-1] + 1, len(time) - 1)] if len(apart) else time[0]
+    if not slides.any():
+        return Stages(float("nan"), float(uniform), 0.0)
+    begin = time[np.argmax(slides)]
+    second = (time >= begin) & (time < uniform)
+    return Stages(float(begin), float(uniform), float(np.mean(1 - speed[second] / theoretical[second])))

@@ -1,0 +1,84 @@
+"""The generator of sealed series against `drive`, and its labels."""
+
+import dataclasses
+
+import generator as g
+import generator_series as gs
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration import records
+from mmrjax import nominal, params
+from mmrjax.effects import ALL, BY_NAME
+from mmrjax.models.drive import drive_batch
+from mmrjax.signals import command
+
+RUNS = gs.starts(g.CLIMBING)
+DURATION, EVERY = 0.6, 0.01
+PASSING = tuple(n for n, f in gs.FORMS.items() if f.cls)
+#: Of each channel's largest value in the run; 4e-6 at worst (a battery run whose movers spin), else below 2e-6.
+ERROR = 1e-5
+
+
+@pytest.fixture(scope="module")
+def package():
+    """Histories of `drive` for amplitudes of PASSING, shape (3, runs, instants)."""
+    base = params.replace(nominal.nominal(), g.CLIMBING)
+    full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in PASSING))
+    times = jnp.arange(round(DURATION / EVERY) + 1) * EVERY
+
+    def read(battery, values=None):
+        run = command(RUNS.U, RUNS.slope, RUNS.payload, RUNS.wheeled, battery=battery, total_mass=RUNS.mass)
+        changed = params.replace(full, {k: jnp.asarray(v, float) for k, v in (values or {}).items()})
+        s = drive_batch(changed, run, times, 1e-9, 20000).signals
+        return np.stack([s.total_current, s.speed_motor, s.speed])
+
+    return read
+
+
+def apart(a, b):
+    """Largest difference in each channel of each run over the run's largest value."""
+    return (np.abs(a - b).max(-1) / np.abs(a).max(-1)).max()
+
+
+def test_series_generator_holds_every_effect_that_only_a_series_shows():
+    assert {e.name for e in ALL if e.transient or e.memory_size is not None} <= set(PASSING)
+    assert sum(not f.cls for f in gs.FORMS.values()) >= 4
+
+
+@pytest.mark.parametrize("battery", [0.0, 1.0])
+def test_clean_histories_agree_with_drive(package, battery):
+    _, y = gs.histories(RUNS, DURATION, EVERY, battery=np.full(6, battery))
+    assert apart(package(battery), y) < ERROR
+
+
+def test_comparison_with_drive_can_fail(package):
+    _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING | {"motor.inertia": 3.36e-6})
+    assert apart(package(0.0), y) > 5 * ERROR
+
+
+@pytest.mark.parametrize("name", PASSING)
+def test_effect_of_a_series_agrees_with_drive(package, name):
+    form, battery = gs.FORMS[name], float(name == "battery_sag")
+    size = {"cogging": 10.0, "stick_slip": 3.0, "thermal_drift": 5.0}.get(name, 1.0) * form.size
+    shapes = {k: 0.5 for k in form.shapes}
+    _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING, [(form, size, shapes)], np.full(6, battery))
+    values = {f"effects.{name}.amplitude": size} | {f"effects.{name}.{k}": v for k, v in shapes.items()}
+    there = package(battery, values)
+    assert apart(there, y) < ERROR
+    assert apart(there, package(battery)) > 3e-5
+
+
+def test_sealed_series_passes_the_door_and_is_reproducible(tmp_path):
+    options = dict(seed=3, duration=0.2, free=g.FRICTION[:2])
+    table, label = gs.case(["rotating_inertia"], 6.0, **options)
+    again, _ = gs.case(["rotating_inertia"], 6.0, **options)
+    assert all((table[n] == again[n]).all() for n in table)
+    (effect,) = label["effects"]
+    assert effect["class"] == "rotating_inertia" and effect["sigmas"] == pytest.approx(6.0)
+    path = tmp_path / "runs.csv"
+    rows = zip(*table.values(), strict=True)
+    path.write_text("\n".join([",".join(table), *(",".join(map(str, r)) for r in rows)]) + "\n")
+    runs = records.read(path)
+    assert len(runs) == 6 * 11 and runs.has("time_s") and "rotating" not in path.read_text()

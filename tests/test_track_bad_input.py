@@ -1,0 +1,108 @@
+"""What the track model says to input that it cannot run, before and after the run."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import params
+from mmrjax.models.half_robot import margin, stand, system
+from mmrjax.models.stability import largest_step
+from mmrjax.models.track import _batch, track_batch
+from mmrjax.running_gear import RunningGear
+from mmrjax.signals import FAILED, command
+
+TWO = command(voltage=jnp.asarray([33.0, 33.0]), payload=jnp.asarray([0.0, 8.0]), wheeled=jnp.asarray([0.0, 1.0]))
+
+
+def test_step_too_large_is_refused_with_the_largest_stable_one(robot):
+    limit = float(largest_step(robot, TWO).min())
+    with pytest.raises(ValueError, match=r"step: got 0.001 s; .*largest stable step is 0\.0001\d s \(run 1"):
+        track_batch(robot, TWO, step=1e-3, sample=1e-3)
+    assert 1e-4 < limit < 2e-4
+
+
+def test_largest_step_falls_with_stiffness(robot):
+    gear = RunningGear()
+    stiff = params.replace(gear, {"contact_stiffness": 1e6 * gear.contact_stiffness})
+    soft = largest_step(robot, TWO, gear)
+    hard = largest_step(robot, TWO, stiff)
+    assert (hard < 0.95 * soft).all()
+
+
+def test_beyond_the_largest_step_a_run_goes_wrong_and_below_it_does_not(robot):
+    """Uphill on wheels: three times over the limit they chatter and lose speed, at half of it they do not."""
+    steep = dataclasses.replace(TWO, slope=jnp.radians(jnp.asarray([10.0, 10.0])))
+    gear, limit = RunningGear(), float(largest_step(robot, steep)[1])
+    assert 0.8e-4 < limit < 1.6e-4
+    speed = [
+        float(_batch(robot, steep, gear, 0.5, step, 1e-3, True).result.reading.speed[1]) for step in (5e-5, 5e-4)
+    ]
+    from mmrjax.models.steady import steady
+
+    right = float(steady(robot, jax.tree.map(lambda x: x[1], steep)).reading.speed)
+    assert speed[0] == pytest.approx(right, rel=5e-4)
+    assert abs(speed[1] / right - 1) > 3e-3
+
+
+@pytest.mark.parametrize("name", ["lever_front", "lever_rear"])
+def test_lever_below_the_ground_is_refused(robot, name):
+    gear = params.replace(RunningGear(), {name: jnp.asarray(-np.pi / 3)})
+    with pytest.raises(ValueError, match=rf"{name}: got -60 deg, its tip 134 mm below the ground"):
+        track_batch(robot, TWO, gear)
+
+
+@pytest.mark.parametrize(
+    "keywords, message",
+    [
+        (dict(sample=1.5e-4), "sample: got 0.00015 s; expected a whole number of intervals of 0.0001 s"),
+        (dict(duration=0.0), "duration: got 0 s"),
+    ],
+)
+def test_times_that_do_not_fit_are_refused(robot, keywords, message):
+    with pytest.raises(ValueError, match=message):
+        track_batch(robot, TWO, **keywords)
+
+
+def test_posture_that_cannot_stand_has_a_negative_margin(robot):
+    gear = params.replace(RunningGear(), {"payload_offset": jnp.asarray(-0.45), "payload_height": jnp.asarray(0.4)})
+    for payload, stands in ((0.0, True), (8.0, False)):
+        run = command(slope=np.radians(20.0), payload=payload)
+        assert (float(margin(system(robot, run, gear, 1e-4))) > 0) is stands
+
+
+def test_standing_robot_is_in_balance(robot):
+    """Weight and moment to 1e-9, on a slope with a payload off centre; then no force is left over."""
+    from mmrjax.models.half_robot import instant
+
+    gear = params.replace(RunningGear(), {"payload_offset": jnp.asarray(0.05)})
+    for wheeled in (0.0, 1.0):
+        run = system(robot, command(slope=0.1, payload=5.0, wheeled=wheeled), gear, 1e-4)
+        _, at, _ = instant(run, stand(run))
+        weight = (run.half.chassis + 2 * run.half.pulley) * 9.80665 * np.cos(0.1)
+        assert float(at.normal) == pytest.approx(float(weight), rel=1e-9)
+
+
+def test_member_that_blows_up_fails_alone(robot):
+    """A step ten times too long, on the door's inner side: its status says so, its neighbour runs on."""
+    gear = RunningGear()
+    stiff = dataclasses.replace(gear, contact_stiffness=jnp.asarray(1e12), contact_damping=jnp.asarray(1e5))
+
+    @jax.jit
+    def both(stiffness, damping):
+        from mmrjax.models.track import track
+
+        def one(c, b):
+            own = dataclasses.replace(gear, contact_stiffness=c, contact_damping=b)
+            return track(robot, command(), own, duration=0.2, rolling=True).result
+
+        return jax.vmap(one)(stiffness, damping)
+
+    answer = both(
+        jnp.stack([stiff.contact_stiffness, gear.contact_stiffness]),
+        jnp.stack([stiff.contact_damping, gear.contact_damping]),
+    )
+    assert int(answer.status[0]) == FAILED and int(answer.status[1]) != FAILED
+    assert np.isnan(float(answer.reading.speed[0])) and np.isfinite(float(answer.reading.speed[1]))

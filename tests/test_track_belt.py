@@ -1,0 +1,160 @@
+"""The belt on its path and the contacts of one side: geometry, tensions, virtual work, contact pairs."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import balances, params, undercarriage
+from mmrjax.belt import POLYGON, Path, runs, tension_along, tips, travel
+from mmrjax.running_gear import GROUSERS, TEETH_BELT, RunningGear
+from mmrjax.signals import State, command
+
+
+@pytest.fixture(scope="module")
+def path(robot):
+    return Path(robot.tracked.radius, RunningGear())
+
+
+def test_belt_is_840_mm_with_grousers_every_35(path):
+    assert float(path.length) == pytest.approx(0.840)
+    assert float(path.pitch) == pytest.approx(0.035)
+    assert TEETH_BELT / GROUSERS == 7
+
+
+@pytest.mark.parametrize("recess", [0.0, 3e-4])
+def test_tip_rates_are_derivatives_of_its_place(path, recess):
+    gear = params.replace(path.gear, {"guide_recess": jnp.asarray(recess)})
+    path = Path(path.radius, gear)
+    places = jnp.linspace(1e-3, 0.8391, 517)  # off the joints of the path
+    slope = jax.vmap(jax.jacfwd(lambda p: jnp.stack([tips(path, p).forward, tips(path, p).up])))(places)
+    at = tips(path, places)
+    np.testing.assert_allclose(slope[:, 0], at.rate_forward, atol=1e-9)
+    np.testing.assert_allclose(slope[:, 1], at.rate_up, atol=1e-9)
+
+
+def test_tip_is_continuous_round_the_whole_path(path):
+    places = jnp.linspace(0.0, path.length, 8401)
+    at = tips(path, places)
+    for value in (at.forward, at.up):
+        assert float(jnp.max(jnp.abs(jnp.diff(value)))) < 1.2e-4 * 1.15  # 0.1 mm of belt moves a tip this far
+        assert float(value[0]) == pytest.approx(float(value[-1]), abs=1e-9)
+    lower = (places > 0.02) & (places < 0.28)
+    # sliding speed, support and compliance too, where the ground can be: no force may jump
+    for value in (at.rate_forward, at.rate_up, at.guided, at.compliance):
+        assert float(jnp.max(jnp.abs(jnp.diff(value))[:3500])) < 0.02
+    np.testing.assert_allclose(at.up[lower], -(path.radius + path.gear.grouser_height))
+
+
+def test_point_of_the_belt_follows_the_pulleys_by_its_weight(path):
+    place, weight = path.place(jnp.asarray(0.4), jnp.asarray(0.4))
+    moved, _ = path.place(jnp.asarray(0.4), jnp.asarray(0.4 + 1e-6))
+    shift = (moved - place) / (path.radius * 1e-6)
+    np.testing.assert_allclose(shift, weight, atol=1e-6)
+    assert ((weight >= 0) & (weight <= 1)).all()
+
+
+def test_mesh_is_the_swing_of_a_polygon(path):
+    angle = jnp.linspace(0.0, 0.5, 400)
+    _, lever = jax.vmap(lambda a: travel(path.radius, a))(angle)
+    slope = jax.vmap(jax.grad(lambda a: travel(path.radius, a)[0]))(angle)
+    np.testing.assert_allclose(lever, slope, rtol=1e-12)
+    apothem = float(path.radius) * np.cos(np.pi / 48)
+    assert float(lever.max() - lever.min()) == pytest.approx(float(path.radius) - apothem, rel=1e-3)
+    assert pytest.approx(0.00107, rel=1e-2) == POLYGON
+
+
+def test_runs_pull_as_their_energy_falls(path):
+    gear = path.gear
+
+    def energy(angles):
+        stretch = travel(path.radius, angles[0])[0] - travel(path.radius, angles[1])[0]
+        p, k = gear.pretension, gear.span_stiffness
+        return ((p + k * stretch) ** 2 + (p - k * stretch) ** 2) / (2 * k)
+
+    angles = jnp.asarray([0.3012, 0.3])
+    torque = -jax.grad(energy)(angles)
+    at = runs(path, angles, jnp.zeros(2))
+    np.testing.assert_allclose(torque, jnp.stack([at.torque_front, at.torque_rear]), rtol=1e-9)
+
+
+def test_slack_run_pulls_nothing(path):
+    at = runs(path, jnp.asarray([0.5, 0.0]), jnp.zeros(2))
+    assert float(at.lower) == 0.0 and float(at.upper) > 100.0
+
+
+def test_centrifugal_tension_is_mass_per_length_times_speed_squared(path):
+    at = runs(path, jnp.zeros(2), jnp.full(2, 25.0))
+    assert float(at.centrifugal) == pytest.approx(0.040 / 0.840 * (25.0 * float(path.radius)) ** 2)
+
+
+def test_tension_jumps_by_the_force_on_the_belt(path):
+    at = runs(path, jnp.asarray([0.301, 0.3]), jnp.zeros(2))
+    place, force = jnp.asarray([0.1, 0.2]), jnp.asarray([7.0, 11.0])
+    along = tension_along(path, at, place, force, jnp.asarray([0.05, 0.15, 0.25, 0.6]))
+    np.testing.assert_allclose(jnp.diff(along)[:2], [7.0, 11.0], rtol=1e-9)
+    lengths = jnp.asarray([0.1, 0.1, 0.1])
+    assert float(jnp.sum(along[:3] * lengths) / 0.3) == pytest.approx(float(at.lower))  # the mean is the run's
+    assert float(along[3]) == pytest.approx(float(at.upper))
+
+
+def _posture(path, wheeled, robot):
+    axle = float(robot.wheeled.radius) if wheeled else float(path.radius + path.gear.grouser_height)
+    return jnp.asarray([0.0, axle - 3e-4, 2e-3, 0.3012, 0.3]), jnp.asarray([0.9, -0.01, 0.02, 25.0, 24.9])
+
+
+@pytest.mark.parametrize("wheeled", [0.0, 1.0])
+def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
+    """Power of the generalized forces = power at the contact points - friction on the guide + belt, rate by rate."""
+    q, v = _posture(path, wheeled, robot)
+    run = command(wheeled=wheeled)
+    radius = robot.wheeled.radius
+    at = undercarriage.touch(path, radius, run.wheeled, q, v)
+    signals = balances.begin(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
+    signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0))
+    done = undercarriage.pull(path, robot.chassis(run.wheeled), signals, at, q[1])
+    assert float(at.normal) > 10.0 and float(jnp.abs(done.traction)) > 0.1
+
+    def point(q):  # of each contact in the world
+        now = undercarriage.touch(path, radius, run.wheeled, q, v)
+        return q[0] + now.lever_x, q[1] + now.lever_z
+
+    slope_x, slope_z = jax.jacfwd(point)(q)
+    if wheeled:  # a wheel's contact point stays below its axle; the material point there turns with the wheel
+        slope_x = slope_x.at[GROUSERS:, 2].set(at.lever_z[GROUSERS:])
+        slope_x = slope_x.at[GROUSERS, 3].set(-radius).at[GROUSERS + 1, 4].set(-radius)
+    work = done.force @ slope_x + at.force @ slope_z
+    work = work.at[0].add(-signals.resistance).at[2].add(signals.resistance * q[1])
+    work = work.at[3].add(-path.radius * jnp.sum(done.guide * (1 - at.weight)) + at.belt.torque_front)
+    work = work.at[4].add(-path.radius * jnp.sum(done.guide * at.weight) + at.belt.torque_rear)
+    ours = jnp.insert(done.generalized, 3, -done.load)
+    # The belt's own stretch (0.05 mm a run) shifts a grouser's share between the pulleys by parts in 1e4.
+    np.testing.assert_allclose(ours, work, rtol=2e-3, atol=2e-3)
+
+
+def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
+    for wheeled, pairs in ((0.0, 720), (1.0, 4)):
+        q, v = _posture(path, wheeled, robot)
+        q = q.at[1].add(-1.0).at[2].set(0.0)  # under the ground, so that every contact that can bear does
+        run = command(wheeled=wheeled)
+        at = undercarriage.touch(path, robot.wheeled.radius, run.wheeled, q, 0 * v)
+        signals = balances.begin(robot, run, State(*(jnp.asarray(0.0) for _ in range(4))))
+        done = undercarriage.pull(path, robot.chassis(run.wheeled), signals, at, q[1])
+        teeth = undercarriage.reactions(path, at, done).teeth(path)
+        ground = int(jnp.sum(at.force > 0))
+        guides = sum(t.size for t in teeth) if wheeled == 0.0 else 0
+        assert robot.sides * (ground + guides) == pairs
+
+
+def test_teeth_carry_what_the_guide_carries(path, robot):
+    q, v = _posture(path, 0.0, robot)
+    at = undercarriage.touch(path, robot.wheeled.radius, jnp.asarray(0.0), q, v)
+    signals = balances.begin(robot, command(), State(*(jnp.asarray(0.0) for _ in range(4))))
+    loads = undercarriage.reactions(path, at, undercarriage.pull(path, robot.tracked, signals, at, q[1]))
+    lower, upper = loads.teeth(path)
+    assert lower.shape == upper.shape == (168,)
+    assert float(jnp.sum(lower)) == pytest.approx(float(loads.guide))
+    assert float(jnp.sum(loads.support) + loads.guide) == pytest.approx(float(at.normal))
+    assert float(jnp.sum(upper)) == pytest.approx(0.040 * 9.80665 * 60 / 168)

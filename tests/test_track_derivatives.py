@@ -1,0 +1,103 @@
+"""Derivatives of the track model's averages, forward and reverse, against central differences.
+
+Eight operating points in both configurations, rolling, averaged over whole grouser periods of the settled
+orbit; every parameter by its relative change. To 1 %, no floor but for what is zero.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import params
+from mmrjax.models.track import track
+from mmrjax.signals import CONVERGED, command
+
+PARAMETERS = (
+    "track.guide_friction",
+    "ground.friction.static",
+    "ground.friction.speed_static",
+    "ground.rolling_resistance",
+    "track.loss_coulomb",
+    "gearbox.efficiency_load",
+    "motor.resistance",
+    "mass",
+)
+#: (wheeled, slope [deg], payload [kg], voltage [V])
+POINTS = np.array(
+    [
+        (0, 0, 0, 33),
+        (0, 5, 8, 33),
+        (0, 10, 0, 15),
+        (0, 5, 3, 24),
+        (1, 0, 0, 33),
+        (1, 10, 8, 33),
+        (1, 15, 0, 15),
+        (1, 5, 3, 24),
+    ],
+    float,
+)
+OUTPUTS = ("total_current", "motor_speed", "speed")
+
+
+@pytest.fixture(scope="module")
+def averages(robot):
+    """Outputs and status over (relative changes of the parameters, command), not compiled."""
+    values = {p.name: p.value for p in params.walk(robot)}
+
+    def outputs(theta, run):
+        changes = {}
+        for k, name in enumerate(PARAMETERS):
+            on_robot = name.startswith(("gearbox", "motor"))
+            for full in [name] if on_robot else [f"tracked.{name}", f"wheeled.{name}"]:
+                changes[full] = values[full] * (1 + theta[k])
+        answer = track(params.replace(robot, changes), run, duration=0.5, rolling=True).result
+        return jnp.stack([getattr(answer.reading, name) for name in OUTPUTS]), answer.status
+
+    return outputs
+
+
+@pytest.fixture(scope="module")
+def commands():
+    wheeled, slope, payload, voltage = POINTS.T
+    return command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+
+
+@pytest.fixture(scope="module")
+def at():
+    return jnp.zeros(len(PARAMETERS))
+
+
+@pytest.fixture(scope="module")
+def forward(averages, commands, at):
+    slope = jax.jit(jax.vmap(jax.jacfwd(averages, has_aux=True), in_axes=(None, 0)))
+    jacobian, status = slope(at, commands)
+    assert (np.asarray(status) == CONVERGED).all()
+    return np.asarray(jacobian)
+
+
+def test_forward_derivatives_are_central_differences(averages, commands, at, forward):
+    runs = jax.jit(jax.vmap(jax.vmap(averages, in_axes=(None, 0)), in_axes=(0, None)))
+    h = 2e-5  # the averages are smooth, but they curve over the phase at which a run ends
+    moved = jnp.concatenate([h * jnp.eye(at.size), -h * jnp.eye(at.size), jnp.zeros((1, at.size))])
+    values = np.asarray(runs(moved, commands)[0])
+    central = (values[: at.size] - values[at.size : -1]).transpose(1, 2, 0) / (2 * h)
+    # A relative change of 1 moves the output by less than 1e-4 of itself: zero to both.
+    floor = 1e-4 * np.abs(values[-1])[..., None]
+    error = np.abs(forward - central) / np.maximum(np.abs(central), floor)
+    worst = np.unravel_index(error.argmax(), error.shape)
+    assert error.max() < 0.01, f"point {worst[0]}, {OUTPUTS[worst[1]]} by {PARAMETERS[worst[2]]}: {error.max():.3g}"
+
+
+def test_no_parameter_is_dead(forward):
+    tracked = np.abs(forward[:4]).max(axis=(0, 1))
+    wheeled = np.abs(forward[4:]).max(axis=(0, 1))
+    assert (tracked > 1e-4).all()
+    assert (np.delete(wheeled, PARAMETERS.index("track.guide_friction")) > 1e-4).all()
+    assert wheeled[PARAMETERS.index("track.guide_friction")] == 0.0  # wheels carry no load on the guides
+
+
+def test_reverse_derivatives_are_forward_ones(averages, commands, at, forward):
+    slope = jax.jit(jax.vmap(jax.jacrev(averages, has_aux=True), in_axes=(None, 0)))
+    reverse = np.asarray(slope(at, commands)[0])
+    np.testing.assert_allclose(reverse, forward, rtol=1e-6, atol=1e-9)

@@ -1,0 +1,106 @@
+"""The MJCF in C MuJoCo, stepped with the same forces, against MJX; and the mass constants of a member."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mmrjax import balances, mjcf, params
+from mmrjax.models.half_robot import advance, generalized, instant, stand, system
+from mmrjax.running_gear import RunningGear
+from mmrjax.signals import State, command
+
+RUNS = {
+    "tracked": dict(voltage=33.0, slope=np.radians(5.0), payload=3.0),
+    "wheeled": dict(voltage=24.0, slope=np.radians(3.0), payload=8.0, wheeled=1.0),
+}
+STEP = 1e-4
+
+
+def native(robot, gear, run):
+    """The same half robot compiled by C MuJoCo from its own MJCF."""
+    rest = State(*(jnp.asarray(0.0) for _ in range(4)))
+    mass = float(balances.begin(robot, run, rest).mass)
+    return mujoco.MjModel.from_xml_string(mjcf.text(robot, gear, run, mass, STEP))
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_member_has_the_constants_that_mujoco_compiles(robot, name):
+    """Against stale derived constants (mujoco issue 1607): MJX's are replaced, MuJoCo's compiled afresh."""
+    gear = params.replace(RunningGear(), {"lever_front": jnp.asarray(2.5), "centre_offset": jnp.asarray(0.01)})
+    run = command(**RUNS[name])
+    ours, theirs = system(robot, run, gear, STEP).model, native(robot, gear, run)
+    for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
+        np.testing.assert_allclose(
+            getattr(ours, field), getattr(theirs, field), rtol=1e-12, atol=1e-15, err_msg=field
+        )
+    np.testing.assert_allclose(ours.opt.gravity, theirs.opt.gravity, rtol=1e-12, atol=1e-15)
+    assert float(ours.opt.timestep) == theirs.opt.timestep == STEP
+    assert [theirs.body(i + 1).name for i in range(3)] == list(mjcf.BODIES)
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_masses_make_up_the_robot(robot, name):
+    run = command(**RUNS[name])
+    half = system(robot, run, RunningGear(), STEP).half
+    chassis = robot.chassis(run.wheeled)
+    assert float(half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
+    assert float(2 * half.inertia_pulley) == pytest.approx(float(chassis.inertia))
+    assert float(half.inertia) > 0
+
+
+@pytest.fixture(scope="module")
+def step_both(robot):
+    gear = RunningGear()
+
+    @jax.jit
+    def forces(run, motion):
+        constants = system(robot, run, gear, STEP)
+        signals, _, pulled = instant(constants, motion)
+        after, _, _ = advance(constants, motion)
+        return generalized(constants, signals, pulled), after
+
+    return gear, forces
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
+    """10 000 steps, each engine on its own trajectory; to 1e-6 of every coordinate's and rate's size."""
+    gear, forces = step_both
+    run = command(**RUNS[name])
+    model = native(robot, gear, run)
+    data = mujoco.MjData(model)
+
+    @jax.jit
+    def second(motion):
+        return jax.lax.scan(lambda m, _: (forces(run, m)[1], None), motion, None, length=10_000)[0]
+
+    start = stand(system(robot, run, gear, STEP))
+    end = second(start)
+    data.qpos[:], motion = start.q, start
+    for _ in range(10_000):
+        (force, armature), after = forces(run, motion)
+        model.dof_armature[:] = armature
+        data.qfrc_applied[:] = force
+        mujoco.mj_step(model, data)
+        # the current is ours in both; its next value depends on this instant alone
+        motion = type(after)(jnp.asarray(data.qpos), jnp.asarray(data.qvel), after.current, after.discharge)
+    scale_q, scale_v = np.array([1.0, 0.05, 0.01, 25.0, 25.0]), np.array([1.0, 1.0, 1.0, 25.0, 25.0])
+    assert abs(float(end.q[0])) > 0.2  # it went somewhere
+    assert np.max(np.abs(data.qpos - end.q) / scale_q) < 1e-6
+    assert np.max(np.abs(data.qvel - end.v) / scale_v) < 1e-6
+
+
+def test_wrong_mass_is_seen(robot, step_both):
+    """The comparison can fail: one gram more, one step."""
+    gear, forces = step_both
+    run = command(**RUNS["tracked"])
+    motion = stand(system(robot, run, gear, STEP))
+    (force, armature), after = forces(run, motion)
+    heavier = command(**(RUNS["tracked"] | {"payload": 3.002}))
+    model = native(robot, gear, heavier)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qfrc_applied[:], model.dof_armature[:] = motion.q, force, armature
+    mujoco.mj_step(model, data)
+    assert np.max(np.abs(data.qvel - after.v)) > 1e-8
