@@ -17,8 +17,9 @@ from calibration.normal import Normal, cholesky, forward
 from calibration.problem import Data, Observation, Problem
 from mmrjax.robot import Robot
 
-#: Predicted decrease of the objective, over 1 + objective, below which a point is an optimum.
-DECREMENT = 1e-6
+#: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
+#: a twentieth of a posterior sd, about what the integrator's tolerance leaves of a rollout), and as a share.
+DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
 #: Rejected steps in a row after which a search ends.
 PATIENCE = 12
 
@@ -48,7 +49,7 @@ class Optimum(eqx.Module):
         sd: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,).
         cost: objective, half the sum of squares of misfit and prior [-].
         decrement: decrease that the Gauss-Newton step from here still predicts [-].
-        converged: whether the decrement is below `DECREMENT`; holds whatever the solver said.
+        converged: whether the decrement is small (see `DECREMENT`); holds whatever the solver said.
         steps: iterations taken.
     """
 
@@ -107,7 +108,7 @@ def _finish(function: Callable[[Z], Array], z: Z, data: Data, pin: Pin, steps: A
     decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))
-    return Optimum(pin.apply(z), sd, cost, decrement, decrement < DECREMENT * (1 + cost), steps)
+    return Optimum(pin.apply(z), sd, cost, decrement, decrement < DECREMENT + DECREMENT_SHARE * cost, steps)
 
 
 class Search(optx.LevenbergMarquardt):

@@ -186,6 +186,8 @@ def remarks(c: Calibration) -> list[str]:
         )
     if not c.converged:
         said.append("the search did not converge; values and intervals are not to be trusted")
+    if c.profile is None:
+        said.append("no profiles were made: the intervals are linear, and too symmetric where the model is curved")
     if c.starts.agree < len(c.starts.cost):
         said.append(c.starts.statement())
     held = names[about.held_by_prior]

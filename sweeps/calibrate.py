@@ -58,7 +58,9 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
 
 def print_calibration(document: dict[str, Any]) -> None:
     """Parameters, errors and remarks, for a person."""
-    shown = Table(title=f"{document['rows']} rows, {document['model']}", title_justify="left")
+    shown = Table(
+        title=f"{document['rows']} rows, {document['model']}", title_justify="left", box=None, pad_edge=False
+    )
     for heading in ("parameter", "value", "95 % interval", "shift [σ]", "held by"):
         side = "left" if heading in ("parameter", "held by") else "right"
         shown.add_column(heading, justify=side, no_wrap=True, overflow="ignore")

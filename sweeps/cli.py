@@ -257,7 +257,8 @@ def calibrate(
     starts: Annotated[int | None, typer.Option(help="Searches at once.  [default: 64]")] = None,
     seed: Annotated[int | None, typer.Option(help="Of the starts.  [default: 0]")] = None,
     profiles: Annotated[
-        bool | None, typer.Option("--profiles/--no-profiles", help="Profile likelihood of each.  [default: profiles]")
+        bool | None,
+        typer.Option("--profiles/--no-profiles", help="Profile likelihood of each.  [default: steady only]"),
     ] = None,
     model: _Model = None,
     robot: _Robot = None,
@@ -274,7 +275,9 @@ def calibrate(
 
     options = _options(model=model, robot=robot, set=set_, report=report) | {
         "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
-        "noise": noise, "starts": starts, "seed": seed, "profiles": profiles,
+        "noise": noise, "starts": starts, "seed": seed,
+        # A profile is some twenty refits a parameter: seconds with steady, many minutes of rollouts.
+        "profiles": False if profiles is None and model not in (None, "steady") else profiles,
     }  # fmt: skip
     resolved = config.resolve(config.Calibrate, None, options)
     from sweeps import calibrate as room
