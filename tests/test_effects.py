@@ -456,7 +456,7 @@ def drive_readings():
         )
 
         def one(c):
-            answer = drive(robot, c, times, tolerance=1e-11)
+            answer = drive(robot, c, times, tolerance=1e-11, max_steps=65_536)
             s = jax.vmap(lambda s: jnp.stack(jax.tree.leaves(balances.sensor(robot, s))))(answer.signals)
             return s[1:]
 
