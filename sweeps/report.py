@@ -67,7 +67,7 @@ def write(
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
     rows = {n: figures_data.rows(r) for n, r in robots.items()}
     album = Album(folder)
-    known: dict[str, Any] = {}
+    known: dict[str, Any] = {"gear": None}
     if runs is not None and len(runs["status"]):
         known["counts"] = report_tables.counts(runs)
         known["volts_drawn"] = _drawn(runs)
