@@ -62,14 +62,13 @@ def drive_table8(robot, table8, times_fine):
     return drive_batch(robot, table8, times_fine)
 
 
-#: One effect of each balance, two that only a start shows, one with a memory; tests/test_effects.py and
-#: tests/test_generator_series.py try every one, each by itself.
+#: One effect of each balance (of `inductance` none: it would be motor.inductance again), one with a memory;
+#: tests/test_effects.py and tests/test_generator_series.py try every one, each by itself.
 REPRESENTATIVE = (
     "mass_offset",
     "rotating_inertia",
     "supply_sag",
-    "winding_heating",
-    "armature_inductance",
+    "series_resistance",
     "windage",
     "gear_load_loss",
     "churning",

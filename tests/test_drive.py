@@ -207,7 +207,8 @@ def test_drive_statuses(small):
     assert names(run.result)[:8] == expected
     assert list(np.asarray(run.result.flags)[[0, 6, 7, 8]]) == [0b010, 0b010, 0b011, 0b100]
     for field in (run.result.reading.speed, run.result.reading.total_current, run.result.power_ground):
-        assert np.isfinite(np.delete(np.asarray(field), 4)).all()  # never a silent NaN
+        assert np.isfinite(np.delete(np.asarray(field), [3, 4])).all()  # no NaN but where the status says why
+        assert np.isnan(np.asarray(field)[[3, 4]]).all()
     short = go(runs, 0.05)
     assert names(short.result)[0] == "not_settled"
 

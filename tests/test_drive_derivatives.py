@@ -114,7 +114,6 @@ NOT_IN_STEADY = {
     "wheeled.ground.friction.speed_dynamic": "below V_s only static friction acts",
     "wheeled.track.guide_friction": "times a guide share of 0: the wheels carry the weight",
     "effects.rotating_inertia.amplitude": "no torque at constant speed",
-    "effects.armature_inductance.amplitude": "no voltage across it at constant current",
     "effects.pulley_eccentricity.amplitude": "zero on the average of a turn",
 }
 #: Alive only away from the nominal value of another parameter.

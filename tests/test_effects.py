@@ -49,7 +49,9 @@ SIGNAL_UNITS = {
     "1/s^2": "acceleration_wheel",
     "N·m": "torque_electromagnetic torque_motor_loss torque_motor torque_track_loss torque_load torque_idle "
     "torque_input torque_gear torque_net",
-    "-": "wheeled slope adhesion direction direction_travel efficiency_load",
+    "H": "inductance",
+    "kg·m^2": "inertia_added",
+    "-": "wheeled battery slope adhesion direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}
@@ -107,10 +109,11 @@ def random_states(n=400):
     rng = np.random.default_rng(12)
     low, high = (-20, -1200, -1.2, 0, 15, -0.3, 0, 0.5), (20, 1200, 1.2, 7000, 33, 0.3, 8, 2)
     current, motor, speed, charge, voltage, slope, payload, adhesion = rng.uniform(low, high, (n, 8)).T
+    memory = {e.name: jnp.asarray(e.memory_size * rng.uniform(0, 1, n)) for e in ALL if e.memory_size is not None}
     motor[:40] *= 1e-4  # through rest
     run = command(voltage, slope, payload, rng.integers(0, 2, n), rng.integers(0, 2, n), charge, adhesion)
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
-    return moving(nominal.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge))))
+    return moving(nominal.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge)), memory))
 
 
 STATES = random_states()
@@ -145,6 +148,19 @@ def outputs_steady(bare, of):
     return jax.jit(lambda a: jax.jvp(numbers, (a,), (jnp.ones_like(a),)))
 
 
+def outputs_start(bare, of):
+    """As `outputs_steady`, of the readings through a start: for what settled travel does not show."""
+    times = jnp.asarray([0.0, 0.002, 0.01, 0.1, 0.4])
+
+    def numbers(amplitude):
+        robot = dataclasses.replace(bare, effects=of(amplitude))
+        signals = jax.vmap(lambda c: drive(robot, c, times).signals)(CONDITIONS)
+        readings = jnp.stack(jax.tree.leaves(balances.sensor(robot, signals)), -1)[:, 1:]
+        return readings.reshape(-1, 3)
+
+    return jax.jit(lambda a: jax.jvp(numbers, (a,), (jnp.ones_like(a),)))
+
+
 # --- the laws: each takes an effect class and raises AssertionError ------------------------------------
 
 
@@ -173,7 +189,8 @@ def law_absent_at_zero(effect: type[Effect]) -> None:
 
 def law_alive_at_zero(effect: type[Effect]) -> None:
     """The derivative at zero is finite everywhere and not zero where the effect acts."""
-    values, slopes = outputs_steady(nominal.nominal(), lambda a: (fitted(effect, a),))(jnp.asarray(0.0))
+    outputs = outputs_start if effect.transient else outputs_steady
+    values, slopes = outputs(nominal.nominal(), lambda a: (fitted(effect, a),))(jnp.asarray(0.0))
     assert np.isfinite(values).all() and np.isfinite(slopes).all()
     moved = np.abs(slopes[:, :3]) * size(effect) / np.abs(values[:, :3])  # the readings
     assert moved.max() > 1e-6, "dead gradient"
@@ -203,6 +220,8 @@ def law_unit(effect: type[Effect]) -> None:
         signals = dataclasses.replace(
             STATES, **{name: getattr(STATES, name) * factor(unit, change) for name, unit in UNIT_OF.items()}
         )
+        kept = {n: v * factor(BY_NAME[n].memory_unit, change) for n, v in STATES.memory.items()}
+        signals = dataclasses.replace(signals, memory=kept)
         after = terms(rescaled(start), rescaled(nominal.nominal()), signals)
         expected = before * factor(balance_unit(effect), change)
         np.testing.assert_allclose(after, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
@@ -400,7 +419,7 @@ def test_effect_names_are_unique_and_those_of_their_files():
 
 
 def test_units_of_signals_are_all_known():
-    assert set(UNIT_OF) == {f.name for f in dataclasses.fields(Signals)}
+    assert {*UNIT_OF, "memory"} == {f.name for f in dataclasses.fields(Signals)}  # each memory states its own
 
 
 def test_units_of_parameters_and_balances_are_all_known(free):
@@ -421,10 +440,14 @@ def test_dimensions_of_products():
 # --- both fidelities feel every effect ------------------------------------------------------------------
 
 
+#: Instants at which `drive` is read [s]: what acts at a crawl shows at the first, what warms up at the last.
+DRIVEN = (0.0, 0.003, 0.1, 1.0, 4.0)
+
+
 @pytest.fixture(scope="module")
 def drive_readings():
-    """Readings of `drive` after 0.1 s and 1 s in all conditions, for a vector of amplitudes of ALL."""
-    times = jnp.asarray([0.0, 0.1, 1.0])
+    """Readings of `drive` from 3 ms to 4 s in all conditions, for a vector of amplitudes of ALL."""
+    times = jnp.asarray(DRIVEN)
 
     @jax.jit
     def run(amplitudes):
@@ -433,7 +456,7 @@ def drive_readings():
         )
 
         def one(c):
-            answer = drive(robot, c, times, tolerance=1e-9)
+            answer = drive(robot, c, times, tolerance=1e-11, max_steps=65_536)
             s = jax.vmap(lambda s: jnp.stack(jax.tree.leaves(balances.sensor(robot, s))))(answer.signals)
             return s[1:]
 
@@ -444,7 +467,7 @@ def drive_readings():
 
 def test_drive_without_amplitudes_is_drive_without_effects(drive_readings):
     bare = nominal.nominal()
-    plain = jax.jit(jax.vmap(lambda c: drive(bare, c, jnp.asarray([0.0, 0.1, 1.0]), tolerance=1e-9)))(CONDITIONS)
+    plain = jax.jit(jax.vmap(lambda c: drive(bare, c, jnp.asarray(DRIVEN), tolerance=1e-11)))(CONDITIONS)
     s = plain.signals
     expected = jnp.stack([s.total_current, s.speed_motor, s.speed], -1)[:, 1:]
     np.testing.assert_allclose(drive_readings(jnp.zeros(len(ALL))), expected, rtol=1e-9, atol=1e-9)
@@ -452,11 +475,16 @@ def test_drive_without_amplitudes_is_drive_without_effects(drive_readings):
 
 @pytest.mark.parametrize("k", range(len(ALL)), ids=[e.name for e in ALL])
 def test_drive_and_steady_both_feel(k, drive_readings):
-    """At a tenth of the prior's standard deviation a reading moves by more than 1e-5, in both fidelities."""
-    share = 0.1 * size(ALL[k])
+    """At a tenth of the prior's standard deviation a reading moves by more than 1e-5, in both fidelities.
+
+    What settled travel does not show is looked for in `drive` alone, at the whole of it.
+    """
+    share = (1.0 if ALL[k].transient else 0.1) * size(ALL[k])
     base, moved = drive_readings(jnp.zeros(len(ALL))), drive_readings(jnp.zeros(len(ALL)).at[k].set(share))
     assert np.isfinite(moved).all()
-    assert (np.abs(moved - base) / np.abs(base)).max() > 1e-5
+    assert (np.abs(moved - base) / np.abs(base)).max() > (1e-6 if ALL[k].transient else 1e-5)
+    if ALL[k].transient:
+        return
     of_steady = outputs_steady(nominal.nominal(), lambda a: (fitted(ALL[k], a),))
     base, moved = of_steady(jnp.asarray(0.0))[0], of_steady(jnp.asarray(share))[0]
     assert (np.abs(moved - base)[:, :3] / np.abs(base[:, :3])).max() > 1e-5

@@ -9,6 +9,7 @@ import pytest
 import reference
 
 from mmrjax import params
+from mmrjax.models.drive import drive_batch
 from mmrjax.models.steady import steady, steady_batch
 from mmrjax.signals import FLAGS, STATUSES, Command, command
 
@@ -177,8 +178,25 @@ def test_steady_stalls_exactly_below_the_voltage_that_breaks_away(robot):
     m, alpha, r = 13.1 / 2, np.radians(5.0), reference.PULLEY
     load = 0.350 + r * m * reference.G * (0.2 * 0.3 * np.cos(alpha) + 0.06 * np.cos(alpha) + np.sin(alpha))
     voltage = 0.611 * (load / (48 * 0.74) + 0.0027 + 0.0003) / 0.0259
-    assert STATUSES[int(one(robot, voltage=[voltage * 0.995], slope=alpha).status)] == "stalled"
-    assert STATUSES[int(one(robot, voltage=[voltage * 1.005], slope=alpha).status)] == "converged"
+    below, above = (one(robot, voltage=[voltage * k], slope=alpha) for k in (0.9999, 1.0001))
+    assert float(below.reading.motor_speed) == 0.0 < float(above.reading.motor_speed)
+    assert STATUSES[int(below.status)] == "stalled"
+
+
+def test_steady_stands_until_shafts_and_robot_are_faster_than_rest(robot):
+    """A tenth of V_s = 2 mm/s: below, the fidelities resolve friction at rest differently, so both say `stalled`."""
+    voltages = np.linspace(0.64, 1.2, 113)
+    runs = command(voltage=voltages, slope=np.radians(5.0))
+    answer = steady_batch(robot, runs)
+    slow = np.minimum(np.asarray(answer.reading.speed), np.asarray(answer.theoretical_speed)) < 2e-3
+    assert slow.any() and not slow.all()
+    assert (np.asarray(answer.status) == np.where(slow, STATUSES.index("stalled"), 0)).all()
+    ends = drive_batch(robot, runs, jnp.asarray([0.0, 30.0])).result
+    agree = np.asarray(answer.status) == np.asarray(ends.status)
+    assert agree.sum() >= len(voltages) - 2  # but for the edge itself
+    moving = ~slow & agree
+    np.testing.assert_allclose(ends.reading.speed[moving], answer.reading.speed[moving], rtol=1e-3)
+    np.testing.assert_allclose(ends.reading.total_current[moving], answer.reading.total_current[moving], rtol=1e-3)
 
 
 @pytest.mark.parametrize(

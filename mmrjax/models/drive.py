@@ -6,6 +6,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
@@ -76,6 +77,11 @@ def _rates(
     return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
 
 
+def _norm(error: Float[Array, " unknowns"]) -> Scalar:
+    """Root mean square of the drive's own unknowns; memories add to it and never dilute it."""
+    return optx.rms_norm(error) * (error.shape[0] / len(_UNITS)) ** 0.5
+
+
 def _step_longest(robot: Robot, command: Command) -> Scalar | None:
     """The longest step that still resolves every effect with a memory [s]; None where none has one."""
     limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in robot.remembering]
@@ -99,7 +105,7 @@ def drive(
         tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
         when the movers spin beyond V_s and the robot gains no speed; `battery_empty` when the charge has
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
-        the integrator gave up. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
+        the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     dtype = jnp.result_type(command.voltage)
     y0 = jnp.zeros(len(_units(robot)), dtype).at[4].set(command.discharge / _UNITS[4])
@@ -115,7 +121,7 @@ def drive(
         max_steps=max_steps,
         throw=False,
         stepsize_controller=diffrax.PIDController(
-            rtol=tolerance, atol=tolerance, dtmax=_step_longest(robot, command)
+            rtol=tolerance, atol=tolerance, norm=_norm, dtmax=_step_longest(robot, command)
         ),
         adjoint=diffrax.ForwardMode(),
     )
@@ -128,8 +134,8 @@ def drive(
     going = (command.battery < 0.5) | ~robot.battery.empty(signals.discharge)
     signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
     time_end = jnp.max(jnp.where(going, times, times[0]))
-    there = status != BATTERY_EMPTY
-    answer = withhold(result(robot, end, status), there, jnp.asarray(True))
+    there = (status != BATTERY_EMPTY) & (status != FAILED)
+    answer = withhold(result(robot, end, status), there, status != FAILED)
     return Trajectory(times, distance, signals, time_end, answer)
 
 
