@@ -84,6 +84,7 @@ class Coordinates(eqx.Module):
         u = self.location + self.spread * z
         w = _SOFTNESS * self.spread
         u = u + w * jax.nn.softplus((self.low - u) / w) - w * jax.nn.softplus((u - self.high) / w)
+        u = jnp.clip(u, self.low, self.high)  # of rounding, far outside
         return jnp.where(jnp.asarray(self.scale), jnp.exp(u), u)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
