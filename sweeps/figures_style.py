@@ -34,6 +34,7 @@ STATUS_WORDS = {
     "not_settled": "not settled",
     "battery_empty": "battery empty",
     "failed": "failed",
+    "tips": "tips over",
 }
 
 _RC = {
