@@ -172,15 +172,24 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
     )
 
 
+def _to_slip(robot: Robot, command: Command, chassis: Chassis, signals: Signals) -> Signals:
+    """The balances between kinematics and traction, in their order."""
+    signals = electrical(robot, supply(robot, command, signals))
+    return slip(robot, travel(robot, chassis, motor(robot, signals)))
+
+
+def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
+    """Traction [N] and what it leaves to accelerate the robot, eq. (1)."""
+    acceleration = (traction - signals.demand) / (signals.mass / robot.sides)
+    return _fill(signals, traction=traction, acceleration=acceleration)
+
+
 def moving(robot: Robot, command: Command, state: State) -> Signals:
     """All signals of a robot in motion: traction follows from sliding by the friction law."""
     chassis = robot.chassis(command.wheeled)
-    signals = electrical(robot, supply(robot, command, begin(robot, command, state)))
-    signals = slip(robot, travel(robot, chassis, motor(robot, signals)))
+    signals = _to_slip(robot, command, chassis, begin(robot, command, state))
     traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
-    signals = _fill(
-        signals, traction=traction, acceleration=(traction - signals.demand) / (signals.mass / robot.sides)
-    )
+    signals = _pulled(robot, signals, traction)
     return gearbox(robot, chassis, track(robot, chassis, signals))
 
 
@@ -209,13 +218,10 @@ def resolved(robot: Robot, command: Command, state: State, mover: Mover, inertia
     """
     chassis = dataclasses.replace(robot.chassis(command.wheeled), inertia=inertia)
     signals = _fill(begin(robot, command, state), normal=mover.normal)
-    signals = electrical(robot, supply(robot, command, signals))
-    signals = slip(robot, travel(robot, chassis, motor(robot, signals)))
+    signals = _to_slip(robot, command, chassis, signals)
     pull = mover.pull(chassis, signals)
     traction, guide = pull.traction, jnp.sum(pull.guide)
-    signals = _fill(
-        signals, traction=traction, acceleration=(traction - signals.demand) / (signals.mass / robot.sides)
-    )
+    signals = _pulled(robot, signals, traction)
     signals = track(robot, chassis, signals, guide)
     return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
 
@@ -229,8 +235,7 @@ def settled(robot: Robot, command: Command, state: State) -> tuple[Signals, Scal
     """
     chassis = robot.chassis(command.wheeled)
     signals = begin(robot, command, state, direction=jnp.ones_like(state.speed_motor))
-    signals = electrical(robot, supply(robot, command, signals))
-    signals = slip(robot, travel(robot, chassis, motor(robot, signals)))
+    signals = _to_slip(robot, command, chassis, signals)
     signals = _fill(signals, traction=signals.demand)
     creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
     return gearbox(robot, chassis, track(robot, chassis, signals)), creep

@@ -13,7 +13,16 @@ from mmrjax.ground import Ground
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
 from mmrjax.robot import Robot
-from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V, adhesion_ratio
+from mmrjax.tables import (
+    BENCH,
+    PAYLOADS_KG,
+    PITCH_TOOTH,
+    SLOPES_DEG,
+    SURFACES,
+    TEETH_PULLEY,
+    VOLTAGES_V,
+    adhesion_ratio,
+)
 from mmrjax.track import Track
 
 __all__ = [
@@ -29,8 +38,6 @@ __all__ = [
     "sm2",
 ]
 
-TEETH_BELT, TEETH_PULLEY, PITCH_TOOTH = 168, 48, 5e-3  # Section 3.4.4; pitch [m], Section 3.2.4
-PITCH_GROUSER = 35e-3  # [m], Section 3.2.4
 RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 RADIUS_WHEEL = 50e-3  # D_w / 2, Table 6
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -112,3 +113,8 @@ def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
         else:
             changes[field.name] = _replace(value, values, f"{name}.")
     return dataclasses.replace(component, **changes) if changes else component
+
+
+def strong(robot: eqx.Module) -> eqx.Module:
+    """`robot` without weakly typed numbers: each of those is another program to compile of the same function."""
+    return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if eqx.is_array(x) else x, robot)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from pathlib import Path as File
 from typing import Any, NamedTuple
@@ -15,11 +16,13 @@ from mmrjax.belt import Path, tips
 from mmrjax.models.track import Trajectory
 from mmrjax.robot import Robot
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, RunningGear
-from mmrjax.signals import Command
+from mmrjax.signals import GRAVITY, Command
 from mmrjax.undercarriage import lever_tip
 
 FORMATS = (".png", ".gif", ".mp4")
 FORCE = 1 / 800  # length of an arrow [m/N]
+RATE = 20  # frames a second
+FRAMES = 10_000  # of a film at most; each takes about a third of a second to draw
 
 _INK, _BODY, _BELT, _GROUND = "#1f2933", "#5b8db8", "#2f3437", "#b8a98f"
 _NORMAL, _TRACTION, _RESISTANCE, _GUIDE, _WEIGHT = "#d1495b", "#2e933c", "#b07d12", "#7048a8", "#1f2933"
@@ -86,7 +89,7 @@ def scene(robot: Robot, command: Command, run: Trajectory, gear: RunningGear | N
         support=np.asarray(reactions.support),
         traction=np.asarray(signals.traction),
         resistance=np.asarray(signals.resistance),
-        weight=float(np.asarray(signals.mass)[0]) / robot.sides * 9.80665,
+        weight=float(np.asarray(signals.mass)[0]) / robot.sides * GRAVITY,
     )
 
 
@@ -232,8 +235,32 @@ def _pixels(sheet: Any) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def instants(
+    file: File, begin: float, end: float | None, slow: float, length: float, rate: int = RATE
+) -> Float[np.ndarray, " frames"]:
+    """Times [s] that `render` draws of a run that lasts `length` [s]; asked before a run, it spares a vain one.
+
+    Raises:
+        ValueError: the suffix is none of `FORMATS`; no time of the run lies between `begin` and `end`; the film
+            has more than `FRAMES` pictures.
+    """
+    if file.suffix not in FORMATS:
+        raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
+    film, last = file.suffix != ".png", length if end is None else end
+    until = min(last, length)
+    if not 0 <= begin <= length or (film and not begin < until):
+        given = f"begin, end: got {begin:g} to {last:g} s" if film else f"begin: got {begin:g} s"
+        raise ValueError(f"{given}; expected times within 0 to {length:g} s, the run's")
+    if not film:
+        return np.asarray([begin])
+    pictures = (until - begin) * rate * slow
+    if not 0 < pictures <= FRAMES:
+        raise ValueError(f"slow: got {slow:g}, a film of {pictures:.0f} pictures; expected at most {FRAMES}")
+    return np.arange(begin, until, 1 / (rate * slow))
+
+
 def render(
-    view: Scene, file: str | File, begin: float = 0.0, end: float | None = None, slow: float = 10.0, rate: int = 20
+    view: Scene, file: str | File, begin: float = 0.0, end: float | None = None, slow: float = 10.0, rate: int = RATE
 ) -> File:
     """Write a picture (.png, of the instant `begin`) or a film (.gif, .mp4) of a scene.
 
@@ -245,35 +272,30 @@ def render(
         rate: frames a second.
 
     Raises:
-        ValueError: the suffix is none of `FORMATS`, or no sample lies between `begin` and `end`.
+        ValueError: as `instants`.
     """
     file = File(file)
-    if file.suffix not in FORMATS:
-        raise ValueError(f"file: got {file.name}; expected a name that ends in {', '.join(FORMATS)}")
-    end = float(view.time[-1]) if end is None else end
-    instants = [begin] if file.suffix == ".png" else np.arange(begin, end, 1 / (rate * slow))
-    frames = [int(np.argmin(np.abs(view.time - t))) for t in instants if t <= view.time[-1]]
-    if not frames:
-        raise ValueError(f"begin, end: got {begin:g} to {end:g} s; expected times within 0 to {view.time[-1]:g} s")
+    times = instants(file, begin, end, slow, float(view.time[-1]), rate)
+    frames = [int(np.argmin(np.abs(view.time - t))) for t in times]
     if file.suffix == ".png":
         figure(view, frames[0]).savefig(file)
         return file
     pictures = (_pixels(figure(view, k)) for k in frames)
+    first = next(pictures)
     if file.suffix == ".gif":
         from PIL import Image
 
-        images = [Image.fromarray(p).quantize(256) for p in pictures]
+        images = [Image.fromarray(p).quantize(256) for p in itertools.chain([first], pictures)]
         images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
         return file
     import imageio_ffmpeg
 
-    first = _pixels(figure(view, frames[0]))
     writer = imageio_ffmpeg.write_frames(str(file), (first.shape[1], first.shape[0]), fps=rate, quality=7)
     with warnings.catch_warnings():
         # jax warns of every fork; this one becomes ffmpeg at once and never touches jax's threads
         warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
         writer.send(None)
-    for picture in pictures:
+    for picture in itertools.chain([first], pictures):
         writer.send(picture.tobytes())
     writer.close()
     return file

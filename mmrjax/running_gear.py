@@ -7,8 +7,10 @@ import math
 import equinox as eqx
 
 from mmrjax.params import Scalar, parameter
+from mmrjax.tables import GROUSERS, TEETH_BELT, TEETH_PULLEY
 
-TEETH_BELT, TEETH_PULLEY, GROUSERS = 168, 48, 24  # main track of one side, Section 3.4.4
+__all__ = ["GROUSERS", "TEETH_BELT", "TEETH_PULLEY", "WHEELS", "RunningGear"]
+
 WHEELS = 2  # of one side, 4W2T
 
 _ASSUMED = "assumed; the paper prints none"

@@ -7,6 +7,10 @@ from typing import NamedTuple
 #: Configurations in the order of `Command.wheeled`.
 CONFIGURATIONS = ("6T2A", "4W2T")
 
+#: Main track of one side: teeth of belt and pulley, grousers (Section 3.4.4); pitches [m] (Section 3.2.4).
+TEETH_BELT, TEETH_PULLEY, GROUSERS = 168, 48, 24
+PITCH_TOOTH, PITCH_GROUSER = 5e-3, 35e-3
+
 #: Axes of Table 8.
 SLOPES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
 PAYLOADS_KG = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0)

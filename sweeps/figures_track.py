@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from mmrjax.models import ripple
-from mmrjax.models.track import Trajectory, track_batch
-from mmrjax.nominal import PITCH_GROUSER, PITCH_TOOTH
+from mmrjax.models.stability import largest_step
+from mmrjax.models.track import STEP, Trajectory, track_batch
 from mmrjax.robot import CONFIGURATIONS, Robot
+from mmrjax.signals import CONVERGED, NOT_SETTLED, SLIDES
+from mmrjax.tables import PITCH_GROUSER, PITCH_TOOTH
 from sweeps.figures_data import command
 from sweeps.figures_style import BLUE, CONFIGURATION, FAINT, GREEN, INK, ORANGE, figure, label_end, note
 
 SECONDS = 1.5  # of a run
+SAMPLE = 5e-4  # of its record [s]
 TAIL = 0.3  # of it at the end that is looked at for ripple [s]
 SHOWN = 0.15  # and drawn [s]
 
 
 def runs(robot: Robot) -> Trajectory:
-    """6T2A and 4W2T from standstill on the flat at 33 V without payload, in NumPy."""
+    """6T2A and 4W2T from standstill on the flat at 33 V without payload, in NumPy.
+
+    A robot too stiff for the model's usual step is run with a smaller one.
+    """
     import jax
 
     conditions = command(robot, configuration=np.array(CONFIGURATIONS), voltage=33.0)
-    return jax.device_get(track_batch(robot, conditions, duration=SECONDS, sample=5e-4))
+    step = min(STEP, float(largest_step(robot, conditions).min()))
+    step = SAMPLE / math.ceil(SAMPLE / step * (1 - 1e-9))
+    return jax.device_get(track_batch(robot, conditions, duration=SECONDS, sample=SAMPLE, step=step))
+
+
+def drives(run: Trajectory) -> bool:
+    """Whether both runs moved forward on their contacts to the end, so that there is a ripple to show."""
+    return bool(np.isin(np.asarray(run.result.status), (CONVERGED, NOT_SETTLED, SLIDES)).all())
 
 
 def _tail(run: Trajectory, seconds: float) -> slice:

@@ -10,8 +10,9 @@ import reference
 from scipy.integrate import cumulative_simpson
 
 from mmrjax import balances, params
+from mmrjax.effects.thermal_drift import ThermalDrift
 from mmrjax.models.drive import drive, drive_batch
-from mmrjax.models.steady import steady_batch
+from mmrjax.models.steady import steady, steady_batch
 from mmrjax.signals import CONVERGED, STATUSES, State, command
 
 STATES = ("current", "speed_motor", "speed", "discharge")
@@ -166,6 +167,39 @@ def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regain
     assert names(point)[:2] == ["converged", "converged"]
     assert names(run.result)[:2] == ["slides", "converged"]
     check_settled(run, point, [1])
+
+
+def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
+    """Also on the slope where a start from standstill slides; above the limit it slides all the same."""
+    runs = command(voltage=[24.0, 24.0, 24.0], slope=np.radians([5.0, 12.0, 20.0]), wheeled=[1.0, 0.0, 0.0])
+    go = jax.jit(lambda r: jax.vmap(lambda c: drive(r, c, jnp.asarray([0.0, 4.0]), rolling=True).result)(runs))
+    answer, point = go(robot), steady_batch(robot, runs)
+    assert names(answer) == names(point) == ["converged", "converged", "slides"]
+    for name in ("total_current", "motor_speed", "speed"):
+        here, there = np.asarray(getattr(answer.reading, name)), np.asarray(getattr(point.reading, name))
+        np.testing.assert_allclose(here[:2], there[:2], rtol=1e-6)
+
+    def speed(model, static):
+        changed = params.replace(robot, {"tracked.ground.friction.static": static})
+        return model(changed).reading.speed[1]
+
+    slopes = [
+        jax.jvp(lambda x, m=m: speed(m, x), (jnp.asarray(0.32),), (jnp.ones(()),))[1]
+        for m in (go, lambda r: steady_batch(r, runs))
+    ]
+    assert slopes[1] > 0.01
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-4)
+
+
+def test_drive_that_starts_rolling_remembers_as_if_it_had_long_been(robot):
+    warm = dataclasses.replace(robot, effects=(ThermalDrift(amplitude=jnp.asarray(1.0)),))
+    run = command(voltage=24.0, slope=0.1)
+    answer = jax.jit(lambda r: drive(r, run, jnp.asarray([0.0, 1.0]), rolling=True))(warm)
+    here, point, bare = answer.result.reading, steady(warm, run).reading, steady(robot, run).reading
+    assert abs(point.motor_speed / bare.motor_speed - 1) > 1e-4
+    np.testing.assert_allclose(here.motor_speed, point.motor_speed, rtol=1e-6)
+    memory = answer.signals.memory["thermal_drift"]
+    np.testing.assert_allclose(memory[1], memory[0], rtol=1e-6)
 
 
 def test_drive_start_has_three_stages(drive_table8, grid):

@@ -7,19 +7,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from calibration.doors import BadConfiguration
 from mmrjax import params
 from mmrjax.models.half_robot import margin, stand, system
-from mmrjax.models.stability import largest_step
+from mmrjax.models.stability import _whole, largest_step
 from mmrjax.models.track import _batch, track_batch
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import FAILED, command
+from sweeps import config as configuration
+from sweeps import run
+from sweeps.grid import grid
 
 TWO = command(voltage=jnp.asarray([33.0, 33.0]), payload=jnp.asarray([0.0, 8.0]), wheeled=jnp.asarray([0.0, 1.0]))
 
 
 def test_step_too_large_is_refused_with_the_largest_stable_one(robot):
     limit = float(largest_step(robot, TWO).min())
-    with pytest.raises(ValueError, match=r"step: got 0.001 s; .*largest stable step is 0\.0001\d s \(run 1"):
+    with pytest.raises(
+        ValueError, match=r"step: got 0.001 s; .*largest stable step is 0\.0001\d s \(run 2 of 2\); take 0.0001 s,"
+    ):
         track_batch(robot, TWO, step=1e-3, sample=1e-3)
     assert 1e-4 < limit < 2e-4
 
@@ -54,11 +60,27 @@ def test_lever_below_the_ground_is_refused(robot, name):
         track_batch(robot, TWO, gear)
 
 
+def test_lever_is_measured_from_the_tracks_axle_whoever_comes_first(robot):
+    """A tip 46 mm below the axles is under the tracks' ground (43.7 mm), though not under the wheels' (50 mm)."""
+    gear = params.replace(RunningGear(), {"lever_front": jnp.asarray(-np.arcsin(0.046 / 0.205))})
+    with pytest.raises(ValueError, match="lever_front: got -13 deg, its tip 2 mm below the ground"):
+        track_batch(robot, jax.tree.map(lambda x: x[::-1], TWO), gear)
+
+
+@pytest.mark.parametrize("limit", [2.6e-4, 1.0999e-4, 1e-4, 3.7e-6, 0.5])
+def test_step_that_is_proposed_can_be_typed_in(limit):
+    """It is not above the limit, divides the sample, and survives being printed; and it is not far below."""
+    proposed = _whole(1e-3, limit)
+    typed = float(f"{proposed:g}")
+    assert 0.5 * min(limit, 1e-3) < typed <= limit * (1 + 1e-12)
+    assert 1e-3 / typed == pytest.approx(round(1e-3 / typed), abs=1e-6)
+
+
 @pytest.mark.parametrize(
     "keywords, message",
     [
-        (dict(sample=1.5e-4), "sample: got 0.00015 s; expected a whole number of intervals of 0.0001 s"),
-        (dict(duration=0.0), "duration: got 0 s"),
+        (dict(sample=1.5e-4), "step: got 0.0001 s; expected 0.00015 s, a sample, divided by a whole number"),
+        (dict(duration=0.0), "duration: got 0 s; expected a whole number of samples of 0.001 s"),
     ],
 )
 def test_times_that_do_not_fit_are_refused(robot, keywords, message):
@@ -106,3 +128,15 @@ def test_member_that_blows_up_fails_alone(robot):
     )
     assert int(answer.status[0]) == FAILED and int(answer.status[1]) != FAILED
     assert np.isnan(float(answer.reading.speed[0])) and np.isfinite(float(answer.reading.speed[1]))
+
+
+def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
+    options = {"model": "track", "step_s": 1.3e-4, "chunk": 2, "slopes_deg": (0.0,)}
+    config = configuration.resolve(configuration.Sweep, None, options)
+    runs, told = grid(config), []
+    limits = largest_step(robot, runs.command())
+    worst = int(np.argmin(limits))
+    assert limits[:2].min() > config.step_s > limits[worst]  # the first chunk could bear it
+    with pytest.raises(BadConfiguration, match=rf"run {worst + 1} of {len(runs)}"):
+        run.evaluate(robot, runs, config, None, told.append)
+    assert told == []

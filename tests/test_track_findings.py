@@ -214,3 +214,17 @@ def test_batch_compiles_once(robot, compilations):
     before = len(compilations)
     track_batch(robot, commands, **keywords)
     assert len(compilations) == before
+
+
+def test_run_in_parts_is_the_run_in_one(robot):
+    """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
+    from mmrjax.models.track import PARTS, _batch
+
+    two = command(voltage=jnp.asarray([33.0, 15.0]), wheeled=jnp.asarray([0.0, 1.0]))
+    shares = []
+    whole = _batch(robot, two, RunningGear(), 0.047, 1e-4, 1e-3, False)
+    parts = track_batch(robot, two, duration=0.047, progress=shares.append)
+    assert shares[-1] == 1.0 and len(shares) <= PARTS and (np.diff(shares) > 0).all()
+    assert jax.tree.structure(whole) == jax.tree.structure(parts)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

@@ -104,3 +104,21 @@ def test_wrong_mass_is_seen(robot, step_both):
     data.qpos[:], data.qfrc_applied[:], model.dof_armature[:] = motion.q, force, armature
     mujoco.mj_step(model, data)
     assert np.max(np.abs(data.qvel - after.v)) > 1e-8
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_mjcf_shows_a_robot_that_stands_on_its_ground(robot, name):
+    """What MuJoCo's viewer draws at the keyframe: wheels touch the ground, pulleys leave room for the grousers."""
+    gear = RunningGear()
+    model = native(robot, gear, command(**RUNS[name]))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+    mujoco.mj_forward(model, data)
+    movers = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_CYLINDER)
+    lowest = data.geom_xpos[movers, 2] - model.geom_size[movers, 0]
+    np.testing.assert_allclose(lowest, {"tracked": gear.grouser_height, "wheeled": 0.0}[name], atol=1e-6)
+    sides = data.geom_xpos[movers, 1]
+    assert len(movers) == 4 and (sides > 0.1).sum() == (sides < -0.1).sum() == 2
+    shown = np.flatnonzero(model.geom_bodyid > 0)
+    assert (model.geom_rgba[shown, 3] == 1.0).all() and set(model.geom_bodyid[shown]) == {1, 2, 3}
+    assert (data.geom_xpos[shown, 2] > 0).all()

@@ -12,6 +12,7 @@ from mmrjax.effects.brush_drop import BrushDrop
 from mmrjax.effects.centrifugal_tension import CentrifugalTension
 from mmrjax.effects.churning import Churning
 from mmrjax.effects.cogging import Cogging
+from mmrjax.effects.curve import CURVES
 from mmrjax.effects.encoder_scale import EncoderScale
 from mmrjax.effects.gear_load_loss import GearLoadLoss
 from mmrjax.effects.gear_quadratic_loss import GearQuadraticLoss
@@ -88,4 +89,4 @@ ALL: tuple[type[Effect], ...] = (
 
 BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 
-__all__ = ["ALL", "BY_NAME", "Effect"]
+__all__ = ["ALL", "BY_NAME", "CURVES", "Effect"]

@@ -1,4 +1,4 @@
-"""Fidelity `drive`: the ODE of drives and chassis from standstill, with slip, inductance and battery."""
+"""Fidelity `drive`: the ODE of drives and chassis, with slip, inductance and battery."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.models.result import result, withhold
 from mmrjax.models.rosenbrock import Rodas4
+from mmrjax.models.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
@@ -33,7 +34,7 @@ _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
 
 
 class Trajectory(eqx.Module):
-    """A run from standstill.
+    """A run.
 
     Attributes:
         time: [s], shape (times,).
@@ -88,10 +89,29 @@ def _step_longest(robot: Robot, command: Command) -> Scalar | None:
     return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
+def _start(robot: Robot, command: Command, rolling: bool) -> Float[Array, " unknowns"]:
+    """At rest; or as the steady fidelity travels, what effects remember settled too, at rest where it has no root."""
+    units = jnp.asarray(_units(robot), jnp.result_type(command.voltage))
+    rest = jnp.zeros_like(units).at[4].set(command.discharge / units[4])
+    if not rolling:
+        return rest
+    settled = operating_signals(robot, command)
+    memory = [effect.settled(robot, settled) for effect in robot.remembering]
+    state = [settled.current, settled.speed_motor, settled.speed, 0.0, command.discharge, *memory]
+    state = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
+    return jnp.where(jnp.all(jnp.isfinite(state)), state, rest)
+
+
 def drive(
-    robot: Robot, command: Command, times: Float[Array, " times"], tolerance: float = 1e-6, max_steps: int = 4096
+    robot: Robot,
+    command: Command,
+    times: Float[Array, " times"],
+    tolerance: float = 1e-6,
+    max_steps: int = 4096,
+    *,
+    rolling: bool = False,
 ) -> Trajectory:
-    """Run one robot from standstill under a constant command and keep the given times.
+    """Run one robot from standstill (or rolling) under a constant command and keep the given times.
 
     Args:
         robot: any robot; its parameters may be tracers.
@@ -99,6 +119,8 @@ def drive(
         times: increasing, from 0 [s]; the last one ends the run.
         tolerance: relative and (in units of 10 A, 1000 rad/s, 1 m/s) absolute error of a step.
         max_steps: integration steps after which a run has `failed`.
+        rolling: start at the operating point of the steady fidelity, or with the contact held at V_s where it
+            would slide; derivatives pass through it. Else from standstill.
 
     Returns:
         The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
@@ -107,14 +129,13 @@ def drive(
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
-    dtype = jnp.result_type(command.voltage)
-    y0 = jnp.zeros(len(_units(robot)), dtype).at[4].set(command.discharge / _UNITS[4])
+    y0 = _start(robot, command, rolling)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(_rates),
         Rodas4(),
         times[0],
         times[-1],
-        dt0=jnp.asarray(1e-4, dtype),
+        dt0=jnp.asarray(1e-4, y0.dtype),
         y0=y0,
         args=(robot, command),
         saveat=diffrax.SaveAt(ts=times),

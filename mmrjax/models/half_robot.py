@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import balances, mjcf, undercarriage
 from mmrjax.belt import Path
-from mmrjax.chassis import Chassis
+from mmrjax.chassis import Chassis, inertia_reduced
 from mmrjax.mjcf import Masses, mjx
 from mmrjax.models.steady import steady
 from mmrjax.params import Scalar
@@ -95,8 +95,9 @@ def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
 def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
     """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
-    reflected = run.robot.motor.inertia * run.robot.gearbox.ratio**2 * signals.efficiency_load
-    return force, jnp.zeros_like(force).at[3].set(reflected + signals.inertia_added)
+    motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
+    rotating = inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
+    return force, jnp.zeros_like(force).at[3].set(rotating)
 
 
 def current_after(run: System, signals: Signals) -> Scalar:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax.models.half_robot import Motion, advance, axle_height, roll, stand, system
+from mmrjax import params
+from mmrjax.models.half_robot import Motion, advance, roll, stand, system
 from mmrjax.robot import Robot
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import Command
@@ -33,7 +36,7 @@ def _slopes(robot: Robot, commands: Command, gear: RunningGear) -> Float[Array, 
         def slope(at: Motion) -> Float[Array, "11 11"]:
             return jax.jacfwd(rate)(jnp.concatenate([at.q, at.v, at.current[None]]), at)
 
-        return jnp.stack([slope(stand(run)), slope(roll(run))])
+        return jax.vmap(slope)(jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run)))
 
     return jax.vmap(one)(commands)
 
@@ -56,7 +59,7 @@ def largest_step(robot: Robot, commands: Command, gear: RunningGear | None = Non
     rolling, would make a small disturbance grow; the quarter is for the ripple of the contacts.
     """
     gear = RunningGear() if gear is None else gear
-    slopes = np.asarray(_slopes(robot, commands, gear))
+    slopes = np.asarray(_slopes(params.strong(robot), commands, gear))
     runs, starts = slopes.shape[:2]
     flat = slopes.reshape(runs * starts, 11, 11)
     usable = np.isfinite(flat).all(axis=(1, 2))
@@ -72,14 +75,19 @@ def largest_step(robot: Robot, commands: Command, gear: RunningGear | None = Non
     return SAFETY * (10**low).reshape(runs, starts).min(axis=1)
 
 
-def refuse(robot: Robot, commands: Command, gear: RunningGear, step: float) -> None:
+def refuse(robot: Robot, commands: Command, gear: RunningGear, step: float, sample: float) -> None:
     """Raise for what no run can be made of.
 
+    Args:
+        robot, commands, gear: a batch of runs.
+        step, sample: intervals of integration and of the record [s].
+
     Raises:
-        ValueError: a lever reaches below the ground, or the step is too large for the stiffness.
+        ValueError: a lever reaches below the ground, or the step is too large for the stiffness; the message
+            then names a step that is neither too large nor at odds with `sample`.
     """
     tracked = np.asarray(commands.wheeled) < 0.5
-    height = float(axle_height(system(robot, jax.tree.map(lambda x: x[0], commands), gear, step)))
+    height = float(robot.tracked.radius + gear.grouser_height)  # levers are on tracks alone
     for name, angle, side in (("lever_front", gear.lever_front, 1.0), ("lever_rear", gear.lever_rear, -1.0)):
         tip = float(lever_tip(gear, angle, side)[1])
         if tracked.any() and tip < -height:
@@ -92,5 +100,14 @@ def refuse(robot: Robot, commands: Command, gear: RunningGear, step: float) -> N
     if step > limits[worst]:
         raise ValueError(
             f"step: got {step:g} s; contacts and friction are too stiff for it, the largest stable step is "
-            f"{limits[worst]:.2g} s (run {worst} of the batch); take that, a softer contact or a larger V_s"
+            f"{limits[worst]:.2g} s (run {worst + 1} of {len(limits)}); take {_whole(sample, limits[worst]):g} s, a "
+            "softer contact or a larger V_s"
         )
+
+
+def _whole(sample: float, limit: float) -> float:
+    # The largest step up to `limit` that divides `sample` and that six digits write down in full.
+    count = math.ceil(sample / limit)
+    while abs(float(f"{sample / count:.6g}") * count / sample - 1) > 1e-12:
+        count += 1
+    return sample / count

@@ -15,7 +15,7 @@ from mmrjax.models.linear import SmallDense
 from mmrjax.models.newton import SmallNewton
 from mmrjax.models.result import result, withhold
 from mmrjax.robot import Robot
-from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Command, Result, State
+from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Command, Result, Signals, State
 
 # Units of the unknowns and of the torque residual, so that all are of the order of one.
 _CURRENT, _SPEED_MOTOR, _SPEED, _VOLTAGE, _TORQUE = 10.0, 1000.0, 1.0, 10.0, 100.0
@@ -58,6 +58,27 @@ def _start(robot: Robot, command: Command) -> Float[Array, " 3"]:
     )
 
 
+def _root(robot: Robot, command: Command) -> tuple[State, Array]:
+    """The state at which the balances close, and whether the search got there; derivatives are implicit."""
+    dtype = jnp.result_type(command.voltage)
+    solution = optx.root_find(
+        _residual,
+        SmallNewton(atol=float(jnp.finfo(dtype).eps) ** 0.85),
+        jax.lax.stop_gradient(_start(robot, command)),
+        args=(robot, command),
+        max_steps=40,
+        throw=False,
+        adjoint=optx.ImplicitAdjoint(linear_solver=SmallDense()),
+    )
+    return _state(solution.value, command.discharge), solution.result == optx.RESULTS.successful
+
+
+def operating_signals(robot: Robot, command: Command) -> Signals:
+    """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
+    _, command = _sound(robot, command)
+    return balances.settled(robot, command, _root(robot, command)[0])[0]
+
+
 def steady(robot: Robot, command: Command) -> Result:
     """Steady forward travel of one run: a root in motor current, motor speed and robot speed.
 
@@ -91,20 +112,9 @@ def operating_point(robot: Robot, command: Command) -> tuple[Result, Array]:
         The result, and whether robot and command are sound (see `_sound`).
     """
     sound, command = _sound(robot, command)
-    dtype = jnp.result_type(command.voltage)
-    solver = SmallNewton(atol=float(jnp.finfo(dtype).eps) ** 0.85)
-    start = jax.lax.stop_gradient(_start(robot, command))
-    solution = optx.root_find(
-        _residual,
-        solver,
-        start,
-        args=(robot, command),
-        max_steps=40,
-        throw=False,
-        adjoint=optx.ImplicitAdjoint(linear_solver=SmallDense()),
-    )
-    signals, _ = balances.settled(robot, command, _state(solution.value, command.discharge))
-    solved = (solution.result == optx.RESULTS.successful) & jnp.isfinite(signals.voltage_left + signals.torque_net)
+    state, solved = _root(robot, command)
+    signals, _ = balances.settled(robot, command, state)
+    solved = solved & jnp.isfinite(signals.voltage_left + signals.torque_net)
     rest = robot.chassis(command.wheeled).ground.friction.speed_rest
     stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest
     # Ordered by what a person would say first.

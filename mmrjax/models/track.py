@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -33,6 +35,7 @@ from mmrjax.undercarriage import Reactions
 STEP = 1e-4  # [s]
 SAMPLE = 1e-3  # [s]
 WINDOW = 0.4  # share of a run at its end over which it is averaged
+PARTS = 20  # of a run between which progress is told
 SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
 
 
@@ -51,6 +54,15 @@ class Steady(eqx.Module):
     guide_share: Scalar
     periods: Int[Array, ""]
     change: Scalar
+
+
+class Record(eqx.Module):
+    """What is kept of each sample: motion and loads at its end, means over it (`guided`: of the guides' load)."""
+
+    motions: Motion
+    signals: Signals
+    guided: Float[Array, " samples"]
+    reactions: Reactions
 
 
 class Trajectory(eqx.Module):
@@ -151,28 +163,35 @@ def track(
         the result's numbers.
     """
     run = system(robot, command, RunningGear() if gear is None else gear, step)
-    inner, samples = round(sample / step), round(duration / sample)
     start = roll(run) if rolling else stand(run)
+    end, record = _record(run, start, sample, round(duration / sample))
+    return _trajectory(run, start, end, record, sample)
 
+
+def _record(run: System, start: Motion, sample: float, samples: int) -> tuple[Motion, Record]:
     def small(motion: Motion, _: None) -> tuple[Motion, tuple[Signals, Array]]:
         after, signals, pulled = advance(run, motion)
         return after, (signals, pulled.guided)
 
     @jax.checkpoint  # reverse mode keeps one motion a sample and recomputes the steps between
-    def interval(motion: Motion, _: None) -> tuple[Motion, Any]:
-        after, every = jax.lax.scan(small, motion, None, length=inner)
-        means = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
+    def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
+        after, every = jax.lax.scan(small, motion, None, length=round(sample / run.step))
+        signals, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
         _, at, pulled = instant(run, after)
-        return after, (after, means, undercarriage.reactions(run.path, at, pulled))
+        return after, Record(after, signals, guided, undercarriage.reactions(run.path, at, pulled))
 
-    end, (motions, means, reactions) = jax.lax.scan(interval, start, None, length=samples)
-    time = sample * jnp.arange(samples + 1)
+    return jax.lax.scan(interval, start, None, length=samples)
+
+
+def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample: float) -> Trajectory:
+    motions = record.motions
+    time = sample * jnp.arange(len(motions.q) + 1)
     travelled = run.path.radius * jnp.concatenate([start.q[None, 3], motions.q[:, 3]])
-    averages = _average(run, time, travelled, means)
+    averages = _average(run, time, travelled, (record.signals, record.guided))
     status = _status(run, averages, end)
     there = (status != FAILED) & (status != TIPS)
-    answer = withhold(result(robot, averages.signals, status), there, status != FAILED)
-    return Trajectory(time[1:], motions.q, motions.v, means[0], reactions, averages, answer)
+    answer = withhold(result(run.robot, averages.signals, status), there, status != FAILED)
+    return Trajectory(time[1:], motions.q, motions.v, record.signals, record.reactions, averages, answer)
 
 
 def track_batch(
@@ -184,18 +203,26 @@ def track_batch(
     step: float = STEP,
     sample: float = SAMPLE,
     rolling: bool = False,
+    progress: Callable[[float], None] | None = None,
 ) -> Trajectory:
     """`track` over a batch of commands (leading axis of every field) for one robot, compiled once.
 
+    Args:
+        progress: told now and then the share of the runs' time that is done; between its calls the runs can be
+            interrupted. None makes one call of XLA of it, which cannot.
+
     Raises:
-        ValueError: `duration` or `sample` is no whole number of intervals; a lever reaches below the
+        ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
             ground; the step is above the largest stable one, which the message states.
     """
     gear = RunningGear() if gear is None else gear
-    for name, whole, part in (("sample", sample, step), ("duration", duration, sample)):
-        if whole < part or abs(whole / part - round(whole / part)) > 1e-6:
-            raise ValueError(f"{name}: got {whole:g} s; expected a whole number of intervals of {part:g} s")
-    refuse(robot, commands, gear, step)
+    if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
+        raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
+    if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
+        raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
+    refuse(robot, commands, gear, step, sample)
+    if progress is not None:
+        return _in_parts(robot, commands, gear, duration, step, sample, rolling, progress)
     return _batch(robot, commands, gear, duration, step, sample, rolling)
 
 
@@ -213,3 +240,59 @@ def _batch(
         return track(robot, command, gear, duration=duration, step=step, sample=sample, rolling=rolling)
 
     return jax.vmap(one)(commands)
+
+
+def _in_parts(
+    robot: Robot,
+    commands: Command,
+    gear: RunningGear,
+    duration: float,
+    step: float,
+    sample: float,
+    rolling: bool,
+    progress: Callable[[float], None],
+) -> Trajectory:
+    # All parts are of one length, for one compilation; what the last one has too many is cut off.
+    samples = round(duration / sample)
+    length = math.ceil(samples / PARTS)
+    start = motion = _begin(robot, commands, gear, step, rolling)
+    records = []
+    for done in range(0, samples, length):
+        motion, record = jax.block_until_ready(_part(robot, commands, gear, motion, step, sample, length))
+        records.append(record)
+        progress(min((done + length) / samples, 1.0))
+    return _end(robot, commands, gear, start, records, step, sample, samples)
+
+
+@eqx.filter_jit
+def _begin(robot: Robot, commands: Command, gear: RunningGear, step: float, rolling: bool) -> Motion:
+    return jax.vmap(lambda command: (roll if rolling else stand)(system(robot, command, gear, step)))(commands)
+
+
+@eqx.filter_jit
+def _part(
+    robot: Robot, commands: Command, gear: RunningGear, motions: Motion, step: float, sample: float, samples: int
+) -> tuple[Motion, Record]:
+    def one(command: Command, motion: Motion) -> tuple[Motion, Record]:
+        return _record(system(robot, command, gear, step), motion, sample, samples)
+
+    return jax.vmap(one)(commands, motions)
+
+
+@eqx.filter_jit
+def _end(
+    robot: Robot,
+    commands: Command,
+    gear: RunningGear,
+    starts: Motion,
+    records: list[Record],
+    step: float,
+    sample: float,
+    samples: int,
+) -> Trajectory:
+    def one(command: Command, start: Motion, parts: list[Record]) -> Trajectory:
+        record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
+        end = jax.tree.map(lambda x: x[-1], record.motions)
+        return _trajectory(system(robot, command, gear, step), start, end, record, sample)
+
+    return jax.vmap(one)(commands, starts, records)

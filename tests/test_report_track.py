@@ -1,0 +1,142 @@
+"""The report's section on the running gear: Figs. 23-27 out of a run of the track model, there when asked for."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from mmrjax import params
+from mmrjax.models.stability import largest_step
+from mmrjax.signals import CONVERGED, FAILED
+from sweeps import figures_track, report
+from sweeps.figures_data import command
+
+FIGURES = {
+    "track_fig23_24_from_standstill",
+    "track_fig25_ripple",
+    "track_fig26_touchdown",
+    "track_fig27_reactions",
+}
+SECONDS = 0.9  # of a run; both configurations are under way after 0.5 s
+
+
+def page(folder, robot, model):
+    path = report.write(folder, robot=robot, robot_name="nominal", model=model, runs=None, title="A run")
+    return path.read_text(encoding="utf-8")
+
+
+def drawn(text):
+    return {name for name in re.findall(r'<figure id="([^"]+)">', text) if name.startswith("track_")}
+
+
+@pytest.fixture(scope="module")
+def written(robot, tmp_path_factory):
+    """Folder and text of a report with `--model track`, and the run that its figures show."""
+    seen, runs = [], figures_track.runs
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures_track, "SECONDS", SECONDS)
+        patch.setattr(figures_track, "runs", lambda robot: seen.append(runs(robot)) or seen[0])
+        folder = tmp_path_factory.mktemp("report")
+        text = page(folder, robot, "track")
+    return folder, text, seen[0]
+
+
+@pytest.fixture(scope="module")
+def period(written):
+    """Eq. (34) [s] at the driving pulley's mean speed at the end, 6T2A: S_g = 35 mm, r_k = 38.2 mm."""
+    run = written[2]
+    return 0.035 / (run.signals.speed_wheel[0, run.time[0] > SECONDS - 0.3].mean() * 0.84 / (7 * np.pi))
+
+
+def test_report_shows_the_running_gear_with_the_track_model(written):
+    folder, text, run = written
+    assert (run.result.status == CONVERGED).all()
+    assert drawn(text) == FIGURES
+    assert {p.stem for p in (folder / "figures").glob("track_*.svg")} == FIGURES
+    assert '<h2 id="gear">' in text and 'href="#gear"' in text
+
+
+def test_report_without_the_track_model_has_none_of_it(robot, tmp_path):
+    text = page(tmp_path, robot, "steady")
+    assert drawn(text) == set() and 'id="gear"' not in text and "#gear" not in text
+    assert not list((tmp_path / "figures").glob("track_*"))
+
+
+def test_ripple_table_has_the_period_of_equation_34(written, period):
+    cells = re.search(r'id="ripple">.*?<tr><td class="words">6T2A</td>(.*?)</tr>', written[1], re.S).group(1)
+    found, expected, current, speed, reaction, guide = map(float, re.findall(r"<td>([^<]+)</td>", cells))
+    assert expected == pytest.approx(1e3 * period, abs=0.006)  # as printed
+    assert found == pytest.approx(1e3 * period, rel=0.02)
+    assert 2 < current < 20 and 0 < speed < 2 and 5 < reaction < 50
+    assert guide == pytest.approx(100 * written[2].steady.guide_share[0], abs=0.06)
+
+
+def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, written):
+    from mmrjax.models.steady import steady
+    from mmrjax.signals import command as one
+
+    said = re.search(r'id="guide-share">(.*?)</p>', written[1], re.S).group(1)
+    here, there = re.search(r"draws ([\d.]+) A here and ([\d.]+) A by the steady model", said).groups()
+    assert float(here) == pytest.approx(written[2].result.reading.total_current[0], abs=0.006)
+    assert float(there) == pytest.approx(float(steady(robot, one(voltage=33.0)).reading.total_current), abs=0.006)
+    assert float(here) > 1.2 * float(there) and "0.3 for this robot" in said
+
+
+def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(robot, written, period):
+    run = written[2]
+    figure, _ = figures_track.ripple_of_current(robot, run)
+    time, current = figure.axes[0].lines[0].get_data()
+    np.testing.assert_allclose(current, run.signals.total_current[0, -len(current) :])
+    spacing = (time[1] - time[0]) / 1e3
+
+    def agreement(lag):
+        shift = round(lag / spacing)
+        return np.corrcoef(current[shift:], current[:-shift])[0, 1]
+
+    assert agreement(period) > 0.98
+    assert max(agreement(period * share) for share in (1 / 4, 1 / 3, 1 / 2, 2 / 3)) < 0.8
+
+
+def test_figure_26_marks_a_touchdown_each_pitch(robot, written, period):
+    upper, lower = figures_track.touchdown(robot, written[2]).axes
+    for axes in (upper, lower):
+        marks = sorted(line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == ":")
+        assert len(marks) >= 3
+        np.testing.assert_allclose(np.diff(marks), 1e3 * period, rtol=0.04)  # to a sample
+    loads = [np.asarray(line.get_ydata()) for line in lower.lines if line.get_linestyle() == "-"]
+    total = np.nansum(loads, axis=0)
+    np.testing.assert_allclose(total, written[2].reactions.grouser[0, -len(total) :].sum(-1))
+
+
+def test_figure_27_ripples_on_tracks_and_not_on_wheels(written):
+    tracked, wheeled = figures_track.reactions(written[2]).axes
+    swing = [np.ptp(axes.lines[0].get_ydata()) / np.mean(axes.lines[0].get_ydata()) for axes in (tracked, wheeled)]
+    assert swing[0] > 0.05 and swing[0] > 100 * swing[1]
+    half = 6.0 * 9.80665  # roughly what one side bears [N]
+    assert all(0.8 * half < np.mean(axes.lines[0].get_ydata()) < 1.2 * half for axes in (tracked, wheeled))
+
+
+def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written, tmp_path, monkeypatch):
+    run = written[2]
+    broken = dataclasses.replace(
+        run,
+        signals=dataclasses.replace(run.signals, total_current=np.full_like(run.signals.total_current, np.nan)),
+        result=dataclasses.replace(run.result, status=np.array([FAILED, CONVERGED])),
+    )
+    monkeypatch.setattr(figures_track, "runs", lambda robot: broken)
+    text = page(tmp_path, robot, "track")
+    assert drawn(text) == set()
+    assert re.search(r'id="gear-left-out">.*6T2A: failed, 4W2T: settled', text)
+
+
+def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
+    """A sweep of it has been asked for with such a step; the report's own runs must not be refused."""
+    names = [f"{c}.ground.friction.speed_static" for c in ("tracked", "wheeled")]
+    stiff = params.replace(robot, dict.fromkeys(names, np.asarray(5e-3)))
+    taken = {}
+    monkeypatch.setattr(figures_track, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords))
+    figures_track.runs(stiff)
+    limit = largest_step(stiff, command(stiff, configuration=np.array(["6T2A", "4W2T"]), voltage=33.0)).min()
+    assert taken["step"] <= limit < 1e-4
+    assert (taken["sample"] / taken["step"]) == pytest.approx(round(taken["sample"] / taken["step"]))
