@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from calibration.doors import BadConfiguration, BadData, number
 from calibration.noise import Noise
-from calibration.problem import is_series
+from calibration.problem import SETTLED, is_series
 from calibration.records import CONDITIONS, MEASURED, Runs
+from mmrjax.models.drive import drive_batch
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED
 
 #: Replicates further apart than this many sds of their difference contradict each other.
 CONTRADICTION = 6.0
@@ -28,6 +32,7 @@ WOULD_MEASURE = {
     "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating present",
     ".friction.dynamic": "a history in which the movers spin faster than V_d (a start on a slippery slope)",
     ".friction.speed_dynamic": "a history in which the movers spin faster than V_s (a start on a slippery slope)",
+    ".guide_share": "the fidelities steady and drive (the track model puts it out; free guide_friction there)",
     ".mass": "a scale, or runs whose table does not state total_mass_kg",
 }
 
@@ -145,6 +150,33 @@ def unmeasured(names: Sequence[str], sensitivity: np.ndarray) -> dict[str, str]:
         for name, s in zip(names, sensitivity, strict=True)
         if s < 1e-6
     }
+
+
+def too_stiff(runs: Runs, robot: Robot) -> list[str]:
+    """A sentence if the track model's step is too long for some row, so that its readings are not to be trusted."""
+    from mmrjax.models.stability import largest_step
+    from mmrjax.models.track import STEP
+
+    limits = largest_step(robot, runs.command())
+    rows = ", ".join(str(k + 1) for k in np.flatnonzero(limits < STEP))
+    if not rows:
+        return []
+    return [
+        f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
+        f"{limits.min():.2g} s, so its readings there are not to be trusted; V_s is too small for μ_s"
+    ]
+
+
+def from_standstill(runs: Runs, robot: Robot) -> list[str]:
+    """A sentence if `drive` settles on some row only because it was rolling."""
+    run = drive_batch(robot, runs.command(), jnp.asarray([0.0, SETTLED]))
+    rows = ", ".join(str(k + 1) for k in np.flatnonzero(np.asarray(run.result.status) != CONVERGED))
+    if not rows:
+        return []
+    return [
+        f"rows {rows}: read from a rolling start; from standstill the calibrated robot does not settle there within "
+        f"{SETTLED:g} s, since it starts by sliding at μ_d"
+    ]
 
 
 def infeasible(

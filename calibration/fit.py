@@ -14,14 +14,16 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.normal import Normal, cholesky, forward
-from calibration.problem import Data, Observation, Problem
+from calibration.problem import MISSING, Data, Observation, Problem
 from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
 #: a twentieth of a posterior sd, about what the integrator's tolerance leaves of a rollout), and as a share.
 DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
-#: Rejected steps in a row after which a search ends.
+#: Rejected steps in a row after which a search ends, and change of z (and of the objective, relative) at which
+#: it does; the second for rollouts.
 PATIENCE = 12
+TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
 
 Z = Float[Array, " parameters"]
 
@@ -101,6 +103,10 @@ def informing(data: Data) -> np.ndarray:
 
 def _finish(function: Callable[[Z], Array], z: Z, data: Data, pin: Pin, steps: Array) -> Optimum:
     jacobian, r = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
+    return _optimum(jacobian, r, z, data, pin, steps)
+
+
+def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
     informed = jacobian[informing(data)]
     lower = cholesky(informed.T @ informed)
     sd = jnp.linalg.norm(forward(lower, jnp.eye(z.shape[0])), axis=0)
@@ -131,14 +137,81 @@ def levenberg_marquardt(
     """One search by `optimistix.LevenbergMarquardt`. To be vmapped over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
     function = residuals(problem, data, pin)
+    tolerance = TOLERANCE_LONG if problem.long else TOLERANCE
     solution = optx.least_squares(
         lambda z, _: function(z),
-        Search(rtol=1e-6, atol=1e-6, linear_solver=Normal()),
+        Search(rtol=tolerance, atol=tolerance, linear_solver=Normal()),
         pin.apply(start),
         max_steps=max_steps,
         throw=False,
     )
     return _finish(function, solution.value, data, pin, solution.stats["num_steps"])
+
+
+@eqx.filter_jit
+def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    """All that is asked of a rollout at z, in one program: residuals (misfit, then prior), Jacobian, observation.
+
+    Where a rollout's step is too long for its friction law (V_s small beside μ_s) the run shakes and its
+    derivative grows without limit; such a reading counts as one that could not be computed.
+    """
+
+    def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
+        seen = problem.observation(z)
+        r = jnp.concatenate([problem.whitened(seen, data), z - data.centre])
+        return r, (r, seen)
+
+    jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
+    known = jnp.all(jnp.isfinite(jacobian), axis=1)
+    return jnp.where(known, r, MISSING), jnp.where(known[:, None], jacobian, 0.0), seen
+
+
+def evaluated(problem: Problem, z: Z, data: Data) -> Array:
+    """The residuals of `linearised` alone, by the program of `read`: a rollout less to compile."""
+    seen = read(problem, problem.robot(z))
+    return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
+
+
+@eqx.filter_jit
+def _step(solver: Search, y: Z, state: Any, r: Array, jacobian: Array) -> tuple[Z, Any, Array]:
+    def tangent(z: Z, _: None) -> tuple[Array, None]:
+        return r + jacobian @ (z - state.y_eval), None  # evaluated at y_eval alone
+
+    y, state, _ = solver.step(tangent, y, None, {}, state, frozenset())
+    return y, state, solver.terminate(tangent, y, None, {}, state, frozenset())[0]
+
+
+def search_long(
+    problem: Problem, start: Z, data: Data, max_steps: int = 100, tell: Callable[[str], None] = lambda _: None
+) -> tuple[Optimum, Observation, Observation]:
+    """`levenberg_marquardt` with the steps taken from outside, so that a rollout is compiled once in all.
+
+    It ends too where the step from a point would gain nothing that counts (a tenth of `DECREMENT`).
+
+    Returns:
+        Where the search ended, and what the model says where it started and where it ended.
+    """
+    pin, solver = no_pin(start.shape[0]), Search(rtol=TOLERANCE_LONG, atol=TOLERANCE_LONG, linear_solver=Normal())
+    y, state, first, best, accepted = start, None, None, None, True
+    for steps in range(1, max_steps + 1):
+        at = start if state is None else state.y_eval
+        # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
+        r = None if accepted else evaluated(problem, at, data)
+        if r is None or 0.5 * jnp.sum(r**2) < best[0].cost:
+            r, jacobian, seen = linearised(problem, at, data)
+        if state is None:
+            shape = jax.eval_shape(lambda: r)  # noqa: B023
+            tangent = lambda z, _: (r + jacobian @ (z - start), None)  # noqa: B023, E731
+            state, first = solver.init(tangent, y, None, {}, shape, None, frozenset()), seen
+        y, state, done = _step(solver, y, state, r, jacobian)
+        accepted = np.array_equal(y, at)
+        if accepted:
+            best = _optimum(jacobian, r, y, data, pin, jnp.asarray(steps)), seen
+            done |= best[0].decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best[0].cost)
+        tell(f"step {steps}: objective {float(best[0].cost):.4f}")
+        if done:
+            break
+    return best[0], first, best[1]
 
 
 def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) -> Optimum:
@@ -190,3 +263,8 @@ def searches(
 def read(problem: Problem, robot: Robot) -> Observation:
     """What the model says of every row of the problem for any robot, compiled."""
     return problem.observe(robot)
+
+
+def observation(problem: Problem, z: Z) -> Observation:
+    """What the model says of every row at z, by a program that the search has compiled already if it is long."""
+    return linearised(problem, z, problem.data)[2] if problem.long else read(problem, problem.robot(z))

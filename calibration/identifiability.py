@@ -91,7 +91,11 @@ def analyse(problem: Problem, z: Array, data: Data | None = None) -> Identifiabi
     Where the adhesion limit holds z the limit is one-sided, which is for the profile to show: no sd does.
     """
     data = problem.data if data is None else data
-    whole, readings = (np.asarray(j) for j in _jacobians(problem, z, data))
+    if problem.long:
+        jacobian = np.asarray(fit.linearised(problem, z, data)[1])
+        whole, readings = jacobian[fit.informing(data)], jacobian[: data.measured.size]
+    else:
+        whole, readings = (np.asarray(j) for j in _jacobians(problem, z, data))
     _, s, v = np.linalg.svd(whole, full_matrices=False)
     covariance = (v.T / s**2) @ v
     _, singular, directions = np.linalg.svd(readings, full_matrices=False)

@@ -12,7 +12,7 @@ from calibration.calibrate import Calibration
 from calibration.identifiability import Z95
 from calibration.problem import MARGIN
 from calibration.records import CHANNELS, CONDITIONS, MEASURED, MM, RPM
-from calibration.residual import relative_error, summary
+from calibration.residual import channel_errors, relative_error
 from mmrjax.signals import STATUSES
 
 SCHEMA = "mmrjax.calibrate/1"
@@ -87,7 +87,7 @@ def parameters(c: Calibration) -> dict[str, dict[str, Any]]:
                 "family": "log-normal" if coordinates.scale[k] else "normal",
                 "median": median[k],
                 "interval": [wide[0][k], wide[1][k]],
-                "source": "stated" if name in coordinates.stated else fields[name].spec.source,
+                "source": _source(c, name, fields[name].spec.source),
             },
             "shift_in_prior_sd": c.z[k],
             "variance_ratio": about.sd[k] ** 2,
@@ -95,7 +95,20 @@ def parameters(c: Calibration) -> dict[str, dict[str, Any]]:
             "at_bound": {-1: "lower", 0: None, 1: "upper"}[int(beyond[k])],
             "measured_by_data": bool(about.sensitivity[k] > 1e-6),
         }
+        if c.beside is not None:
+            found[name]["with_steady"] = {
+                "value": float(coordinates.value(jnp.asarray(c.beside))[k]),
+                "apart_in_sd": float((c.z[k] - c.beside[k]) / about.sd[k]),
+            }
     return found
+
+
+def _source(c: Calibration, name: str, field: str) -> str:
+    if name in c.problem.coordinates.stated:
+        return "stated"
+    if c.model == "track" and name == priors.GUIDE_FRICTION:
+        return "its product with the share of the guides, as in the other fidelities"
+    return field
 
 
 def noise(c: Calibration) -> dict[str, Any]:
@@ -112,16 +125,7 @@ def noise(c: Calibration) -> dict[str, Any]:
 
 
 def _errors(simulated: np.ndarray, c: Calibration) -> dict[str, dict[str, Any]]:
-    measured = c.runs.measured()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        percent = relative_error(simulated, measured)
-    sigma = (simulated - measured) / c.sd
-    answer = {}
-    for k, channel in enumerate(CHANNELS):
-        there = sigma[np.isfinite(sigma[:, k]), k]
-        rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
-        answer[channel] = {**summary(percent[:, k]), "rms_sigma": rms}
-    return answer
+    return channel_errors(simulated, c.runs.measured(), c.sd)
 
 
 def main_kind(c: Calibration) -> str | None:
@@ -186,10 +190,14 @@ def remarks(c: Calibration) -> list[str]:
         )
     if not c.converged:
         said.append("the search did not converge; values and intervals are not to be trusted")
+    said += _beside(c)
     if c.profile is None:
         said.append("no profiles were made: the intervals are linear, and too symmetric where the model is curved")
     if c.starts.agree < len(c.starts.cost):
         said.append(c.starts.statement())
+    for status in np.unique(c.status_after[c.status_after != 0]):
+        rows = ", ".join(str(k + 1) for k in np.flatnonzero(c.status_after == status))
+        said.append(f"rows {rows}: {STATUSES[status]} with the calibrated robot")
     held = names[about.held_by_prior]
     if held.size:
         said.append(f"the prior says more than the data of: {', '.join(held)}")
@@ -223,6 +231,21 @@ def remarks(c: Calibration) -> list[str]:
         for kind, h in c.held_out.items()
         if not h.converged.all()
     ]
+    return said
+
+
+def _beside(c: Calibration) -> list[str]:
+    """How a calibration with rollouts compares with that of `steady`."""
+    if c.beside is None:
+        return []
+    about, said = c.identifiability, []
+    apart = np.abs(c.z - c.beside) / about.sd
+    worst = int(apart.argmax())
+    inside = int(np.sum(apart < Z95))
+    said.append(
+        f"{inside} of {len(apart)} parameters lie within their 95 % intervals of the same problem's optimum with "
+        f"steady; furthest apart is {about.names[worst]}, {apart[worst]:.2f} sd"
+    )
     return said
 
 

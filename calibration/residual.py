@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.records import CHANNELS
+
 
 def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """δCV = (CV - EV) / CV · 100 [%], eq. (35), with CV simulated and EV measured; any shape."""
@@ -33,3 +35,20 @@ def certainty(measured: np.ndarray, approximated: np.ndarray) -> float:
         return float("nan")
     spread = float(np.sum(y**2) - np.sum(y) ** 2 / y.size)
     return float(1 - np.sum((approximation - y) ** 2) / spread) if spread > 0 else float("nan")
+
+
+def channel_errors(simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> dict[str, dict[str, float | int]]:
+    """Errors (35) [%] and in sigmas of every channel over the rows that have a simulated value.
+
+    Args:
+        simulated, measured, sd: current [A], motor speed [rad/s], speed [m/s], shape (rows, 3).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = relative_error(simulated, measured)
+    sigma = (simulated - measured) / sd
+    answer = {}
+    for k, channel in enumerate(CHANNELS):
+        there = sigma[np.isfinite(sigma[:, k]), k]
+        rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
+        answer[channel] = {**summary(percent[:, k]), "rms_sigma": rms}
+    return answer

@@ -36,7 +36,7 @@ def load(name_or_path: str, library: Library = effects.BY_NAME) -> Robot:
 
 
 def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
-    """Read a robot file; its effects are looked up in `library` (see `effect_file.library`).
+    """Read a robot file; its effects are looked up in `library` (see `effect_file.library`) and among the curves.
 
     The file states `schema` (optional), `base` (a robot's name, `nominal` if left out), and tables of
     parameters by dotted name in SI units, e.g. `[motor] resistance = 0.9`; an effect is present when its
@@ -61,15 +61,16 @@ def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
     for name in present:
-        if name not in library:
+        if name not in library and name not in effects.CURVES:
             raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
     robot = with_effects(robot, tuple(present), library)
     return change(robot, dict(_flatten(content)), where=path.name)
 
 
 def with_effects(robot: Robot, names: tuple[str, ...], library: Library = effects.BY_NAME) -> Robot:
-    """The robot with these effects of `library` present, each with amplitude 0."""
-    return dataclasses.replace(robot, effects=tuple(library[name]() for name in names))
+    """The robot with these effects of `library`, or curves, present, each with amplitude 0."""
+    known = {**effects.CURVES, **library}
+    return dataclasses.replace(robot, effects=tuple(known[name]() for name in names))
 
 
 def change(robot: Robot, values: dict[str, Any], where: str) -> Robot:
@@ -98,6 +99,12 @@ def change(robot: Robot, values: dict[str, Any], where: str) -> Robot:
             raise BadConfiguration(
                 f"{where}, {gear}.ground.friction.speed_dynamic: got {float(friction.speed_dynamic):g}; "
                 f"expected more than speed_static, {float(friction.speed_static):g} m/s"
+            )
+    for effect in robot.effects:
+        if effect.name in effects.CURVES and not effect.low < effect.high:  # type: ignore[attr-defined]
+            raise BadConfiguration(
+                f"{where}, effects.{effect.name}.high: got {float(effect.high):g}; "  # type: ignore[attr-defined]
+                f"expected more than low, {float(effect.low):g}"  # type: ignore[attr-defined]
             )
     return robot
 

@@ -7,13 +7,14 @@ from typing import Any
 
 from rich.table import Table
 
-from calibration import outcome, priors, robot_file
+from calibration import holdout, outcome, priors, robot_file
 from calibration.calibrate import calibrate as run
-from calibration.doors import BadConfiguration
 from calibration.records import CHANNELS
 from sweeps import commands
 from sweeps import config as configuration
-from sweeps.store import digest
+
+#: Kinds of blocks to hold out, by --hold-out; None leaves them to the fidelity.
+_BLOCKS = {None: None, True: tuple(holdout.BLOCKS), False: ()}
 
 
 def calibrate(config: configuration.Calibrate, source: str, out: Path | None, force: bool) -> int:
@@ -23,16 +24,12 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
     """
     runs = commands.read_runs(source, measured=True, series=True)
     robot = commands.load_robot(config)
-    stated: dict[str, tuple[float, float]] = {}
-    for text in config.prior:
-        name, mean, sd = priors.parse_prior(text)
-        if name in stated:
-            raise BadConfiguration(f"--prior {name}: given twice; give it once")
-        stated[name] = (mean, sd)
+    stated = priors.parse_priors(config.prior)
     with commands.open_folder("calibrate", config, robot, out, force, runs) as folder:
         found = run(
             runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
             model=config.model, starts=config.starts, seed=config.seed, profiles=config.profiles,
+            blocks=_BLOCKS[config.hold_out], tell=commands.tell,
         )  # fmt: skip
         document = outcome.document(found)
         folder.write_json("result.json", document)
@@ -46,10 +43,7 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
             from sweeps import report_calibration
 
             report_calibration.write(folder.partial, found, document, robot_name=config.robot)
-        hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}
-        if runs.digest:
-            hashes[runs.source] = runs.digest
-        path = folder.finish({"seed": config.seed, "hashes": hashes, "statuses": document["statuses"]})
+        path = folder.finish({"seed": config.seed, "statuses": document["statuses"]}, runs)
         commands.say(str(path))
         settled = found.converged and all(h.converged.all() for h in found.held_out.values())
         reached = document["statuses"]["converged"] == len(runs)

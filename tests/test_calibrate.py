@@ -193,6 +193,18 @@ def test_infeasible_starts_are_refused_with_the_rows(measured):
         quick(measured, fix=["tracked.ground.friction.static"])
 
 
+def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
+    """Among them one on which the calibrated robot could not start: docs/benchmarks.md."""
+    rows = measured.where(np.array([1, 3, 4]))
+    free = ["tracked.ground.friction.static", "tracked.track.guide_share"]
+    made = quick(rows, model="drive", free=free, noise="current=10%,motor_speed=6%,speed=4%")
+    assert made.converged and made.starts.agree == 2 and (made.status_after == 0).all()
+    assert made.adhesion_used[2] > 0.9
+    for entry in outcome.parameters(made).values():
+        assert abs(entry["with_steady"]["apart_in_sd"]) < 0.01
+    assert any(note.startswith("rows 3: read from a rolling start; from standstill") for note in made.notes)
+
+
 def rows_of(path):
     with path.open(newline="") as stream:
         return list(csv.DictReader(stream))

@@ -263,6 +263,20 @@ def test_histories_calibrate_with_drive():
     assert np.all(np.abs(np.asarray(best.z - truth)) < 4 * about.sd)
 
 
+def test_lbfgs_reaches_the_same_optimum_through_a_rollout():
+    """One start-up history of `drive`, one parameter that it tells."""
+    base = nominal.nominal()
+    c = priors.coordinates(base, ("motor.inertia",))
+    runs = series_runs(c.robot(base, jnp.asarray([1.5])), seed=2)
+    runs = runs.where(runs["run_id"] == "a")
+    posed = problem.build(runs, base, c, noise.of(runs, "current=2%,motor_speed=2%,speed=2%").sd, "drive")
+    lm = solve(posed, jnp.zeros(1), posed.data)
+    other = jax.jit(lambda z: fit.quasi_newton(posed, z, posed.data, max_steps=50))(jnp.zeros(1))
+    assert lm.converged and other.converged and abs(lm.z[0]) > 0.5
+    np.testing.assert_allclose(other.cost, lm.cost, rtol=1e-5)
+    np.testing.assert_allclose(other.z, lm.z, atol=0.05 * float(lm.sd[0]))
+
+
 def test_series_pads_runs_of_different_length():
     runs = series_runs(nominal.nominal())
     short = runs.where((runs["run_id"] != "b") | (runs["time_s"] < 0.3))

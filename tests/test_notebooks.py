@@ -17,7 +17,7 @@ SCRIPTS = sorted(NOTEBOOKS.glob("*.py"))
 
 
 def test_there_are_notebooks():
-    assert len(SCRIPTS) >= 2
+    assert len(SCRIPTS) >= 3
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.stem)

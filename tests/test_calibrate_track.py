@@ -1,0 +1,128 @@
+"""Calibration through the rollouts of the track model: exact derivatives, a recovered truth, agreement with steady."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration import checks, fit, outcome, priors, records
+from calibration.calibrate import calibrate
+from calibration.priors import GUIDE_FRICTION, GUIDE_SHARE, GUIDED
+from mmrjax import nominal, params
+from mmrjax.models.steady import steady_batch
+from mmrjax.models.track import track
+from mmrjax.signals import CONVERGED
+
+STATIC = "tracked.ground.friction.static"
+CREEP = "tracked.ground.friction.speed_static"
+STATED = "current=1%,motor_speed=0.5%,speed=1%"
+TRUTH = 0.12
+
+
+@pytest.fixture(scope="module")
+def base():
+    """Nominal, with adhesion for the slopes of the tests, and a friction law that is no stiffer for it."""
+    return params.replace(nominal.nominal(), {STATIC: jnp.asarray(0.6), CREEP: jnp.asarray(0.1)})
+
+
+@pytest.fixture(scope="module")
+def seen(base):
+    """Two runs of a robot whose guides rub with 0.12: longer ones than the fit makes."""
+    conditions = records.read("measured").where(np.array([5, 7]))
+    robot = params.replace(base, {GUIDE_FRICTION: jnp.asarray(TRUTH), GUIDE_SHARE: jnp.asarray(GUIDED)})
+    run = jax.jit(jax.vmap(lambda c: track(robot, c, duration=1.0, rolling=True)))
+    return conditions, run(conditions.command())
+
+
+@pytest.fixture(scope="module")
+def made(seen):
+    """The table of those runs."""
+    conditions, runs = seen
+    reading = runs.result.reading
+    columns = {
+        "total_current_A": np.asarray(reading.total_current),
+        "motor_speed_rpm": np.asarray(reading.motor_speed) / records.RPM,
+        "speed_mm_s": np.asarray(reading.speed) / records.MM,
+    }
+    return dataclasses.replace(conditions, source="made", columns={**conditions.columns, **columns})
+
+
+def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
+    np.testing.assert_allclose(seen[1].steady.guide_share, GUIDED, atol=0.01)
+
+
+def test_in_track_the_guide_friction_stands_for_the_product(base):
+    names = priors.default_names(["6T2A", "4W2T"], base, "track")
+    assert GUIDE_FRICTION in names and GUIDE_SHARE not in names and len(names) == 11
+    turned, known = priors.guided(base)
+    fields, mean = priors.known(turned), known[GUIDE_FRICTION][0]
+    assert float(fields[GUIDE_SHARE].value) == GUIDED
+    assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
+    assert priors.known(base)[GUIDE_SHARE].value == 0.3
+    assert "free guide_friction there" in checks.would_measure(GUIDE_SHARE)
+
+
+@pytest.fixture(scope="module")
+def told():
+    return []
+
+
+@pytest.fixture(scope="module")
+def found(base, made, told):
+    free = [GUIDE_FRICTION, STATIC]
+    return calibrate(made, base, model="track", free=free, noise=STATED, starts=2, tell=told.append)
+
+
+def test_jacobian_through_the_rollout_is_the_central_difference(found):
+    at, step = jnp.asarray([0.5, -0.5]), 1e-4
+    _, jacobian, seen = fit.linearised(found.problem, at, found.problem.data)
+    assert (np.asarray(seen.status) == CONVERGED).all()
+    moved = [
+        [fit.linearised(found.problem, at + s * e, found.problem.data)[0] for s in (step, -step)] for e in np.eye(2)
+    ]
+    central = np.stack([(up - down) / (2 * step) for up, down in moved], 1)
+    np.testing.assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
+    assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
+
+
+def test_track_calibration_recovers_the_guide_friction(found, made, told):
+    document = outcome.document(found)
+    answer = document["parameters"][GUIDE_FRICTION]
+    assert found.converged and found.starts.agree == 2 and (found.status_after == CONVERGED).all()
+    assert answer["value"] == pytest.approx(TRUTH, rel=0.01)
+    assert answer["interval"][0] < TRUTH < answer["interval"][1]
+    assert abs(answer["with_steady"]["apart_in_sd"]) < 1.96
+    assert found.profile is None and not found.held_out  # minutes each, so only when asked for
+    assert any("round 1" in t for t in told) and any("start 2 of 2" in t for t in told)
+    said = " ".join(document["notes"])
+    assert "the track model puts 98% of the weight on them" in said and "2 of 2 parameters lie within" in said
+
+
+def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
+    current = steady_batch(found.robot, made.command()).reading.total_current
+    np.testing.assert_allclose(current, made["total_current_A"], rtol=5e-3)
+
+
+def test_a_friction_law_too_stiff_for_the_step_is_said(base, made):
+    stiff = params.replace(base, {CREEP: jnp.asarray(0.02)})
+    (said,) = checks.too_stiff(made, stiff)
+    assert said.startswith("rows 1, 2: the track model's step of 0.0001 s is above the largest stable one")
+
+
+@pytest.mark.slow
+def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady():
+    """docs/benchmarks.md, Calibration through the track model; some ten minutes on two cores."""
+    runs = records.read("measured")
+    found = calibrate(runs, nominal.nominal(), model="track", starts=1)
+    assert found.converged and (found.status_after == CONVERGED).all()
+    steady = outcome.parameters(calibrate(runs, nominal.nominal(), blocks=()))
+    low, high = steady[GUIDE_SHARE]["interval"]
+    here = outcome.parameters(found)
+    for name, entry in here.items():
+        assert abs(entry["with_steady"]["apart_in_sd"]) < 1.96, name
+        if name == GUIDE_FRICTION:
+            assert 0.2 * low < entry["value"] * GUIDED < 0.2 * high
+        else:
+            assert steady[name]["interval"][0] < entry["value"] < steady[name]["interval"][1], name
