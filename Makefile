@@ -6,12 +6,12 @@ READY := $(VENV)/ready
 # A command that ends with 3 is done, with some runs that did not converge; their status says why.
 DONE := || [ $$? -eq 3 ]
 
-.PHONY: demo test slow lint bench clean
+.PHONY: demo test slow lint campaign bench clean
 
 demo: $(READY)
-	$(BIN)/mmrjax sweep --out runs/demo/table8 --force $(DONE)
-	$(BIN)/mmrjax compare measured --out runs/demo/measured --force $(DONE)
-	@echo "open runs/demo/table8/report.html and runs/demo/measured/report.html"
+	$(BIN)/mmrjax loop measured --out runs/demo/loop --force $(DONE)
+	$(BIN)/mmrjax sweep --robot runs/demo/loop/robot.toml --out runs/demo/table8 --force $(DONE)
+	@echo "open runs/demo/loop/report.html, then runs/demo/table8/report.html"
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
@@ -22,6 +22,9 @@ slow: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+campaign: $(READY)
+	$(BIN)/python benchmarks/loop.py --clean 1000 --library 500 --variants 210 --outside 300 --pairs 330
 
 bench: $(READY)
 	$(BIN)/python benchmarks/steady.py

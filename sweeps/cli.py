@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from pathlib import Path
@@ -22,41 +23,44 @@ app = typer.Typer(
     "converge (their status says why); 4 bad data; 130 interrupted (the same command takes it up again).",
 )  # fmt: skip
 
-_Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady, drive or track.  [default: steady]")]
+_Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady, drive or track.  \\[default: steady]")]
 _Duration = Annotated[
     float | None,
-    typer.Option("--duration", help="Length of a run (s).  [default: drive 30, simulate 5; track 1.5]"),
+    typer.Option("--duration", help="Length of a run (s).  \\[default: drive 30, simulate 5; track 1.5]"),
 ]
 _Robot = Annotated[
-    str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  [default: nominal]")
+    str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  \\[default: nominal]")
 ]
 _Set = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change a parameter, SI units, repeatable: tracked.ground.friction.static=0.6."),
+]
+_Effects = Annotated[
+    list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
 ]
 _Configuration = Annotated[str, typer.Option(help="6T2A (tracked) or 4W2T (wheeled).")]
 _Voltage = Annotated[float, typer.Option(help="Supply voltage (V).")]
 _Slope = Annotated[float, typer.Option(help="Slope, positive uphill (deg).")]
 _Payload = Annotated[float, typer.Option(help="Additional load mass (kg).")]
 _Mass = Annotated[
-    float | None, typer.Option(help="Total mass (kg).  [default: the robot's own mass and the payload]")
+    float | None, typer.Option(help="Total mass (kg).  \\[default: the robot's own mass and the payload]")
 ]
 _Surface = Annotated[
     str, typer.Option(help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood.")
 ]
 _Step = Annotated[
-    float | None, typer.Option("--step", help="Integration step of the track model (s).  [default: 1e-4]")
+    float | None, typer.Option("--step", help="Integration step of the track model (s).  \\[default: 1e-4]")
 ]
-_Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  [default: runs/COMMAND-TIME]")]
+_Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
-_Report = Annotated[bool | None, typer.Option("--report/--no-report", help="Write report.html.  [default: report]")]
+_Report = Annotated[bool | None, typer.Option("--report/--no-report", help="Write report.html.  \\[default: report]")]
 _Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from the on-board battery.")]
 _Discharge = Annotated[
-    float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  [default: 0]")
+    float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  \\[default: 0]")
 ]
 _Chunk = Annotated[
     int | None,
-    typer.Option("--chunk", help="Runs in one vmapped call.  [default: steady 16384, drive 4096, track 512]"),
+    typer.Option("--chunk", help="Runs in one vmapped call.  \\[default: steady 16384, drive 4096, track 512]"),
 ]
 
 
@@ -83,6 +87,7 @@ def simulate(
     step: _Step = None,
     robot: _Robot = None,
     set_: _Set = None,
+    effects: _Effects = None,
     battery: _Battery = None,
     discharge: _Discharge = None,
     out: _Out = None,
@@ -91,15 +96,16 @@ def simulate(
 ) -> int:
     """Simulate one run, or the runs of a CSV file, and write a run folder.
 
-    With --model drive the run starts from standstill, and history.csv holds current and speeds over time.
+    With --model drive or track the run starts from standstill, and history.csv holds current and speeds over
+    time; with track, reactions.csv holds every load inside the running gear too.
     """
     from sweeps import config
 
     options = _options(
-        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, battery=battery,
+        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
         discharge_mAh=discharge, report=report,
     )  # fmt: skip
-    resolved = config.resolve(config.History, None, options)
+    resolved = _prepared(config.resolve(config.History, None, options))
     from sweeps import commands
 
     if runs is not None:
@@ -114,15 +120,15 @@ def simulate(
     "--set tracked.ground.friction.static=0.6"
 )
 def sweep(
-    configurations: Annotated[str | None, typer.Option(help="Comma-separated.  [default: 6T2A,4W2T]")] = None,
-    voltages: Annotated[str | None, typer.Option(help="Supply voltages (V).  [default: 15,24,33]")] = None,
+    configurations: Annotated[str | None, typer.Option(help="Comma-separated.  \\[default: 6T2A,4W2T]")] = None,
+    voltages: Annotated[str | None, typer.Option(help="Supply voltages (V).  \\[default: 15,24,33]")] = None,
     payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses (kg).  [default: 0,1.5,3,5,6.5,8]")
+        str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8]")
     ] = None,
     slopes: Annotated[
-        str | None, typer.Option(help="Slopes, positive uphill (deg).  [default: 0,5,10,15,20]")
+        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: 0,5,10,15,20]")
     ] = None,
-    surface: Annotated[str | None, typer.Option(help="Surface of Table 5.  [default: lacquered_wood]")] = None,
+    surface: Annotated[str | None, typer.Option(help="Surface of Table 5.  \\[default: lacquered_wood]")] = None,
     config_file: Annotated[
         Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
     ] = None,
@@ -131,6 +137,7 @@ def sweep(
     step: _Step = None,
     robot: _Robot = None,
     set_: _Set = None,
+    effects: _Effects = None,
     battery: _Battery = None,
     discharge: _Discharge = None,
     chunk: _Chunk = None,
@@ -151,6 +158,7 @@ def sweep(
         step_s=step,
         robot=robot,
         set=set_,
+        effects=effects,
         battery=battery,
         discharge_mAh=discharge,
         chunk=chunk,
@@ -162,7 +170,7 @@ def sweep(
         "slopes_deg": config.axis("--slopes", slopes),
         "surface": surface,
     }
-    resolved = config.resolve(config.Sweep, config_file, options)
+    resolved = _prepared(config.resolve(config.Sweep, config_file, options))
     from sweeps import commands
 
     return commands.sweep(resolved, out, force)
@@ -181,6 +189,7 @@ def compare(
     step: _Step = None,
     robot: _Robot = None,
     set_: _Set = None,
+    effects: _Effects = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
@@ -188,8 +197,10 @@ def compare(
     """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
     from sweeps import config
 
-    options = _options(model=model, duration_s=duration, step_s=step, robot=robot, set=set_, report=report)
-    resolved = config.resolve(config.Simulation, None, options)
+    options = _options(
+        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
+    )
+    resolved = _prepared(config.resolve(config.Simulation, None, options))
     from sweeps import commands
 
     return commands.compare(resolved, data, own_mass, out, force)
@@ -199,7 +210,7 @@ def compare(
 def render(
     file: Annotated[Path, typer.Argument(help="What to write: its suffix is .png, .gif or .mp4.")],
     begin: Annotated[float, typer.Option(help="Instant of a picture, first one of a film (s).")] = 0.8,
-    end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  [default: begin + 0.1]")] = None,
+    end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  \\[default: begin + 0.1]")] = None,
     slow: Annotated[float, typer.Option(help="How many times slower than life a film runs.", min=0.01)] = 20.0,
     configuration: _Configuration = "6T2A",
     voltage: _Voltage = 33.0,
@@ -211,6 +222,7 @@ def render(
     step: _Step = None,
     robot: _Robot = None,
     set_: _Set = None,
+    effects: _Effects = None,
     battery: _Battery = None,
     discharge: _Discharge = None,
     force: _Force = False,
@@ -227,10 +239,11 @@ def render(
         step_s=step,
         robot=robot,
         set=set_,
+        effects=effects,
         battery=battery,
         discharge_mAh=discharge,
     )
-    resolved = config.resolve(config.History, None, options)
+    resolved = _prepared(config.resolve(config.History, None, options))
     from sweeps import commands
 
     table = _one_run(configuration, voltage, slope, payload, mass, surface)
@@ -252,37 +265,84 @@ def calibrate(
     ] = None,
     noise: Annotated[
         str | None,
-        typer.Option(help="Sd: current=2%,motor_speed=0.5%,speed=1%.  [default: the file's columns; else estimated]"),
+        typer.Option(
+            help="Sd: current=2%,motor_speed=0.5%,speed=1%.  \\[default: the file's columns, else estimated]"
+        ),
     ] = None,
-    starts: Annotated[int | None, typer.Option(help="Searches at once.  [default: 64]")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the starts.  [default: 0]")] = None,
+    starts: Annotated[
+        int | None, typer.Option(help="Searches.  \\[default: 64; histories 8; rows with drive or track 1]")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the starts.  \\[default: 0]")] = None,
     profiles: Annotated[
         bool | None,
-        typer.Option("--profiles/--no-profiles", help="Profile likelihood of each.  [default: steady only]"),
+        typer.Option("--profiles/--no-profiles", help="Profile likelihood of each.  \\[default: steady only]"),
+    ] = None,
+    hold_out: Annotated[
+        bool | None,
+        typer.Option("--hold-out/--no-hold-out", help="Fit again without each block.  \\[default: steady only]"),
     ] = None,
     model: _Model = None,
     robot: _Robot = None,
     set_: _Set = None,
+    effects: _Effects = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
 ) -> int:
     """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
 
-    Writes robot.toml, which every command takes with --robot, and result.json.
+    Writes robot.toml, which every command takes with --robot, and result.json. With --model drive or track the search
+    begins at the optimum of steady; track takes minutes. Intervals are linear then, unless --profiles.
     """
     from sweeps import config
 
-    options = _options(model=model, robot=robot, set=set_, report=report) | {
+    options = _options(model=model, robot=robot, set=set_, effects=effects, report=report) | {
         "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
-        "noise": noise, "starts": starts, "seed": seed,
-        # A profile is some twenty refits a parameter: seconds with steady, many minutes of rollouts.
-        "profiles": False if profiles is None and model not in (None, "steady") else profiles,
+        "noise": noise, "starts": starts, "seed": seed, "profiles": profiles, "hold_out": hold_out,
     }  # fmt: skip
-    resolved = config.resolve(config.Calibrate, None, options)
+    resolved = _prepared(config.resolve(config.Calibrate, None, options))
     from sweeps import calibrate as room
 
     return room.calibrate(resolved, data, out, force)
+
+
+@app.command(epilog="Example: mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml")
+def loop(
+    data: Annotated[str, typer.Argument(help="A CSV of measured runs, or measured.")] = "measured",
+    noise: Annotated[
+        str | None,
+        typer.Option(
+            help="Sd: current=2%,motor_speed=0.5%,speed=1%, or in A, rpm, mm/s.  \\[default: the file's columns; "
+            "else these shares are assumed, and halved and doubled]"
+        ),
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(help="A prior in SI units, repeatable: tracked.ground.friction.static=0.45±0.05."),
+    ] = None,
+    replicates: Annotated[int | None, typer.Option(help="Tables of the bootstrap.  \\[default: 500]")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of everything random.  \\[default: 0]")] = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+) -> int:
+    """Find what the model lacks: fit it, trace what is left to an effect, add that, report errors before and after.
+
+    Says that nothing is missing where nothing is, and names no effect where none of the library fits. Writes
+    result.json, report.html, and robot.toml, which every command takes with --robot.
+    """
+    from sweeps import config
+
+    options = _options(robot=robot, set=set_, effects=effects, report=report) | {
+        "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
+    }  # fmt: skip
+    resolved = config.resolve(config.Loop, None, options)
+    from sweeps import loop as room
+
+    return room.loop(resolved, data, out, force)
 
 
 @app.command()
@@ -296,7 +356,20 @@ def doctor() -> int:
 def _options(**given: Any) -> dict[str, Any]:
     from sweeps import config
 
-    return {**given, "set": config.settings(given["set"])}
+    effects = given["effects"]
+    return {**given, "set": config.settings(given["set"]), "effects": tuple(effects) if effects else None}
+
+
+def _prepared(resolved: Any) -> Any:
+    """A command's configuration, once the environment is ready for the jax that the command will import.
+
+    Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
+    XLA's CPU executor (jax 0.10.2); with this flag none of twelve did (docs/benchmarks.md). Whoever sets
+    XLA_FLAGS, be it to nothing, is heeded.
+    """
+    if resolved.model == "track":
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    return resolved
 
 
 def _one_run(configuration: str, voltage: float, slope: float, payload: float, mass: float | None,
@@ -322,7 +395,8 @@ def main() -> None:
     except DoorError as error:
         code = _fail(str(error), error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
-        code = _fail("interrupted; the same command with the same --out goes on where it stopped", INTERRUPTED)
+        advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
+        code = _fail(f"interrupted; {advice}", INTERRUPTED)
     except OSError as error:
         place = error.filename or "a file"
         code = _fail(f"{place}: {error.strerror}; no run folder was left, only its .partial beside it", 2)
@@ -334,6 +408,10 @@ def main() -> None:
 
             traceback.print_exc()
             code = _fail(f"internal error: {error}", 1)
+    if code == INTERRUPTED:  # XLA may still be at work, and has crashed when Python was taken down around it
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     sys.exit(code if isinstance(code, int) else 0)
 
 

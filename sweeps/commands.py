@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from calibration import records, residual, robot_file
+from calibration import effect_file, records, residual, robot_file
 from calibration.doors import BadConfiguration, BadData
 from mmrjax import __version__, balances, params
 from mmrjax.models.drive import drive_batch
@@ -26,7 +26,7 @@ from sweeps import config as configuration
 from sweeps import outputs, run
 from sweeps.config import Simulation
 from sweeps.grid import grid
-from sweeps.store import RunFolder, default_path, digest
+from sweeps.store import RunFolder, default_path
 
 jax.config.update("jax_enable_x64", True)
 
@@ -81,8 +81,9 @@ def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bo
             if config.model == "steady":
                 table = run.evaluate(robot, runs, config, folder, advance)
             else:
-                table = {**run.conditions(robot, runs), **_histories(folder, robot, runs, config)}
-                advance(len(runs))
+                told = run.shares(advance, len(runs))
+                table = {**run.conditions(robot, runs), **_histories(folder, robot, runs, config, told)}
+                told(1.0)
         shown = min(len(runs), 6)
         print_runs({key: value[:shown] for key, value in table.items()})
         if shown < len(runs):
@@ -97,7 +98,9 @@ def simulate(config: Simulation, runs: records.Runs, out: Path | None, force: bo
         return _finish(folder, config, robot, table, {"schema": "mmrjax.simulate/1"}, runs)
 
 
-def _histories(folder: RunFolder, robot: Robot, runs: records.Runs, config: Simulation) -> dict[str, np.ndarray]:
+def _histories(
+    folder: RunFolder, robot: Robot, runs: records.Runs, config: Simulation, progress: Callable[[float], None]
+) -> dict[str, np.ndarray]:
     """Write the runs over time, of the track model with every reaction; returns the columns of their ends."""
     command = runs.command(battery=float(config.battery), discharge=run.charge(config))
     if config.model == "drive":
@@ -105,10 +108,10 @@ def _histories(folder: RunFolder, robot: Robot, runs: records.Runs, config: Simu
         trajectory = jax.device_get(drive_batch(robot, command, times))
         folder.write_table("history.csv", history_table(robot, trajectory, trajectory.distance, runs))
         return outputs.columns(trajectory.result)
-    trajectory = jax.device_get(run.track_runs(robot, command, config, rolling=False))
+    trajectory = jax.device_get(run.track_runs(robot, command, config, rolling=False, progress=progress))
     folder.write_table("history.csv", history_table(robot, trajectory, trajectory.q[..., 0], runs))
     folder.write_table("reactions.csv", reactions_table(trajectory, runs))
-    return {**outputs.columns(trajectory.result), "guide_share": np.asarray(trajectory.steady.guide_share)}
+    return outputs.columns_track(trajectory)
 
 
 def _names(runs: records.Runs) -> np.ndarray:
@@ -154,22 +157,27 @@ def render(config: Simulation, runs: records.Runs, file: Path, begin: float, end
     """Draw one run of the track model from standstill as a picture or a film."""
     from mmrjax import render as pictures
 
-    if file.suffix not in pictures.FORMATS:
-        raise BadConfiguration(f"FILE: got {file.name}; expected a name that ends in {', '.join(pictures.FORMATS)}")
+    try:
+        pictures.instants(file, begin, end, slow, config.duration)
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}") from error
     if file.exists() and not force:
         raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
     if not file.parent.is_dir():
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
     robot = load_robot(config)
     command = runs.command(battery=float(config.battery), discharge=run.charge(config))
-    with _progress(1, quiet=False, doing="simulating"):
-        trajectory = run.track_runs(robot, command, config, rolling=False)
+    with _progress(1, quiet=False) as advance:
+        told = run.shares(advance, 1)
+        trajectory = run.track_runs(robot, command, config, rolling=False, progress=told)
+        told(1.0)
     first = jax.tree.map(lambda x: x[0], (trajectory, command))
     aside = file.with_name(f".{file.stem}.writing{file.suffix}")
     try:
         view = pictures.scene(robot, first[1], first[0])
-        with _progress(1, quiet=False, doing="drawing"):
+        with _progress(1, quiet=False, doing="drawing") as advance:
             pictures.render(view, aside, begin, end, slow)
+            advance(1)
         aside.replace(file)
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
@@ -230,8 +238,9 @@ def compared(
 
 
 def load_robot(config: Simulation) -> Robot:
-    """The robot that a configuration names, with its changes."""
-    return robot_file.change(robot_file.load(config.robot), config.set, where="--set")
+    """The robot that a configuration names, with its changes; its effects may be the user's own."""
+    library = effect_file.library(config.effects)
+    return robot_file.change(robot_file.load(config.robot, library), config.set, where="--set")
 
 
 def read_runs(source: str, *, measured: bool, series: bool = False) -> records.Runs:
@@ -247,6 +256,11 @@ def read_runs(source: str, *, measured: bool, series: bool = False) -> records.R
 def say(what: Any) -> None:
     """Print text or a table to stdout."""
     _out.print(what)
+
+
+def tell(text: str) -> None:
+    """Print a line to stderr, where what is not the result goes."""
+    _err.print(text)
 
 
 def print_counts(table: dict[str, np.ndarray]) -> None:
@@ -337,7 +351,8 @@ def _progress(total: int, quiet: bool, doing: str = "simulating") -> Iterator[An
     columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=_err, disable=quiet) as bar:
         task = bar.add_task("", total=total)
-        yield lambda count: bar.advance(task, count)
+        # rounded, or the sum of a chunk's shares would end a hair below its runs
+        yield lambda count: bar.update(task, completed=round(bar.tasks[task].completed + count, 6))
 
 
 def _finish(
@@ -351,9 +366,6 @@ def _finish(
     flags = {name: int(np.sum(np.char.find(table["flags"], name) >= 0)) for name in FLAGS}
     folder.write_json("result.json", {**result, "model": config.model, "runs": len(table["status"]),
                                       "statuses": counts, "flags": flags})  # fmt: skip
-    hashes = {"robot": digest((folder.partial / "robot.toml").read_bytes())}
-    if runs.digest:
-        hashes[runs.source] = runs.digest
-    path = folder.finish({"seed": None, "hashes": hashes, "statuses": counts})
+    path = folder.finish({"seed": None, "statuses": counts}, runs)
     _out.print(str(path))
     return DONE if counts["converged"] == len(table["status"]) else SOME_NOT_CONVERGED

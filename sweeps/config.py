@@ -17,6 +17,7 @@ from mmrjax.tables import BENCH, CONFIGURATIONS, PAYLOADS_KG, SLOPES_DEG, SURFAC
 Model = Literal["steady", "drive", "track"]
 #: Length of a run [s] and runs in one vmapped call, by fidelity, where none is stated.
 DURATION = {"steady": 0.0, "drive": 30.0, "track": 1.5}
+STEP = 1e-4  # of the track model [s], where none is stated
 CHUNK = {"steady": 16_384, "drive": 4_096, "track": 512}
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
@@ -33,6 +34,7 @@ class Simulation(BaseModel):
         step_s: integration step of `track` [s].
         robot: name of a robot, or path of its TOML file.
         set: parameters to change, by dotted name, in SI units.
+        effects: Python files with effects of the user's own, see `calibration.effect_file`.
         battery: run on the on-board battery instead of the external supply.
         discharge_mAh: charge already taken from the battery.
         chunk: runs in one vmapped call; None takes `CHUNK`.
@@ -42,10 +44,11 @@ class Simulation(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     model: Model = "steady"
-    duration_s: Annotated[float, Field(gt=0, le=3600)] | None = None
-    step_s: Annotated[float, Field(gt=0, le=0.01)] = 1e-4
+    duration_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = None
+    step_s: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = STEP
     robot: str = "nominal"
     set: dict[str, float] = {}
+    effects: tuple[str, ...] = ()
     battery: bool = False
     discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
     chunk: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
@@ -55,6 +58,8 @@ class Simulation(BaseModel):
     def _acts(self) -> Self:
         if self.duration_s is not None and self.model == "steady":
             raise PydanticCustomError("idle", "duration_s acts with model drive or track only")
+        if self.step_s != STEP and self.model != "track":
+            raise PydanticCustomError("idle", "step_s acts with model track only")
         if self.discharge_mAh and not self.battery:
             raise PydanticCustomError("idle", "discharge_mAh acts with battery only")
         return self
@@ -95,17 +100,33 @@ class Calibrate(Simulation):
         free, fix: parameters to free (`default` stands for the default set) and to hold, by dotted name.
         prior: `name=value±sd` in SI units, in place of the fields' priors.
         noise: `current=2%,motor_speed=0.5%,speed=1%`; empty takes the file's sd columns, or estimates.
-        starts: searches at once; seed: of their draws.
+        starts: searches; seed: of their draws.
         profiles: whether to profile every parameter.
+        hold_out: whether to fit again without each block. None leaves these three to the fidelity.
     """
 
     free: tuple[str, ...] = ()
     fix: tuple[str, ...] = ()
     prior: tuple[str, ...] = ()
     noise: str = ""
-    starts: Annotated[int, Field(ge=1, le=100_000)] = 64
+    starts: Annotated[int, Field(ge=1, le=100_000)] | None = None
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
-    profiles: bool = True
+    profiles: bool | None = None
+    hold_out: bool | None = None
+
+
+class Loop(Simulation):
+    """What the closed loop needs to know beside the data.
+
+    Attributes:
+        prior, noise: as for `Calibrate`; noise not stated and in no column is assumed, and said so.
+        replicates: of the bootstrap; seed: of everything random.
+    """
+
+    prior: tuple[str, ...] = ()
+    noise: str = ""
+    replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
 
 
 C = TypeVar("C", bound=Simulation)

@@ -91,9 +91,10 @@ def from_standstill(starts: list[data.Start]) -> Figure:
             middle = float(np.nanmedian(start.current[during]))
             at = (start.starting + start.slipping) / 2
             current.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
+        settled = start.current[start.time > 0.9 * last]  # the running gear may ripple: mean, above the crests
         current.annotate(
-            f"{start.current[-1]:.2f} A",
-            (0.9 * last, start.current[-1]),
+            f"{settled.mean():.2f} A",
+            (0.9 * last, settled.max()),
             xytext=(0, 5),
             ha="right",
             textcoords="offset points",

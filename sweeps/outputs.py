@@ -39,3 +39,8 @@ def columns(result: Result) -> dict[str, np.ndarray]:
     bits = np.asarray(result.flags)
     columns["flags"] = np.array([";".join(f for k, f in enumerate(FLAGS) if b >> k & 1) for b in bits], dtype=str)
     return columns
+
+
+def columns_track(trajectory: Any) -> dict[str, np.ndarray]:
+    """As `columns`, of runs of the track model, with the share of the weight that its guides carry."""
+    return {**columns(trajectory.result), "guide_share": np.asarray(trajectory.steady.guide_share)}

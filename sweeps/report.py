@@ -14,6 +14,7 @@ import numpy as np
 
 from calibration import residual
 from mmrjax import __version__
+from mmrjax.robot import CONFIGURATIONS
 from sweeps import figures, figures_data, figures_runs, figures_sweep, report_tables
 from sweeps.figures_style import CHANNEL_WORDS, STATUS_WORDS, style, svg
 
@@ -103,17 +104,35 @@ def write(
     return render(folder, "report.html.j2", album, title=title, robot=words_shown(name), model=model, **known)
 
 
-def _running_gear(album: Album, robot: Robot) -> list[dict[str, Any]]:
-    """Figs. 23-27 from the track model, both configurations from standstill on the flat at 33 V."""
+def _running_gear(album: Album, robot: Robot) -> dict[str, Any]:
+    """Figs. 23-27 from the track model, both configurations from standstill on the flat at 33 V.
+
+    Returns:
+        `left_out` None, `rows` of the ripple table, and of 6T2A the guide `friction`, the robot's own `share`
+        and both `currents` [A], by `steady` at that share and with the share resolved; or `left_out`, the
+        statuses of both, and no figures drawn.
+    """
+    from mmrjax.signals import STATUSES
     from sweeps import figures_track
 
     run = figures_track.runs(robot)
+    if not figures_track.drives(run):
+        return {"left_out": [STATUSES[k] for k in np.asarray(run.result.status)]}
     starts = figures_data.starts_of(robot, run)
     album.add("track_fig23_24_from_standstill", lambda: figures_runs.from_standstill(starts))
     facts = album.add("track_fig25_ripple", lambda: figures_track.ripple_of_current(robot, run))
     album.add("track_fig26_touchdown", lambda: figures_track.touchdown(robot, run))
     album.add("track_fig27_reactions", lambda: figures_track.reactions(run))
-    return facts
+    tracked = np.array(CONFIGURATIONS[:1])
+    lumped = figures_data.operating_points(robot, figures_data.command(robot, configuration=tracked, voltage=33.0))
+    resolved = np.asarray(run.result.reading.total_current)[0]
+    return {
+        "left_out": None,
+        "rows": facts,
+        "share": float(robot.tracked.track.guide_share),
+        "friction": float(robot.tracked.track.guide_friction),
+        "currents": (float(lumped["total_current_A"][0]), float(resolved)),
+    }
 
 
 def write_comparison(

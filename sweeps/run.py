@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,6 @@ import numpy as np
 
 from calibration.doors import BadConfiguration
 from calibration.records import Runs
-from mmrjax.models import track
 from mmrjax.models.drive import drive_batch
 from mmrjax.models.steady import steady_batch
 from mmrjax.power import COULOMB_PER_MAH
@@ -20,26 +20,51 @@ from sweeps import outputs
 from sweeps.config import Simulation
 from sweeps.store import RunFolder
 
+if TYPE_CHECKING:
+    from mmrjax.models.track import Trajectory
 
-def simulate(robot: Robot, command: Command, config: Simulation) -> dict[str, np.ndarray]:
-    """One vmapped call of the fidelity that the configuration names: the columns that it adds to its runs."""
+
+def simulate(
+    robot: Robot, command: Command, config: Simulation, progress: Callable[[float], None]
+) -> dict[str, np.ndarray]:
+    """One batch in the fidelity that the configuration names: the columns that it adds to its runs.
+
+    `progress` is told by the track model alone, which takes long, the share that is done.
+    """
     if config.model == "steady":
         return outputs.columns(jax.device_get(steady_batch(robot, command)))
     if config.model == "drive":
         answer = drive_batch(robot, command, jnp.array([0.0, config.duration]))
         return outputs.columns(jax.device_get(answer.result))
-    run = track_runs(robot, command, config, rolling=True)
-    return {**outputs.columns(jax.device_get(run.result)), "guide_share": np.asarray(run.steady.guide_share)}
+    run = track_runs(robot, command, config, rolling=True, progress=progress)
+    return outputs.columns_track(jax.device_get(run))
 
 
-def track_runs(robot: Robot, command: Command, config: Simulation, *, rolling: bool) -> track.Trajectory:
+def track_runs(
+    robot: Robot, command: Command, config: Simulation, *, rolling: bool, progress: Callable[[float], None]
+) -> Trajectory:
     """Runs of the track model, from standstill or rolling at the steady fidelity's speed.
 
     Raises:
         BadConfiguration: no whole number of steps, or a step too large for the stiffness.
     """
+    from mmrjax.models import track  # mujoco is imported only where it is used
+
     try:
-        return track.track_batch(robot, command, duration=config.duration, step=config.step_s, rolling=rolling)
+        return track.track_batch(
+            robot, command, duration=config.duration, step=config.step_s, rolling=rolling, progress=progress
+        )
+    except ValueError as error:
+        raise BadConfiguration(f"--model track: {error}") from error
+
+
+def _bear(robot: Robot, runs: Runs, config: Simulation) -> None:
+    """Refuse a step that some run of any chunk cannot bear, before the first is simulated."""
+    from mmrjax.models import stability, track
+    from mmrjax.running_gear import RunningGear
+
+    try:
+        stability.refuse(robot, runs.command(), RunningGear(), config.step_s, track.SAMPLE)
     except ValueError as error:
         raise BadConfiguration(f"--model track: {error}") from error
 
@@ -50,7 +75,7 @@ def charge(config: Simulation) -> float:
 
 
 def evaluate(
-    robot: Robot, runs: Runs, config: Simulation, folder: RunFolder, advance: Callable[[int], None]
+    robot: Robot, runs: Runs, config: Simulation, folder: RunFolder, advance: Callable[[float], None]
 ) -> dict[str, np.ndarray]:
     """Simulate every run and return the table of conditions and outcomes.
 
@@ -58,9 +83,11 @@ def evaluate(
     The last chunk is filled up with its last run, so that all chunks share one compilation.
 
     Args:
-        advance: called with the number of runs done after each chunk.
+        advance: called with the number of runs done since its last call; of a chunk under way, its share.
     """
     size = min(config.runs_at_once, len(runs))
+    if config.model == "track" and len(runs) > size:
+        _bear(robot, runs, config)
     parts = []
     for first in range(0, len(runs), size):
         rows = np.minimum(np.arange(first, first + size), len(runs) - 1)
@@ -68,14 +95,29 @@ def evaluate(
         name = f"chunk-{first // size:06d}"
         part = folder.chunk(name)
         if part is None:
+            told = shares(advance, count)
             command = runs.where(rows).command(battery=float(config.battery), discharge=charge(config))
-            part = simulate(robot, command, config)
+            part = simulate(robot, command, config, told)
             part = {key: value[:count] for key, value in part.items()}
             folder.keep_chunk(name, part)
+            told(1.0)
+        else:
+            advance(count)
         parts.append(part)
-        advance(count)
     outcome = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return {**conditions(robot, runs), **outcome}
+
+
+def shares(advance: Callable[[float], None], count: int) -> Callable[[float], None]:
+    """A function to be told what share of `count` runs is done so far, which passes on how many that adds."""
+    so_far = 0.0
+
+    def told(share: float) -> None:
+        nonlocal so_far
+        advance(count * share - so_far)
+        so_far = count * share
+
+    return told
 
 
 def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:

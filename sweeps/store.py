@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from calibration.doors import BadConfiguration, DoorError
+from calibration.records import Runs
 from mmrjax import __version__
 
 #: Packages whose versions are part of a result.
-PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "numpy")
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "lineax", "diffrax", "numpy")
 
 
 class RunFolder:
@@ -72,8 +73,14 @@ class RunFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
-        """Leave nothing behind where the command was refused; what an interrupt leaves is taken up again."""
-        if kind is not None and issubclass(kind, DoorError):
+        """Leave nothing behind where the command was refused, or interrupted before a chunk was done.
+
+        What else an interrupt leaves is taken up again.
+        """
+        if kind is None:
+            return
+        vain = issubclass(kind, KeyboardInterrupt) and not any((self.partial / "chunks").glob("*.npz"))
+        if vain or issubclass(kind, DoorError):
             shutil.rmtree(self.partial, ignore_errors=True)
 
     def chunk(self, name: str) -> dict[str, np.ndarray] | None:
@@ -107,8 +114,15 @@ class RunFolder:
             writer.writerow(columns)
             writer.writerows(zip(*(map(_text, column) for column in columns.values()), strict=True))
 
-    def finish(self, manifest: dict[str, Any]) -> Path:
-        """Write the manifest, drop the chunks, and move the folder into place; returns its path."""
+    def finish(self, manifest: dict[str, Any], runs: Runs) -> Path:
+        """Write the manifest, drop the chunks, and move the folder into place; returns its path.
+
+        Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added.
+        """
+        hashes = {"robot": digest((self.partial / "robot.toml").read_bytes())}
+        if runs.digest:
+            hashes[runs.source] = runs.digest
+        manifest = {**manifest, "hashes": hashes}
         now = datetime.datetime.now(datetime.UTC)
         self.write_json(
             "manifest.json",

@@ -23,6 +23,9 @@ CLIMBS = ["--set", "tracked.ground.friction.static=0.6", "--set", "wheeled.groun
 def mmrjax(monkeypatch, capsys, tmp_path):
     """Run a command in this process; returns exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it, for this process alone
+
+    monkeypatch.setattr(os, "_exit", sys.exit)  # how an interrupted command ends; this process goes on
 
     def command(*arguments):
         monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
@@ -174,6 +177,8 @@ USAGE = {
         ["sweep", "--duration", "2"],
         r"options: duration_s acts with model drive or track only",
     ),
+    "step without the track model": (["simulate", "--step", "1e-5"], r"options: step_s acts with model track only"),
+    "duration without end": (["simulate", "--model", "track", "--duration", "inf"], r"option duration_s: got inf"),
     "discharge without battery": (["sweep", "--discharge", "100"], r"options: discharge_mAh acts with battery only"),
     "duration of zero": (["simulate", "--duration", "0"], r"option duration_s: got 0"),
 }
@@ -249,11 +254,51 @@ def test_simulate_track_writes_every_reaction(mmrjax, tmp_path):
     assert table(tmp_path / "t" / "runs.csv")[0]["guide_share"] != ""
 
 
+def test_sweep_track_has_a_bar_a_status_a_run_and_the_share_of_each(mmrjax, tmp_path):
+    """Rolling: on tracks 10° is climbed and 15° slides, on wheels both are climbed."""
+    arguments = ("--voltages", "33", "--payloads", "0", "--slopes", "10,15", "--duration", "0.6", "--no-report")
+    code, out, err = mmrjax("sweep", "--model", "track", *arguments, "--out", "t")
+    assert code == 3 and out.rstrip().splitlines()[-1] == "t"
+    assert "simulating" in err and "4/4" in err
+    rows = table(tmp_path / "t" / "runs.csv")
+    assert [row["status"] for row in rows] == ["converged", "slides", "converged", "converged"]
+    shares = [float(row["guide_share"]) for row in rows]
+    assert shares[0] > 0.95 and shares[2:] == [0.0, 0.0]
+    assert json.loads((tmp_path / "t" / "manifest.json").read_text())["versions"]["mujoco-mjx"]
+
+
+def test_track_run_is_interrupted_while_it_runs_and_leaves_nothing(mmrjax, tmp_path, monkeypatch):
+    """The bar moves within a batch; an interrupt between two of its moves ends the command."""
+    from rich.progress import Progress
+
+    honest, moves = Progress.update, []
+
+    def update(self, task, *, completed, **rest):
+        moves.append(completed)
+        honest(self, task, completed=completed, **rest)
+        if len(moves) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Progress, "update", update)
+    code, _, err = mmrjax("simulate", "--model", "track", "--duration", "0.06", "--no-report", "--out", "t")
+    assert code == 130 and "interrupted" in err
+    assert moves == [0.05, 0.1, 0.15] and not any(tmp_path.iterdir())
+
+
+def test_shares_of_a_batch_add_up_to_its_runs():
+    told = []
+    share = run.shares(told.append, 180)
+    for k in range(21):
+        share(k / 20)
+    share(1.0)
+    assert sum(told) == pytest.approx(180) and told[1] == pytest.approx(9) and told[-1] == 0
+
+
 def test_track_step_that_is_too_large_is_refused_before_the_run(mmrjax, tmp_path):
     code, out, err = mmrjax("simulate", "--model", "track", "--step", "0.001", "--out", "x")
     assert code == 2 and out == ""
     assert re.search(
-        r"--model track: step: got 0\.001 s; .* the largest stable step is 0\.000\d+ s", err.splitlines()[-1]
+        r"--model track: step: got 0\.001 s; .* the largest stable step is 0\.000\d+ s .*; take 0\.000\d+ s", err
     )
     assert not any(tmp_path.iterdir())
 
@@ -261,6 +306,14 @@ def test_track_step_that_is_too_large_is_refused_before_the_run(mmrjax, tmp_path
 def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
     code, _, err = mmrjax("render", "robot.bmp")
     assert code == 2 and "expected a name that ends in .png, .gif, .mp4" in err
+    for words, message in (
+        (("robot.png", "--begin", "2"), "render: begin: got 2 s; expected times within 0 to 1.5 s, the run's"),
+        (("robot.png", "--begin", "nan"), "render: begin: got nan s"),
+        (("robot.gif", "--begin", "0.2", "--end", "0.1"), "render: begin, end: got 0.2 to 0.1 s"),
+        (("robot.mp4", "--slow", "inf"), "render: slow: got inf, a film of inf pictures; expected at most 10000"),
+    ):
+        code, out, err = mmrjax("render", *words)  # before the run: there is no progress bar
+        assert code == 2 and out == "" and message in err and len(err.strip().splitlines()) == 1
     code, out, _ = mmrjax("render", "robot.png", "--duration", "0.05", "--begin", "0.04")
     assert code == 3 and out.rstrip().endswith("robot.png")
     assert (tmp_path / "robot.png").read_bytes().startswith(b"\x89PNG")
@@ -332,11 +385,11 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
                  "--no-report", "--out", "s"]  # fmt: skip
     simulated, honest = [], run.simulate
 
-    def interrupted(robot, command, settings):
+    def interrupted(robot, command, settings, progress):
         if len(simulated) == 3:
             raise KeyboardInterrupt
         simulated.append(command.slope.shape)
-        return honest(robot, command, settings)
+        return honest(robot, command, settings, progress)
 
     monkeypatch.setattr(run, "simulate", interrupted)
     code, _, err = mmrjax(*arguments)
@@ -351,11 +404,24 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
     assert not (tmp_path / "s.partial").exists()
 
 
+def test_interrupt_before_anything_is_done_leaves_nothing(mmrjax, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "simulate", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert mmrjax("sweep", "--no-report", "--out", "s")[0] == 130
+    assert not any(tmp_path.iterdir())
+
+
 def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
     arguments = ["sweep", "--slopes", "0:9:1", "--chunk", "60", "--no-report", "--out", "s"]
-    honest = run.simulate
-    monkeypatch.setattr(run, "simulate", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
-    assert mmrjax(*arguments)[0] == 130
+    honest, calls = run.simulate, []
+
+    def interrupted(*call):
+        if calls:
+            raise KeyboardInterrupt
+        calls.append(call)
+        return honest(*call)
+
+    monkeypatch.setattr(run, "simulate", interrupted)
+    assert mmrjax(*arguments)[0] == 130 and (tmp_path / "s.partial" / "chunks" / "chunk-000000.npz").exists()
     monkeypatch.setattr(run, "simulate", honest)
     mmrjax(*arguments, "--set", "motor.resistance=0.9")
     mmrjax(*arguments[:-1], "t", "--set", "motor.resistance=0.9")
@@ -392,6 +458,52 @@ def test_help_is_quick_and_imports_no_jax():
             assert "(deg)" in text if command != ["compare"] else True
     probe = "import sys; import sweeps.cli; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", probe]).returncode == 0
+
+
+@pytest.mark.parametrize("given", [None, "", "--xla_cpu_use_fusion_emitters=false"])
+@pytest.mark.parametrize("model", ["track", "drive", "steady"])
+def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, given, model):
+    monkeypatch.setenv("XLA_FLAGS", given or "")  # so that it is put back
+    if given is None:
+        monkeypatch.delenv("XLA_FLAGS")
+    resolved = config.resolve(config.Sweep, None, {"model": model})
+    assert cli._prepared(resolved) is resolved
+    ours = "--xla_cpu_multi_thread_eigen=false" if model == "track" else None
+    assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
+
+
+def test_flag_is_set_before_jax_is_imported(tmp_path):
+    """In a process of its own, up to where the options are checked and a folder refused."""
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "thesis.txt").write_text("years of work")
+    (tmp_path / "grid.toml").write_text('model = "track"\n')
+    probe = (
+        "import os, sys\n"
+        "class Seen:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'jax': print(os.environ.get('XLA_FLAGS'))\n"
+        "sys.meta_path.insert(0, Seen())\n"
+        "from sweeps.cli import main; main()"
+    )
+    bare = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"} | {"JAX_PLATFORMS": "cpu"}
+    for arguments, flag in (
+        (["sweep", "--config", "grid.toml"], "--xla_cpu_multi_thread_eigen=false"),
+        (["compare", "--model", "track"], "--xla_cpu_multi_thread_eigen=false"),
+        (["sweep"], "None"),
+    ):
+        words = [sys.executable, "-c", probe, *arguments, "--out", "taken"]
+        done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, env=bare)
+        assert done.returncode == 2 and done.stdout.split() == [flag], done.stderr
+
+
+def test_help_shows_what_an_option_is_when_it_is_not_given(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(sys, "argv", ["mmrjax", "sweep", "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    text = capsys.readouterr().out
+    for default in ("[default: steady]", "[default: 0,5,10,15,20]", "[default: 1e-4]"):
+        assert default in text
 
 
 def test_doctor_finds_this_installation_healthy(mmrjax):

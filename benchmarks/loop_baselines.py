@@ -1,0 +1,326 @@
+"""Plain selection on the tables of `loop.py`: stepwise by AICc and by BIC over the same library, and PySINDy.
+
+    python benchmarks/loop_baselines.py --clean 40 --library 66 --outside 36 --pairs 30
+
+Tables, priors and fits are the loop's; only the choice of effects is plain. PySINDy comes with the extra
+`bench`; `--without-sindy` does without. Every table is one line of `--out`, and a run that is started again
+goes on where it ended.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from loop import MIMIC, STATED, interval, make, oracle
+
+KINDS = ("clean", "library", "outside", "pairs")
+#: Effects that are refitted beside a fit: the loop's own number.
+BATCH = 16
+#: Thresholds that are tried: of a coefficient, where columns and target have an rms of 1.
+THRESHOLDS = tuple(np.geomspace(0.02, 20.0, 40))
+#: Share of a signature's norm below which an equation does not see an effect.
+UNSEEN = 1e-3
+METHODS = {
+    "aicc": "stepwise AICc",
+    "bic": "stepwise BIC",
+    "sindy": "PySINDy on the defects",
+    "sindy_refit": "PySINDy, constants refitted",
+}
+
+
+# --- stepwise -------------------------------------------------------------------------------------------
+
+
+def aicc(chi2: float, k: int, n: int) -> float:
+    """Akaike's criterion for small samples (Hurvich and Tsai 1989)."""
+    return chi2 + 2 * k + 2 * k * (k + 1) / (n - k - 1)
+
+
+def bic(chi2: float, k: int, n: int) -> float:
+    """Schwarz's criterion (1978)."""
+    return chi2 + k * np.log(n)
+
+
+class Ladder:
+    """Fits of sets of effects, each made once.
+
+    Args:
+        looped: the loop of the table, which fits; base: its fit without effects.
+    """
+
+    def __init__(self, looped, base) -> None:
+        self.looped, self.base = looped, base
+        self.curves = looped._curves(base)
+        self.fitted: dict = {frozenset(): base}
+        self.looks: dict = {}
+
+    def look(self, h) -> tuple:
+        """A fit linearised, and the scores of the library there."""
+        key = frozenset(h.effects)
+        if key not in self.looks:
+            self.looks[key] = self.looped.look(h, self.curves)[:2]
+        return self.looks[key]
+
+    def beside(self, h) -> list:
+        """Fits with one effect more: the strongest by the score test, as many as the loop itself refits."""
+        looped, scores = self.looped, self.look(h)[1]
+        single = np.abs(np.asarray(scores.single))
+        by_effect = np.array([single[looped.engine.of == k].max() for k in range(len(looped.engine.names))])
+        by_effect[list(h.effects)] = -1.0
+        wanted = [(*h.effects, int(k)) for k in np.argsort(-by_effect)[:BATCH]]
+        new = [w for w in wanted if frozenset(w) not in self.fitted]
+        empty = (-1,) * (looped.engine.size - len(h.effects) - 1)
+        found = looped.fit_all([((*w, *empty), looped.start(h, (*w, *empty), scores)) for w in new])
+        self.fitted |= {frozenset(w): x for w, x in zip(new, found, strict=True)}
+        return [self.fitted[frozenset(w)] for w in wanted]
+
+
+def stepwise(ladder: Ladder, criterion) -> list[str]:
+    """Effects added one by one, each the one with the lowest criterion, while that falls and slots are left.
+
+    Args:
+        criterion: of χ² with priors, free parameters and readings. A free parameter is a constant of the base,
+            an amplitude or a shape.
+    """
+    looped = ladder.looped
+    n = 3 * int(looped.counts.sum())
+    shaped = np.array([bool(s) for s in looped.coordinates.shapes], int)
+
+    def value(h) -> float:
+        k = len(looped.coordinates.base) + sum(1 + shaped[j] for j in h.effects)
+        return criterion(2 * h.cost, k, n)
+
+    best = ladder.base
+    while len(best.effects) < looped.engine.size:
+        further = min(ladder.beside(best), key=value)
+        if value(further) >= value(best):
+            break
+        best = further
+    return [looped.engine.names[k] for k in best.effects]
+
+
+# --- PySINDy --------------------------------------------------------------------------------------------
+
+
+def pysindy():
+    """The package, or a clear end."""
+    try:
+        import pysindy
+    except ImportError as error:
+        raise SystemExit("PySINDy is missing: install the extra `bench`, or give --without-sindy") from error
+    return pysindy
+
+
+def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
+    """Columns that STLSQ keeps at the threshold of the lowest BIC, which may be none.
+
+    Args:
+        theta: columns, shape (points, columns); target: shape (points,).
+        known: whether the target's noise has an sd of 1; else BIC takes that of the residual.
+    """
+    n, ps = len(target), pysindy()
+
+    def value(support: np.ndarray) -> float:
+        left = target
+        if support.any():
+            left = target - theta[:, support] @ np.linalg.lstsq(theta[:, support], target, rcond=None)[0]
+        rss = float(left @ left)
+        return (rss if known else n * np.log(rss / n)) + support.sum() * np.log(n)
+
+    x = theta / np.sqrt(np.mean(theta**2, 0))
+    y = target / np.sqrt(np.mean(target**2))
+    supports = [np.zeros(theta.shape[1], bool)]
+    for threshold in THRESHOLDS:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of thresholds that leave nothing
+            found = ps.STLSQ(threshold=threshold).fit(x, y[:, None])
+        supports.append(np.ravel(found.coef_) != 0)
+    return min(supports, key=value)
+
+
+def columns(looped, linear, scores) -> np.ndarray:
+    """Signature of every effect, at the shape whose score is the strongest, shape (rows that count, 3, effects)."""
+    at = [looped._best_instance(scores, k) for k in range(len(looped.engine.names))]
+    whole = np.asarray(linear.signatures)[:, at]
+    return whole.reshape(-1, 3, len(at))[looped.counts]
+
+
+def sindy(looped, linear, scores) -> list[str]:
+    """STLSQ on the defect of each of the three equations, over the effects' unit terms.
+
+    A term of another balance, or of an instrument, is taken as the defects that change the readings as it does.
+    """
+    from calibration.loop_outcome import defects
+    from calibration.trace import PROBED
+
+    found = defects(looped, SimpleNamespace(linear=linear))
+    signatures = columns(looped, linear, scores)
+    there = looped.counts[: len(looped.runs)]
+    sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][looped.counts] for b in found], 2)
+    terms = np.linalg.solve(sensitivity, signatures)  # rows, equations, effects
+    names: set[str] = set()
+    whole = np.sqrt(np.sum(signatures**2, (0, 1)))
+    for k, values in enumerate(found.values()):
+        moved = np.sqrt(np.sum((sensitivity[:, :, k, None] * terms[:, None, k]) ** 2, (0, 1)))
+        seen = np.flatnonzero(moved > UNSEEN * np.maximum(whole, 1e-12))
+        kept = sparse(terms[:, k, seen], values[there], known=False)
+        names |= {looped.engine.names[j] for j in seen[kept]}
+    return sorted(names)
+
+
+def sindy_refit(looped, linear, scores) -> list[str]:
+    """STLSQ on all three equations together, weighted by the readings' sds, the constants refitted beside it.
+
+    Both sides are what a linear refit of the constants leaves of them (Frisch, Waugh and Lovell).
+    """
+    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    theta = np.zeros((len(residual), len(looped.engine.names)))
+    at = [looped._best_instance(scores, k) for k in range(theta.shape[1])]
+    theta[: len(np.asarray(linear.signatures))] = np.asarray(linear.signatures)[:, at]
+    root = np.linalg.qr(jacobian)[0]
+    left, target = theta - root @ (root.T @ theta), residual - root @ (root.T @ residual)
+    seen = np.linalg.norm(left, axis=0) > UNSEEN * np.maximum(np.linalg.norm(theta, axis=0), 1e-12)
+    counts = np.abs(target) + np.abs(left[:, seen]).sum(1) > 0  # rows that pad the table are zero
+    kept = sparse(left[counts][:, seen], -target[counts], known=True)
+    return [looped.engine.names[j] for j in np.flatnonzero(seen)[kept]]
+
+
+# --- the campaign ---------------------------------------------------------------------------------------
+
+
+def one(engine, kind: str, seed: int, with_sindy: bool) -> dict:
+    """A case made, and what each method names."""
+    from calibration import loop, noise, records
+
+    case = make(kind, seed)
+    if case is None:
+        return {"kind": kind, "seed": seed, "skipped": True}
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "runs.csv"
+        case.write(table, Path(folder) / "label.json")
+        runs = records.read(table)
+    began = time.perf_counter()
+    looped = loop.Loop(engine, runs, noise.of(runs).sd, stated=STATED, seed=seed)
+    base = looped.base_fit()
+    ladder = Ladder(looped, base)
+    linear, scores = ladder.look(base)
+    named = {"aicc": stepwise(ladder, aicc), "bic": stepwise(ladder, bic)}
+    if with_sindy:
+        named |= {"sindy": sindy(looped, linear, scores), "sindy_refit": sindy_refit(looped, linear, scores)}
+    truth = [
+        {**{k: e[k] for k in ("name", "class", "balance", "sigmas", "sizes")}, **o}
+        for e, o in zip(case.label["effects"], oracle(case), strict=True)
+    ]
+    return {
+        "kind": kind, "seed": seed, "seconds": time.perf_counter() - began, "truth": truth,
+        "fits": len(ladder.fitted), "named": named,
+    }  # fmt: skip
+
+
+def alike(truth: dict) -> set[str]:
+    """Effects that noise-free data could not tell from the truth, itself included."""
+    return {truth["class"], *truth["class_oracle"]}
+
+
+def summary(lines: list[dict]) -> list[str]:
+    """The figures of every method."""
+    out = []
+    for method, words in METHODS.items():
+        there = [x for x in lines if method in x.get("named", {})]
+        if not there:
+            continue
+        out.append(f"--- {words}")
+
+        def say(what: str, those: list[dict], hit) -> None:
+            out.append(f"{what:64s} {interval(sum(map(bool, map(hit, those))), len(those))}")
+
+        def of(kind: str, there=there) -> list[dict]:
+            return [x for x in there if x["kind"] == kind]
+
+        def names(x: dict, method=method) -> list[str]:
+            return x["named"][method]
+
+        def right(x: dict) -> bool:
+            return len(names(x)) == 1 and names(x)[0] in alike(x["truth"][0])
+
+        def both(x: dict) -> bool:
+            (a, b), one = (alike(t) for t in x["truth"]), names(x)
+            return len(one) == 2 and any(one[i] in a and one[1 - i] in b for i in (0, 1))
+
+        def holds(x: dict) -> bool:
+            return all(alike(t) & set(names(x)) for t in x["truth"])
+
+        say("clean: a false finding", of("clean"), names)
+        library, outside = of("library"), of("outside")
+        say("library: one effect, and it is of the truth's noise-free class", library, right)
+        sole = [x for x in library if len(x["truth"][0]["class_oracle"]) == 1]
+        say("  the same, where that class is the truth alone", sole, right)
+        say("  one of the class among those named", library, holds)
+        say("  two or more effects named", library, lambda x: len(names(x)) > 1)
+        say("  nothing named", library, lambda x: not names(x))
+        free = [x for x in outside if x["truth"][0]["best_other"] >= MIMIC]
+        say("outside: a wrong name named", outside, names)
+        say("  the same without a mimic", free, names)
+        say("  without a mimic: one wrong name", free, lambda x: len(names(x)) == 1)
+        say("pairs: two effects, one of each class", of("pairs"), both)
+        say("  both classes among those named", of("pairs"), holds)
+        for kind in KINDS:
+            if of(kind):
+                out.append(f"{kind}: effects named, mean {np.mean([len(names(x)) for x in of(kind)]):.2f}")
+    spent = [x["seconds"] for x in lines if "seconds" in x]
+    done = {k: sum(x["kind"] == k and "named" in x for x in lines) for k in KINDS}
+    out.append(f"tables {done}, skipped {sum('skipped' in x for x in lines)}")
+    if spent:
+        out.append(f"seconds a table, all methods: median {np.median(spent):.2f}, mean {np.mean(spent):.2f}")
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for kind in KINDS:
+        parser.add_argument(f"--{kind}", type=int, default=0, help="tables")
+    parser.add_argument("--robot", default="nominal")
+    parser.add_argument("--without-sindy", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("runs/baselines.jsonl"))
+    parser.add_argument("--limit", type=float, default=np.inf, help="seconds after which no table is begun")
+    given = parser.parse_args()
+    if not given.without_sindy:
+        pysindy()
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from calibration import loop
+    from mmrjax import nominal as robots
+
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    lines = [json.loads(x) for x in given.out.read_text().splitlines()] if given.out.exists() else []
+    done = {(x["kind"], x["seed"]) for x in lines}
+    tasks = [(seed / getattr(given, kind), kind, seed) for kind in KINDS for seed in range(getattr(given, kind))]
+    tasks = sorted(t for t in tasks if t[1:] not in done)  # kinds go on side by side
+    engine = loop.Engine(robots.ROBOTS[given.robot]())
+    began = time.monotonic()
+    with given.out.open("a") as file:
+        for k, (_, kind, seed) in enumerate(tasks):
+            if time.monotonic() - began > given.limit:
+                break
+            line = one(engine, kind, seed, not given.without_sindy)
+            lines.append(line)
+            file.write(json.dumps(line, default=float) + "\n")
+            file.flush()
+            if k % 10 == 0:
+                print(f"{k}/{len(tasks)} tables, {time.monotonic() - began:.0f} s", flush=True)
+    print("\n".join(summary(lines)))
+    print(f"{time.monotonic() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

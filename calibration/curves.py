@@ -1,0 +1,68 @@
+"""Families of smooth curves that a missing effect outside the library is looked for with."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.polynomial import legendre
+
+from calibration.trace import PROBED, Curves
+from mmrjax.tables import CONFIGURATIONS
+
+#: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
+#: also loads the contact. What `supply`, `motor` and `gearbox` lack has the same shape in these.
+BALANCES = ("electrical", "track", "ground", "slip")
+#: Variables of a curve, fields of `Signals`, with the column of the table that measures each.
+VARIABLES = {
+    "voltage": "supply_voltage_V",
+    "current": "total_current_A",
+    "speed_motor": "motor_speed_rpm",
+    "slope": "slope_deg",
+    "payload": "payload_kg",
+    "speed": "speed_mm_s",
+}
+#: Terms of a curve of one variable (Legendre polynomials), and degree of the polynomial in all conditions.
+TERMS, DEGREE = 5, 2
+CONDITIONS = "conditions"
+
+
+def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """x mapped linearly so that the rows that count span -1 to 1; zeros where it does not vary."""
+    there = x[weight > 0]
+    low, high = there.min(), there.max()
+    return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
+
+
+def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> tuple[Curves, ...]:
+    """Curves of one variable, and polynomials in all conditions for each configuration, in every balance.
+
+    Args:
+        columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,).
+    """
+    names, bases = [], []
+    for variable, column in VARIABLES.items():
+        basis = legendre.legvander(scaled(columns[column], weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
+        for balance in BALANCES:
+            names.append((balance, variable))
+            bases.append(basis)
+    wheeled = columns["configuration"] == CONFIGURATIONS[1]
+    axes = [scaled(columns[c], weight) for c in ("supply_voltage_V", "slope_deg", "payload_kg")]
+    powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(axes)) if sum(p) <= DEGREE]
+    terms = [
+        np.prod([a**k for a, k in zip(axes, p, strict=True)], 0) * mask
+        for mask in (wheeled, ~wheeled)
+        for p in powers
+    ]
+    wide = np.stack(terms, 1)
+    groups = [(names, bases), ([(b, CONDITIONS) for b in BALANCES], [wide] * len(BALANCES))]
+    return tuple(
+        Curves(jnp.asarray(np.stack(b)), tuple(PROBED.index(n[0]) for n in ns), tuple(ns)) for ns, b in groups if ns
+    )
+
+
+def names(curves: tuple[Curves, ...]) -> tuple[tuple[str, str], ...]:
+    """(balance, variable) of every family, in the order of `Scores.curve`."""
+    return tuple(n for family in curves for n in family.names)

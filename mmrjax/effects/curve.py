@@ -1,0 +1,138 @@
+"""Smooth curves in a balance: a discrepancy that has a place and a shape and no name."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax.effects.base import Effect
+from mmrjax.params import Scalar, parameter
+from mmrjax.signals import Signals
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+#: Balances that a curve may enter: unit, amplitude that is plausible, and which direction it acts along.
+BALANCES = {
+    "electrical": ("V", 1.0, "direction"),
+    "track": ("N·m", 0.2, "direction"),
+    "ground": ("N", 4.0, "direction_travel"),
+    "slip": ("m/s", 0.05, "direction"),
+}
+#: Variables of a curve, signals that every one of these balances knows: unit and ordinary range.
+VARIABLES = {
+    "voltage": ("V", 10.0, 35.0),
+    "current": ("A", 0.0, 6.0),
+    "speed_motor": ("rad/s", 100.0, 1000.0),
+    "slope": ("rad", 0.0, 0.35),
+    "payload": ("kg", 0.0, 8.0),
+    "speed": ("m/s", 0.1, 1.0),
+}
+ORDINATES = tuple(f"y{k}" for k in range(6))
+#: Share of the range over which a curve levels out beyond each of its ends.
+LEVEL = 0.05
+
+_LAST = len(ORDINATES) - 1
+# Keys's points beyond the ends continue a parabola: y_-1 = 3 y_0 - 3 y_1 + y_2, and one more for y_-2.
+_EXTENDED = np.zeros((_LAST + 5, _LAST + 1))
+_EXTENDED[2:-2] = np.eye(_LAST + 1)
+_EXTENDED[1, :3] = _EXTENDED[-2, :-4:-1] = 3.0, -3.0, 1.0
+_EXTENDED[0, :3] = _EXTENDED[-1, :-4:-1] = 6.0, -8.0, 3.0
+
+
+def _level(u: Scalar) -> Scalar:
+    """u where it is positive; below, a parabola that is level from u = -LEVEL _LAST on, with slope 1 at 0."""
+    width = LEVEL * _LAST
+    below = jnp.clip(u, -width, 0.0)
+    return jnp.maximum(u, 0.0) + below + below**2 / (2 * width)
+
+
+def weights(x: Scalar, low: Scalar, high: Scalar) -> Float[Array, "... 6"]:
+    """What each ordinate counts at x: cubic convolution, Keys (1981) eq. (15); they sum to 1.
+
+    Args:
+        x: the variable; low, high: where the first and the last ordinate stand [its unit].
+    """
+    u = _level((x - low) / (high - low) * _LAST)
+    u = _LAST - _level(_LAST - u)
+    t = jnp.abs(u[..., None] - jnp.arange(-2, _LAST + 3))
+    near = 1.5 * t**3 - 2.5 * t**2 + 1
+    far = -0.5 * t**3 + 2.5 * t**2 - 4 * t + 2
+    return jnp.where(t < 1, near, jnp.where(t < 2, far, 0.0)) @ _EXTENDED
+
+
+def _ordinate() -> Scalar:
+    return parameter(
+        1.0, unit="-", meaning="ordinate, over the amplitude", bounds=(-1e3, 1e3), sd=1.0, source="flat until fitted"
+    )
+
+
+def _curve(place: str, over: str) -> type[Effect]:
+    """The curve of one variable in one balance."""
+    unit, size, along = BALANCES[place]
+    unit_x, first, last = VARIABLES[over]
+
+    class Curve(Effect):
+        name: ClassVar[str] = f"curve_{place}_{over}"
+        balance: ClassVar[str] = place
+        dissipative: ClassVar[bool] = False
+        variable: ClassVar[str] = over
+
+        amplitude: Scalar = parameter(
+            0.0,
+            unit=unit,
+            meaning="size of the discrepancy",
+            bounds=(-100 * size, 100 * size),
+            sd=size,
+            source="what the fit leaves; no cause is known",
+            amplitude=True,
+        )
+        low: Scalar = parameter(
+            first,
+            unit=unit_x,
+            meaning=f"{over} at the first ordinate",
+            bounds=(-1e4, 1e4),
+            sd=0.1 * (last - first),
+            source="lower end of the range of the data",
+        )
+        high: Scalar = parameter(
+            last,
+            unit=unit_x,
+            meaning=f"{over} at the last ordinate",
+            bounds=(-1e4, 1e4),
+            sd=0.1 * (last - first),
+            source="upper end of the range of the data",
+        )
+        y0: Scalar = _ordinate()
+        y1: Scalar = _ordinate()
+        y2: Scalar = _ordinate()
+        y3: Scalar = _ordinate()
+        y4: Scalar = _ordinate()
+        y5: Scalar = _ordinate()
+
+        def term(self, robot: Robot, signals: Signals) -> Scalar:
+            way = jnp.asarray(getattr(signals, along))
+            # In the frame of travel: a run in mirror image shows the discrepancy in mirror image.
+            x = signals.payload if over == "payload" else getattr(signals, over) * way
+            y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
+            return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
+
+    words = "".join(w.capitalize() for w in Curve.name.split("_"))
+    Curve.__name__ = Curve.__qualname__ = words
+    Curve.__doc__ = f"""Δ = a y(x) along the travel in the balance `{place}` [{unit}], x = {over} [{unit_x}].
+
+    y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
+
+    Source: none, a discrepancy without a name; Keys, Cubic convolution interpolation for digital image
+    processing, IEEE Trans. ASSP 29 (1981) 1153, eqs. (15), (19), (25) of the interpolation.
+    """
+    return Curve
+
+
+#: Every curve by its name. Robot files know them; they are no part of the library that is scored.
+CURVES: dict[str, type[Effect]] = {
+    effect.name: effect for effect in (_curve(place, over) for place in BALANCES for over in VARIABLES)
+}

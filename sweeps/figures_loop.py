@@ -1,0 +1,214 @@
+"""Figures of the loop: residuals before and after, the score ladder, defects, look-alikes, base parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibration.discover import Discrepancy
+from calibration.loop import Finding, Loop
+from calibration.records import CHANNELS, MM, RPM
+from sweeps.figures_calibration import short
+from sweeps.figures_style import (
+    BLUE,
+    CHANNEL_WORDS,
+    CONFIGURATION,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    SKY,
+    figure,
+    note,
+)
+
+#: Effects on the ladder and on the map of look-alikes.
+RUNGS, ALIKE = 20, 14
+DEFECT_WORDS = {
+    "electrical": ("voltage missing", "V", "current_A", "current of all motors [A]"),
+    "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
+    "slip": ("speed lost", "mm/s", "slope_deg", "slope [deg]"),
+}
+
+
+def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
+    """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
+    order = np.lexsort((table["payload_kg"], table["slope_deg"], table["supply_voltage_V"], table["configuration"]))
+    fig, grid = figure(3, 1, 5.4, sharex=True)
+    groups = [f"{table['configuration'][k]}, {table['supply_voltage_V'][k]:g} V" for k in order]
+    edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
+    x = np.arange(len(order))
+    for axes, channel in zip(grid[:, 0], CHANNELS, strict=True):
+        before = table[f"residual_before_{channel}_sigma"][order]
+        after = table[f"residual_after_{channel}_sigma"][order]
+        axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
+        axes.axhline(0, color=FAINT, lw=0.8)
+        if verdict == "none":
+            axes.plot(x, before, "o", ms=4.5, color=BLUE, label="the fitted model")
+        else:
+            axes.plot(x, before, "o", ms=5.5, mfc="none", color=ORANGE, label="before: the fitted model")
+            axes.plot(x, after, "o", ms=4, color=BLUE, label="after: with what was found")
+        for edge in edges:
+            axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
+        axes.set_ylabel(f"{CHANNEL_WORDS[channel][0]} [σ]")
+    grid[0, 0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
+    starts = [0, *edges]
+    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)],
+                           [groups[a] for a in starts])  # fmt: skip
+    grid[-1, 0].grid(axis="x", visible=False)
+    grid[-1, 0].set_xlabel("runs, in each group by slope, then payload; band: ±2σ of the instruments")
+    return fig
+
+
+def ladder(document: dict[str, Any]) -> Figure:
+    """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
+    rungs = document["scores"][:RUNGS]
+    named = {e["name"] for e in document["effects"]}
+    alike = {n for e in document["effects"] for n in e["class"]} - named
+    fig, grid = figure(1, 1, 1.1 + 0.24 * len(rungs))
+    axes = grid[0, 0]
+    root = [np.sqrt(r["score"]) for r in rungs]
+    colours = [BLUE if r["name"] in named else SKY if r["name"] in alike else "#c9c9c9" for r in rungs]
+    axes.barh(range(len(rungs)), root, color=colours, height=0.72)
+    level = document["evidence"]["before"]["single"]["threshold"]
+    axes.axvline(level, color=ORANGE, lw=1.6)
+    axes.text(level, -0.9, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
+    axes.set_yticks(range(len(rungs)), [f"{r['name']}  ({r['balance']})" for r in rungs])
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set(xlabel="what the effect alone would explain, after the base has been fitted again [σ]")
+    axes.set_title("blue: found; light blue: these data cannot tell it from one that was found")
+    return fig
+
+
+def null(found: Finding) -> Figure:
+    """The strongest statistics among bootstrap tables in which nothing is missing, and those of the data."""
+    gate = found.base.gate
+    words = {
+        "single": ("strongest effect [σ]", gate.found.single),
+        "curve": ("strongest curve [normal deviate]", gate.found.curve),
+        "chi2": ("χ² of the residuals", gate.found.chi2),
+    }
+    fig, grid = figure(1, 3, 2.5)
+    for axes, (kind, (text, value)) in zip(grid[0], words.items(), strict=True):
+        axes.hist(getattr(gate.null, kind), bins=30, color="#c9c9c9")
+        axes.axvline(gate.threshold(kind), color=ORANGE, lw=1.6)
+        axes.axvline(float(value), color=BLUE, lw=2)
+        axes.set_xlabel(text)
+        axes.set_yticks([])
+    note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
+    return fig
+
+
+def errors(document: dict[str, Any]) -> Figure:
+    """rms error (35) before and after, fitted and held out by every kind of block."""
+    lines = {"fitted": (document["errors"]["before"]["fitted"], document["errors"]["after"]["fitted"])}
+    lines |= {
+        f"held out by\n{k.replace('_', ', ')}": (v["before"], v["after"]) for k, v in document["held_out_by"].items()
+    }
+    fig, grid = figure(1, 3, 2.9, sharey=False)
+    for axes, channel in zip(grid[0], CHANNELS, strict=True):
+        for k, (colour, when) in enumerate(((ORANGE, "before"), (BLUE, "after"))):
+            values = [v[k][channel]["rms_percent"] for v in lines.values()]
+            axes.barh(np.arange(len(lines)) + 0.4 * k - 0.2, values, height=0.38, color=colour, label=when)
+            for row, v in enumerate(values):
+                axes.text(v, row + 0.4 * k - 0.2, f" {v:.2g}", va="center", fontsize=8, color=INK)
+        axes.set_yticks(range(len(lines)), list(lines) if channel == CHANNELS[0] else [""] * len(lines))
+        axes.invert_yaxis()
+        axes.margins(x=0.16)
+        axes.grid(axis="y", visible=False)
+        axes.set_title(CHANNEL_WORDS[channel][0])
+        axes.set_xlabel("rms of eq. (35) [%]")
+    grid[0, -1].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
+    return fig
+
+
+def defects(table: dict[str, np.ndarray], document: dict[str, Any]) -> Figure:
+    """What each equation lacks, run by run, over the variable that shows it, before and after."""
+    whens = ("before",) if document["verdict"] in ("none", "unnamed") else ("before", "after")
+    fig, grid = figure(len(whens), 3, 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
+    for row, when in enumerate(whens):
+        for axes, (balance, (words, unit, column, label)) in zip(grid[row], DEFECT_WORDS.items(), strict=True):
+            x = table["total_" + column if column == "current_A" else column]
+            y = table[f"defect_{when}_{balance}"] * (1e3 if balance == "slip" else 1.0)
+            axes.axhline(0, color=FAINT, lw=0.8)
+            for name, colour in CONFIGURATION.items():
+                mine = table["configuration"] == name
+                axes.plot(x[mine], y[mine], "o", ms=4.5, color=colour, label=name)
+            axes.set_title(f"{balance}, {when}")
+            axes.set_ylabel(f"{words} [{unit}]")
+            if row == len(whens) - 1:
+                axes.set_xlabel(label)
+    grid[0, 0].legend(loc="best")
+    return fig
+
+
+def look_alikes(looped: Loop, found: Finding, document: dict[str, Any]) -> Figure:
+    """|cos| between what the base leaves of two effects' signatures, for the effects that score highest."""
+    names = [s["name"] for s in document["scores"] if s["score"] > 0][:ALIKE]
+    index = [looped.engine.names.index(n) for n in names]
+    cosine = looped.cosines(found.base)[np.ix_(index, index)]
+    fig, grid = figure(1, 1, 5.6)
+    axes = grid[0, 0]
+    shown = axes.imshow(cosine, cmap="Blues", vmin=0, vmax=1)
+    for i in range(len(names)):
+        for j in range(len(names)):
+            if i != j and cosine[i, j] > 0.5:
+                axes.text(j, i, f"{cosine[i, j]:.2f}", ha="center", va="center", fontsize=7,
+                          color="white" if cosine[i, j] > 0.7 else INK)  # fmt: skip
+    axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(visible=False)
+    fig.colorbar(shown, ax=axes, label="|cos| of the signatures", shrink=0.8)
+    return fig
+
+
+def base_shift(document: dict[str, Any]) -> Figure:
+    """Where each base parameter lies in prior sds, before and after the effects were added."""
+    shift = document["base_shift"]
+    fig, grid = figure(1, 1, 1.0 + 0.27 * len(shift))
+    axes = grid[0, 0]
+    axes.axvspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
+    axes.axvline(0, color=FAINT, lw=0.9)
+    for row, p in enumerate(shift.values()):
+        axes.plot([p["shift_before"], p["shift_after"]], [row, row], color="#c9c9c9", lw=1.6, zorder=1)
+        axes.plot(p["shift_before"], row, "o", ms=6, mfc="white", color=ORANGE)
+        axes.plot(p["shift_after"], row, "o", ms=5, color=BLUE)
+    axes.set_yticks(range(len(shift)), [short(n) for n in shift])
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set(xlabel="shift from the prior [prior sds]")
+    axes.set_title("orange: before, blue: after; a far one stands in for something that is missing")
+    return fig
+
+
+def curve(table: dict[str, np.ndarray], found: Discrepancy) -> Figure:
+    """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
+    column, factor, words = VARIABLE_WORDS[found.variable]
+    fig, grid = figure(1, 1, 3.4)
+    axes = grid[0, 0]
+    axes.axhline(0, color=FAINT, lw=0.8)
+    there = np.isfinite(found.defect.value)
+    axes.errorbar(np.asarray(table[column])[there] * factor, found.defect.value[there], 2 * found.defect.sd[there],
+                  fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip
+    scale = SHOWN.get(found.variable, 1.0)
+    low, high = found.curve - 1.96 * found.sd, found.curve + 1.96 * found.sd
+    axes.fill_between(found.grid * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
+    axes.plot(found.grid * scale, found.curve, color=GREEN, label="smooth curve")
+    axes.set(xlabel=words, ylabel=f"missing in {found.balance} [{found.unit}]")
+    axes.legend(loc="best")
+    return fig
+
+
+#: Column, factor to the figure's unit, and words of the variable of a curve; factor from SI to that unit.
+VARIABLE_WORDS = {
+    "voltage": ("supply_voltage_V", 1.0, "supply voltage [V]"),
+    "current": ("total_current_A", 0.5, "current of one motor [A]"),
+    "speed_motor": ("motor_speed_rpm", 1.0, "motor speed [rpm]"),
+    "slope": ("slope_deg", 1.0, "slope [deg]"),
+    "payload": ("payload_kg", 1.0, "payload [kg]"),
+    "speed": ("speed_mm_s", 1.0, "speed [mm/s]"),
+}
+SHOWN = {"speed_motor": 1 / RPM, "slope": 180 / np.pi, "speed": 1 / MM}

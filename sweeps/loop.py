@@ -1,0 +1,181 @@
+"""The command `loop`: from a table of runs to what the model lacks, and a robot that has it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from calibration import checks, effect_file, loop_outcome, priors, robot_file
+from calibration import noise as noise_room
+from calibration.doors import BadData
+from calibration.loop import ALPHA, Engine, Finding, Loop
+from calibration.records import CHANNELS, Runs
+from sweeps import commands
+from sweeps import config as configuration
+
+#: Fewest rows in which a missing effect can be told from noise.
+FEWEST = 6
+#: Factors on an assumed noise at which the verdict is looked at too.
+FACTORS = (0.5, 2.0)
+
+
+def loop(config: configuration.Loop, source: str, out: Path | None, force: bool) -> int:
+    """Run the closed loop on a table and leave a run folder; returns the exit code.
+
+    0 done; 3 done, but rows could not be simulated, or the fit that is proposed did not converge.
+    """
+    began = time.monotonic()
+    runs, numbers, notes = _distinct(commands.read_runs(source, measured=True))
+    if len(runs) < FEWEST:
+        raise BadData(f"{runs.source}: {len(runs)} runs cannot show what a model lacks; at least {FEWEST} are needed")
+    robot = commands.load_robot(config)
+    stated = priors.parse_priors(config.prior)
+    known = noise_room.assumed(runs, config.noise or None)
+    notes += checks.check(runs, (), known)
+
+    def progress(text: str) -> None:
+        commands.tell(f"{time.monotonic() - began:4.0f} s  {text}")
+
+    with commands.open_folder("loop", config, robot, out, force, runs) as folder:
+        engine = Engine(robot, effect_file.library(config.effects))
+
+        def one(factor: float = 1.0) -> tuple[Loop, Finding]:
+            sd = noise_room.assumed(runs, config.noise or None, factor).sd
+            looped = Loop(
+                engine, runs, sd, stated=stated, replicates=config.replicates, seed=config.seed,
+                numbers=numbers,
+                progress=progress if factor == 1.0 else lambda text: None,
+            )  # fmt: skip
+            return looped, looped.run()
+
+        looped, found = one()
+        progress("errors on data held out")
+        curve = loop_outcome.discrepancy(looped, found)
+        seen = loop_outcome.readings(looped, found, curve)
+        progress("the next experiment")
+        document = loop_outcome.document(looped, found, seen, curve)
+        document["noise"] = _noise(looped, known)
+        document["noise_sensitivity"] = []
+        if "assumed" in known.source:
+            for factor in FACTORS:
+                progress(f"the verdict with {factor:g} times the assumed noise")
+                document["noise_sensitivity"].append(_other(factor, *one(factor)))
+            silent = ", ".join(c for c, w in zip(CHANNELS, known.source, strict=True) if w == "assumed")
+            notes.append(f"no sd is stated for {silent}: {noise_room.ASSUMED} is assumed; state yours with --noise")
+        document["notes"] = [*notes, *remarks(document)]
+        folder.write_json("result.json", document)
+        folder.write_table("rows.csv", loop_outcome.rows_table(looped, found, seen))
+        folder.write_text("config.resolved.toml", configuration.as_toml(config))
+        proposed = loop_outcome.robot(looped, found, curve)
+        note = f"found by the loop from {config.robot} with {runs.source}: {document['statement']}"
+        robot_file.write(proposed, folder.partial / "robot.toml", note=note)
+        print_loop(document)
+        if config.report:
+            from sweeps import report_loop
+
+            progress("writing the report")
+            report_loop.write(folder.partial, looped, found, seen, document, curve, robot_name=config.robot)
+        path = folder.finish({"seed": config.seed, "verdict": found.verdict}, runs)
+        commands.say(str(path))
+        converged = found.after.hypothesis.converged if curve is None else curve.converged
+        sound = converged and not found.unusable
+        return commands.DONE if sound else commands.SOME_NOT_CONVERGED
+
+
+def _distinct(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
+    """The runs without exact copies of one another, their row numbers, and what to say of that."""
+    seen: set[tuple[str, ...]] = set()
+    keep, copies = [], []
+    for k in range(len(runs)):
+        row = tuple(str(column[k]) for name, column in runs.columns.items() if name != "run_id")
+        (copies if row in seen else keep).append(k)
+        seen.add(row)
+    if not copies:
+        return runs, np.arange(1, len(runs) + 1), []
+    said = f"rows {', '.join(str(k + 1) for k in copies)} are exact copies of earlier ones and count once"
+    return runs.where(keep), np.asarray(keep) + 1, [said]  # type: ignore[arg-type]
+
+
+def _noise(looped: Loop, known: noise_room.Noise) -> dict[str, Any]:
+    share = 100 * np.median(known.sd / np.maximum(np.abs(looped.runs.measured()), 1e-12), axis=0)
+    return {c: {"source": known.source[k], "median_percent": float(share[k])} for k, c in enumerate(CHANNELS)}
+
+
+def _other(factor: float, looped: Loop, found: Finding) -> dict[str, Any]:
+    """What the loop says with another noise, in short."""
+    return {
+        "factor": factor,
+        "verdict": found.verdict,
+        "statement": loop_outcome.statement(looped, found),
+        "classes": [[looped.engine.names[k] for k in c] for c in found.classes],
+        "adequate_after": not found.after.gate.clear,
+    }
+
+
+def remarks(document: dict[str, Any]) -> list[str]:
+    """What a careful engineer would say of this result, one sentence each."""
+    said = []
+    for rows, why in (
+        (document["rows_unusable"], "cannot be simulated: the fitted model slides or fails there"),
+        (document["rows_outliers"], "stand alone: outliers, which no effect explains"),
+    ):
+        if rows:
+            said.append(f"rows {', '.join(map(str, rows))} {why}; they are kept out")
+    for name, p in document["base_shift"].items():
+        if abs(p["shift_after"]) > 3:
+            said.append(
+                f"{name} lies {abs(p['shift_after']):.1f} prior sds from its prior: it stands in for something"
+            )
+    if document["remains"]:
+        where, over = document["remains"]["balance"], document["remains"]["variable"].replace("_", " ")
+        said.append(f"what was found does not explain everything: {where} still lacks something over {over}")
+    settled, asked = document["bootstrap"]["replicates"], document["bootstrap"]["asked"]
+    if settled < 0.9 * asked:
+        said.append(f"only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs")
+    if 1 / (1 + settled) > min(ALPHA.values()):
+        said.append(f"{settled} bootstrap tables are too few for pairs of effects to count; use 500 or more")
+    return said
+
+
+def print_loop(document: dict[str, Any]) -> None:
+    """Verdict, effects, errors and remarks, for a person."""
+    commands.say(f"{document['verdict']}: {document['statement']}")
+    if document["effects"] and document["verdict"] != "unnamed":
+        shown = Table(box=None, pad_edge=False)
+        for heading in ("effect", "balance", "amplitude", "explains [σ²]", "could as well be"):
+            shown.add_column(
+                heading, justify="right" if heading.startswith(("ampl", "expl")) else "left", no_wrap=True
+            )
+        for e in document["effects"]:
+            a = e["parameters"]["amplitude"]
+            shown.add_row(
+                e["name"], e["balance"], f"{a['value']:.3g} ± {a['sd']:.2g} {a['unit']}", f"{e['score']:.0f}",
+                ", ".join(e["class"][1:]) or "-",
+            )  # fmt: skip
+        commands.say(shown)
+    if document["verdict"] == "unnamed":
+        proposal = document["effects"][0]["proposal"]
+        commands.say(f"{proposal['formula']} ({proposal['mark']})")
+    after = document["next_experiment"]
+    if after is not None:
+        sigma = f" (expected {after['expected_sigma']:.1f} σ)" if after["separates"] else ""
+        commands.say(f"next: {after['name']}: {after['description']}{sigma}")
+    errors = Table(title="rms of (simulated - measured) / simulated, eq. (35) [%]", title_justify="left")
+    for heading in ("", "rows", *(c.replace("_", " ") for c in CHANNELS)):
+        errors.add_column(heading, justify="right" if heading else "left")
+    whens = ("before",) if document["verdict"] == "none" else ("before", "after")
+    lines = {f"{w}, fitted": document["errors"][w]["fitted"] for w in whens}
+    for kind, by in document["held_out_by"].items():
+        lines |= {f"{w}, held out by {kind.replace('_', ' and ')}": by[w] for w in whens}
+    for words, by in lines.items():
+        cells = ("-" if by[c]["rows"] == 0 else f"{by[c]['rms_percent']:.1f}" for c in CHANNELS)
+        errors.add_row(words, f"{by['total_current']['rows']}/{document['rows']}", *cells)
+    commands.say(errors)
+    for other in document["noise_sensitivity"]:
+        commands.say(f"with {other['factor']:g} times the assumed noise: {other['verdict']}: {other['statement']}")
+    for note in document["notes"]:
+        commands.say(f"- {note}")

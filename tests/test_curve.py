@@ -1,0 +1,148 @@
+"""Curves: smooth through their ordinates, and lawful as every effect of the library, in `steady` and `drive`."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import test_effects as laws
+
+from calibration import curves, robot_file
+from calibration.doors import BadConfiguration
+from mmrjax import balances, effects, nominal, params
+from mmrjax.effects import CURVES, curve
+from mmrjax.models.drive import drive
+from mmrjax.signals import Signals
+
+EACH = pytest.mark.parametrize("effect", CURVES.values(), ids=list(CURVES))
+SHAPE = {"y0": 0.7, "y1": -0.4, "y2": 1.1, "y3": 0.2, "y4": -0.9, "y5": 0.5}
+#: Two starts from rest, and instants of them [s].
+STARTS, TIMES = jax.tree.map(lambda x: x[:2], laws.CONDITIONS), jnp.asarray([0.0, 0.003, 0.1, 0.6])
+SIZES = jnp.asarray([laws.size(c) for c in CURVES.values()])
+
+
+def robot(amplitudes=None):
+    """Nominal, with every curve, of a shape that is not flat, at these amplitudes."""
+    every = []
+    for k, effect in enumerate(CURVES.values()):
+        values = SHAPE if amplitudes is None else {**SHAPE, "amplitude": amplitudes[k]}
+        every.append(params.replace(effect(), {n: jnp.asarray(v) for n, v in values.items()}))
+    return dataclasses.replace(nominal.nominal(), effects=tuple(every))
+
+
+# --- interpolation --------------------------------------------------------------------------------------
+
+
+def test_curve_passes_through_its_ordinates():
+    x = jnp.linspace(2.0, 7.0, 6)
+    np.testing.assert_allclose(curve.weights(x, 2.0, 7.0), np.eye(6), atol=1e-12)
+
+
+def test_curve_is_exact_for_parabolas():
+    x, at = np.linspace(2.0, 7.0, 101), np.linspace(2.0, 7.0, 6)
+    for power in range(3):
+        np.testing.assert_allclose(curve.weights(x, 2.0, 7.0) @ at**power, x**power, rtol=1e-12)
+
+
+def test_curve_is_level_beyond_its_ends_and_has_no_corner():
+    y = jnp.asarray(list(SHAPE.values()))
+    height = jax.vmap(lambda x: curve.weights(x, 2.0, 7.0) @ y)
+    slope = jax.vmap(jax.grad(lambda x: curve.weights(x, 2.0, 7.0) @ y))
+    far = jnp.asarray([-1e6, 0.0, 2.0 - 5 * curve.LEVEL, 7.0 + 5 * curve.LEVEL, 9.0, 1e6])
+    assert np.ptp(height(far)[:3]) == np.ptp(height(far)[3:]) == 0 and not np.any(slope(far))
+    x = jnp.linspace(1.0, 8.0, 7001)
+    assert np.abs(np.diff(slope(x))).max() < 0.03  # 30 a unit at most: no step of the slope
+    np.testing.assert_allclose(np.gradient(height(x), x)[1:-1], slope(x)[1:-1], atol=0.01)
+    np.testing.assert_allclose(curve.weights(x, 2.0, 7.0).sum(1), 1.0, rtol=1e-12)
+
+
+# --- the laws -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", [laws.law_declared, laws.law_linear, laws.law_unit], ids=lambda law: law.__name__[4:])
+@EACH
+def test_curve_obeys(effect, law):
+    law(effect)
+
+
+def test_curves_at_zero_change_nothing_in_steady_and_none_is_dead():
+    both = jax.jit(lambda a: jax.jacfwd(lambda a: (_steady(robot(a)),) * 2, has_aux=True)(a))
+    slopes, with_them = both(jnp.zeros(len(CURVES)))
+    np.testing.assert_allclose(with_them, jax.jit(_steady)(nominal.nominal()), rtol=1e-13, atol=1e-13)
+    assert np.isfinite(slopes).all()
+    moved = np.abs(slopes * SIZES / with_them[..., None]).max((0, 1))
+    assert moved.min() > 1e-4, "dead gradient"
+
+
+def _steady(bare):
+    return jax.vmap(lambda c: laws.floats(laws.steady(bare, c).reading))(laws.CONDITIONS)
+
+
+def _driven(amplitudes):
+    there = robot(amplitudes)
+
+    def one(c):
+        signals = drive(there, c, TIMES, tolerance=1e-9).signals
+        return jax.vmap(lambda s: jnp.stack(jax.tree.leaves(balances.sensor(there, s))))(signals)[1:]
+
+    return jax.vmap(one)(STARTS)
+
+
+def test_curves_act_in_drive_and_at_zero_change_nothing():
+    both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * SIZES,)))
+    still, slope = both(jnp.zeros(len(CURVES)))
+    bare = nominal.nominal()
+    plain = jax.jit(jax.vmap(lambda c: drive(bare, c, TIMES, tolerance=1e-9)))(STARTS)
+    s = plain.signals
+    expected = jnp.stack([s.total_current, s.speed_motor, s.speed], -1)[:, 1:]
+    np.testing.assert_allclose(still, expected, rtol=1e-7, atol=1e-7)
+    assert np.isfinite(slope).all() and np.abs(slope / still).max() > 1e-3
+
+
+@EACH
+def test_curve_of_a_run_in_mirror_image_is_the_mirror_image(effect):
+    made = params.replace(effect(), {**{n: jnp.asarray(v) for n, v in SHAPE.items()}, "amplitude": jnp.asarray(0.3)})
+    kept = ("payload", "mass", "normal", "wheeled", "battery", "adhesion", "memory", "discharge")
+    flipped = {f.name: -getattr(laws.STATES, f.name) for f in dataclasses.fields(Signals) if f.name not in kept}
+    there = laws.terms(made, signals=dataclasses.replace(laws.STATES, **flipped))
+    np.testing.assert_allclose(there, -laws.terms(made), rtol=1e-12, atol=1e-15)
+
+
+@EACH
+def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
+    made = params.replace(effect(), {"amplitude": jnp.asarray(0.3)})
+    still = Signals(**{f.name: jnp.asarray(0.0) for f in dataclasses.fields(Signals) if f.name != "memory"})
+    slopes = jax.grad(lambda both: both[0].term(nominal.nominal(), both[1]))((made, still))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
+
+
+# --- where they are known -------------------------------------------------------------------------------
+
+
+def test_curves_are_no_part_of_the_library():
+    assert not set(CURVES) & set(effects.BY_NAME) and not set(CURVES.values()) & set(effects.ALL)
+
+
+def test_curves_are_those_that_the_trace_looks_for():
+    assert tuple(curve.BALANCES) == curves.BALANCES and tuple(curve.VARIABLES) == tuple(curves.VARIABLES)
+    assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
+
+
+def test_robot_with_curves_written_and_read_is_the_same(tmp_path):
+    mine = robot(0.1 * SIZES)
+    robot_file.write(mine, tmp_path / "robot.toml")
+    for library in ({}, effects.BY_NAME):
+        again = robot_file.read(tmp_path / "robot.toml", library)
+        assert [(p.name, float(p.value)) for p in params.walk(again)] == [
+            (p.name, float(p.value)) for p in params.walk(mine)
+        ]
+
+
+def test_curve_without_a_range_is_refused(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[effects.curve_track_payload]\nlow = 3\nhigh = 3\n")
+    with pytest.raises(
+        BadConfiguration, match=r"mine\.toml, effects\.curve_track_payload\.high: got 3; expected more than low, 3"
+    ):
+        robot_file.read(path)

@@ -1,0 +1,279 @@
+"""The command `loop` as a user runs it: what it leaves, what it says of bad input, effects of the user's own."""
+
+import contextlib
+import csv
+import io
+import json
+import os
+import re
+import sys
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import generator as g
+import numpy as np
+import pytest
+
+from calibration import effect_file
+from mmrjax.effects import BY_NAME
+from sweeps import cli
+from sweeps import loop as room
+
+PRIORS = [a for c in ("tracked", "wheeled") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")]
+
+#: What the generator's `guide_binding` does, which is not in the library, as a user would write it.
+MINE = '''
+from typing import ClassVar
+
+import jax.numpy as jnp
+from mmrjax.effects import Effect
+from mmrjax.params import Scalar, parameter
+from mmrjax.signals import Signals
+
+
+class PayloadBinding(Effect):
+    """ΔM_t = a max(m - 2 kg, 0)² / 25 kg²: the payload bends the chassis. Source: none, an example."""
+
+    name: ClassVar[str] = "payload_binding"
+    balance: ClassVar[str] = "track"
+    dissipative: ClassVar[bool] = True
+
+    amplitude: Scalar = parameter(
+        0.0, unit="N·m", meaning="torque at 7 kg", bounds=(-3.0, 3.0), sd=0.3, source="example", amplitude=True
+    )
+
+    def term(self, robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.maximum(signals.payload - 2.0, 0.0) ** 2 / 25.0
+'''
+
+
+def mmrjax(folder, *arguments) -> SimpleNamespace:
+    """Run a command in this process and in a folder: exit code, stdout and stderr."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.chdir(folder)
+        patch.setattr(os, "_exit", sys.exit)
+        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+    return SimpleNamespace(code=end.value.code, out=out.getvalue(), err=err.getvalue())
+
+
+def written(path, table) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(table)
+        out.writerows(zip(*table.values(), strict=True))
+
+
+def small(p):
+    return g.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 10.0))
+
+
+def loaded(p):
+    return g.table8(p, payloads=(0.0, 3.0, 5.0, 8.0), slopes=(0.0, 10.0), voltages=(24.0, 33.0))
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The whole command on 24 runs of a robot whose track churns, one of them twice."""
+    folder = tmp_path_factory.mktemp("done")
+    case = g.case(["churning"], 15.0, seed=3, grid=small)
+    written(folder / "runs.csv", {k: np.append(v, v[4]) for k, v in case.table.items()})
+    answer = mmrjax(folder, "loop", "runs.csv", "--replicates", 250, "--out", "found", *PRIORS)
+    result = json.loads((folder / "found" / "result.json").read_text())
+    return SimpleNamespace(folder=folder, case=case, answer=answer, result=result)
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """The command with a library of three effects beside the user's, compiled once for every table of 17 to 32 runs."""
+    engines = {}
+    with pytest.MonkeyPatch.context() as patch:
+        some = {n: BY_NAME[n] for n in ("churning", "series_resistance", "load_slip")}
+
+        def library(paths):
+            return some | {e.name: e for path in paths for e in effect_file.read(Path(path))}
+
+        def engine(robot, known):
+            return engines.setdefault(tuple(known), honest(robot, known, 1))
+
+        honest = room.Engine
+        patch.setattr(room, "effect_file", SimpleNamespace(library=library))
+        patch.setattr(room, "Engine", engine)
+        yield
+
+
+# --- what it leaves ----------------------------------------------------------------------------------
+
+
+def test_command_ends_well_and_says_what_it_found(done):
+    assert done.answer.code == 0
+    lines = done.answer.out.rstrip().splitlines()
+    assert lines[-1] == "found" and re.match(r"(named|class): Missing: .*churning", lines[0])
+    assert "fitting the base model" in done.answer.err and "fitting the base model" not in done.answer.out
+    names = {p.name for p in (done.folder / "found").iterdir()}
+    assert names == {
+        "config.resolved.toml", "figures", "manifest.json", "report.html", "result.json", "robot.toml", "rows.csv",
+    }  # fmt: skip
+
+
+def test_result_has_the_schema_of_the_issue(done):
+    r = done.result
+    assert r["schema"] == "mmrjax.loop/1" and r["verdict"] in ("named", "class")
+    (effect,) = r["effects"]
+    assert {"name", "class", "balance", "equation", "parameters", "p_value", "score"} <= set(effect)
+    assert effect["name"] == effect["class"][0] and "churning" in effect["class"]
+    amplitude = effect["parameters"]["amplitude"]
+    assert set(amplitude) == {"value", "sd", "unit"} and amplitude["sd"] > 0 and 0 < effect["p_value"] < 0.05
+    if effect["name"] == "churning":
+        truth = done.case.label["effects"][0]["amplitude"]
+        assert abs(amplitude["value"] - truth) < 4 * amplitude["sd"] and amplitude["unit"] == "N·m·s^2"
+    assert isinstance(r["cannot_see"], list) and isinstance(r["alternatives"], list)
+    assert set(r["cannot_see"]) <= set(BY_NAME) and "cogging" in r["needs_series"]
+    following = r["next_experiment"]
+    assert following is None or {"description", "separates", "expected_sigma"} <= set(following)
+    assert following is not None or r["verdict"] == "named"
+    for when in ("before", "after"):
+        for seen in ("fitted", "held_out"):
+            assert set(r["errors"][when][seen]) == {"total_current", "motor_speed", "speed"}
+            for by in r["errors"][when][seen].values():
+                assert {"rms_percent", "max_percent", "rms_sigma"} <= set(by) and 0 < by["rms_percent"] < 20
+    before, after = (r["errors"][w]["held_out"]["total_current"]["rms_sigma"] for w in ("before", "after"))
+    assert after < 0.7 * before
+    assert r["adequate"] == {"before": False, "after": True}
+    assert {"prior", "before", "after", "unit"} <= set(r["base_shift"]["motor.resistance"])
+    assert not re.search(r"\bNaN\b|Infinity", (done.folder / "found" / "result.json").read_text())
+
+
+def test_copies_count_once_and_are_said(done):
+    assert done.result["rows"] == done.result["rows_used"] == 24
+    assert any(
+        "rows 25 are exact copies" in note or "row 25 is an exact copy" in note for note in done.result["notes"]
+    )
+
+
+def test_robot_is_accepted_by_the_other_commands(done):
+    robot = tomllib.loads((done.folder / "found" / "robot.toml").read_text())
+    (name,) = robot["effects"]
+    assert name == done.result["effects"][0]["name"]
+    assert robot["effects"][name]["amplitude"] == done.result["effects"][0]["parameters"]["amplitude"]["value"]
+    run = ["simulate", "--voltage", 33, "--no-report", "--force", "--out", "s"]
+    shown = []
+    for robot_file in ("nominal", "found/robot.toml"):
+        assert mmrjax(done.folder, *run, "--robot", robot_file).code == 0
+        with (done.folder / "s" / "runs.csv").open(newline="") as stream:
+            shown.append(float(next(csv.DictReader(stream))["total_current_A"]))
+    table = done.case.table
+    k = np.flatnonzero((table["supply_voltage_V"] == 33) & (table["slope_deg"] == 0) & (table["payload_kg"] == 0))[0]
+    wrong = np.abs(np.array(shown) - table["total_current_A"][k])
+    assert wrong[1] < 0.06 < wrong[0]
+
+
+def test_report_tells_the_story_in_order(done):
+    text = (done.folder / "found" / "report.html").read_text(encoding="utf-8")
+    assert done.result["statement"].split(" (")[0] in text
+    order = [
+        'id="effects"', 'id="before_after"', 'id="errors"', 'id="next"', 'id="notes"', 'id="defects"', 'id="ladder"',
+        'id="look_alikes"', 'id="unseen"', 'id="base_shift"',
+    ]  # fmt: skip
+    at = [text.find(mark) for mark in order]
+    assert -1 not in at and at == sorted(at)
+    assert not re.search(r"\bnan\b|Undefined|\{\{", re.sub(r"<svg.*?</svg>", "", text, flags=re.S))
+
+
+# --- effects of the user's own, and thin data --------------------------------------------------------
+
+
+def test_users_effect_is_scored_and_named(quick, tmp_path):
+    written(tmp_path / "runs.csv", g.case(["guide_binding"], 12.0, seed=5, grid=loaded).table)
+    (tmp_path / "mine.py").write_text(MINE)
+    run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", *PRIORS]
+    answer = mmrjax(tmp_path, *run, "--effects", "mine.py")
+    assert answer.code == 0
+    result = json.loads((tmp_path / "x" / "result.json").read_text())
+    assert result["verdict"] == "named" and [e["name"] for e in result["effects"]] == ["payload_binding"]
+    assert result["scores"][0]["name"] == "payload_binding" and result["scores"][0]["score"] > 60
+    assert "[effects.payload_binding]" in (tmp_path / "x" / "robot.toml").read_text()
+
+
+def test_one_voltage_gives_a_verdict(quick, tmp_path):
+    table = g.case(seed=1).table
+    written(tmp_path / "runs.csv", {k: v[table["supply_voltage_V"] == 24] for k, v in table.items()})
+    (tmp_path / "mine.py").write_text(MINE)
+    run = ["loop", "runs.csv", "--no-report", "--replicates", 250, "--out", "x", "--effects", "mine.py", *PRIORS]
+    answer = mmrjax(tmp_path, *run)
+    result = json.loads((tmp_path / "x" / "result.json").read_text())
+    assert answer.code == 0 and result["verdict"] == "none" and result["effects"] == []
+    assert result["adequate"]["before"] and result["next_experiment"] is None
+    assert any("supply_voltage_V" in note for note in result["notes"])  # what one voltage cannot show
+
+
+# --- bad input ---------------------------------------------------------------------------------------
+
+HEADER = (
+    "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
+)
+ROW = "6T2A,15,13.1,0,5,2.75,4800,400"
+#: Eight runs with nothing wrong.
+TABLE = "\n".join([HEADER, *(f"6T2A,{u},13.1,0,5,{2 + 0.05 * u},{320 * u},{27 * u}" for u in range(12, 20))])
+#: What the file holds, and what is said of it.
+BAD = {
+    "empty": ("", "runs.csv: the file is empty"),
+    "missing column": (f"{HEADER.replace(',speed_mm_s', '')}\n6T2A,15,13.1,0,5,2.75,4800", "column speed_mm_s is missing"),
+    "not a number": (f"{HEADER}\n{ROW.replace('2.75', 'nan')}", "runs.csv row 1, total_current_A: got nan"),
+    "no noise": (f"{HEADER},speed_sd_mm_s\n{ROW},0", "runs.csv row 1, speed_sd_mm_s: got 0; expected more than 0"),
+    "three rows": (
+        "\n".join([HEADER, *(ROW.replace("15", str(u)) for u in (15, 24, 33))]),
+        "runs.csv: 3 runs cannot show what a model lacks; at least 6 are needed",
+    ),
+    "copies of one row": ("\n".join([HEADER, *[ROW] * 8]), "runs.csv: 1 runs cannot show what a model lacks"),
+    "three samples": ("\n".join([f"{HEADER},time_s", *(f"{ROW},{t}" for t in (0, 1, 2))]), "runs.csv: "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_data_end_with_4_and_leave_nothing(tmp_path, case):
+    text, sentence = BAD[case]
+    (tmp_path / "runs.csv").write_text(text)
+    answer = mmrjax(tmp_path, "loop", "runs.csv", "--out", "x")
+    assert answer.code == 4 and answer.out == "" and sentence in answer.err
+    assert len(answer.err.strip().splitlines()) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["runs.csv"]
+
+
+#: Options, and what is said of them.
+WRONG = {
+    "unit": (["--noise", "current=2V"], "--noise current=2V: expected a positive number with % or A"),
+    "channel": (["--noise", "voltage=2%"], "--noise voltage=2%: no such channel"),
+    "no file": (["--effects", "yours.py"], "--effects: got yours.py, no such file"),
+    "contract": (["--effects", "mine.py"], "mine.py, PayloadBinding, balance: got trakc; did you mean track?"),
+    "few replicates": (["--replicates", "10"], "option replicates: got 10"),
+    "prior twice": (["--prior", "motor.resistance=1±0.1"] * 2, "--prior motor.resistance: given twice"),
+    "prior of nothing": (["--prior", "motor.resistence=1±0.1"], "motor.resistance"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_options_end_with_2_and_leave_nothing(tmp_path, case):
+    options, sentence = WRONG[case]
+    (tmp_path / "runs.csv").write_text(TABLE)
+    (tmp_path / "mine.py").write_text(MINE.replace('"track"', '"trakc"'))
+    before = sorted(p.name for p in tmp_path.iterdir())
+    answer = mmrjax(tmp_path, "loop", "runs.csv", "--out", "x", *options)
+    assert answer.code == 2 and answer.out == "" and sentence in answer.err
+    assert len(answer.err.strip().splitlines()) == 1
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name != "__pycache__") == before
+
+
+def test_interrupt_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        assert (tmp_path / "x.partial").exists()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(room, "Engine", interrupted)
+    (tmp_path / "runs.csv").write_text(TABLE)
+    answer = mmrjax(tmp_path, "loop", "runs.csv", "--out", "x")
+    assert answer.code == 130 and answer.err.splitlines()[-1].startswith("mmrjax: interrupted")
+    assert [p.name for p in tmp_path.iterdir()] == ["runs.csv"]
