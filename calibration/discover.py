@@ -67,7 +67,7 @@ class Projection:
 
     def __init__(self, linear: Linear) -> None:
         jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-        self.readings = 3 * np.asarray(linear.defects).shape[1]
+        self.readings = 3 * linear.rows
         half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
         self.half = half[:, : self.readings]
         self.left = (residual - half.T @ (half @ residual))[: self.readings]
@@ -97,25 +97,25 @@ class Defect:
 def defect(linear: Linear, balance: str) -> Defect:
     """The defect of a balance in each row: least squares of the row's residual along its sensitivity.
 
-    δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i.
+    δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i
+    (of histories: at that instant, falling to zero at the knots beside it; NaN between knots).
     """
-    projection = Projection(linear)
-    sensitivity = np.asarray(linear.defects)[PROBED.index(balance)]  # rows, 3
-    rows = len(sensitivity)
-    half = projection.half.reshape(-1, rows, 3)
-    inside = np.einsum("prk,rk->pr", half, sensitivity)
-    whole = np.sum(sensitivity**2, 1)
-    norm2 = whole - np.sum(inside**2, 0)
-    dots = -np.sum(sensitivity * projection.left.reshape(rows, 3), 1)
+    places = np.arange(linear.rows) if linear.series is None else np.unique(np.asarray(linear.series.at_knots))
+    shapes = np.zeros((linear.rows, len(places)))
+    shapes[places, np.arange(len(places))] = 1.0
+    columns = _columns(linear, balance, shapes)
+    a, b = Projection(linear)(columns)
+    norm2, whole = np.diag(a), np.sum(columns**2, 0)
     seen = norm2 > 1e-6 * np.maximum(whole, 1e-300)
     norm2 = np.where(seen, norm2, np.nan)
-    return Defect(dots / norm2, 1 / np.sqrt(norm2))
+    value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
+    value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
+    return Defect(value, sd)
 
 
 def _columns(linear: Linear, balance: str, shapes: np.ndarray) -> np.ndarray:
     """Change of the readings by terms of a balance, shape (readings, terms), of shapes (rows, terms)."""
-    sensitivity = np.asarray(linear.defects)[PROBED.index(balance)]
-    return (sensitivity[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
+    return np.asarray(linear.columns(PROBED.index(balance), jnp.asarray(shapes)))
 
 
 # --- the curve ------------------------------------------------------------------------------------------
@@ -178,8 +178,7 @@ def smooth(linear: Linear, balance: str, variable: str, counts: np.ndarray) -> S
 
 
 def _seen(linear: Linear, variable: str) -> np.ndarray:
-    rows = np.asarray(linear.defects).shape[1]
-    return np.broadcast_to(np.asarray(getattr(linear.signals, variable), float), (rows,))
+    return np.broadcast_to(np.asarray(getattr(linear.signals, variable), float), (linear.rows,))
 
 
 class Shaped(eqx.Module):

@@ -34,6 +34,8 @@ BENCH = (
     "gearbox.friction_coulomb",
     "gearbox.friction_viscous",
 )
+#: And beside them what only a start shows.
+START, START_CHASSIS = ("motor.inductance", "motor.inertia"), ("inertia", "ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: Family-wise error of «something is missing», shared out among the four kinds of evidence.
 ALPHA = {"single": 0.03, "curve": 0.01, "pair": 0.004, "chi2": 0.006}
 #: Hypotheses refitted in one batch.
@@ -163,11 +165,12 @@ class Finding:
     invisible: tuple[int, ...]
 
 
-def free_names(configurations: Sequence[str]) -> tuple[str, ...]:
-    """What the loop frees for data of these configurations."""
+def free_names(configurations: Sequence[str], starts: bool = False) -> tuple[str, ...]:
+    """What the loop frees for data of these configurations, settled or with histories of starts."""
     present = set(configurations)
     chassis = [c for c, word in (("tracked", "6T2A"), ("wheeled", "4W2T")) if word in present]
-    return (*BENCH, *(f"{c}.{n}" for c in chassis for n in (*priors.FRICTION[c], "radius")))
+    more = START_CHASSIS * starts
+    return (*BENCH, *START * starts, *(f"{c}.{n}" for c in chassis for n in (*priors.FRICTION[c], "radius", *more)))
 
 
 def visible_effects(library: Library, robot: Robot) -> tuple[Effect, ...]:

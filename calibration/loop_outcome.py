@@ -7,6 +7,7 @@ import inspect
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -203,8 +204,9 @@ def effects_found(loop: Loop, found: Finding, curve: Discrepancy | None = None) 
         values = {amplitude.name: {"value": float(value), "sd": float(sd), "unit": amplitude.spec.unit}}
         shape = slots.shape_of(effect)
         if shape is not None:
-            value = float(shape.value) * np.exp(slots.shape_spread(shape) * after.z[p + size + slot])
-            sd = value * slots.shape_spread(shape) * after.sd[p + size + slot]
+            of = lambda z: slots.shaped(slots.shape_scales(shape), z)  # noqa: B023, E731
+            value, slope = jax.value_and_grad(of)(jnp.asarray(after.z[p + size + slot]))
+            sd = float(slope) * after.sd[p + size + slot]
             values[shape.name] = {"value": float(value), "sd": float(sd), "unit": shape.spec.unit}
         words, source = equation(effect)
         listed.append(

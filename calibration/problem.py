@@ -16,10 +16,12 @@ from calibration.doors import BadConfiguration, choices
 from calibration.priors import Coordinates
 from calibration.records import Runs
 from mmrjax import balances, params
-from mmrjax.models.drive import drive
+from mmrjax.effects import Effect
+from mmrjax.models.drive import drive, rates, state_of
+from mmrjax.models.histories import grid, histories, respond, states
 from mmrjax.models.steady import operating_point
 from mmrjax.robot import Robot
-from mmrjax.signals import FAILED, SLIDES, TIPS, Command, Reading, Result
+from mmrjax.signals import CONVERGED, FAILED, SLIDES, TIPS, Command, Reading, Result, Signals
 
 #: Share of the adhesion limit that a measured steady row is taken to leave unused [-].
 MARGIN = 0.02
@@ -32,6 +34,9 @@ SETTLED = 4.0
 #: Length of a run of `track` from a rolling start [s]. Its last 40 % hold two grouser periods (34) or more down
 #: to 0.29 m/s, and averages over them are within 1e-4 of those of a run of 1.5 s.
 ROLLED = 0.6
+
+#: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
+KNOTS, KNOT_STEPS = 256, 1e7
 
 Simulate = Callable[[Robot, Command], Result]
 
@@ -99,25 +104,77 @@ class Settled(eqx.Module):
 
 
 class Series(eqx.Module):
-    """Observer of time histories with `drive`: one run from standstill for each `run_id`, one row a sample.
+    """Observer of time histories: one run of `drive` from standstill for each `run_id`, one row a sample.
 
     Sliding during a start is part of the run, so adhesion is not penalised.
 
     Attributes:
         commands: of each run, shape (runs,).
-        times: from 0 on, padded beyond a run's last sample, shape (runs, times) [s].
-        run, sample: indices of each row into `times`, shape (rows,).
+        times: the grid of each run from 0 on, its last instant repeated to one length, shape (runs, instants) [s].
+        run: index of each row's run; instant: of its sample in `times`; shape (rows,).
+        rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
+        knots: of those, the samples between which a defect is taken to be linear, shape (knots,).
     """
 
     commands: Command
-    times: Float[Array, "runs times"]
+    times: Float[Array, "runs instants"]
     run: Int[Array, " rows"]
-    sample: Int[Array, " rows"]
+    instant: Int[Array, " rows"]
+    rows: Int[Array, "runs samples"]
+    knots: Int[Array, " knots"]
+
+    @property
+    def at_knots(self) -> Int[Array, "runs knots"]:
+        """Rows at the knots of each run; a run's last where it has ended."""
+        last = jnp.max(self.rows, 1, keepdims=True)
+        return jnp.where(self.rows < 0, last, self.rows)[:, self.knots]
+
+    def defective(self, robot: Robot, probes: tuple[Effect, ...]) -> Float[Array, "probes runs knots samples 3"]:
+        """Change of the readings by a defect of each probe's balance [its unit] that is 1 at a knot of a run and
+        falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
+        clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.at_knots]]
+
+        def one(command: Command, times: Array, clock: Array, instants: Array) -> Array:
+            def probed(amplitude: Array) -> Robot:
+                put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
+                return dataclasses.replace(robot, effects=(*robot.effects, *put))
+
+            none = jnp.zeros(len(probes))
+            # A run that ended early repeats its last knot; only the first of them is one.
+            real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
+            before = jnp.concatenate([clock[:1] - 1.0, clock[:-1]])
+            after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
+
+            def source(t: Array, y: Array) -> Array:
+                slope = jax.jacfwd(lambda a: rates(probed(a), command, y))(none)
+                rising = (t - before) / jnp.maximum(clock - before, 1e-12)
+                falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
+                hat = real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
+                return slope[:, :, None] * hat
+
+            def seen(y: Array, dy: Array) -> Array:
+                def reading(y: Array) -> Array:
+                    return _stack(balances.sensor(robot, balances.moving(robot, command, state_of(robot, y))))
+
+                return jnp.tensordot(jax.jacfwd(reading)(y), dy, 1)
+
+            changed = respond(robot, command, times, states(robot, command, times), source, seen)[1]
+            whole = jnp.concatenate([jnp.zeros_like(changed[:1]), changed])
+            return jnp.moveaxis(whole[instants], (0, 1), (2, 3))  # probes, knots, samples, 3
+
+        instants = self.instant[jnp.where(self.rows < 0, 0, self.rows)]
+        return jnp.moveaxis(jax.vmap(one)(self.commands, self.times, clock, instants), 0, 1)
+
+    def signals(self, robot: Robot) -> Signals:
+        """Every signal at every row."""
+        whole = jax.vmap(lambda c, t: histories(robot, c, t))(self.commands, self.times)
+        there = jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), whole)
+        return jax.tree.map(lambda x: x[self.run, self.instant], there)
 
     def __call__(self, robot: Robot) -> Observation:
-        runs = jax.vmap(lambda c, t: drive(robot, c, t))(self.commands, self.times)
-        readings = _stack(jax.vmap(jax.vmap(lambda s: balances.sensor(robot, s)))(runs.signals))
-        return Observation(readings[self.run, self.sample], jnp.zeros(self.run.shape), runs.result.status[self.run])
+        reading = _stack(jax.vmap(lambda s: balances.sensor(robot, s))(self.signals(robot)))
+        followed = jnp.all(jnp.isfinite(reading), 1)
+        return Observation(reading, jnp.zeros(self.run.shape), jnp.where(followed, CONVERGED, FAILED))
 
 
 def is_series(runs: Runs) -> bool:
@@ -129,11 +186,16 @@ def series(runs: Runs) -> Series:
     """Observer of a table with `time_s`; rows may come in any order, conditions are those of a run's first row."""
     identity = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
     names, first, run = np.unique(identity, return_index=True, return_inverse=True)
-    clocks = [np.unique(np.concatenate([[0.0], runs["time_s"][run == k]])) for k in range(len(names))]
-    longest = max(len(c) for c in clocks)
-    times = np.stack([np.concatenate([c, c[-1] + 1e-3 * np.arange(1, longest - len(c) + 1)]) for c in clocks])
-    sample = np.array([np.searchsorted(clocks[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
-    return Series(runs.where(first).command(), jnp.asarray(times), jnp.asarray(run), jnp.asarray(sample))
+    mine = [np.flatnonzero(run == k) for k in range(len(names))]
+    mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
+    grids = [grid(runs["time_s"][m]) for m in mine]
+    longest, samples = max(map(len, grids)), max(map(len, mine))
+    times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
+    instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
+    rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
+    most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
+    knots = np.unique(np.round(np.linspace(0, samples - 1, most)).astype(int))
+    return Series(runs.where(first).command(), *map(jnp.asarray, (times, run, instant, rows, knots)))
 
 
 class Data(eqx.Module):

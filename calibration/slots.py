@@ -26,11 +26,15 @@ PLAUSIBLE = 4.0
 
 
 def shape_of(effect: Effect) -> Parameter | None:
-    """The shape parameter that a fit frees: the first scale beside the amplitude, if the effect has one."""
+    """The shape parameter that a fit frees: the first phase or scale beside the amplitude, if the effect has one."""
     for p in params.walk(effect):
-        if not p.spec.amplitude and p.spec.relative_sd and float(p.value) > 0:
+        if not p.spec.amplitude and (_phase(p) or (p.spec.relative_sd and float(p.value) > 0)):
             return p
     return None
+
+
+def _phase(p: Parameter) -> bool:
+    return p.name == "phase"
 
 
 def amplitude_of(effect: Effect) -> Parameter:
@@ -38,9 +42,20 @@ def amplitude_of(effect: Effect) -> Parameter:
     return next(p for p in params.walk(effect) if p.spec.amplitude)
 
 
-def shape_spread(shape: Parameter) -> float:
-    """Prior sd of the logarithm of a shape parameter."""
-    return math.sqrt(math.log1p(shape.spec.relative_sd**2))  # type: ignore[operator]
+def shape_scales(shape: Parameter | None) -> tuple[float, float, float]:
+    """(value, spread, sd) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z: a phase is
+    shifted, a scale multiplied."""
+    if shape is None:
+        return 1.0, 0.0, 0.0
+    if _phase(shape):
+        return float(shape.value), 0.0, float(shape.spec.sd)  # type: ignore[arg-type]
+    return float(shape.value), math.sqrt(math.log1p(shape.spec.relative_sd**2)), 0.0  # type: ignore[operator]
+
+
+def shaped(scales: tuple, z: Array) -> Array:
+    """A shape parameter at coordinate z, `scales` as by `shape_scales`."""
+    value, spread, sd = scales
+    return value * jnp.exp(spread * z) + sd * z
 
 
 class Slots(eqx.Module):
@@ -53,15 +68,14 @@ class Slots(eqx.Module):
     Attributes:
         base: coordinates of the base parameters.
         which: index into `names` of the effect in each slot, -1 if it is empty; shape (slots,).
+        sd: of each effect's amplitude; scales: of each effect's shape, see `shape_scales`.
         names, shapes: of the effects of the robot, and of their shape parameter ("" for none).
-        sd, nominal, spread: of each effect's amplitude, its shape's value, and its shape's spread.
     """
 
     base: Coordinates
     which: Int[Array, " slots"]
     sd: Float[Array, " effects"]
-    nominal: Float[Array, " effects"]
-    spread: Float[Array, " effects"]
+    scales: tuple[Array, Array, Array]
     names: tuple[str, ...] = eqx.field(static=True)
     shapes: tuple[str, ...] = eqx.field(static=True)
 
@@ -87,7 +101,7 @@ class Slots(eqx.Module):
         base, amplitude, shape = self.parts(z)
         held = self.held()
         amplitudes = WIDE * self.sd * (amplitude @ held)
-        shapes = self.nominal * jnp.exp(self.spread * (shape @ held))
+        shapes = shaped(self.scales, shape @ held)
         values = {f"effects.{name}.amplitude": amplitudes[k] for k, name in enumerate(self.names)}
         values |= {f"effects.{n}.{s}": shapes[k] for k, (n, s) in enumerate(zip(self.names, self.shapes)) if s}  # noqa: B905
         return params.replace(self.base.robot(robot, base), values)  # type: ignore[return-value]
@@ -104,8 +118,7 @@ def slots(base: Coordinates, effects: Sequence[Effect], size: int) -> Slots:
         base,
         jnp.full(size, -1),
         jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in effects]),
-        jnp.asarray([1.0 if s is None else float(s.value) for s in shapes]),
-        jnp.asarray([0.0 if s is None else shape_spread(s) for s in shapes]),
+        tuple(jnp.asarray(x) for x in zip(*map(shape_scales, shapes), strict=True)),  # type: ignore[arg-type]
         tuple(e.name for e in effects),
         tuple("" if s is None else s.name for s in shapes),
     )
@@ -120,6 +133,8 @@ def equipped(robot: Robot, library: Library, names: Sequence[str]) -> Robot:
 
 #: Where on the prior of a shape parameter the library is scored, in its sds.
 GRID = (-1.5, -0.75, 0.0, 0.75, 1.5)
+#: The same for a phase, whose sd is 2 rad: 36 degrees apart through half a turn; an amplitude has either sign.
+TURN = tuple(float(x) for x in np.arange(-2, 3) * math.pi / 10)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,6 +152,11 @@ class Scored:
     at: tuple[float, ...]
     values: tuple[float, ...]
 
+    @property
+    def absent(self) -> Effect:
+        """The effect with amplitude 0."""
+        return eqx.tree_at(lambda e: e.amplitude, self.effect, jnp.zeros_like(jnp.asarray(self.effect.amplitude)))
+
     def each(self, function: Callable[[Effect], Array]) -> Array:
         """`function` of the effect at every point of the grid, along a new leading axis."""
         if not self.name:
@@ -151,5 +171,6 @@ def scored(effect: Effect, grid: Sequence[float] = GRID) -> Scored:
     unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
     if shape is None:
         return Scored(unit, "", (0.0,), ())  # type: ignore[arg-type]
-    values = float(shape.value) * np.exp(shape_spread(shape) * np.asarray(grid))
-    return Scored(unit, shape.name, tuple(grid), tuple(map(float, np.clip(values, *shape.spec.bounds))))  # type: ignore[arg-type]
+    grid = TURN if _phase(shape) else grid
+    values = np.clip(np.asarray(shaped(shape_scales(shape), np.asarray(grid))), *shape.spec.bounds)  # type: ignore[arg-type]
+    return Scored(unit, shape.name, tuple(grid), tuple(map(float, values)))  # type: ignore[arg-type]

@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 
 from calibration import fit
 from calibration.normal import backward, cholesky, forward
-from calibration.problem import Data, Problem, Settled
+from calibration.problem import Data, Problem, Series
 from calibration.records import CHANNELS
 from calibration.slots import Scored
-from mmrjax import balances
+from mmrjax import balances, params
 from mmrjax.effects import Effect
 from mmrjax.models.steady import operating_signals
 from mmrjax.params import Scalar, parameter
@@ -60,15 +60,34 @@ class Linear(eqx.Module):
         residual: whitened residuals, shape (residuals,): readings (3 a row), adhesion (1 a row), priors.
         jacobian: by the free coordinates, shape (residuals, coordinates).
         signatures: by each instance's amplitude in prior sds, shape (3 rows, instances).
-        defects: by a defect of each balance of PROBED [its unit], shape (balances, rows, 3).
-        signals: of every row, at the fit; None for histories.
+        defects: by a defect of each balance of PROBED [its unit]: of settled rows each of its own, shape
+            (balances, rows, 3); of histories at each knot of a run, shape (balances, runs, knots, samples, 3).
+        signals: of every row, at the fit.
+        series: how the rows of histories lie in time; None for settled rows.
     """
 
     residual: Float[Array, " residuals"]
     jacobian: Float[Array, "residuals coordinates"]
     signatures: Float[Array, "readings instances"]
-    defects: Float[Array, "balances rows 3"]
-    signals: Signals | None
+    defects: Float[Array, "balances ..."]
+    signals: Signals
+    series: Series | None = None
+
+    @property
+    def rows(self) -> int:
+        """How many rows there are."""
+        return self.signatures.shape[0] // 3
+
+    def columns(self, balance: Any, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+        """Change of the whitened readings by defects of a balance, each a column over the rows (linear between
+        knots in histories); `balance` an index into PROBED."""
+        if self.series is None:
+            return (self.defects[balance][:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
+        rows = self.series.rows
+        moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.series.at_knots])
+        there = jnp.where(rows < 0, self.rows, rows)  # beyond the last row: dropped
+        out = jnp.zeros((self.rows, 3, shapes.shape[1])).at[there].set(moved, mode="drop")
+        return out.reshape(-1, shapes.shape[1])
 
 
 def linearise(problem: Problem, z: Array, data: Data, candidates: tuple[Scored, ...]) -> Linear:
@@ -77,8 +96,8 @@ def linearise(problem: Problem, z: Array, data: Data, candidates: tuple[Scored, 
     In settled travel a signature is the sensitivity of the readings to a defect of the effect's balance,
     times its term: exact, as an effect enters one balance and is linear in its amplitude.
     """
-    if not isinstance(problem.observe, Settled):
-        return _linearise_rollout(problem, z, data, candidates)
+    if isinstance(problem.observe, Series):
+        return _linearise_series(problem, z, data, candidates)
     probes = tuple(_probe(b) for b in PROBED)
     robot = problem.robot(z)
 
@@ -114,25 +133,40 @@ def linearise(problem: Problem, z: Array, data: Data, candidates: tuple[Scored, 
     return Linear(residual, jacobian[:, : z.size], _finite(signatures), defects, signals)
 
 
-def _linearise_rollout(problem: Problem, z: Array, data: Data, candidates: tuple[Scored, ...]) -> Linear:
-    """As `linearise` for histories: signatures by differentiating the rollout in every amplitude."""
-
-    def moved(effect: Effect) -> Array:
-        robot = problem.robot(z)
-        kept = tuple(e for e in robot.effects if e.name != effect.name)
-
-        def readings(amplitude: Array) -> Array:
-            put = eqx.tree_at(lambda e: e.amplitude, effect, amplitude * effect.amplitude)
-            there = dataclasses.replace(robot, effects=(*kept, put))
-            return problem.whitened(problem.observe(there), data)[: data.measured.size]
-
-        return jax.jvp(readings, (jnp.zeros(()),), (jnp.ones(()),))[1]
-
+def _linearise_series(problem: Problem, z: Array, data: Data, candidates: tuple[Scored, ...]) -> Linear:
+    """As `linearise` for histories: effects that keep a memory act by the whole past of a run, so a signature is
+    the derivative of the run by the amplitude. All effects are in one run, once for each point of the shapes'
+    grids; those that are there already keep their shape."""
+    observe = problem.observe
     function = fit.residuals(problem, data, fit.no_pin(z.size))
     jacobian, residual = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
-    signatures = jnp.concatenate([c.each(moved) for c in candidates]).T
-    rows = data.measured.shape[0]
-    return Linear(residual, jacobian, _finite(signatures), jnp.zeros((len(PROBED), rows, 3)), None)
+    robot = problem.robot(z)
+    have = {e.name for e in robot.effects}
+    whole = dataclasses.replace(robot, effects=(*robot.effects, *(c.absent for c in candidates if c.effect.name not in have)))
+    value = {p.name: p.value for p in params.walk(whole)}
+    sds = jnp.stack([jnp.asarray(c.effect.amplitude) for c in candidates])
+
+    def moved(point: Array) -> Array:
+        def readings(a: Array) -> Array:
+            put = {}
+            for k, c in enumerate(candidates):
+                amplitude = f"effects.{c.effect.name}.amplitude"
+                put[amplitude] = value[amplitude] + a[k] * sds[k]
+                if c.name:
+                    shape = f"effects.{c.effect.name}.{c.name}"
+                    wanted = jnp.asarray(c.values)[jnp.minimum(point, len(c.values) - 1)]
+                    put[shape] = jnp.where(value[amplitude] == 0, wanted, value[shape])
+            there = params.replace(whole, put)
+            return problem.whitened(observe(there), data)[: data.measured.size]
+
+        return jax.jacfwd(readings)(jnp.zeros(len(candidates)))
+
+    by_point = jax.lax.map(moved, jnp.arange(max(len(c.at) for c in candidates)))
+    parts = [by_point[j, :, k] for k, c in enumerate(candidates) for j in range(len(c.at))]
+    defects = observe.defective(robot, tuple(_probe(b) for b in PROBED))
+    scale = (data.weight / data.sd)[observe.rows]
+    defects = jnp.where(observe.rows[:, None, :, None] < 0, 0.0, defects * scale[:, None])
+    return Linear(residual, jacobian, _finite(jnp.stack(parts, 1)), _finite(defects), observe.signals(robot), observe)
 
 
 def _finite(x: Array) -> Array:
@@ -190,9 +224,7 @@ def _projected(linear: Linear, columns: Array) -> tuple[Array, Array, Array]:
 
 def curve_columns(linear: Linear, curves: Curves) -> Float[Array, "families readings terms"]:
     """Signatures of every curve's columns."""
-    defects = linear.defects[jnp.asarray(curves.balance)]  # families, rows, 3
-    columns = defects[..., None] * curves.basis[:, :, None, :]
-    return columns.reshape(columns.shape[0], -1, columns.shape[-1])
+    return jax.vmap(linear.columns)(jnp.asarray(curves.balance), curves.basis)
 
 
 def score(linear: Linear, curves: tuple[Curves, ...]) -> Scores:
@@ -248,14 +280,35 @@ def _curve_score(linear: Linear, columns: Array) -> tuple[Array, Array]:
 
 
 class Summary(eqx.Module):
-    """The strongest of each kind: |single|, pair [σ²], curve [normal deviate]; χ² of the residuals; and whether
-    the fit that left them is an optimum."""
+    """The strongest of each kind: |single|, pair [σ²], curve [normal deviate]; χ² of the residuals; memory of
+    the residuals of histories, see `memory`; and whether the fit that left them is an optimum."""
 
     single: Array
     pair: Array
     curve: Array
     chi2: Array
+    white: Array
     settled: Array
+
+
+#: Lags of a run's residual that are looked at, at most a quarter of its samples.
+LAGS = 12
+
+
+def memory(linear: Linear) -> Array:
+    """Whether residuals of histories remember: Ljung and Box's (1978) statistic over all runs, as a normal
+    deviate, the largest of the channels; -inf for settled rows, whose order means nothing."""
+    if linear.series is None:
+        return jnp.asarray(-jnp.inf)
+    rows = linear.series.rows
+    x = jnp.where(rows[:, :, None] < 0, 0.0, linear.residual[: 3 * linear.rows].reshape(-1, 3)[rows])
+    count = jnp.sum(rows >= 0, 1)[:, None]
+    power = jnp.sum(x**2, 1)
+    lags = min(LAGS, rows.shape[1] // 4)
+    of = [jnp.sum(x[:, k:] * x[:, :-k], 1) ** 2 / jnp.maximum(power, 1e-9) ** 2 / (count - k) for k in range(1, lags + 1)]
+    statistic = jnp.sum(sum(of, jnp.zeros_like(power)) * count * (count + 2), 0)
+    freedom = max(rows.shape[0] * lags, 1)
+    return jnp.max((statistic - freedom) / (2 * freedom) ** 0.5)
 
 
 #: Fall of the objective [½σ²] that a refit may still predict for its statistics to count.
@@ -271,6 +324,7 @@ def strongest(scores: Scores, linear: Linear) -> Summary:
         jnp.max(scores.pair),
         jnp.max(scores.curve),
         jnp.sum(e**2),
+        memory(linear),
         decrement < UNSETTLED,
     )
 
@@ -304,6 +358,7 @@ class Tracer:
     def __post_init__(self) -> None:
         object.__setattr__(self, "look", eqx.filter_jit(self._look))
         object.__setattr__(self, "null", eqx.filter_jit(self._null))
+        object.__setattr__(self, "null_linear", eqx.filter_jit(self._null_linear))
 
     def _look(
         self, problem: Problem, z: Array, data: Data, curves: tuple[Curves, ...]
@@ -325,6 +380,21 @@ class Tracer:
             there = gauss_newton(problem, z, noisy, self.steps)
             linear = linearise(problem, there, noisy, self.candidates)
             return strongest(score(linear, curves), linear)
+
+        return jax.vmap(replicate)(keys)
+
+
+    def _null_linear(self, linear: Linear, data: Data, curves: tuple[Curves, ...], keys: Array) -> Summary:
+        jacobian = linear.jacobian
+        lower = cholesky(jacobian.T @ jacobian)
+        rows = linear.rows
+        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(rows), jnp.ones(jacobian.shape[1])])
+
+        def replicate(key: Array) -> Summary:
+            noise = counts * jax.random.normal(key, counts.shape)
+            left = noise - jacobian @ backward(lower, forward(lower, jacobian.T @ noise))
+            there = dataclasses.replace(linear, residual=left)
+            return strongest(score(there, curves), there)
 
         return jax.vmap(replicate)(keys)
 
@@ -353,7 +423,7 @@ def beside_curve(linear: Linear, curves: tuple[Curves, ...], chosen: int) -> Sum
     others = balances != balances[chosen]
     curve = float(np.max(np.asarray(scores.curve)[others], initial=-np.inf))
     single = float(np.max(np.abs(np.asarray(scores.single))))
-    return Summary(single, float(np.max(np.asarray(scores.pair))), curve, -np.inf, True)  # type: ignore[arg-type]
+    return Summary(single, float(np.max(np.asarray(scores.pair))), curve, -np.inf, -np.inf, True)  # type: ignore[arg-type]
 
 
 _score_jit = eqx.filter_jit(score)
@@ -373,9 +443,16 @@ def bootstrap(
 
     A replicate draws readings with their sds, and the bench values too: a prior is a measurement made
     beforehand. Replicates whose refit did not settle are left out; there may be fewer than asked for.
+    Histories have hundreds of readings a parameter and their refits stay where the model is linear: there the
+    refit is the linear one.
     """
+    if isinstance(problem.observe, Series):
+        linear = tracer.look(problem, z, data, curves)[0]  # type: ignore[attr-defined]
+        one = lambda keys: tracer.null_linear(linear, data, curves, keys)  # type: ignore[attr-defined]  # noqa: E731
+    else:
+        one = lambda keys: tracer.null(problem, z, data, curves, keys)  # type: ignore[attr-defined]  # noqa: E731
     count = -(-replicates // chunk)
     keys = jax.random.split(jax.random.key(seed), (count, chunk))
-    parts = [jax.device_get(tracer.null(problem, z, data, curves, k)) for k in keys]  # type: ignore[attr-defined]
+    parts = [jax.device_get(one(k)) for k in keys]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)

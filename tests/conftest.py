@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
+from pathlib import Path
 
 import jax
 
@@ -18,6 +20,21 @@ from mmrjax.effects import ALL, BY_NAME
 from mmrjax.models.drive import drive, drive_batch
 from mmrjax.models.steady import steady, steady_batch
 from mmrjax.signals import Command, Result, command
+
+
+#: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
+#: compiler crashes or hangs beyond. A program takes some dozens.
+MAPPINGS = 12_000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _room_for_programs():
+    """Forget compiled programs between files before the process has too many."""
+    yield
+    mapped = Path("/proc/self/maps")
+    if mapped.exists() and mapped.read_bytes().count(b"\n") > MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -55,17 +55,16 @@ def _units(robot: Robot) -> tuple[float, ...]:
     return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering)
 
 
-def _state(robot: Robot, y: Float[Array, " unknowns"]) -> State:
+def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
+    """The state that a vector of unknowns stands for."""
     y = y * jnp.asarray(_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     return State(y[0], y[1], y[2], y[4], memory)
 
 
-def _rates(
-    time: Scalar, y: Float[Array, " unknowns"], conditions: tuple[Robot, Command]
-) -> Float[Array, " unknowns"]:
-    robot, command = conditions
-    signals = balances.moving(robot, command, _state(robot, y))
+def rates(robot: Robot, command: Command, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+    """Rates of the unknowns, in their units [1/s]."""
+    signals = balances.moving(robot, command, state_of(robot, y))
     current_battery = robot.battery.current(signals.total_current) * (command.battery > 0.5)  # eq. (11)
     rates = [
         signals.voltage_left / signals.inductance,
@@ -89,7 +88,7 @@ def _step_longest(robot: Robot, command: Command) -> Scalar | None:
     return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
-def _start(robot: Robot, command: Command, rolling: bool) -> Float[Array, " unknowns"]:
+def start(robot: Robot, command: Command, rolling: bool = False) -> Float[Array, " unknowns"]:
     """At rest; or as the steady fidelity travels, what effects remember settled too, at rest where it has no root."""
     units = jnp.asarray(_units(robot), jnp.result_type(command.voltage))
     rest = jnp.zeros_like(units).at[4].set(command.discharge / units[4])
@@ -129,9 +128,9 @@ def drive(
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
-    y0 = _start(robot, command, rolling)
+    y0 = start(robot, command, rolling)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(_rates),
+        diffrax.ODETerm(lambda _, y, conditions: rates(*conditions, y)),
         Rodas4(),
         times[0],
         times[-1],
@@ -148,7 +147,7 @@ def drive(
     )
     assert solution.ys is not None
     ys = solution.ys
-    signals = jax.vmap(lambda y: balances.moving(robot, command, _state(robot, y)))(ys)
+    signals = jax.vmap(lambda y: balances.moving(robot, command, state_of(robot, y)))(ys)
     end = jax.tree.map(lambda x: x[-1], signals)
     status = _status(robot, command, end, solution.result == diffrax.RESULTS.successful)
     # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
