@@ -27,6 +27,20 @@ VARIABLES = {
 #: Terms of a curve of one variable (Legendre polynomials), and degree of the polynomial in all conditions.
 TERMS, DEGREE = 5, 2
 CONDITIONS = "conditions"
+TIME = "time"
+#: Waves of histories: per turn of the driving pulley or wheel, and whether of the belt (168 teeth, 24 grousers
+#: around a pulley of 48 teeth).
+ORDERS = {
+    "order 1 of the driving shaft": (1.0, False),
+    "order 2 of the driving shaft": (2.0, False),
+    "order 3 of the driving shaft": (3.0, False),
+    "order 1 of the belt": (48 / 168, True),
+    "order 2 of the belt": (96 / 168, True),
+    "order of the grousers": (24 * 48 / 168, True),
+    "order of the teeth": (48.0, True),
+}
+#: Largest angle of a wave between samples [rad]: two and a half samples a period.
+RESOLVED = 2.5
 
 
 def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -61,6 +75,40 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> tuple[Cur
     return tuple(
         Curves(jnp.asarray(np.stack(b)), tuple(PROBED.index(n[0]) for n in ns), tuple(ns)) for ns, b in groups if ns
     )
+
+
+def in_time(columns: Mapping[str, np.ndarray], speed: np.ndarray, rows: np.ndarray) -> tuple[Curves, ...]:
+    """Curves over time, and waves of the orders that the samples resolve, in every balance.
+
+    A wave has its own amplitude and phase in each run: how the parts stood at its start is not known.
+
+    Args:
+        columns: of the table; speed: of the driving shaft [rad/s], shape (rows,).
+        rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
+    """
+    time = scaled(columns["time_s"], np.ones(len(speed)))
+    drift = legendre.legvander(time, TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
+    found = [Curves(jnp.asarray(np.stack([drift] * len(BALANCES))), tuple(map(PROBED.index, BALANCES)), tuple((b, TIME) for b in BALANCES))]
+    wheeled = columns["configuration"] == CONFIGURATIONS[1]
+    bases, words = [], []
+    for word, (order, belted) in ORDERS.items():
+        wave = np.zeros((len(speed), 2 * len(rows)))
+        for k, row in enumerate(rows):
+            mine = row[row >= 0]
+            if len(mine) < 8 or (belted and wheeled[mine[0]]):
+                continue
+            clock = columns["time_s"][mine]
+            angle = np.concatenate([[0.0], np.cumsum(np.diff(clock) * 0.5 * (speed[mine][1:] + speed[mine][:-1]))])
+            if order * angle[-1] < 4 * np.pi or order * np.median(speed[mine]) * np.median(np.diff(clock)) > RESOLVED:
+                continue
+            wave[mine, 2 * k], wave[mine, 2 * k + 1] = np.cos(order * angle), np.sin(order * angle)
+        if wave.any():
+            bases.append(wave)
+            words.append(word)
+    if words:
+        every = [(b, w) for b in BALANCES for w in words]
+        found.append(Curves(jnp.asarray(np.stack(bases * len(BALANCES))), tuple(PROBED.index(b) for b, _ in every), tuple(every)))
+    return tuple(found)
 
 
 def names(curves: tuple[Curves, ...]) -> tuple[tuple[str, str], ...]:

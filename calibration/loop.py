@@ -1,4 +1,4 @@
-"""The closed loop on a table of runs: fit, find the residual, trace it, name it or say that it has no name."""
+"""The closed loop on a table of settled runs or on histories: fit, find the residual, trace it, name it or say that it has no name."""
 
 from __future__ import annotations
 
@@ -38,8 +38,14 @@ BENCH = (
 START, START_CHASSIS = ("motor.inductance", "motor.inertia"), ("inertia", "ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: Family-wise error of «something is missing», shared out among the four kinds of evidence.
 ALPHA = {"single": 0.03, "curve": 0.01, "pair": 0.004, "chi2": 0.006}
-#: Hypotheses refitted in one batch.
+#: The same for histories, where also the memory of what is left counts.
+ALPHA_SERIES = ALPHA | {"chi2": 0.003, "white": 0.003}
+#: Hypotheses refitted in one batch; of histories, and the most steps of such a fit.
 BATCH = 16
+BATCH_SERIES, STEPS_SERIES = 8, 30
+#: Draws of the prior among which the starts of a fit to histories are chosen: far off, a start slides where the
+#: measured one grips, and a search from there stays.
+DRAWS = 128
 #: Rise of the objective [σ²] up to which another effect explains the data as well, and up to which it does
 #: where the signatures are nearly parallel.
 SAME, SAME_PARALLEL, PARALLEL = 4.0, 9.0, 0.95
@@ -47,7 +53,7 @@ SAME, SAME_PARALLEL, PARALLEL = 4.0, 9.0, 0.95
 BOTH = 5.0
 #: How far beyond its threshold a statistic has to be for a fit with effects to be rejected: two sigmas of a
 #: leftover that lies right on it would flip the verdict, at a family-wise error of some 1 %.
-MARGIN = {"single": 0.5, "curve": 0.7, "pair": 6.0, "chi2": 10.0}
+MARGIN = {"single": 0.5, "curve": 0.7, "pair": 6.0, "chi2": 10.0, "white": 1.0}
 #: Rows are padded to a multiple of this, so that tables of about one size share what is compiled.
 PAD = 16
 #: Largest share of rows set aside as outliers, and the family-wise error of that.
@@ -64,10 +70,12 @@ class Gate:
 
     Attributes:
         found: the strongest statistics of the data; null: of the bootstrap, shape (replicates,) each.
+        alpha: share of the family-wise error of each kind of evidence.
     """
 
     found: Summary
     null: Summary
+    alpha: dict[str, float] = dataclasses.field(default_factory=lambda: ALPHA)
 
     def p(self, kind: str) -> float:
         """Share of bootstrap tables with a statistic as strong, never below 1 / (replicates + 1)."""
@@ -76,23 +84,23 @@ class Gate:
 
     def threshold(self, kind: str) -> float:
         """What the strongest statistic of its kind has to exceed."""
-        return float(np.quantile(getattr(self.null, kind), 1 - ALPHA[kind], method="higher"))
+        return float(np.quantile(getattr(self.null, kind), 1 - self.alpha[kind], method="higher"))
 
     @property
     def open(self) -> bool:
         """Whether something is missing, at a family-wise error of 5 %."""
-        return any(self.p(kind) <= level for kind, level in ALPHA.items())
+        return any(self.p(kind) <= level for kind, level in self.alpha.items())
 
     @property
     def clear(self) -> bool:
         """Whether what is left is beyond doubt, so that a fit which leaves it is not the whole story."""
-        return any(float(getattr(self.found, k)) > self.threshold(k) + MARGIN[k] for k in ALPHA)
+        return any(float(getattr(self.found, k)) > self.threshold(k) + MARGIN[k] for k in self.alpha)
 
     @property
     def p_value(self) -> float:
         """Family-wise p-value: the smallest of the four, each over its share of the error."""
-        total = sum(ALPHA.values())
-        return min(1.0, min(self.p(kind) * total / level for kind, level in ALPHA.items()))
+        total = sum(self.alpha.values())
+        return min(1.0, min(self.p(kind) * total / level for kind, level in self.alpha.items()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,13 +181,14 @@ def free_names(configurations: Sequence[str], starts: bool = False) -> tuple[str
     return (*BENCH, *START * starts, *(f"{c}.{n}" for c in chassis for n in (*priors.FRICTION[c], "radius", *more)))
 
 
-def visible_effects(library: Library, robot: Robot) -> tuple[Effect, ...]:
-    """The effects that settled runs on an external supply can show and that the robot does not have yet."""
+def visible_effects(library: Library, robot: Robot, series: bool = False) -> tuple[Effect, ...]:
+    """The effects that runs on an external supply can show, settled or from their start on, and that the robot
+    does not have yet."""
     have = {e.name for e in robot.effects}
-    # thermal_drift settles to winding_heating, battery_sag acts on the battery alone
-    skip = {"thermal_drift", "battery_sag"} | have
-    found = [e() for name, e in library.items() if name not in skip and not e.transient]
-    return tuple(found)
+    skip = have | {"battery_sag"}  # acts on the battery alone
+    if not series:
+        skip |= {"thermal_drift"} | {name for name, e in library.items() if e.transient}  # settles to winding_heating
+    return tuple(e() for name, e in library.items() if name not in skip)
 
 
 class Engine:
@@ -189,11 +198,15 @@ class Engine:
         base: robot whose values are the prior means.
         library: effects to look for.
         size: slots, thus the most effects that are found at once.
+        series: whether its tables hold histories.
     """
 
-    def __init__(self, base: Robot, library: Library = effects.BY_NAME, size: int = 4) -> None:
-        self.base, self.library = base, library
-        self.effects = visible_effects(library, base)
+    def __init__(
+        self, base: Robot, library: Library = effects.BY_NAME, size: int = 4, *, series: bool = False
+    ) -> None:
+        self.base, self.library, self.series = base, library, series
+        self.effects = visible_effects(library, base, series)
+        self.batch, self.max_steps = (BATCH_SERIES, STEPS_SERIES) if series else (BATCH, 60)
         self.names = tuple(e.name for e in self.effects)
         self.equipped = slots.equipped(base, library, self.names)
         self.size = size
@@ -203,6 +216,13 @@ class Engine:
         self.tracer = Tracer(self.candidates)
         self.fits = eqx.filter_jit(self._fits)
         self.observe = eqx.filter_jit(lambda problem, z: problem.observation(z))
+        self.bare = eqx.filter_jit(
+            lambda problem, starts: jax.vmap(lambda z: fit.levenberg_marquardt(problem, z, problem.data, max_steps=60))(
+                starts
+            )
+        )
+        self.costs = eqx.filter_jit(lambda problem, zs: jax.lax.map(lambda z: _cost(problem, z), zs, batch_size=16))
+        self.signals = eqx.filter_jit(lambda problem, z: problem.observe.signals(problem.robot(z)))
 
     def _fits(self, problem: Problem, which: Array, starts: Array, weights: Array) -> tuple[fit.Optimum, Observation]:
         """Fits of hypotheses, each to its own rows, and what each says of every row."""
@@ -210,10 +230,15 @@ class Engine:
         def one(w: Array, z: Array, weight: Array) -> tuple[fit.Optimum, Observation]:
             there = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(w))
             data = dataclasses.replace(problem.data, weight=weight)
-            found = fit.levenberg_marquardt(there, z, data, max_steps=60)
+            found = fit.levenberg_marquardt(there, z, data, max_steps=self.max_steps)
             return found, there.observation(found.z)
 
         return jax.vmap(one)(which, starts, weights)
+
+
+def _cost(problem: Problem, z: Array) -> Array:
+    cost = jnp.sum(problem.misfit(z, problem.data) ** 2) + jnp.sum(z**2)
+    return jnp.where(jnp.isfinite(cost), cost, jnp.inf)
 
 
 def padded(runs: Runs, to: int = PAD) -> tuple[Runs, np.ndarray]:
@@ -248,18 +273,23 @@ class Loop:
         progress: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.engine, self.runs, self.replicates, self.seed, self.progress = engine, runs, replicates, seed, progress
-        whole, there = padded(runs)
+        whole, there = padded(runs, 1 if engine.series else PAD)
         sd = np.concatenate([sd, np.repeat(sd[:1], len(there) - len(runs), 0)])
         self.counts = there.copy()  # rows that count; changes as outliers are set aside
-        names = free_names(runs["configuration"])
+        names = free_names(runs["configuration"], engine.series)
         coordinates = priors.coordinates(engine.base, names, stated)
-        self.problem = build(whole, engine.base, coordinates, sd)
+        self.problem = build(whole, engine.base, coordinates, sd, "drive" if engine.series else "steady")
         self.coordinates = slots.slots(coordinates, engine.effects, engine.size)
         self.numbers = np.arange(1, len(runs) + 1) if numbers is None else numbers
         self.unusable: tuple[int, ...] = ()
         self.outliers: tuple[int, ...] = ()
 
     # --- fits ---------------------------------------------------------------------------------------
+
+    @property
+    def alpha(self) -> dict[str, float]:
+        """Share of the family-wise error of each kind of evidence."""
+        return ALPHA_SERIES if self.engine.series else ALPHA
 
     @property
     def weight(self) -> np.ndarray:
@@ -282,17 +312,30 @@ class Loop:
 
         Rows that it cannot reach at all are kept out, and it is fitted again.
         """
-        p, empty = len(self.coordinates.base), (-1,) * self.engine.size
-        starts = np.zeros((BATCH, len(self.coordinates)))
-        starts[1:, :p] = np.random.default_rng(self.seed).standard_normal((BATCH - 1, p))
+        p, empty, batch = len(self.coordinates.base), (-1,) * self.engine.size, self.engine.batch
+        starts = np.zeros((batch, len(self.coordinates)))
+        if self.engine.series:
+            starts[:, :p] = self._starts_series()
+        else:
+            starts[1:, :p] = np.random.default_rng(self.seed).standard_normal((batch - 1, p))
         while True:
-            found, seen = self._batch([empty] * BATCH, starts, [self.weight] * BATCH)
+            found, seen = self._batch([empty] * batch, starts, [self.weight] * batch)
             k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
             lost = self.problem.unreachable(seen.status[k]) & self.counts
             if not lost.any():
                 best = jax.tree.map(lambda x: x[k], found)  # noqa: B023
                 return dataclasses.replace(self._hypothesis(empty, best), reading=seen.reading[k])
             self._set_aside(lost)
+
+    def _starts_series(self) -> np.ndarray:
+        """Where searches of the bare base from the prior mean and from its best draws end, shape (batch, parameters)."""
+        bare, p = self._weighted(self.problem), len(self.coordinates.base)
+        draws = np.random.default_rng(self.seed).standard_normal((DRAWS, p))
+        order = np.argsort(np.asarray(self.engine.costs(bare, jnp.asarray(draws))))
+        starts = np.concatenate([np.zeros((1, p)), draws[order[: self.engine.batch - 1]]])
+        found = jax.device_get(self.engine.bare(bare, jnp.asarray(starts)))
+        best = found.z[int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
+        return np.repeat(best[None], self.engine.batch, 0)
 
     def _set_aside(self, lost: np.ndarray) -> None:
         self.unusable = tuple(sorted({*self.unusable, *map(int, np.flatnonzero(lost))}))
@@ -309,11 +352,11 @@ class Loop:
         self, proposals: Sequence[tuple[tuple[int, ...], np.ndarray]], weights: Sequence[np.ndarray] | None = None
     ) -> list[Hypothesis]:
         """Fit every (which, start), in batches of one size."""
-        found = []
-        for first in range(0, len(proposals), BATCH):
-            part = list(proposals[first : first + BATCH])
-            fill = part + [part[0]] * (BATCH - len(part))
-            best, _ = self._batch([w for w, _ in fill], [z for _, z in fill], [self.weight] * BATCH)
+        found, batch = [], self.engine.batch
+        for first in range(0, len(proposals), batch):
+            part = list(proposals[first : first + batch])
+            fill = part + [part[0]] * (batch - len(part))
+            best, _ = self._batch([w for w, _ in fill], [z for _, z in fill], [self.weight] * batch)
             found += [self._hypothesis(w, jax.tree.map(lambda x: x[k], best)) for k, (w, _) in enumerate(part)]  # noqa: B023
         return found
 
@@ -327,13 +370,13 @@ class Loop:
             Readings [SI], NaN where no block holds the row or the fit cannot reach it, shape (rows, 3); and
             which blocks' fits converged.
         """
-        rows = len(self.runs)
+        rows, batch = len(self.runs), self.engine.batch
         reading, converged = np.full((rows, 3), np.nan), []
-        for first in range(0, len(blocks), BATCH):
-            part = list(blocks[first : first + BATCH])
-            fill = part + [part[0]] * (BATCH - len(part))
+        for first in range(0, len(blocks), batch):
+            part = list(blocks[first : first + batch])
+            fill = part + [part[0]] * (batch - len(part))
             out = [np.concatenate([m, np.zeros(len(self.counts) - rows, bool)]) for m in fill]
-            best, seen = self._batch([h.which] * BATCH, [h.z] * BATCH, [self.weight * ~m[:, None] for m in out])
+            best, seen = self._batch([h.which] * batch, [h.z] * batch, [self.weight * ~m[:, None] for m in out])
             converged += list(best.converged[: len(part)])
             for k, mask in enumerate(part):
                 lost = self.problem.unreachable(seen.status[k])[:rows, None]
@@ -396,13 +439,13 @@ class Loop:
     def gate(self, h: Hypothesis, curves: tuple[Curves, ...], null: Summary) -> Round:
         """Look at a fit, and test what it leaves."""
         linear, scores, found = self.look(h, curves)
-        return Round(h, linear, scores, Gate(found, null))
+        return Round(h, linear, scores, Gate(found, null, self.alpha))
 
     def gate_of(self, problem: Problem, z: np.ndarray, like: Gate) -> Gate:
         """What the fit of another problem of the same table leaves, against the thresholds of a gate."""
         curves = self.curves
         _, _, found = jax.device_get(self.engine.tracer.look(problem, jnp.asarray(z), problem.data, curves))  # type: ignore[attr-defined]
-        return Gate(found, like.null)
+        return Gate(found, like.null, like.alpha)
 
     # --- the loop -----------------------------------------------------------------------------------
 
@@ -448,7 +491,7 @@ class Loop:
     def _one_curve(self, base: Round, curves: tuple[Curves, ...]) -> bool:
         """Whether one smooth curve in one balance would leave nothing that is beyond doubt."""
         k = int(np.argmax(np.asarray(base.scores.explained)))
-        gate = Gate(trace.beside_curve(base.linear, curves, k), base.gate.null)
+        gate = Gate(trace.beside_curve(base.linear, curves, k), base.gate.null, base.gate.alpha)
         return not gate.clear
 
     def _finding(
@@ -467,9 +510,14 @@ class Loop:
 
     def _curves(self, h: Hypothesis) -> tuple[Curves, ...]:
         # Of fitted readings: a curve over measured ones would share their noise.
-        columns = dict(padded(self.runs)[0].columns)
+        columns = dict(padded(self.runs, 1 if self.engine.series else PAD)[0].columns)
         columns |= dict(zip(MEASURED, h.reading.T, strict=True))  # type: ignore[union-attr]
-        return curve_room.families(columns, self.counts.astype(float))
+        found = curve_room.families(columns, self.counts.astype(float))
+        if not self.engine.series:
+            return found
+        signals = self.engine.signals(self.problem, jnp.asarray(h.z[: len(self.coordinates.base)]))
+        speed = np.broadcast_to(np.asarray(signals.speed_wheel), len(self.runs))
+        return (*found, *curve_room.in_time(columns, speed, np.asarray(self.problem.observe.rows)))
 
     def _said(self, h: Hypothesis) -> str:
         return " and ".join(self.engine.names[k] for k in h.effects)
@@ -498,7 +546,8 @@ class Loop:
             return h
         for _ in range(ROBUST):
             weight = self.weight / np.sqrt(1 + (far / CAUCHY) ** 2)[:, None]
-            found, seen = self._batch([h.which] * BATCH, [start] * BATCH, [weight] * BATCH)
+            batch = self.engine.batch
+            found, seen = self._batch([h.which] * batch, [start] * batch, [weight] * batch)
             far, start = off(seen.reading[0]), found.z[0]
         gross = self.counts & (far > GROSS * max(1.0, float(np.median(far[self.counts]))))
         if not gross.any() or gross.sum() > OUTLIERS * self.counts.sum():
@@ -527,7 +576,7 @@ class Loop:
     def _singles(self, base: Round) -> list[Hypothesis]:
         scores = np.abs(np.asarray(base.scores.single))
         by_effect = np.array([scores[self.engine.of == k].max() for k in range(len(self.engine.names))])
-        order = [int(k) for k in np.argsort(-by_effect)[:BATCH]]
+        order = [int(k) for k in np.argsort(-by_effect)[: self.engine.batch]]
         empty = (-1,) * (self.engine.size - 1)
         proposals = [((k, *empty), self.start(base.hypothesis, (k, *empty), base.scores)) for k in order]
         return self.fit_all(proposals)
@@ -539,7 +588,7 @@ class Loop:
         single = np.abs(np.asarray(scores.single))
         by_effect = np.array([single[self.engine.of == k].max() for k in range(len(self.engine.names))])
         by_effect[list(best.effects)] = 0.0
-        wanted = [(*best.effects, int(k), *empty) for k in np.argsort(-by_effect)[:BATCH]]
+        wanted = [(*best.effects, int(k), *empty) for k in np.argsort(-by_effect)[: self.engine.batch]]
         sources = {w: (best, scores) for w in wanted}
         if count == 2:
             pair = np.triu(np.asarray(base.scores.pair))
@@ -549,7 +598,7 @@ class Loop:
                 w = tuple(sorted((int(self.engine.of[i]), int(self.engine.of[j]))))
                 if w[0] != w[1] and w not in seen:
                     seen.append(w)
-                if len(seen) == BATCH:
+                if len(seen) == self.engine.batch:
                     break
             for w in seen:
                 full = (*w, *empty)
@@ -573,7 +622,7 @@ class Loop:
         cosine = self.cosines(base)
         wanted = []
         for slot, k in enumerate(best.effects):
-            for j in np.argsort(-cosine[k])[:BATCH]:
+            for j in np.argsort(-cosine[k])[: self.engine.batch]:
                 if cosine[k, j] > 0.5 and j not in best.effects:
                     which = list(best.which)
                     which[slot] = int(j)
