@@ -109,6 +109,26 @@ def _series(runs: Runs) -> None:
                 )
 
 
+def from_rest(runs: Runs, noise: Noise) -> None:
+    """Histories begin when the supply is switched on, the robot at rest.
+
+    Raises:
+        BadData: a run whose first samples, in the first hundredth of a second, show it moving.
+    """
+    names = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+    moving = runs.measured()[:, 1:]
+    for name in np.unique(names):
+        mine = np.flatnonzero(names == name)
+        first = mine[np.argmin(runs["time_s"][mine])]
+        limit = np.maximum(0.2 * np.abs(moving[mine]).max(0), 5 * noise.sd[first, 1:])
+        if runs["time_s"][first] < 0.005 and (np.abs(moving[first]) > limit).any():
+            raise BadData(
+                f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
+                f"{number(runs['time_s'][first])} s ({number(runs['motor_speed_rpm'][first])} rpm); a history starts "
+                "from rest when the supply is switched on, at 0 s. Settled travel is one row a run, without time_s"
+            )
+
+
 def _replicates(runs: Runs, noise: Noise) -> None:
     columns = [c for c in ("configuration", *CONDITIONS, "surface") if runs.has(c)]
     keys = ["|".join(str(runs[c][k]) for c in columns) for k in range(len(runs))]

@@ -15,7 +15,7 @@ from mmrjax.tables import CONFIGURATIONS
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
 #: also loads the contact. What `supply`, `motor` and `gearbox` lack has the same shape in these.
 BALANCES = ("electrical", "track", "ground", "slip")
-#: Variables of a curve, fields of `Signals`, with the column of the table that measures each.
+#: Variables of a curve, fields of `Signals` (and the time of histories), with the column that measures each.
 VARIABLES = {
     "voltage": "supply_voltage_V",
     "current": "total_current_A",
@@ -23,14 +23,14 @@ VARIABLES = {
     "slope": "slope_deg",
     "payload": "payload_kg",
     "speed": "speed_mm_s",
+    "time": "time_s",
 }
 #: Terms of a curve of one variable (Legendre polynomials), and degree of the polynomial in all conditions.
 TERMS, DEGREE = 5, 2
 CONDITIONS = "conditions"
-TIME = "time"
 #: Waves of histories: per turn of the driving pulley or wheel, and whether of the belt (168 teeth, 24 grousers
 #: around a pulley of 48 teeth).
-ORDERS = {
+ORDERS: dict[str, tuple[float, bool]] = {
     "order 1 of the driving shaft": (1.0, False),
     "order 2 of the driving shaft": (2.0, False),
     "order 3 of the driving shaft": (3.0, False),
@@ -58,6 +58,8 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> tuple[Cur
     """
     names, bases = [], []
     for variable, column in VARIABLES.items():
+        if column not in columns:
+            continue
         basis = legendre.legvander(scaled(columns[column], weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
         for balance in BALANCES:
             names.append((balance, variable))
@@ -77,38 +79,35 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> tuple[Cur
     )
 
 
-def in_time(columns: Mapping[str, np.ndarray], speed: np.ndarray, rows: np.ndarray) -> tuple[Curves, ...]:
-    """Curves over time, and waves of the orders that the samples resolve, in every balance.
+def waves(columns: Mapping[str, np.ndarray], angle: np.ndarray, rows: np.ndarray) -> tuple[Curves, ...]:
+    """Waves of the orders that the samples of histories resolve, in every balance.
 
     A wave has its own amplitude and phase in each run: how the parts stood at its start is not known.
 
     Args:
-        columns: of the table; speed: of the driving shaft [rad/s], shape (rows,).
+        columns: of the table; angle: of the driving shaft [rad], shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
     """
-    time = scaled(columns["time_s"], np.ones(len(speed)))
-    drift = legendre.legvander(time, TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
-    found = [Curves(jnp.asarray(np.stack([drift] * len(BALANCES))), tuple(map(PROBED.index, BALANCES)), tuple((b, TIME) for b in BALANCES))]
     wheeled = columns["configuration"] == CONFIGURATIONS[1]
     bases, words = [], []
     for word, (order, belted) in ORDERS.items():
-        wave = np.zeros((len(speed), 2 * len(rows)))
+        wave = np.zeros((len(angle), 2 * len(rows)))
         for k, row in enumerate(rows):
             mine = row[row >= 0]
             if len(mine) < 8 or (belted and wheeled[mine[0]]):
                 continue
-            clock = columns["time_s"][mine]
-            angle = np.concatenate([[0.0], np.cumsum(np.diff(clock) * 0.5 * (speed[mine][1:] + speed[mine][:-1]))])
-            if order * angle[-1] < 4 * np.pi or order * np.median(speed[mine]) * np.median(np.diff(clock)) > RESOLVED:
+            turned = order * angle[mine]
+            if turned[-1] - turned[0] < 4 * np.pi or np.median(np.diff(turned)) > RESOLVED:
                 continue
-            wave[mine, 2 * k], wave[mine, 2 * k + 1] = np.cos(order * angle), np.sin(order * angle)
+            wave[mine, 2 * k], wave[mine, 2 * k + 1] = np.cos(turned), np.sin(turned)
         if wave.any():
             bases.append(wave)
             words.append(word)
-    if words:
-        every = [(b, w) for b in BALANCES for w in words]
-        found.append(Curves(jnp.asarray(np.stack(bases * len(BALANCES))), tuple(PROBED.index(b) for b, _ in every), tuple(every)))
-    return tuple(found)
+    if not words:
+        return ()
+    every = [(b, w) for b in BALANCES for w in words]
+    whole = jnp.asarray(np.stack(bases * len(BALANCES)))
+    return (Curves(whole, tuple(PROBED.index(b) for b, _ in every), tuple(every)),)
 
 
 def names(curves: tuple[Curves, ...]) -> tuple[tuple[str, str], ...]:

@@ -18,12 +18,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration import fit
+from calibration.curves import ORDERS
 from calibration.priors import Coordinates
 from calibration.problem import Observation, Problem
 from calibration.slots import Slots
 from calibration.trace import PROBED, Linear
 from mmrjax import params
-from mmrjax.effects import CURVES
+from mmrjax.effects import UNNAMED
 from mmrjax.effects.curve import BALANCES, ORDINATES, weights
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -123,12 +124,12 @@ def _columns(linear: Linear, balance: str, shapes: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Smooth:
-    """A smooth curve at the base fit, with the prior that these data find most likely.
+    """A smooth curve (or a wave) at the base fit, with the prior that these data find most likely.
 
     Attributes:
         effect, variable: name of the curve, and what it is over; low, high: ends of its range; scale: its amplitude.
-        root: L of the prior covariance L Lᵀ of the ordinates, shape (6, 6).
-        start: ordinates in prior coordinates, y = L z, shape (6,).
+        root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
+        start: ordinates in prior coordinates, y = L z, shape (ordinates,).
         explained: fall of χ²; freedom: how many parameters that took.
     """
 
@@ -142,54 +143,90 @@ class Smooth:
     explained: float
     freedom: float
 
+    @property
+    def wave(self) -> bool:
+        """Whether it repeats with the angle of a shaft."""
+        return self.variable in ORDERS
+
+    @property
+    def ordinates(self) -> tuple[str, ...]:
+        """Parameters of the effect that make its shape."""
+        return ("y_sin", "y_cos") if self.wave else ORDINATES
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The other parameters of the effect."""
+        if self.wave:
+            return {"amplitude": self.scale, "order_shaft": ORDERS[self.variable][0]}
+        return {"amplitude": self.scale, "low": self.low, "high": self.high}
+
+    def basis(self, x: np.ndarray) -> np.ndarray:
+        """What each ordinate counts at x, shape (points, ordinates)."""
+        return _basis(self.variable, x, self.low, self.high)
+
+
+def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
+    if variable in ORDERS:
+        return np.stack([np.sin(x), np.cos(x)], 1)
+    return np.asarray(weights(jnp.asarray(x), low, high))  # type: ignore[arg-type]
+
 
 def smooth(linear: Linear, balance: str, variable: str, counts: np.ndarray) -> Smooth:
     """The curve of a variable in a balance, linear at the base fit.
 
     The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) over their distance Δ, and a level
     and a trend WIDE times as large, which base parameters can hide; size s and length l are those of the
-    greatest evidence (Rasmussen and Williams 2006, eqs. (2.39), (5.8)).
+    greatest evidence (Rasmussen and Williams 2006, eqs. (2.39), (5.8)). Of a wave sine and cosine are independent.
 
     Args:
         counts: whether a row counts, shape (rows,).
     """
     x = _seen(linear, variable)
-    low, high = float(x[counts].min()), float(x[counts].max())
+    low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # the variable stands still: an offset is all that can be seen
-    basis = np.asarray(weights(jnp.asarray(x), low, high))  # type: ignore[arg-type]
+    basis = _basis(variable, x, low, high)
     a, b = Projection(linear)(_columns(linear, balance, basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
-    distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
-    across = np.linspace(-1.0, 1.0, len(ORDINATES))
-    broad = WIDE**2 * (1 + np.outer(across, across)) + 1e-6 * np.eye(len(ORDINATES))
+    roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
-    for length, sigmas in itertools.product(LENGTHS, SIZES):
-        root = np.linalg.cholesky(np.exp(-0.5 * (distance / length) ** 2) + broad)
+    for root, sigmas in itertools.product(roots, SIZES):
         scale = sigmas * size
         inner, pull = scale**2 * root.T @ a @ root, scale * root.T @ b
-        there = np.eye(len(ORDINATES)) + inner
+        there = np.eye(len(root)) + inner
         z = np.linalg.solve(there, pull)
         evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(there)[1]
         if evidence > best[0]:
             explained = 2 * pull @ z - z @ inner @ z
             best = evidence, (scale, root, z, float(explained), float(np.trace(np.linalg.solve(there, inner))))
-    return Smooth(f"curve_{balance}_{variable}", variable, low, high, *best[1])
+    name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{variable}"
+    return Smooth(name, variable, low, high, *best[1])
+
+
+def _smoothness(length: float) -> np.ndarray:
+    """L of the prior covariance of the ordinates at a correlation length [spacings]."""
+    distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
+    across = np.linspace(-1.0, 1.0, len(ORDINATES))
+    broad = WIDE**2 * (1 + np.outer(across, across)) + 1e-6 * np.eye(len(ORDINATES))
+    return np.linalg.cholesky(np.exp(-0.5 * (distance / length) ** 2) + broad)
 
 
 def _seen(linear: Linear, variable: str) -> np.ndarray:
-    return np.broadcast_to(np.asarray(getattr(linear.signals, variable), float), (linear.rows,))
+    if variable in ORDERS:
+        return ORDERS[variable][0] * np.asarray(linear.angle)
+    x = linear.time if variable == "time" else getattr(linear.signals, variable)
+    return np.broadcast_to(np.asarray(x, float), (linear.rows,))
 
 
 class Shaped(eqx.Module):
     """Coordinates of a base fit, then those of a curve's ordinates: y = L z, all standard normal.
 
     Attributes:
-        base: of the base; root: L, shape (6, 6); names: dotted, of the ordinates.
+        base: of the base; root: L, shape (ordinates, ordinates); names: dotted, of the ordinates.
     """
 
     base: Coordinates | Slots
-    root: Float[Array, "6 6"]
+    root: Float[Array, "ordinates ordinates"]
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -264,19 +301,19 @@ def discover(loop: Loop, base: Hypothesis, linear: Linear, balance: str, variabl
     Args:
         loop: as it stands after the base fit, with rows that do not count set aside.
         base: the fit that leaves it; linear: the same linearised, from `loop.look`.
-        balance: one of `curves.BALANCES`; variable: one of `curves.VARIABLES`.
+        balance: one of `curves.BALANCES`; variable: one of `curves.VARIABLES`, or of `curves.ORDERS`.
     """
     rows, counts = len(loop.runs), loop.counts
     at_base = smooth(linear, balance, variable, counts)
     problem, inner = _with_curve(loop, base, at_base)
-    starts = np.zeros((BATCH, len(inner) + len(ORDINATES)))
+    starts = np.zeros((BATCH, len(inner) + len(at_base.ordinates)))
     starts[:, : len(inner)] = base.z[: len(inner)]
     starts[:, len(inner) :] = np.linspace(1.0, 0.0, BATCH)[:, None] * at_base.start
     found, seen, curvature = jax.device_get(_fits(problem, starts, np.repeat(loop.weight[None], BATCH, 0)))
     k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
     z, covariance = found.z[k], np.linalg.inv(curvature[k])
     grid = np.linspace(at_base.low, at_base.high, POINTS)
-    shape = at_base.scale * np.asarray(weights(jnp.asarray(grid), at_base.low, at_base.high)) @ at_base.root  # type: ignore[arg-type]
+    shape = at_base.scale * at_base.basis(grid) @ at_base.root
     ordinates = covariance[len(inner) :, len(inner) :]
     lacking = defect(linear, balance)
     return Discrepancy(
@@ -329,11 +366,10 @@ def _with_curve(loop: Loop, base: Hypothesis, curve: Smooth) -> tuple[Problem, C
     problem = loop.problem_of(base) if base.effects else loop.problem
     # A robot that has this curve from an earlier round keeps one of them: the names are its parameters'.
     kept = tuple(e for e in problem.base.effects if e.name != curve.effect)
-    values = {"amplitude": curve.scale, "low": curve.low, "high": curve.high}
-    added = CURVES[curve.effect](**{n: jnp.asarray(v) for n, v in values.items()})
+    added = UNNAMED[curve.effect](**{n: jnp.asarray(v) for n, v in curve.values.items()})
     robot = dataclasses.replace(problem.base, effects=(*kept, added))
     inner = problem.coordinates
-    names = tuple(f"effects.{curve.effect}.{n}" for n in ORDINATES)
+    names = tuple(f"effects.{curve.effect}.{n}" for n in curve.ordinates)
     shaped = Shaped(inner, jnp.asarray(curve.root), names)  # type: ignore[arg-type]
     data = dataclasses.replace(problem.data, weight=jnp.asarray(loop.weight), centre=jnp.zeros(len(shaped)))
     return dataclasses.replace(problem, base=robot, coordinates=shaped, data=data), inner  # type: ignore[return-value]
@@ -462,6 +498,10 @@ def propose(linear: Linear, balance: str, counts: np.ndarray, curve: Smooth) -> 
     Args:
         counts: whether a row counts, shape (rows,); curve: what the formula is weighed against.
     """
+    if curve.wave:
+        return _harmonic(balance, curve)
+    if curve.variable == "time":
+        return _decay(linear, balance, counts, curve)
     rows = len(counts)
     ratios = np.stack([r(linear.signals, rows) for r in RATIOS], 1)  # type: ignore[arg-type]
     known = dictionary(ratios[counts])
@@ -511,4 +551,36 @@ def propose(linear: Linear, balance: str, counts: np.ndarray, curve: Smooth) -> 
         explained=float(len(chosen) * cost - bic),
         gain=float(curve.freedom * cost - curve.explained - bic),
         tried=len(terms),
+    )
+
+
+def _harmonic(balance: str, curve: Smooth) -> Proposal:
+    """A wave is its own formula."""
+    sine, cosine = curve.scale * curve.root @ curve.start
+    size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+    order, unit = ORDERS[curve.variable][0], BALANCES[balance][0]
+    formula = (
+        f"{SYMBOL[balance]} = {size:.2g} {unit} sin({order:.3g} θ_k {'-' if phase < 0 else '+'} {abs(phase):.2g})"
+    )
+    return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
+
+
+def _decay(linear: Linear, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
+    """What fades or builds up with the time since the start: a level and an exponential, the time constant from a
+    grid over the length of the runs."""
+    t = _seen(linear, "time")
+    constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
+    best: tuple[float, tuple] = (np.inf, ())
+    project, cost = Projection(linear), np.log(3 * counts.sum())
+    for tau in constants:
+        a, b = project(_columns(linear, balance, np.exp(-t / tau)[:, None] * counts[:, None]))
+        if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
+            best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
+    if not best[1]:
+        return Proposal("none: no term shows in these data", (), (), (), (), 0.0, 0.0, len(constants))
+    tau, value, sd = best[1]
+    formula = f"{SYMBOL[balance]} = {value:.2g} {BALANCES[balance][0]} exp(-t / {tau:.2g} s)"
+    gain = float(curve.freedom * cost - curve.explained - best[0])
+    return Proposal(
+        formula, (), (float(value),), (float(sd),), ("time",), float(2 * cost - best[0]), gain, len(constants)
     )

@@ -32,7 +32,7 @@ def library(paths: Sequence[Path | str] = ()) -> Library:
     known = dict(effects.BY_NAME)
     for path in map(Path, paths):
         for effect in read(path):
-            if effect.name in known or effect.name in effects.CURVES:
+            if effect.name in known or effect.name in effects.UNNAMED:
                 raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is taken; choose another")
             known[effect.name] = effect
     return known

@@ -245,7 +245,13 @@ DENSER = {
     "slope": "Repeat at one voltage and payload with the slope from 0 to 20 deg in steps of 1 deg, and downhill",
     "payload": "Repeat at one voltage and slope with the payload from 0 to 12 kg in steps of 1 kg",
     "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest",
+    "time": "Record one condition from a cold start for ten minutes, and again at once while everything is warm",
 }
+#: The same for a wave.
+STEADY_SPEEDS = (
+    "Mark the driving shaft, start every run from the mark, and record steady travel at three speeds with at least "
+    "20 samples a wave: what keeps its {variable} at every speed turns with that part"
+)
 #: Runs of such a series, and repeats of each that are averaged.
 SERIES, REPEATS = 15, 3
 
@@ -260,8 +266,9 @@ def denser(looped: Loop, found: Finding) -> Proposal:
     scores = found.base.scores
     explained = float(np.asarray(scores.explained)[int(np.argmax(np.asarray(scores.curve)))])
     sigma = float(np.sqrt(max(explained, 0.0) * SERIES * REPEATS / max(looped.counts.sum(), 1)))
-    text = f"{DENSER[variable]}; read all three channels. What the {balance} balance lacks then shows its shape"
-    name = f"finer steps in {variable}"
+    how = DENSER.get(variable) or STEADY_SPEEDS.format(variable=variable)
+    text = f"{how}; read all three channels. What the {balance} balance lacks then shows its shape"
+    name = f"finer steps in {variable}" if variable in DENSER else f"steady speeds for {variable}"
     if sigma < WORTH:
         return Proposal(
             NONE, f"A series in {variable} would show what is missing by {sigma:.1f} sigma", (), 0.0, False, ()

@@ -1,4 +1,4 @@
-"""The closed loop on a table of settled runs or on histories: fit, find the residual, trace it, name it or say that it has no name."""
+"""The closed loop, on settled runs or histories: fit, find the residual, trace it, name it or say it has no name."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BENCH = (
     "gearbox.friction_viscous",
 )
 #: And beside them what only a start shows.
-START, START_CHASSIS = ("motor.inductance", "motor.inertia"), ("inertia", "ground.friction.dynamic", "ground.friction.speed_dynamic")
+START, START_CHASSIS = ("motor.inductance", "motor.inertia"), ("inertia", "ground.friction.dynamic")
 #: Family-wise error of «something is missing», shared out among the four kinds of evidence.
 ALPHA = {"single": 0.03, "curve": 0.01, "pair": 0.004, "chi2": 0.006}
 #: The same for histories, where also the memory of what is left counts.
@@ -45,7 +45,7 @@ BATCH = 16
 BATCH_SERIES, STEPS_SERIES = 8, 30
 #: Draws of the prior among which the starts of a fit to histories are chosen: far off, a start slides where the
 #: measured one grips, and a search from there stays.
-DRAWS = 128
+DRAWS, SEARCHES = 128, 16
 #: Rise of the objective [σ²] up to which another effect explains the data as well, and up to which it does
 #: where the signatures are nearly parallel.
 SAME, SAME_PARALLEL, PARALLEL = 4.0, 9.0, 0.95
@@ -216,13 +216,9 @@ class Engine:
         self.tracer = Tracer(self.candidates)
         self.fits = eqx.filter_jit(self._fits)
         self.observe = eqx.filter_jit(lambda problem, z: problem.observation(z))
-        self.bare = eqx.filter_jit(
-            lambda problem, starts: jax.vmap(lambda z: fit.levenberg_marquardt(problem, z, problem.data, max_steps=60))(
-                starts
-            )
-        )
+        self.bare = eqx.filter_jit(_searches)
         self.costs = eqx.filter_jit(lambda problem, zs: jax.lax.map(lambda z: _cost(problem, z), zs, batch_size=16))
-        self.signals = eqx.filter_jit(lambda problem, z: problem.observe.signals(problem.robot(z)))
+        self.clock = eqx.filter_jit(lambda problem, z: problem.observe.clock(problem.robot(z)))
 
     def _fits(self, problem: Problem, which: Array, starts: Array, weights: Array) -> tuple[fit.Optimum, Observation]:
         """Fits of hypotheses, each to its own rows, and what each says of every row."""
@@ -234,6 +230,10 @@ class Engine:
             return found, there.observation(found.z)
 
         return jax.vmap(one)(which, starts, weights)
+
+
+def _searches(problem: Problem, starts: Array) -> fit.Optimum:
+    return jax.vmap(lambda z: fit.levenberg_marquardt(problem, z, problem.data, max_steps=40))(starts)
 
 
 def _cost(problem: Problem, z: Array) -> Array:
@@ -328,11 +328,12 @@ class Loop:
             self._set_aside(lost)
 
     def _starts_series(self) -> np.ndarray:
-        """Where searches of the bare base from the prior mean and from its best draws end, shape (batch, parameters)."""
+        """Where the best search of the bare base, from the prior mean and from its best draws, ends; shape (batch,
+        parameters)."""
         bare, p = self._weighted(self.problem), len(self.coordinates.base)
         draws = np.random.default_rng(self.seed).standard_normal((DRAWS, p))
         order = np.argsort(np.asarray(self.engine.costs(bare, jnp.asarray(draws))))
-        starts = np.concatenate([np.zeros((1, p)), draws[order[: self.engine.batch - 1]]])
+        starts = np.concatenate([np.zeros((1, p)), draws[order[: SEARCHES - 1]]])
         found = jax.device_get(self.engine.bare(bare, jnp.asarray(starts)))
         best = found.z[int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
         return np.repeat(best[None], self.engine.batch, 0)
@@ -515,9 +516,8 @@ class Loop:
         found = curve_room.families(columns, self.counts.astype(float))
         if not self.engine.series:
             return found
-        signals = self.engine.signals(self.problem, jnp.asarray(h.z[: len(self.coordinates.base)]))
-        speed = np.broadcast_to(np.asarray(signals.speed_wheel), len(self.runs))
-        return (*found, *curve_room.in_time(columns, speed, np.asarray(self.problem.observe.rows)))
+        _, angle = self.engine.clock(self.problem, jnp.asarray(h.z[: len(self.coordinates.base)]))
+        return (*found, *curve_room.waves(columns, np.asarray(angle), np.asarray(self.problem.observe.rows)))
 
     def _said(self, h: Hypothesis) -> str:
         return " and ".join(self.engine.names[k] for k in h.effects)
@@ -563,13 +563,16 @@ class Loop:
         level = stats.norm.isf(ALPHA_OUTLIER / 2 / (3 * self.counts.sum()))
         while len(self.outliers) < allowed:
             _, scores, _ = self.look(h, self._curves(h))
-            alone = np.abs(np.asarray(scores.row)) * self.counts[:, None]
-            k = int(alone.max(1).argmax())
+            alone = (np.abs(np.asarray(scores.row)) * self.counts[:, None]).max(1)
+            k = int(alone.argmax())
             together = max(np.max(np.asarray(scores.single) ** 2), np.max(np.asarray(scores.explained)))
-            if alone[k].max() < level or alone[k].max() ** 2 < together:
+            if alone[k] < level or alone[k] ** 2 < together:
                 break
-            self.outliers = (*self.outliers, k)
-            self.counts = self.counts & (np.arange(len(self.counts)) != k)
+            # A fit to histories takes too long to go on sample by sample.
+            far = np.argsort(-alone)[: allowed - len(self.outliers)] if self.engine.series else np.array([k])
+            far = far[alone[far] >= level]
+            self.outliers = (*self.outliers, *map(int, far))
+            self.counts = self.counts & ~np.isin(np.arange(len(self.counts)), far)
             h = self.base_fit()
         return h
 

@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration import discover, experiment, holdout, priors, slots
+from calibration import curves as curve_room
+from calibration import discover, experiment, holdout, priors, slots, trace
 from calibration.discover import Discrepancy
-from calibration.loop import ALPHA, Finding, Gate, Hypothesis, Loop, Round
+from calibration.loop import Finding, Gate, Hypothesis, Loop, Round
 from calibration.records import CHANNELS, CONDITIONS, MEASURED, MM, RPM
 from calibration.residual import channel_errors
-from calibration.trace import PROBED
+from calibration.trace import PROBED, Linear
 from mmrjax.balances import BALANCES
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
@@ -24,6 +25,8 @@ from mmrjax.robot import Robot
 SCHEMA = "mmrjax.loop/1"
 #: Kinds of block whose held-out errors are reported, the first that the data have in `errors`.
 KINDS = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
+#: The same for histories, whose fits take longer.
+KINDS_SERIES = ("slope", "voltage", "run")
 #: Rise of the objective [σ²] up to which a hypothesis is listed as an alternative.
 ALTERNATIVE = 9.0
 
@@ -61,7 +64,11 @@ def readings(loop: Loop, found: Finding, curve: Discrepancy | None = None) -> Re
         return np.where(lost, np.nan, np.asarray(seen.reading)[:rows])
 
     base, after = found.base.hypothesis, found.after.hypothesis
-    blocks = {kind: holdout.blocks(loop.runs, kind) for kind in KINDS}
+    blocks: dict[str, dict[str, np.ndarray]] = {}
+    for kind in KINDS_SERIES if loop.engine.series else KINDS:
+        by = holdout.blocks(loop.runs, kind)
+        if not any(_alike(by, other) for other in blocks.values()):
+            blocks[kind] = by
     held = {}
     for kind, by in blocks.items():
         if by:
@@ -74,6 +81,11 @@ def readings(loop: Loop, found: Finding, curve: Discrepancy | None = None) -> Re
             held[kind] = (before, later)
     later = fitted(after) if curve is None else curve.reading
     return Readings(fitted(base), later, held, {k: b for k, b in blocks.items() if b})
+
+
+def _alike(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    """Whether two kinds of block divide the rows alike."""
+    return {m.tobytes() for m in a.values()} == {m.tobytes() for m in b.values()}
 
 
 def robot(loop: Loop, found: Finding, curve: Discrepancy | None = None) -> Robot:
@@ -109,7 +121,8 @@ def document(loop: Loop, found: Finding, seen: Readings, curve: Discrepancy | No
         "next_experiment": next_experiment(loop, found),
         "remains": remains(found) if found.verdict in ("named", "class") else None,
         "cannot_see": [loop.engine.names[k] for k in found.invisible],
-        "needs_series": sorted(n for n, e in loop.engine.library.items() if e.transient),
+        "needs_series": needs_series(loop),
+        "series": series(loop, found) if loop.engine.series else None,
         "alternatives": alternatives(loop, found),
         "implausible": alternatives(loop, found, plausible=False),
         "errors": errors(loop, seen, counts),
@@ -121,9 +134,14 @@ def document(loop: Loop, found: Finding, seen: Readings, curve: Discrepancy | No
         "scores": scores(loop, found.base),
         "bootstrap": {
             "replicates": len(found.base.gate.null.single), "asked": loop.replicates, "seed": loop.seed,
-            "family_wise_error": sum(ALPHA.values()), "shares": ALPHA,
+            "family_wise_error": sum(loop.alpha.values()), "shares": loop.alpha,
         },
     }  # fmt: skip
+
+
+def needs_series(loop: Loop) -> list[str]:
+    """Effects of the library that settled runs cannot show."""
+    return [] if loop.engine.series else sorted(n for n, e in loop.engine.library.items() if e.transient)
 
 
 def statement(loop: Loop, found: Finding) -> str:
@@ -239,6 +257,50 @@ def without(loop: Loop, found: Finding) -> list[float]:
     return [2 * (h.cost - after.cost) for h in loop.fit_all([(w, loop.start(after, w)) for w in fewer])]
 
 
+def series(loop: Loop, found: Finding) -> dict[str, Any]:
+    """What only histories tell: memory of the residual, waves in shaft angle, drift in time, before and after.
+
+    A wave or a drift is given for the balance in which it explains most; `deviate` is its score as a normal
+    deviate, `explained` the fall of χ² [σ²] in sines and cosines of each run, or a smooth curve over time.
+    """
+    rows = np.asarray(loop.problem.observe.rows)
+    names = curve_room.names(loop.curves)
+    words = [w for w in curve_room.ORDERS if any(n[1] == w for n in names)]
+
+    def strongest(r: Round, variable: str) -> dict[str, Any]:
+        mine = [k for k, n in enumerate(names) if n[1] == variable]
+        k = max(mine, key=lambda j: np.asarray(r.scores.curve)[j])
+        return {
+            "balance": names[k][0], "deviate": float(r.scores.curve[k]), "explained": float(r.scores.explained[k])
+        }  # fmt: skip
+
+    def told(r: Round) -> dict[str, Any]:
+        lags = min(trace.LAGS, rows.shape[1] // 4)
+        return {
+            "memory": {
+                "deviate": float(r.gate.found.white), "threshold": r.gate.threshold("white"),
+                "p": r.gate.p("white"), "lags": lags, "autocorrelation": autocorrelation(r.linear, lags),
+            },
+            "orders": [{"order": w, "a_turn": curve_room.ORDERS[w][0], **strongest(r, w)} for w in words],
+            "drift": strongest(r, "time"),
+        }  # fmt: skip
+
+    return {
+        "runs": len(rows), "samples": int((rows >= 0).sum()),
+        "orders_unresolved": [w for w in curve_room.ORDERS if w not in words],
+        "before": told(found.base), "after": told(found.after),
+    }  # fmt: skip
+
+
+def autocorrelation(linear: Linear, lags: int) -> dict[str, list[float]]:
+    """Of each channel's residual over all runs, at lags 1 to `lags` samples."""
+    rows = np.asarray(linear.series.rows)  # type: ignore[union-attr]
+    x = np.where(rows[:, :, None] < 0, 0.0, np.asarray(linear.residual)[: 3 * linear.rows].reshape(-1, 3)[rows])
+    power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
+    of = np.stack([np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)])
+    return {c: of[:, k].tolist() for k, c in enumerate(CHANNELS)}
+
+
 def remains(found: Finding) -> dict[str, Any] | None:
     """What the effects leave beyond doubt: where it is and over what it shows best."""
     if found.unnamed is None:
@@ -300,7 +362,7 @@ def evidence(gate: Gate) -> dict[str, Any]:
     """The strongest statistic of each kind, what it has to exceed, and its share among bootstrap tables."""
     kinds = {
         kind: {"found": float(getattr(gate.found, kind)), "threshold": gate.threshold(kind), "p": gate.p(kind)}
-        for kind in ALPHA
+        for kind in gate.alpha
     }
     return {**kinds, "p_value": gate.p_value}
 
@@ -349,6 +411,8 @@ def defects(loop: Loop, r: Round) -> dict[str, np.ndarray]:
     defects of the balances `electrical`, `track` and `slip` that together make it.
     """
     rows = len(loop.runs)
+    if loop.engine.series:
+        return {}  # a reading of a history answers to defects of all the time before it
     chosen = ("electrical", "track", "slip")
     sensitivity = np.stack([np.asarray(r.linear.defects)[PROBED.index(b)][:rows] for b in chosen], 2)
     residual = np.asarray(r.linear.residual)[: 3 * len(loop.counts)].reshape(-1, 3)[:rows]
@@ -363,7 +427,7 @@ def rows_table(loop: Loop, found: Finding, seen: Readings) -> dict[str, np.ndarr
     rows, unit = len(loop.runs), np.array([1.0, RPM, MM])
     table = {
         "row": loop.numbers,
-        **{k: loop.runs[k] for k in ("run_id", "configuration", *CONDITIONS) if loop.runs.has(k)},
+        **{k: loop.runs[k] for k in ("run_id", "time_s", "configuration", *CONDITIONS) if loop.runs.has(k)},
     }
     sd = np.asarray(loop.problem.data.sd)[:rows]
     kind = next(iter(seen.held_out), None)

@@ -69,7 +69,8 @@ def of(runs: Runs, stated: str | None = None) -> Noise:
     """Noise of a table: `stated` channels as stated, else the file's sd columns, else to be estimated.
 
     An estimated channel has an sd proportional to its reading, one share for all rows. A reading of zero
-    gets the share of the channel's largest reading a hundredth.
+    gets the share of the channel's largest reading a hundredth. Histories pass through zero while their
+    instruments stay as they are: there a share is of the channel's root mean square, one sd for all rows.
 
     Raises:
         BadConfiguration: as `parse`.
@@ -89,7 +90,11 @@ def of(runs: Runs, stated: str | None = None) -> Noise:
             raise BadData(
                 f"{runs.source}: {CHANNELS[k]} reads 0 in every row; state its sd, e.g. --noise in {UNITS[k]}"
             )
-        sd[:, k] = size * np.maximum(measured[:, k], 0.01 * largest) if relative else size
+        if runs.has("time_s"):
+            reading = np.full(len(runs), np.sqrt(np.mean(measured[:, k] ** 2)))
+        else:
+            reading = np.maximum(measured[:, k], 0.01 * largest)
+        sd[:, k] = size * reading if relative else size
         source.append("stated" if k in shares else "estimated")
     return Noise(sd, np.array([s == "estimated" for s in source]), tuple(source))  # type: ignore[arg-type]
 

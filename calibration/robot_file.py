@@ -61,7 +61,7 @@ def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
     for name in present:
-        if name not in library and name not in effects.CURVES:
+        if name not in library and name not in effects.UNNAMED:
             raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
     robot = with_effects(robot, tuple(present), library)
     return change(robot, dict(_flatten(content)), where=path.name)
@@ -69,7 +69,7 @@ def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
 
 def with_effects(robot: Robot, names: tuple[str, ...], library: Library = effects.BY_NAME) -> Robot:
     """The robot with these effects of `library`, or curves, present, each with amplitude 0."""
-    known = {**effects.CURVES, **library}
+    known = {**effects.UNNAMED, **library}
     return dataclasses.replace(robot, effects=tuple(known[name]() for name in names))
 
 

@@ -64,6 +64,7 @@ class Linear(eqx.Module):
             (balances, rows, 3); of histories at each knot of a run, shape (balances, runs, knots, samples, 3).
         signals: of every row, at the fit.
         series: how the rows of histories lie in time; None for settled rows.
+        angle: of the driving shaft at every row of histories [rad]; time: of every row [s]; None for settled rows.
     """
 
     residual: Float[Array, " residuals"]
@@ -72,6 +73,8 @@ class Linear(eqx.Module):
     defects: Float[Array, "balances ..."]
     signals: Signals
     series: Series | None = None
+    angle: Float[Array, " rows"] | None = None
+    time: Float[Array, " rows"] | None = None
 
     @property
     def rows(self) -> int:
@@ -142,7 +145,9 @@ def _linearise_series(problem: Problem, z: Array, data: Data, candidates: tuple[
     jacobian, residual = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
     robot = problem.robot(z)
     have = {e.name for e in robot.effects}
-    whole = dataclasses.replace(robot, effects=(*robot.effects, *(c.absent for c in candidates if c.effect.name not in have)))
+    whole = dataclasses.replace(
+        robot, effects=(*robot.effects, *(c.absent for c in candidates if c.effect.name not in have))
+    )
     value = {p.name: p.value for p in params.walk(whole)}
     sds = jnp.stack([jnp.asarray(c.effect.amplitude) for c in candidates])
 
@@ -166,7 +171,9 @@ def _linearise_series(problem: Problem, z: Array, data: Data, candidates: tuple[
     defects = observe.defective(robot, tuple(_probe(b) for b in PROBED))
     scale = (data.weight / data.sd)[observe.rows]
     defects = jnp.where(observe.rows[:, None, :, None] < 0, 0.0, defects * scale[:, None])
-    return Linear(residual, jacobian, _finite(jnp.stack(parts, 1)), _finite(defects), observe.signals(robot), observe)
+    signatures = _finite(jnp.stack(parts, 1))
+    clock, angle = observe.clock(robot)
+    return Linear(residual, jacobian, signatures, _finite(defects), observe.signals(robot), observe, angle, clock)
 
 
 def _finite(x: Array) -> Array:
@@ -305,8 +312,11 @@ def memory(linear: Linear) -> Array:
     count = jnp.sum(rows >= 0, 1)[:, None]
     power = jnp.sum(x**2, 1)
     lags = min(LAGS, rows.shape[1] // 4)
-    of = [jnp.sum(x[:, k:] * x[:, :-k], 1) ** 2 / jnp.maximum(power, 1e-9) ** 2 / (count - k) for k in range(1, lags + 1)]
-    statistic = jnp.sum(sum(of, jnp.zeros_like(power)) * count * (count + 2), 0)
+    statistic = jnp.zeros(3)
+    for k in range(1, lags + 1):
+        r = jnp.sum(x[:, k:] * x[:, :-k], 1) / jnp.maximum(power, 1e-9)
+        weight = jnp.where(count > k, count * (count + 2) / jnp.maximum(count - k, 1), 0.0)
+        statistic = statistic + jnp.sum(weight * r**2, 0)
     freedom = max(rows.shape[0] * lags, 1)
     return jnp.max((statistic - freedom) / (2 * freedom) ** 0.5)
 
@@ -382,7 +392,6 @@ class Tracer:
             return strongest(score(linear, curves), linear)
 
         return jax.vmap(replicate)(keys)
-
 
     def _null_linear(self, linear: Linear, data: Data, curves: tuple[Curves, ...], keys: Array) -> Summary:
         jacobian = linear.jacobian

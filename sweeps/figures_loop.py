@@ -62,6 +62,76 @@ def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
     return fig
 
 
+#: Runs of histories whose residual is drawn, and samples over which it is averaged.
+RUNS_SHOWN, AVERAGED = 8, 5
+
+
+def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
+    """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
+    running mean as a line."""
+    names = list(dict.fromkeys(table.get("run_id", np.zeros(len(table["row"]), str))))[:RUNS_SHOWN]
+    fig, grid = figure(3, len(names), 5.4, sharex="col", sharey="row")
+    whens = [("before", ORANGE)] if verdict != "none" else []
+    whens += [("after", BLUE)]
+    for column, name in enumerate(names):
+        mine = np.flatnonzero(table["run_id"] == name) if "run_id" in table else np.arange(len(table["row"]))
+        mine = mine[np.argsort(table["time_s"][mine])]
+        for axes, channel in zip(grid[:, column], CHANNELS, strict=True):
+            axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
+            axes.axhline(0, color=FAINT, lw=0.8)
+            for when, colour in whens:
+                y = table[f"residual_{when}_{channel}_sigma"][mine]
+                axes.plot(table["time_s"][mine], y, ".", ms=3, color=colour, alpha=0.35)
+                if len(y) >= AVERAGED:
+                    smooth = np.convolve(y, np.ones(AVERAGED) / AVERAGED, "valid")
+                    edge = AVERAGED // 2
+                    axes.plot(table["time_s"][mine][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
+            if column == 0:
+                axes.set_ylabel(f"{CHANNEL_WORDS[channel][0]} [σ]")
+        first = mine[0]
+        grid[0, column].set_title(
+            f"{name}\n{table['configuration'][first]} {table['supply_voltage_V'][first]:g} V "
+            f"{table['slope_deg'][first]:g}°", fontsize=8,
+        )  # fmt: skip
+        grid[-1, column].set_xlabel("time [s]")
+    words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
+    fig.suptitle(f"{words}; line: mean of {AVERAGED} samples; band: ±2σ of the instruments", fontsize=8.5)
+    return fig
+
+
+def series(document: dict[str, Any]) -> Figure:
+    """What only histories tell: memory of the residual, waves in shaft angle, drift in time."""
+    told = document["series"]
+    whens = [("before", ORANGE), ("after", BLUE)] if document["verdict"] != "none" else [("after", BLUE)]
+    fig, grid = figure(1, 4, 2.9, width_ratios=[1, 1, 1, 1.5])
+    samples = told["samples"]
+    for axes, channel in zip(grid[0, :3], CHANNELS, strict=True):
+        lags = np.arange(1, told["before"]["memory"]["lags"] + 1)
+        limit = 2 / np.sqrt(samples)
+        axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
+        axes.axhline(0, color=FAINT, lw=0.8)
+        for when, colour in whens:
+            axes.plot(
+                lags, told[when]["memory"]["autocorrelation"][channel], "o-", ms=3, lw=1, color=colour, label=when
+            )
+        axes.set_title(CHANNEL_WORDS[channel][0])
+        axes.set_xlabel("lag [samples]")
+    grid[0, 0].set_ylabel("autocorrelation of the residual")
+    grid[0, 0].legend(loc="best")
+    axes = grid[0, 3]
+    words = [o["order"] for o in told["before"]["orders"]]
+    lines = [*(f"{w}" for w in words), "drift in time"]
+    for k, (when, colour) in enumerate(whens):
+        values = [*(o["explained"] for o in told[when]["orders"]), told[when]["drift"]["explained"]]
+        place = np.arange(len(lines)) + (k - (len(whens) - 1) / 2) * 0.36
+        axes.barh(place, np.sqrt(values), height=0.34, color=colour)
+    axes.set_yticks(range(len(lines)), lines, fontsize=8)
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("would explain [σ]")
+    return fig
+
+
 def ladder(document: dict[str, Any]) -> Figure:
     """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
     rungs = document["scores"][:RUNGS]
@@ -186,13 +256,17 @@ def base_shift(document: dict[str, Any]) -> Figure:
 
 def curve(table: dict[str, np.ndarray], found: Discrepancy) -> Figure:
     """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
-    column, factor, words = VARIABLE_WORDS[found.variable]
+    column, factor, words = VARIABLE_WORDS.get(
+        found.variable, ("", 1.0, f"phase of the wave, {found.variable} [rad]")
+    )
     fig, grid = figure(1, 1, 3.4)
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
     there = np.isfinite(found.defect.value)
-    axes.errorbar(np.asarray(table[column])[there] * factor, found.defect.value[there], 2 * found.defect.sd[there],
-                  fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip
+    if "time_s" not in table:  # one by one the samples of a history say little
+        axes.errorbar(np.asarray(table[column])[there] * factor, found.defect.value[there],
+                      2 * found.defect.sd[there],
+                      fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip
     scale = SHOWN.get(found.variable, 1.0)
     low, high = found.curve - 1.96 * found.sd, found.curve + 1.96 * found.sd
     axes.fill_between(found.grid * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
@@ -210,5 +284,6 @@ VARIABLE_WORDS = {
     "slope": ("slope_deg", 1.0, "slope [deg]"),
     "payload": ("payload_kg", 1.0, "payload [kg]"),
     "speed": ("speed_mm_s", 1.0, "speed [mm/s]"),
+    "time": ("time_s", 1.0, "time since the start [s]"),
 }
 SHOWN = {"speed_motor": 1 / RPM, "slope": 180 / np.pi, "speed": 1 / MM}

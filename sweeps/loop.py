@@ -12,7 +12,8 @@ from rich.table import Table
 from calibration import checks, effect_file, loop_outcome, priors, robot_file
 from calibration import noise as noise_room
 from calibration.doors import BadData
-from calibration.loop import ALPHA, Engine, Finding, Loop
+from calibration.loop import Engine, Finding, Loop
+from calibration.problem import is_series
 from calibration.records import CHANNELS, Runs
 from sweeps import commands
 from sweeps import config as configuration
@@ -29,19 +30,21 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
     0 done; 3 done, but rows could not be simulated, or the fit that is proposed did not converge.
     """
     began = time.monotonic()
-    runs, numbers, notes = _distinct(commands.read_runs(source, measured=True))
+    runs, numbers, notes = _distinct(commands.read_runs(source, measured=True, series=True))
     if len(runs) < FEWEST:
         raise BadData(f"{runs.source}: {len(runs)} runs cannot show what a model lacks; at least {FEWEST} are needed")
     robot = commands.load_robot(config)
     stated = priors.parse_priors(config.prior)
     known = noise_room.assumed(runs, config.noise or None)
     notes += checks.check(runs, (), known)
+    if is_series(runs):
+        checks.from_rest(runs, known)
 
     def progress(text: str) -> None:
         commands.tell(f"{time.monotonic() - began:4.0f} s  {text}")
 
     with commands.open_folder("loop", config, robot, out, force, runs) as folder:
-        engine = Engine(robot, effect_file.library(config.effects))
+        engine = Engine(robot, effect_file.library(config.effects), series=is_series(runs))
 
         def one(factor: float = 1.0) -> tuple[Loop, Finding]:
             sd = noise_room.assumed(runs, config.noise or None, factor).sd
@@ -91,12 +94,16 @@ def _distinct(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
     seen: set[tuple[str, ...]] = set()
     keep, copies = [], []
     for k in range(len(runs)):
-        row = tuple(str(column[k]) for name, column in runs.columns.items() if name != "run_id")
+        # Repeats of a history begin alike, at rest.
+        row = tuple(str(column[k]) for name, column in runs.columns.items() if name != "run_id" or is_series(runs))
         (copies if row in seen else keep).append(k)
         seen.add(row)
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
-    said = f"rows {', '.join(str(k + 1) for k in copies)} are exact copies of earlier ones and count once"
+    rows = ", ".join(str(k + 1) for k in copies)
+    said = f"rows {rows} are exact copies of earlier ones and count once"
+    if len(copies) == 1:
+        said = f"row {rows} is an exact copy of an earlier one and counts once"
     return runs.where(keep), np.asarray(keep) + 1, [said]  # type: ignore[arg-type]
 
 
@@ -136,7 +143,7 @@ def remarks(document: dict[str, Any]) -> list[str]:
     settled, asked = document["bootstrap"]["replicates"], document["bootstrap"]["asked"]
     if settled < 0.9 * asked:
         said.append(f"only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs")
-    if 1 / (1 + settled) > min(ALPHA.values()):
+    if 1 / (1 + settled) > min(document["bootstrap"]["shares"].values()):
         said.append(f"{settled} bootstrap tables are too few for pairs of effects to count; use 500 or more")
     return said
 

@@ -35,9 +35,16 @@ def write(
     """
     table = loop_outcome.rows_table(looped, found, seen)
     album = Album(Path(folder))
-    album.add("before_after", lambda: figures_loop.before_after(table, found.verdict))
+    series = looped.engine.series
+    album.add(
+        "before_after",
+        lambda: (figures_loop.over_time if series else figures_loop.before_after)(table, found.verdict),
+    )
     album.add("errors", lambda: figures_loop.errors(document))
-    album.add("defects", lambda: figures_loop.defects(table, document))
+    if series:
+        album.add("series", lambda: figures_loop.series(document))
+    else:
+        album.add("defects", lambda: figures_loop.defects(table, document))
     if curve is not None:
         album.add("curve", lambda: figures_loop.curve(table, curve))
     album.add("ladder", lambda: figures_loop.ladder(document))

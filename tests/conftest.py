@@ -21,7 +21,6 @@ from mmrjax.models.drive import drive, drive_batch
 from mmrjax.models.steady import steady, steady_batch
 from mmrjax.signals import Command, Result, command
 
-
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.
 MAPPINGS = 12_000

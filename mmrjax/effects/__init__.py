@@ -12,7 +12,7 @@ from mmrjax.effects.brush_drop import BrushDrop
 from mmrjax.effects.centrifugal_tension import CentrifugalTension
 from mmrjax.effects.churning import Churning
 from mmrjax.effects.cogging import Cogging
-from mmrjax.effects.curve import CURVES
+from mmrjax.effects.curve import CURVES, WAVES
 from mmrjax.effects.encoder_scale import EncoderScale
 from mmrjax.effects.gear_load_loss import GearLoadLoss
 from mmrjax.effects.gear_quadratic_loss import GearQuadraticLoss
@@ -89,4 +89,7 @@ ALL: tuple[type[Effect], ...] = (
 
 BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 
-__all__ = ["ALL", "BY_NAME", "CURVES", "Effect"]
+#: Discrepancies without a name, which robot files know and no library holds.
+UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES}
+
+__all__ = ["ALL", "BY_NAME", "CURVES", "UNNAMED", "WAVES", "Effect"]

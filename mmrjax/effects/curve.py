@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.effects.base import Effect
+from mmrjax.effects.periodic import Periodic
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
 
@@ -22,7 +23,8 @@ BALANCES = {
     "ground": ("N", 4.0, "direction_travel"),
     "slip": ("m/s", 0.05, "direction"),
 }
-#: Variables of a curve, signals that every one of these balances knows: unit and ordinary range.
+#: Variables of a curve, signals that every one of these balances knows, and the time since the start of the run:
+#: unit and ordinary range.
 VARIABLES = {
     "voltage": ("V", 10.0, 35.0),
     "current": ("A", 0.0, 6.0),
@@ -30,6 +32,7 @@ VARIABLES = {
     "slope": ("rad", 0.0, 0.35),
     "payload": ("kg", 0.0, 8.0),
     "speed": ("m/s", 0.1, 1.0),
+    "time": ("s", 0.0, 2.0),
 }
 ORDINATES = tuple(f"y{k}" for k in range(6))
 #: Share of the range over which a curve levels out beyond each of its ends.
@@ -80,6 +83,8 @@ def _curve(place: str, over: str) -> type[Effect]:
         balance: ClassVar[str] = place
         dissipative: ClassVar[bool] = False
         variable: ClassVar[str] = over
+        memory_size: ClassVar[float | None] = 1.0 if over == "time" else None
+        memory_unit: ClassVar[str] = unit_x
 
         amplitude: Scalar = parameter(
             0.0,
@@ -116,9 +121,20 @@ def _curve(place: str, over: str) -> type[Effect]:
         def term(self, robot: Robot, signals: Signals) -> Scalar:
             way = jnp.asarray(getattr(signals, along))
             # In the frame of travel: a run in mirror image shows the discrepancy in mirror image.
-            x = signals.payload if over == "payload" else getattr(signals, over) * way
+            if over == "time":
+                x = self.recall(robot, signals)
+            else:
+                x = signals.payload if over == "payload" else getattr(signals, over) * way
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
             return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
+
+        def rate(self, robot: Robot, signals: Signals) -> Scalar:
+            """Time passes [s/s]; only a curve over time remembers anything."""
+            return jnp.ones_like(signals.speed_motor)
+
+        def settled(self, robot: Robot, signals: Signals) -> Scalar:
+            """Long after the start: the curve's last value."""
+            return self.high + jnp.zeros_like(signals.speed_motor)
 
     words = "".join(w.capitalize() for w in Curve.name.split("_"))
     Curve.__name__ = Curve.__qualname__ = words
@@ -131,6 +147,64 @@ def _curve(place: str, over: str) -> type[Effect]:
     """
     return Curve
 
+
+def _wave(place: str) -> type[Effect]:
+    """The wave of one balance."""
+    unit, size, _ = BALANCES[place]
+
+    class Wave(Periodic, Effect):
+        name: ClassVar[str] = f"wave_{place}"
+        balance: ClassVar[str] = place
+
+        amplitude: Scalar = parameter(
+            0.0,
+            unit=unit,
+            meaning="size of the discrepancy",
+            bounds=(-100 * size, 100 * size),
+            sd=size,
+            source="what the fit leaves; no cause is known",
+            amplitude=True,
+        )
+        phase: Scalar = parameter(
+            0.0,
+            unit="rad",
+            meaning="phase φ of the wave at the start of the run",
+            bounds=(-4.0, 4.0),
+            sd=2.0,
+            source="how the parts stood at the start: anything",
+        )
+        order_shaft: Scalar = parameter(
+            1.0,
+            unit="-",
+            meaning="waves a turn of the driving pulley or wheel k",
+            bounds=(0.01, 1000.0),
+            relative_sd=0.01,
+            source="the order that the data show",
+        )
+        y_sin: Scalar = _ordinate()
+        y_cos: Scalar = _ordinate()
+
+        def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
+            return self.order_shaft / robot.gearbox.ratio
+
+        def term(self, robot: Robot, signals: Signals) -> Scalar:
+            if self.name not in signals.memory:
+                return self.amplitude * jnp.zeros_like(signals.speed_motor)
+            angle = signals.memory[self.name] + self.phase
+            return self.amplitude * (self.y_sin * jnp.sin(angle) + self.y_cos * jnp.cos(angle))
+
+    Wave.__name__ = Wave.__qualname__ = f"Wave{place.capitalize()}"
+    Wave.__doc__ = f"""Δ = a (y_s sin(k θ_k + φ) + y_c cos(k θ_k + φ)) in the balance `{place}` [{unit}].
+
+    θ_k is the angle of the driving pulley or wheel; settled travel shows nothing of it.
+
+    Source: none, a discrepancy without a name that repeats with the angle of a shaft.
+    """
+    return Wave
+
+
+#: The wave of every balance that carries curves: what a series shows as an order.
+WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, BALANCES)}
 
 #: Every curve by its name. Robot files know them; they are no part of the library that is scored.
 CURVES: dict[str, type[Effect]] = {
