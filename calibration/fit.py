@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -212,6 +213,71 @@ def search_long(
         if done:
             break
     return best[0], first, best[1]
+
+
+Evaluate = Callable[[Array], tuple[Array, Array, Observation]]
+
+
+@eqx.filter_jit
+def _begun(solver: Search, starts: Array, r: Array, jacobian: Array) -> Any:
+    def one(y: Array, r: Array, jacobian: Array) -> Any:
+        shape = jax.eval_shape(lambda: r)
+        return solver.init(lambda z, _: (r + jacobian @ (z - y), None), y, None, {}, shape, None, frozenset())
+
+    return eqx.filter_vmap(one)(starts, r, jacobian)
+
+
+@eqx.filter_jit
+def _steps(solver: Search, y: Array, state: Any, r: Array, jacobian: Array) -> tuple[Array, Any, Array]:
+    return eqx.filter_vmap(lambda *x: _step(solver, *x))(y, state, r, jacobian)
+
+
+@eqx.filter_jit
+def _optima(jacobian: Array, r: Array, z: Array, data: Data, weights: Array, steps: Array) -> Optimum:
+    def one(jacobian: Array, r: Array, z: Array, weight: Array, steps: Array) -> Optimum:
+        there = dataclasses.replace(data, weight=weight)
+        return _optimum(jacobian, r, z, there, no_pin(z.shape[0]), steps)
+
+    return jax.vmap(one)(jacobian, r, z, weights, steps)
+
+
+def searches_long(
+    evaluate: Evaluate, starts: Array, data: Data, weights: Array, max_steps: int
+) -> tuple[Optimum, Observation]:
+    """A batch of `levenberg_marquardt` with the steps taken from outside, so that rollouts are compiled once in all.
+
+    Args:
+        evaluate: residuals, their Jacobian and the observation of every member at its z, compiled; leading axis the
+            batch.
+        starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, 3).
+
+    Returns:
+        Where each search ended, and what the model says there.
+    """
+    solver = Search(rtol=TOLERANCE_LONG, atol=TOLERANCE_LONG, linear_solver=Normal())
+    starts = jnp.asarray(starts)
+    r, jacobian, seen = evaluate(starts)
+    y, at, state = starts, starts, _begun(solver, starts, r, jacobian)
+    best, over, taken = (r, jacobian, seen), np.zeros(len(starts), bool), np.zeros(len(starts), int)
+    for steps in range(1, max_steps + 1):
+        # A step judges what was found where the last one led; what is accepted becomes y.
+        new_y, state, done = _steps(solver, y, state, r, jacobian)
+        moved = np.asarray(jnp.all(new_y == at, 1)) & ~over
+        y, best = _where(moved, (new_y, (r, jacobian, seen)), (y, best))
+        taken = np.where(over, taken, steps)
+        found = _optima(best[1], best[0], y, data, weights, jnp.asarray(taken))
+        small = 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost)
+        over = over | np.asarray(done) | np.asarray(moved & (found.decrement < small))
+        if over.all():
+            break
+        at = jnp.where(over[:, None], y, state.y_eval)
+        r, jacobian, seen = evaluate(at)
+    return found, best[2]
+
+
+@jax.jit
+def _where(which: Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
 
 
 def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) -> Optimum:

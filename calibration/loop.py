@@ -18,7 +18,7 @@ from calibration.doors import BadData
 from calibration.effect_file import Library
 from calibration.problem import Observation, Problem, build
 from calibration.records import MEASURED, Runs
-from calibration.slots import amplitude_of
+from calibration.slots import Slots, amplitude_of
 from calibration.trace import Curves, Linear, Scores, Summary, Tracer
 from mmrjax import effects
 from mmrjax.effects import Effect
@@ -206,7 +206,7 @@ class Engine:
     ) -> None:
         self.base, self.library, self.series = base, library, series
         self.effects = visible_effects(library, base, series)
-        self.batch, self.max_steps = (BATCH_SERIES, STEPS_SERIES) if series else (BATCH, 60)
+        self.batch = BATCH_SERIES if series else BATCH
         self.names = tuple(e.name for e in self.effects)
         self.equipped = slots.equipped(base, library, self.names)
         self.size = size
@@ -214,9 +214,9 @@ class Engine:
         self.of = np.repeat(np.arange(len(self.names)), [len(c.at) for c in self.candidates])
         self.at = np.concatenate([c.at for c in self.candidates])
         self.tracer = Tracer(self.candidates)
-        self.fits = eqx.filter_jit(self._fits)
+        self.evaluate = eqx.filter_jit(_evaluate)
+        self.fits = self._fits_series if series else eqx.filter_jit(self._fits)
         self.observe = eqx.filter_jit(lambda problem, z: problem.observation(z))
-        self.bare = eqx.filter_jit(_searches)
         self.costs = eqx.filter_jit(lambda problem, zs: jax.lax.map(lambda z: _cost(problem, z), zs, batch_size=16))
         self.clock = eqx.filter_jit(lambda problem, z: problem.observe.clock(problem.robot(z)))
 
@@ -226,14 +226,28 @@ class Engine:
         def one(w: Array, z: Array, weight: Array) -> tuple[fit.Optimum, Observation]:
             there = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(w))
             data = dataclasses.replace(problem.data, weight=weight)
-            found = fit.levenberg_marquardt(there, z, data, max_steps=self.max_steps)
+            found = fit.levenberg_marquardt(there, z, data, max_steps=60)
             return found, there.observation(found.z)
 
         return jax.vmap(one)(which, starts, weights)
 
+    def _fits_series(
+        self, problem: Problem, which: Array, starts: Array, weights: Array
+    ) -> tuple[fit.Optimum, Observation]:
+        """As `_fits`, of histories; their runs are compiled once for all steps."""
+        evaluate = lambda z: self.evaluate(problem, which, z, weights)  # noqa: E731
+        return fit.searches_long(evaluate, starts, problem.data, weights, STEPS_SERIES)
 
-def _searches(problem: Problem, starts: Array) -> fit.Optimum:
-    return jax.vmap(lambda z: fit.levenberg_marquardt(problem, z, problem.data, max_steps=40))(starts)
+
+def _evaluate(problem: Problem, which: Array, z: Array, weights: Array) -> tuple[Array, Array, Observation]:
+    def one(w: Array, z: Array, weight: Array) -> tuple[Array, Array, Observation]:
+        coordinates = problem.coordinates
+        if isinstance(coordinates, Slots):
+            coordinates = coordinates.with_effects(w)
+        there = dataclasses.replace(problem, coordinates=coordinates)
+        return fit.linearised(there, z, dataclasses.replace(problem.data, weight=weight))
+
+    return jax.vmap(one)(which, z, weights)
 
 
 def _cost(problem: Problem, z: Array) -> Array:
@@ -334,7 +348,9 @@ class Loop:
         draws = np.random.default_rng(self.seed).standard_normal((DRAWS, p))
         order = np.argsort(np.asarray(self.engine.costs(bare, jnp.asarray(draws))))
         starts = np.concatenate([np.zeros((1, p)), draws[order[: SEARCHES - 1]]])
-        found = jax.device_get(self.engine.bare(bare, jnp.asarray(starts)))
+        evaluate = lambda z: self.engine.evaluate(bare, jnp.zeros((SEARCHES, 0)), z, weights)  # noqa: E731
+        weights = jnp.repeat(bare.data.weight[None], SEARCHES, 0)
+        found, _ = jax.device_get(fit.searches_long(evaluate, starts, bare.data, weights, STEPS_SERIES))
         best = found.z[int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
         return np.repeat(best[None], self.engine.batch, 0)
 
@@ -433,8 +449,9 @@ class Loop:
 
     def null(self, h: Hypothesis, curves: tuple[Curves, ...]) -> Summary:
         """Bootstrap of the base fit: the strongest statistics of tables in which nothing is missing."""
-        problem = self._weighted(self.problem)
-        z = jnp.asarray(h.z[: len(problem.coordinates)])
+        problem, z = self._weighted(self.problem), jnp.asarray(h.z[: len(self.coordinates.base)])
+        if self.engine.series:  # by the program of `look`
+            problem, z = self.problem_of(h), jnp.asarray(h.z)
         return trace.bootstrap(self.engine.tracer, problem, z, problem.data, curves, self.replicates, self.seed)
 
     def gate(self, h: Hypothesis, curves: tuple[Curves, ...], null: Summary) -> Round:
@@ -442,11 +459,11 @@ class Loop:
         linear, scores, found = self.look(h, curves)
         return Round(h, linear, scores, Gate(found, null, self.alpha))
 
-    def gate_of(self, problem: Problem, z: np.ndarray, like: Gate) -> Gate:
-        """What the fit of another problem of the same table leaves, against the thresholds of a gate."""
-        curves = self.curves
-        _, _, found = jax.device_get(self.engine.tracer.look(problem, jnp.asarray(z), problem.data, curves))  # type: ignore[attr-defined]
-        return Gate(found, like.null, like.alpha)
+    def round_of(self, problem: Problem, z: np.ndarray, like: Round) -> Round:
+        """A look at the fit of another problem of the same table, against the thresholds of a round."""
+        seen = self.engine.tracer.look(problem, jnp.asarray(z), problem.data, self.curves)  # type: ignore[attr-defined]
+        linear, scores, found = jax.device_get(seen)
+        return dataclasses.replace(like, linear=linear, scores=scores, gate=Gate(found, like.gate.null, self.alpha))
 
     # --- the loop -----------------------------------------------------------------------------------
 

@@ -108,7 +108,7 @@ def document(loop: Loop, found: Finding, seen: Readings, curve: Discrepancy | No
     """Everything that the loop found, as JSON-able data."""
     counts = loop.counts[: len(loop.runs)]
     chi2 = (2 * found.base.hypothesis.cost, 2 * found.after.hypothesis.cost) if curve is None else curve.chi2
-    left = found.after.gate if curve is None else loop.gate_of(curve.problem, curve.z, found.base.gate)
+    after = found.after if curve is None else loop.round_of(curve.problem, curve.z, found.base)
     return {
         "schema": SCHEMA,
         "verdict": found.verdict,
@@ -122,13 +122,13 @@ def document(loop: Loop, found: Finding, seen: Readings, curve: Discrepancy | No
         "remains": remains(found) if found.verdict in ("named", "class") else None,
         "cannot_see": [loop.engine.names[k] for k in found.invisible],
         "needs_series": needs_series(loop),
-        "series": series(loop, found) if loop.engine.series else None,
+        "series": series(loop, found.base, after) if loop.engine.series else None,
         "alternatives": alternatives(loop, found),
         "implausible": alternatives(loop, found, plausible=False),
         "errors": errors(loop, seen, counts),
         "held_out_by": held_out_errors(loop, seen, counts),
-        "adequate": {"before": not found.base.gate.open, "after": not left.clear},
-        "evidence": {"before": evidence(found.base.gate), "after": evidence(left)},
+        "adequate": {"before": not found.base.gate.open, "after": not after.gate.clear},
+        "evidence": {"before": evidence(found.base.gate), "after": evidence(after.gate)},
         "chi2": {"before": float(chi2[0]), "after": float(chi2[1]), "readings": int(3 * counts.sum())},
         "base_shift": base_shift(loop, found, curve),
         "scores": scores(loop, found.base),
@@ -257,7 +257,7 @@ def without(loop: Loop, found: Finding) -> list[float]:
     return [2 * (h.cost - after.cost) for h in loop.fit_all([(w, loop.start(after, w)) for w in fewer])]
 
 
-def series(loop: Loop, found: Finding) -> dict[str, Any]:
+def series(loop: Loop, before: Round, after: Round) -> dict[str, Any]:
     """What only histories tell: memory of the residual, waves in shaft angle, drift in time, before and after.
 
     A wave or a drift is given for the balance in which it explains most; `deviate` is its score as a normal
@@ -288,7 +288,7 @@ def series(loop: Loop, found: Finding) -> dict[str, Any]:
     return {
         "runs": len(rows), "samples": int((rows >= 0).sum()),
         "orders_unresolved": [w for w in curve_room.ORDERS if w not in words],
-        "before": told(found.base), "after": told(found.after),
+        "before": told(before), "after": told(after),
     }  # fmt: skip
 
 

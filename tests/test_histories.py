@@ -1,0 +1,102 @@
+"""`drive` on a fixed grid: it follows `drive`, its derivatives are those of what it computes, it says when it can't."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from mmrjax import nominal, params
+from mmrjax.effects import BY_NAME
+from mmrjax.models.drive import drive
+from mmrjax.models.histories import FIRST, LONGEST, grid, histories
+from mmrjax.signals import command
+
+RUNS = command(
+    voltage=np.array([15.0, 33.0, 24.0]),
+    slope=np.radians([0.0, 10.0, 5.0]),
+    payload=np.array([0.0, 8.0, 3.0]),
+    wheeled=np.array([0.0, 0.0, 1.0]),
+)
+TIMES = np.concatenate([np.linspace(2e-4, 4e-3, 8), np.arange(0.02, 0.8001, 0.02)])
+GRID = grid(TIMES)
+AT = np.searchsorted(GRID, TIMES)
+STATE = ("current", "speed_motor", "speed")
+#: Every effect with a memory, and one in each of `inertia` and `inductance`.
+EFFECTS = ("rotating_inertia", "thermal_drift", "armature_inductance", "cogging", "stick_slip", "pulley_eccentricity",
+           "grouser_polygon")  # fmt: skip
+
+
+def seen(robot, runs=RUNS):
+    """Current [A], motor speed [rad/s] and speed [m/s] at TIMES, shape (runs, times, 3)."""
+    s = jax.vmap(lambda c: histories(robot, c, jnp.asarray(GRID)))(runs)
+    return jnp.stack([getattr(s, k) for k in STATE], -1)[:, AT]
+
+
+def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
+    step = np.diff(GRID)
+    assert GRID[0] == 0.0 and GRID[-1] == TIMES[-1] and np.isin(TIMES, GRID).all()
+    assert (step > 0).all() and step[0] <= 1.5 * FIRST and step.max() <= LONGEST * (1 + 1e-9)
+    assert len(GRID) < 600  # LONGEST throughout would be 320, FIRST 80 000
+    assert np.diff(grid(np.array([0.0, 600.0]))).max() > LONGEST  # a long run: no more steps than it can have
+
+
+def test_histories_follow_drive():
+    robot = nominal.nominal()
+    times = jnp.asarray(np.concatenate([[0.0], TIMES]))
+    s = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-9, max_steps=20000).signals))(RUNS)
+    expected = np.stack([np.asarray(getattr(s, k)) for k in STATE], -1)[:, 1:]
+    got = np.asarray(jax.jit(seen)(robot))
+    # measured: 5 mA of 50 A, 0.11 rad/s of 1200, 13 µm/s of 1.3 m/s
+    assert (np.abs(got - expected) < np.array([8e-3, 0.2, 3e-5])).all()
+    assert expected[..., 0].max() > 10 and expected[..., 2].max() > 0.5
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"effects.cogging.amplitude": 3e-4, "effects.pulley_eccentricity.amplitude": 0.02}],
+    ids=["bare", "waves"],
+)
+def test_derivatives_are_those_of_what_is_computed(changes):
+    """By parameters and by the amplitude of every effect with a memory, against central differences."""
+    robot = dataclasses.replace(nominal.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
+    robot = params.strong(params.replace(robot, {k: jnp.asarray(v) for k, v in changes.items()}))
+    names = [
+        "motor.resistance", "motor.inertia", "motor.inductance", "tracked.ground.friction.static", "wheeled.radius",
+        *(f"effects.{n}.amplitude" for n in EFFECTS),
+    ]  # fmt: skip
+    known = {p.name: p for p in params.walk(robot)}
+    theta = jnp.asarray([float(known[n].value) for n in names])
+    step = jnp.asarray([1e-4 * (abs(float(known[n].value)) or known[n].spec.prior_sd(0.0)) for n in names])
+
+    def of(theta):
+        return seen(params.replace(robot, {n: theta[k] for k, n in enumerate(names)}))
+
+    slopes = np.asarray(jax.jit(jax.jacfwd(of))(theta))
+    sides = jax.jit(lambda thetas: jax.lax.map(of, thetas))
+    up, down = (np.asarray(sides(theta + s * jnp.diag(step))) for s in (1, -1))
+    for k, name in enumerate(names):
+        expected = (up[k] - down[k]) / (2 * float(step[k]))
+        scale = np.abs(expected).max((0, 1))
+        assert (scale > 0).any(), name
+        error = np.abs(slopes[..., k] - expected).max((0, 1))
+        assert (error <= 2e-3 * scale + 1e-9 * np.abs(up[k]).max((0, 1)) / float(step[k])).all(), name
+
+
+def test_repeated_instants_change_nothing():
+    robot = nominal.nominal()
+    short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])
+    one = jax.tree.map(lambda x: x[0], RUNS)
+    first, second = (
+        ravel_pytree(jax.tree.map(lambda x: x[119], histories(robot, one, jnp.asarray(g))))[0] for g in (short, long)
+    )
+    np.testing.assert_array_equal(first, second)
+    last = histories(robot, one, jnp.asarray(long)).speed_motor
+    np.testing.assert_allclose(last[120:], last[119], rtol=1e-12)
+
+
+def test_run_that_cannot_be_followed_is_not_finite():
+    robot = params.replace(nominal.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
+    assert not np.isfinite(seen(robot)).any()
