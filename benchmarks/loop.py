@@ -308,15 +308,19 @@ def summary(lines: list[dict]) -> list[str]:
     return out
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for kind in KINDS:
+def campaign(doc: str | None, kinds: tuple[str, ...], work, summary, out: str) -> None:
+    """The command of a campaign: so many tables of each kind, one line of a file each, resumable.
+
+    `work((kind, seed, replicates, robot))` makes and judges a case; `summary(lines)` says the figures.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for kind in kinds:
         parser.add_argument(f"--{kind}", type=int, default=0, help="tables")
     parser.add_argument("--replicates", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--robot", default="nominal")
-    parser.add_argument("--out", type=Path, default=Path("runs/campaign.jsonl"))
+    parser.add_argument("--out", type=Path, default=Path(out))
     parser.add_argument("--limit", type=float, default=np.inf, help="seconds after which no table is begun")
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)
@@ -324,7 +328,7 @@ def main() -> None:
     done = {(x["kind"], x["seed"]) for x in lines}
     tasks = [
         (kind, seed, given.replicates, given.robot)
-        for kind in KINDS
+        for kind in kinds
         for seed in range(given.first, given.first + getattr(given, kind))
         if (kind, seed) not in done
     ]
@@ -347,4 +351,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    campaign(__doc__, KINDS, work, summary, "runs/campaign.jsonl")

@@ -247,7 +247,9 @@ def read_runs(source: str, *, measured: bool, series: bool = False) -> records.R
     """Read a table, and say on stderr which of its columns are not used."""
     runs = records.read(source, measured=measured)
     if runs.has("time_s") and not series:
-        raise BadData(f"{runs.source}: column time_s: time histories are for calibrate; expected one row a run")
+        raise BadData(
+            f"{runs.source}: column time_s: time histories are for calibrate and loop; expected one row a run"
+        )
     if runs.unknown:
         _err.print(f"{runs.source}: not used: {', '.join(runs.unknown)}")
     return runs

@@ -18,8 +18,8 @@ from calibration.records import CHANNELS, Runs
 from sweeps import commands
 from sweeps import config as configuration
 
-#: Fewest rows in which a missing effect can be told from noise.
-FEWEST = 6
+#: Fewest rows, and fewest samples of histories, in which a missing effect can be told from noise.
+FEWEST, FEWEST_SAMPLES = 6, 24
 #: Factors on an assumed noise at which the verdict is looked at too.
 FACTORS = (0.5, 2.0)
 
@@ -31,20 +31,24 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
     """
     began = time.monotonic()
     runs, numbers, notes = _distinct(commands.read_runs(source, measured=True, series=True))
-    if len(runs) < FEWEST:
-        raise BadData(f"{runs.source}: {len(runs)} runs cannot show what a model lacks; at least {FEWEST} are needed")
+    series = is_series(runs)
+    fewest, word = (FEWEST_SAMPLES, "samples") if series else (FEWEST, "runs")
+    if len(runs) < fewest:
+        raise BadData(
+            f"{runs.source}: {len(runs)} {word} cannot show what a model lacks; at least {fewest} are needed"
+        )
     robot = commands.load_robot(config)
     stated = priors.parse_priors(config.prior)
     known = noise_room.assumed(runs, config.noise or None)
     notes += checks.check(runs, (), known)
-    if is_series(runs):
+    if series:
         checks.from_rest(runs, known)
 
     def progress(text: str) -> None:
         commands.tell(f"{time.monotonic() - began:4.0f} s  {text}")
 
     with commands.open_folder("loop", config, robot, out, force, runs) as folder:
-        engine = Engine(robot, effect_file.library(config.effects), series=is_series(runs))
+        engine = Engine(robot, effect_file.library(config.effects), series=series)
 
         def one(factor: float = 1.0) -> tuple[Loop, Finding]:
             sd = noise_room.assumed(runs, config.noise or None, factor).sd

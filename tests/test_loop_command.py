@@ -12,10 +12,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import generator as g
+import generator_series as gs
 import numpy as np
 import pytest
 
-from calibration import effect_file
+from calibration import curves, effect_file
 from mmrjax.effects import BY_NAME
 from sweeps import cli
 from sweeps import loop as room
@@ -96,8 +97,8 @@ def quick():
         def library(paths):
             return some | {e.name: e for path in paths for e in effect_file.read(Path(path))}
 
-        def engine(robot, known):
-            return engines.setdefault(tuple(known), honest(robot, known, 1))
+        def engine(robot, known, series=False):
+            return engines.setdefault((series, *known), honest(robot, known, 1, series=series))
 
         honest = room.Engine
         patch.setattr(room, "effect_file", SimpleNamespace(library=library))
@@ -218,6 +219,13 @@ HEADER = (
 ROW = "6T2A,15,13.1,0,5,2.75,4800,400"
 #: Eight runs with nothing wrong.
 TABLE = "\n".join([HEADER, *(f"6T2A,{u},13.1,0,5,{2 + 0.05 * u},{320 * u},{27 * u}" for u in range(12, 20))])
+
+
+def moving(t, voltage=15):
+    """A sample of a run that moves from the first."""
+    return f"6T2A,{voltage},13.1,0,5,{2.7 + 0.01 * t},{4800 + t},{400 + t}"
+
+
 #: What the file holds, and what is said of it.
 BAD = {
     "empty": ("", "runs.csv: the file is empty"),
@@ -229,7 +237,18 @@ BAD = {
         "runs.csv: 3 runs cannot show what a model lacks; at least 6 are needed",
     ),
     "copies of one row": ("\n".join([HEADER, *[ROW] * 8]), "runs.csv: 1 runs cannot show what a model lacks"),
-    "three samples": ("\n".join([f"{HEADER},time_s", *(f"{ROW},{t}" for t in (0, 1, 2))]), "runs.csv: "),
+    "three samples": (
+        "\n".join([f"{HEADER},time_s", *(f"{ROW},{t}" for t in (0, 1, 2))]),
+        "runs.csv: 3 samples cannot show what a model lacks; at least 24 are needed",
+    ),
+    "not from rest": (
+        "\n".join([f"{HEADER},time_s", *(f"{moving(t)},{t / 10}" for t in range(30))]),
+        "runs.csv row 1, time_s: run (no run_id) is moving at 0 s",
+    ),
+    "two conditions in a run": (
+        "\n".join([f"{HEADER},time_s", *(f"{moving(t, 15 + t // 20)},{t / 10}" for t in range(30))]),
+        "runs.csv, supply_voltage_V: run (no run_id) has several values",
+    ),
 }  # fmt: skip
 
 
@@ -277,3 +296,51 @@ def test_interrupt_leaves_nothing(tmp_path, monkeypatch):
     answer = mmrjax(tmp_path, "loop", "runs.csv", "--out", "x")
     assert answer.code == 130 and answer.err.splitlines()[-1].startswith("mmrjax: interrupted")
     assert [p.name for p in tmp_path.iterdir()] == ["runs.csv"]
+
+
+# --- histories ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def started(quick, tmp_path_factory):
+    """The whole command on six starts of a robot whose tracks churn, one sample given twice."""
+    folder = tmp_path_factory.mktemp("started")
+    table, label = gs.case(["churning"], 14.0, seed=5, duration=0.8)
+    written(folder / "starts.csv", {k: np.append(v, v[40]) for k, v in table.items()})
+    priors = [*PRIORS, *(a.replace("static=0.6±0.09", "dynamic=0.48±0.08") for a in PRIORS)]
+    answer = mmrjax(folder, "loop", "starts.csv", "--replicates", 250, "--out", "found", *priors)
+    return SimpleNamespace(folder=folder, label=label["effects"][0], answer=answer)
+
+
+def test_histories_go_through_the_command(started):
+    assert started.answer.code == 0, started.answer.err
+    r = json.loads((started.folder / "found" / "result.json").read_text())
+    (effect,) = r["effects"]
+    assert r["verdict"] == "named" and effect["name"] == "churning" and r["rows"] == 6 * 41
+    amplitude = effect["parameters"]["amplitude"]
+    assert abs(amplitude["value"] - started.label["amplitude"]) < 4 * amplitude["sd"]
+    assert any("row 247 is an exact copy" in note for note in r["notes"])
+    told = r["series"]
+    assert told["runs"] == 6 and told["samples"] == 6 * 41 and r["needs_series"] == []
+    assert {o["order"] for o in told["before"]["orders"]} | set(told["orders_unresolved"]) == set(curves.ORDERS)
+    assert len(told["after"]["memory"]["autocorrelation"]["speed"]) == told["after"]["memory"]["lags"]
+    assert r["evidence"]["before"]["white"]["threshold"] > 0
+    # the errors by blocks that differ: slope, voltage and payload go together in these six runs
+    assert set(r["held_out_by"]) == {"slope", "run"}
+
+
+def test_robot_found_in_histories_starts_with_the_effect(started):
+    robot = tomllib.loads((started.folder / "found" / "robot.toml").read_text())
+    assert robot["effects"]["churning"]["amplitude"] > 0
+    run = mmrjax(started.folder, "simulate", "--robot", "found/robot.toml", "--model", "drive", "--out", "run",
+                 "--duration", "0.5", "--no-report")  # fmt: skip
+    assert run.code in (0, 3), run.err
+
+
+def test_report_of_histories_shows_what_only_they_tell(started):
+    page = (started.folder / "found" / "report.html").read_text()
+    for words in ("What only histories tell", "Ljung and Box", "246 of 246 samples", "t [s]"):
+        assert words in page
+    assert "What each equation lacks" not in page and "Settled runs show nothing" not in page
+    figures = {p.stem for p in (started.folder / "found" / "figures").iterdir()}
+    assert "series" in figures and "defects" not in figures
