@@ -308,17 +308,20 @@ def calibrate(
 
 @app.command(epilog="Example: mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml")
 def loop(
-    data: Annotated[str, typer.Argument(help="A CSV of measured runs, or measured.")] = "measured",
+    data: Annotated[
+        str,
+        typer.Argument(help="A CSV of measured runs, or with time_s of histories from rest; or measured."),
+    ] = "measured",
     noise: Annotated[
         str | None,
         typer.Option(
-            help="Sd: current=2%,motor_speed=0.5%,speed=1%, or in A, rpm, mm/s.  \\[default: the file's columns; "
-            "else these shares are assumed, and halved and doubled]"
+            help="Sd of current, motor_speed, speed in % or A, rpm, mm/s, e.g. current=2%,speed=5mm/s.  \\[default: "
+            "the file's columns; else 2, 0.5, 1 % are assumed, and halved and doubled]"
         ),
     ] = None,
     prior: Annotated[
         list[str] | None,
-        typer.Option(help="A prior in SI units, repeatable: tracked.ground.friction.static=0.45±0.05."),
+        typer.Option(help="A prior in SI units, repeatable, e.g. motor.resistance=0.9±0.1."),
     ] = None,
     replicates: Annotated[int | None, typer.Option(help="Tables of the bootstrap.  \\[default: 500]")] = None,
     seed: Annotated[int | None, typer.Option(help="Of everything random.  \\[default: 0]")] = None,
@@ -395,7 +398,9 @@ def main() -> None:
     except DoorError as error:
         code = _fail(str(error), error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
-        advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
+        advice = "no run folder was left"
+        if "sweep" in sys.argv[1:2]:
+            advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
         code = _fail(f"interrupted; {advice}", INTERRUPTED)
     except OSError as error:
         place = error.filename or "a file"

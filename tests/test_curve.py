@@ -11,7 +11,7 @@ import test_effects as laws
 from calibration import curves, robot_file
 from calibration.doors import BadConfiguration
 from mmrjax import balances, effects, nominal, params
-from mmrjax.effects import CURVES, curve
+from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.models.drive import drive
 from mmrjax.signals import Signals
 
@@ -22,11 +22,16 @@ STARTS, TIMES = jax.tree.map(lambda x: x[:2], laws.CONDITIONS), jnp.asarray([0.0
 SIZES = jnp.asarray([laws.size(c) for c in CURVES.values()])
 
 
-def robot(amplitudes=None):
-    """Nominal, with every curve, of a shape that is not flat, at these amplitudes."""
+#: In runs of `drive`: in every balance a curve of the state, one over time, and a wave.
+DRIVEN = {n: e for n, e in UNNAMED.items() if n.endswith(("speed_motor", "time")) or n.startswith("wave")}
+
+
+def robot(amplitudes=None, kinds=CURVES):
+    """Nominal, with every curve of `kinds`, of a shape that is not flat, at these amplitudes."""
     every = []
-    for k, effect in enumerate(CURVES.values()):
-        values = SHAPE if amplitudes is None else {**SHAPE, "amplitude": amplitudes[k]}
+    for k, effect in enumerate(kinds.values()):
+        values = {n: v for n, v in SHAPE.items() if hasattr(effect(), n)}
+        values |= {} if amplitudes is None else {"amplitude": amplitudes[k]}
         every.append(params.replace(effect(), {n: jnp.asarray(v) for n, v in values.items()}))
     return dataclasses.replace(nominal.nominal(), effects=tuple(every))
 
@@ -80,7 +85,7 @@ def _steady(bare):
 
 
 def _driven(amplitudes):
-    there = robot(amplitudes)
+    there = robot(amplitudes, DRIVEN)
 
     def one(c):
         signals = drive(there, c, TIMES, tolerance=1e-9).signals
@@ -89,9 +94,15 @@ def _driven(amplitudes):
     return jax.vmap(one)(STARTS)
 
 
+def test_settled_travel_shows_nothing_of_a_wave():
+    waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
+    np.testing.assert_array_equal(jax.jit(_steady)(waves), jax.jit(_steady)(nominal.nominal()))
+
+
 def test_curves_act_in_drive_and_at_zero_change_nothing():
-    both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * SIZES,)))
-    still, slope = both(jnp.zeros(len(CURVES)))
+    sizes = jnp.asarray([laws.size(e) for e in DRIVEN.values()])
+    both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * sizes,)))
+    still, slope = both(jnp.zeros(len(DRIVEN)))
     bare = nominal.nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, TIMES, tolerance=1e-9)))(STARTS)
     s = plain.signals
@@ -130,7 +141,7 @@ def test_curves_are_those_that_the_trace_looks_for():
 
 
 def test_robot_with_curves_written_and_read_is_the_same(tmp_path):
-    mine = robot(0.1 * SIZES)
+    mine = robot(0.1 * jnp.asarray([laws.size(e) for e in UNNAMED.values()]), UNNAMED)
     robot_file.write(mine, tmp_path / "robot.toml")
     for library in ({}, effects.BY_NAME):
         again = robot_file.read(tmp_path / "robot.toml", library)

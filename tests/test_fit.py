@@ -279,7 +279,8 @@ def test_lbfgs_reaches_the_same_optimum_through_a_rollout():
 
 def test_series_pads_runs_of_different_length():
     runs = series_runs(nominal.nominal())
-    short = runs.where((runs["run_id"] != "b") | (runs["time_s"] < 0.3))
-    observer = problem.series(short)
-    seen = observer(nominal.nominal()).reading
-    np.testing.assert_allclose(seen, short.measured(), rtol=1e-4, atol=1e-4)
+    kept = (runs["run_id"] != "b") | (runs["time_s"] < 0.3)
+    seen, whole = (problem.series(r)(nominal.nominal()).reading for r in (runs.where(kept), runs))
+    np.testing.assert_allclose(seen, whole[kept], rtol=1e-8)
+    # against `drive`, which made them: tests/test_histories.py says how close
+    np.testing.assert_allclose(seen, runs.measured()[kept], rtol=5e-4, atol=1e-4)

@@ -116,6 +116,7 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     assert not after.gate.clear and found.base.gate.clear
 
 
+@pytest.mark.slow
 def test_sample_that_stands_alone_is_an_outlier(looped, clean):
     runs = clean.loop.runs
     speed = runs["speed_mm_s"].copy()
