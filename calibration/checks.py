@@ -110,16 +110,22 @@ def _series(runs: Runs) -> None:
 
 
 def from_rest(runs: Runs, noise: Noise) -> None:
-    """Histories begin when the supply is switched on, the robot at rest.
+    """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time.
 
     Raises:
-        BadData: a run whose first samples, in the first hundredth of a second, show it moving.
+        BadData: a run whose first sample, at 0 s, shows it moving, or with two samples at one time.
     """
     names = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
     moving = runs.measured()[:, 1:]
     for name in np.unique(names):
         mine = np.flatnonzero(names == name)
         first = mine[np.argmin(runs["time_s"][mine])]
+        times, count = np.unique(runs["time_s"][mine], return_counts=True)
+        if (count > 1).any():
+            raise BadData(
+                f"{runs.source}, time_s: run {name or '(no run_id)'} has {count.max()} samples at "
+                f"{number(times[count.argmax()])} s; give each run its own run_id"
+            )
         limit = np.maximum(0.2 * np.abs(moving[mine]).max(0), 5 * noise.sd[first, 1:])
         if runs["time_s"][first] < 0.005 and (np.abs(moving[first]) > limit).any():
             raise BadData(

@@ -39,7 +39,7 @@ ORDERS: dict[str, tuple[float, bool]] = {
     "order of the grousers": (24 * 48 / 168, True),
     "order of the teeth": (48.0, True),
 }
-#: Largest angle of a wave between samples [rad]: two and a half samples a period.
+#: Largest angle of a wave between knots [rad]: two and a half a period.
 RESOLVED = 2.5
 
 
@@ -79,7 +79,9 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> tuple[Cur
     )
 
 
-def waves(columns: Mapping[str, np.ndarray], angle: np.ndarray, rows: np.ndarray) -> tuple[Curves, ...]:
+def waves(
+    columns: Mapping[str, np.ndarray], angle: np.ndarray, rows: np.ndarray, knots: np.ndarray
+) -> tuple[Curves, ...]:
     """Waves of the orders that the samples of histories resolve, in every balance.
 
     A wave has its own amplitude and phase in each run: how the parts stood at its start is not known.
@@ -87,6 +89,7 @@ def waves(columns: Mapping[str, np.ndarray], angle: np.ndarray, rows: np.ndarray
     Args:
         columns: of the table; angle: of the driving shaft [rad], shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
+        knots: rows between which a defect is linear, shape (runs, knots).
     """
     wheeled = columns["configuration"] == CONFIGURATIONS[1]
     bases, words = [], []
@@ -97,7 +100,8 @@ def waves(columns: Mapping[str, np.ndarray], angle: np.ndarray, rows: np.ndarray
             if len(mine) < 8 or (belted and wheeled[mine[0]]):
                 continue
             turned = order * angle[mine]
-            if turned[-1] - turned[0] < 4 * np.pi or np.median(np.diff(turned)) > RESOLVED:
+            step = np.diff(order * angle[knots[k]])
+            if turned[-1] - turned[0] < 4 * np.pi or np.median(step[step > 0]) > RESOLVED:
                 continue
             wave[mine, 2 * k], wave[mine, 2 * k + 1] = np.cos(turned), np.sin(turned)
         if wave.any():

@@ -101,7 +101,7 @@ def defect(linear: Linear, balance: str) -> Defect:
     δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i
     (of histories: at that instant, falling to zero at the knots beside it; NaN between knots).
     """
-    places = np.arange(linear.rows) if linear.series is None else np.unique(np.asarray(linear.series.at_knots))
+    places = np.arange(linear.rows) if linear.series is None else np.unique(np.asarray(linear.series.knots))
     shapes = np.zeros((linear.rows, len(places)))
     shapes[places, np.arange(len(places))] = 1.0
     columns = _columns(linear, balance, shapes)
@@ -315,7 +315,9 @@ def discover(loop: Loop, base: Hypothesis, linear: Linear, balance: str, variabl
     grid = np.linspace(at_base.low, at_base.high, POINTS)
     shape = at_base.scale * at_base.basis(grid) @ at_base.root
     ordinates = covariance[len(inner) :, len(inner) :]
-    lacking = defect(linear, balance)
+    # One by one the samples of a history say little, and there are thousands.
+    nothing = np.full(rows, np.nan)
+    lacking = Defect(nothing, nothing) if loop.engine.series else defect(linear, balance)
     return Discrepancy(
         balance=balance,
         variable=variable,
@@ -566,8 +568,8 @@ def _harmonic(balance: str, curve: Smooth) -> Proposal:
 
 
 def _decay(linear: Linear, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
-    """What fades or builds up with the time since the start: a level and an exponential, the time constant from a
-    grid over the length of the runs."""
+    """What fades with the time since the start: an exponential, its time constant from a grid over the length of the
+    runs. A level beside it is left to the base."""
     t = _seen(linear, "time")
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())

@@ -265,7 +265,8 @@ def denser(looped: Loop, found: Finding) -> Proposal:
     balance, variable, _ = found.unnamed  # type: ignore[misc]
     scores = found.base.scores
     explained = float(np.asarray(scores.explained)[int(np.argmax(np.asarray(scores.curve)))])
-    sigma = float(np.sqrt(max(explained, 0.0) * SERIES * REPEATS / max(looped.counts.sum(), 1)))
+    runs = len(looped.problem.observe.rows) if looped.engine.series else looped.counts.sum()
+    sigma = float(np.sqrt(max(explained, 0.0) * SERIES * REPEATS / max(runs, 1)))
     how = DENSER.get(variable) or STEADY_SPEEDS.format(variable=variable)
     text = f"{how}; read all three channels. What the {balance} balance lacks then shows its shape"
     name = f"finer steps in {variable}" if variable in DENSER else f"steady speeds for {variable}"

@@ -98,7 +98,7 @@ class Gate:
 
     @property
     def p_value(self) -> float:
-        """Family-wise p-value: the smallest of the four, each over its share of the error."""
+        """Family-wise p-value: the smallest of its kinds, each over its share of the error."""
         total = sum(self.alpha.values())
         return min(1.0, min(self.p(kind) * total / level for kind, level in self.alpha.items()))
 
@@ -508,7 +508,7 @@ class Loop:
 
     def _one_curve(self, base: Round, curves: tuple[Curves, ...]) -> bool:
         """Whether one smooth curve in one balance would leave nothing that is beyond doubt."""
-        k = int(np.argmax(np.asarray(base.scores.explained)))
+        k = int(np.argmax(self._said_by(base.scores)))
         gate = Gate(trace.beside_curve(base.linear, curves, k), base.gate.null, base.gate.alpha)
         return not gate.clear
 
@@ -529,12 +529,17 @@ class Loop:
     def _curves(self, h: Hypothesis) -> tuple[Curves, ...]:
         # Of fitted readings: a curve over measured ones would share their noise.
         columns = dict(padded(self.runs, 1 if self.engine.series else PAD)[0].columns)
-        columns |= dict(zip(MEASURED, h.reading.T, strict=True))  # type: ignore[union-attr]
+        reading = np.where(np.isfinite(h.reading), h.reading, np.asarray(self.problem.data.measured))  # type: ignore[arg-type]
+        columns |= dict(zip(MEASURED, reading.T, strict=True))
         found = curve_room.families(columns, self.counts.astype(float))
         if not self.engine.series:
             return found
+        observe = self.problem.observe
         _, angle = self.engine.clock(self.problem, jnp.asarray(h.z[: len(self.coordinates.base)]))
-        return (*found, *curve_room.waves(columns, np.asarray(angle), np.asarray(self.problem.observe.rows)))
+        return (
+            *found,
+            *curve_room.waves(columns, np.nan_to_num(angle), *map(np.asarray, (observe.rows, observe.knots))),
+        )
 
     def _said(self, h: Hypothesis) -> str:
         return " and ".join(self.engine.names[k] for k in h.effects)
@@ -579,15 +584,17 @@ class Loop:
         h = self._gross(h)
         level = stats.norm.isf(ALPHA_OUTLIER / 2 / (3 * self.counts.sum()))
         while len(self.outliers) < allowed:
-            _, scores, _ = self.look(h, self._curves(h))
+            families = self._curves(h)
+            _, scores, _ = self.look(h, families)
             alone = (np.abs(np.asarray(scores.row)) * self.counts[:, None]).max(1)
             k = int(alone.argmax())
-            together = max(np.max(np.asarray(scores.single) ** 2), np.max(np.asarray(scores.explained)))
+            curves = np.asarray(scores.explained)[[n[1] not in curve_room.ORDERS for n in curve_room.names(families)]]
+            together = max(np.max(np.asarray(scores.single) ** 2), np.max(curves))
             if alone[k] < level or alone[k] ** 2 < together:
                 break
             # A fit to histories takes too long to go on sample by sample.
             far = np.argsort(-alone)[: allowed - len(self.outliers)] if self.engine.series else np.array([k])
-            far = far[alone[far] >= level]
+            far = far[(alone[far] >= level) & (alone[far] ** 2 >= together)]
             self.outliers = (*self.outliers, *map(int, far))
             self.counts = self.counts & ~np.isin(np.arange(len(self.counts)), far)
             h = self.base_fit()
@@ -642,7 +649,7 @@ class Loop:
         cosine = self.cosines(base)
         wanted = []
         for slot, k in enumerate(best.effects):
-            for j in np.argsort(-cosine[k])[: self.engine.batch]:
+            for j in np.argsort(-cosine[k])[:BATCH]:
                 if cosine[k, j] > 0.5 and j not in best.effects:
                     which = list(best.which)
                     which[slot] = int(j)
@@ -673,15 +680,19 @@ class Loop:
         np.maximum.at(whole, (self.engine.of[:, None], self.engine.of[None, :]), cosine)
         return whole
 
+    def _said_by(self, scores: Scores) -> np.ndarray:
+        """By what curves are compared: what they explain, or where they have different numbers of terms (waves have
+        two a run) how improbable that is."""
+        return np.asarray(scores.curve if self.engine.series else scores.explained)
+
     def _locate(self, scores: Scores, curves: tuple[Curves, ...]) -> tuple[str, str, tuple[str, ...]]:
         """Balance and variable of the curve that explains most, and the balances in which one explains as much."""
         names = curve_room.names(curves)
-        deviate = np.asarray(scores.curve)
-        explained = np.asarray(scores.explained)
+        deviate, said = np.asarray(scores.curve), self._said_by(scores)
         k = int(deviate.argmax())
         variable = max(
             (j for j, n in enumerate(names) if n[0] == names[k][0] and n[1] != curve_room.CONDITIONS),
-            key=lambda j: explained[j],
+            key=lambda j: said[j],
         )
         best = {b: max(deviate[j] for j, n in enumerate(names) if n[0] == b) for b in curve_room.BALANCES}
         alike = tuple(b for b, d in best.items() if d > deviate[k] - 1.0)

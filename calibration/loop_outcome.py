@@ -16,7 +16,7 @@ from calibration import discover, experiment, holdout, priors, slots, trace
 from calibration.discover import Discrepancy
 from calibration.loop import Finding, Gate, Hypothesis, Loop, Round
 from calibration.records import CHANNELS, CONDITIONS, MEASURED, MM, RPM
-from calibration.residual import channel_errors
+from calibration.residual import channel_errors, summary
 from calibration.trace import PROBED, Linear
 from mmrjax.balances import BALANCES
 from mmrjax.effects import Effect
@@ -126,6 +126,7 @@ def document(loop: Loop, found: Finding, seen: Readings, curve: Discrepancy | No
         "alternatives": alternatives(loop, found),
         "implausible": alternatives(loop, found, plausible=False),
         "errors": errors(loop, seen, counts),
+        "errors_percent_of": ("simulated reading, eq. (35)", "channel's root mean square")[loop.engine.series],
         "held_out_by": held_out_errors(loop, seen, counts),
         "adequate": {"before": not found.base.gate.open, "after": not after.gate.clear},
         "evidence": {"before": evidence(found.base.gate), "after": evidence(after.gate)},
@@ -200,6 +201,7 @@ def effects_found(loop: Loop, found: Finding, curve: Discrepancy | None = None) 
                 "variable": variable, "unit": curve.unit, "equation": None, "parameters": {},
                 "p_value": found.base.gate.p_value,
                 "score": float(curve.chi2[0] - curve.chi2[1]), "effect": curve.effect,
+                "score_free_in_each_run": free_in_each_run(loop, found),
                 "curve": {
                     "at": curve.grid.tolist(), "value": curve.curve.tolist(), "sd": curve.sd.tolist(),
                     "unit": curve.unit,
@@ -236,6 +238,14 @@ def effects_found(loop: Loop, found: Finding, curve: Discrepancy | None = None) 
             }
         )  # fmt: skip
     return listed
+
+
+def free_in_each_run(loop: Loop, found: Finding) -> float | None:
+    """What the wave that was located explains with a phase of its own in each run [σ²]; None for other curves."""
+    where, over, _ = found.unnamed  # type: ignore[misc]
+    if over not in curve_room.ORDERS:
+        return None
+    return float(np.asarray(found.base.scores.explained)[curve_room.names(loop.curves).index((where, over))])
 
 
 def member(loop: Loop, found: Finding, slot: int, j: int) -> dict[str, float]:
@@ -297,7 +307,7 @@ def autocorrelation(linear: Linear, lags: int) -> dict[str, list[float]]:
     rows = np.asarray(linear.series.rows)  # type: ignore[union-attr]
     x = np.where(rows[:, :, None] < 0, 0.0, np.asarray(linear.residual)[: 3 * linear.rows].reshape(-1, 3)[rows])
     power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
-    of = np.stack([np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)])
+    of = np.reshape([np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)], (lags, 3))
     return {c: of[:, k].tolist() for k, c in enumerate(CHANNELS)}
 
 
@@ -355,7 +365,14 @@ def held_out_errors(loop: Loop, seen: Readings, counts: np.ndarray) -> dict[str,
 def _errors(loop: Loop, simulated: np.ndarray, counts: np.ndarray) -> dict[str, Any]:
     rows = len(loop.runs)
     sd = np.asarray(loop.problem.data.sd)[:rows]
-    return channel_errors(np.where(counts[:, None], simulated, np.nan), loop.runs.measured(), sd)
+    simulated = np.where(counts[:, None], simulated, np.nan)
+    found = channel_errors(simulated, loop.runs.measured(), sd)
+    if loop.engine.series:  # eq. (35) divides by readings, which begin at rest
+        size = np.sqrt(np.nanmean(simulated**2, 0))
+        percent = 100 * (simulated - loop.runs.measured()) / size
+        for k, channel in enumerate(CHANNELS):
+            found[channel] |= summary(percent[:, k])
+    return found
 
 
 def evidence(gate: Gate) -> dict[str, Any]:

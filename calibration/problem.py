@@ -113,7 +113,7 @@ class Series(eqx.Module):
         times: the grid of each run from 0 on, its last instant repeated to one length, shape (runs, instants) [s].
         run: index of each row's run; instant: of its sample in `times`; shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
-        knots: of those, the samples between which a defect is taken to be linear, shape (knots,).
+        knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
     """
 
     commands: Command
@@ -121,18 +121,12 @@ class Series(eqx.Module):
     run: Int[Array, " rows"]
     instant: Int[Array, " rows"]
     rows: Int[Array, "runs samples"]
-    knots: Int[Array, " knots"]
-
-    @property
-    def at_knots(self) -> Int[Array, "runs knots"]:
-        """Rows at the knots of each run; a run's last where it has ended."""
-        last = jnp.max(self.rows, 1, keepdims=True)
-        return jnp.where(self.rows < 0, last, self.rows)[:, self.knots]
+    knots: Int[Array, "runs knots"]
 
     def defective(self, robot: Robot, probes: tuple[Effect, ...]) -> Float[Array, "probes runs knots samples 3"]:
         """Change of the readings by a defect of each probe's balance [its unit] that is 1 at a knot of a run and
         falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
-        clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.at_knots]]
+        clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
 
         def one(command: Command, times: Array, clock: Array, instants: Array) -> Array:
             def probed(amplitude: Array) -> Robot:
@@ -142,12 +136,12 @@ class Series(eqx.Module):
             none = jnp.zeros(len(probes))
             # A run that ended early repeats its last knot; only the first of them is one.
             real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
-            before = jnp.concatenate([clock[:1] - 1.0, clock[:-1]])
+            before = jnp.concatenate([clock[:1], clock[:-1]])
             after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
 
             def source(t: Array, y: Array) -> Array:
                 slope = jax.jacfwd(lambda a: rates(probed(a), command, y))(none)
-                rising = (t - before) / jnp.maximum(clock - before, 1e-12)
+                rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
                 falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
                 hat = real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
                 return slope[:, :, None] * hat
@@ -201,8 +195,14 @@ def series(runs: Runs) -> Series:
     instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
     rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
     most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
-    knots = np.unique(np.round(np.linspace(0, samples - 1, most)).astype(int))
+    knots = np.stack([_knots(m, most) for m in mine])
     return Series(runs.where(first).command(), *map(jnp.asarray, (times, run, instant, rows, knots)))
+
+
+def _knots(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of a run's rows, evenly chosen, its first and last among them; the last again for the rest."""
+    chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
+    return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
 
 
 class Data(eqx.Module):
@@ -269,7 +269,7 @@ class Problem(eqx.Module):
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         """Whether the model has no such operating point, by row."""
-        return np.isin(status, (SLIDES, FAILED, TIPS)) & isinstance(self.observe, Settled)
+        return np.isin(status, (SLIDES, FAILED, TIPS) if isinstance(self.observe, Settled) else (FAILED,))
 
 
 def build(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str = "steady") -> Problem:

@@ -87,7 +87,7 @@ class Linear(eqx.Module):
         if self.series is None:
             return (self.defects[balance][:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
         rows = self.series.rows
-        moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.series.at_knots])
+        moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.series.knots])
         there = jnp.where(rows < 0, self.rows, rows)  # beyond the last row: dropped
         out = jnp.zeros((self.rows, 3, shapes.shape[1])).at[there].set(moved, mode="drop")
         return out.reshape(-1, shapes.shape[1])
@@ -143,6 +143,7 @@ def _linearise_series(problem: Problem, z: Array, data: Data, candidates: tuple[
     observe = problem.observe
     function = fit.residuals(problem, data, fit.no_pin(z.size))
     jacobian, residual = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
+    jacobian = jnp.where(jnp.all(jnp.isfinite(jacobian), 1, keepdims=True), jacobian, 0.0)
     robot = problem.robot(z)
     have = {e.name for e in robot.effects}
     whole = dataclasses.replace(
@@ -317,7 +318,7 @@ def memory(linear: Linear) -> Array:
         r = jnp.sum(x[:, k:] * x[:, :-k], 1) / jnp.maximum(power, 1e-9)
         weight = jnp.where(count > k, count * (count + 2) / jnp.maximum(count - k, 1), 0.0)
         statistic = statistic + jnp.sum(weight * r**2, 0)
-    freedom = max(rows.shape[0] * lags, 1)
+    freedom = jnp.maximum(jnp.sum(jnp.minimum(lags, count - 1)), 1)
     return jnp.max((statistic - freedom) / (2 * freedom) ** 0.5)
 
 

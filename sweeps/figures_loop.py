@@ -190,7 +190,7 @@ def errors(document: dict[str, Any]) -> Figure:
         axes.margins(x=0.16)
         axes.grid(axis="y", visible=False)
         axes.set_title(CHANNEL_WORDS[channel][0])
-        axes.set_xlabel("rms of eq. (35) [%]")
+        axes.set_xlabel("rms error [%]")
     grid[0, -1].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
     return fig
 

@@ -43,6 +43,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
     notes += checks.check(runs, (), known)
     if series:
         checks.from_rest(runs, known)
+        notes += _long(runs)
 
     def progress(text: str) -> None:
         commands.tell(f"{time.monotonic() - began:4.0f} s  {text}")
@@ -111,8 +112,24 @@ def _distinct(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
     return runs.where(keep), np.asarray(keep) + 1, [said]  # type: ignore[arg-type]
 
 
+def _long(runs: Runs) -> list[str]:
+    """What to say of runs so long that the steps of the model are."""
+    from mmrjax.models.histories import LONGEST, STEPS
+
+    step = runs["time_s"].max() / STEPS
+    if step <= 2 * LONGEST:
+        return []
+    return [
+        f"runs of {runs['time_s'].max():.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft faster "
+        "than some ten steps are not resolved; cut the runs to look for them"
+    ]
+
+
 def _noise(looped: Loop, known: noise_room.Noise) -> dict[str, Any]:
-    share = 100 * np.median(known.sd / np.maximum(np.abs(looped.runs.measured()), 1e-12), axis=0)
+    reading = np.abs(looped.runs.measured())
+    if looped.engine.series:
+        reading = np.sqrt(np.mean(reading**2, 0, keepdims=True))
+    share = 100 * np.median(known.sd / np.maximum(reading, 1e-12), axis=0)
     return {c: {"source": known.source[k], "median_percent": float(share[k])} for k, c in enumerate(CHANNELS)}
 
 
@@ -141,6 +158,13 @@ def remarks(document: dict[str, Any]) -> list[str]:
             said.append(
                 f"{name} lies {abs(p['shift_after']):.1f} prior sds from its prior: it stands in for something"
             )
+    for e in document["effects"]:
+        free = e.get("score_free_in_each_run")
+        if free and e["score"] < 0.5 * free:
+            said.append(
+                f"the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
+                f"{e['score']:.0f} with one phase): robot.toml holds the mean; start runs from a mark"
+            )
     if document["remains"]:
         where, over = document["remains"]["balance"], document["remains"]["variable"].replace("_", " ")
         said.append(f"what was found does not explain everything: {where} still lacks something over {over}")
@@ -148,7 +172,7 @@ def remarks(document: dict[str, Any]) -> list[str]:
     if settled < 0.9 * asked:
         said.append(f"only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs")
     if 1 / (1 + settled) > min(document["bootstrap"]["shares"].values()):
-        said.append(f"{settled} bootstrap tables are too few for pairs of effects to count; use 500 or more")
+        said.append(f"{settled} bootstrap tables are too few for every kind of evidence to count; use 500 or more")
     return said
 
 
@@ -175,7 +199,7 @@ def print_loop(document: dict[str, Any]) -> None:
     if after is not None:
         sigma = f" (expected {after['expected_sigma']:.1f} σ)" if after["separates"] else ""
         commands.say(f"next: {after['name']}: {after['description']}{sigma}")
-    errors = Table(title="rms of (simulated - measured) / simulated, eq. (35) [%]", title_justify="left")
+    errors = Table(title=f"rms error [% of the {document['errors_percent_of']}]", title_justify="left")
     for heading in ("", "rows", *(c.replace("_", " ") for c in CHANNELS)):
         errors.add_column(heading, justify="right" if heading else "left")
     whens = ("before",) if document["verdict"] == "none" else ("before", "after")

@@ -245,6 +245,10 @@ BAD = {
         "\n".join([f"{HEADER},time_s", *(f"{moving(t)},{t / 10}" for t in range(30))]),
         "runs.csv row 1, time_s: run (no run_id) is moving at 0 s",
     ),
+    "two runs as one": (
+        "\n".join([f"{HEADER},time_s", *(f"{moving(t)},{t % 15 / 10}" for t in range(30))]),
+        "runs.csv, time_s: run (no run_id) has 2 samples at 0 s; give each run its own run_id",
+    ),
     "two conditions in a run": (
         "\n".join([f"{HEADER},time_s", *(f"{moving(t, 15 + t // 20)},{t / 10}" for t in range(30))]),
         "runs.csv, supply_voltage_V: run (no run_id) has several values",

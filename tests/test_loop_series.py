@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibration import checks, curves, discover, loop, loop_outcome, noise, records, slots, trace
+from calibration import checks, curves, discover, loop, loop_outcome, noise, problem, records, slots, trace
 from calibration.doors import BadData
 from mmrjax import nominal, params
 from mmrjax.effects import BY_NAME, UNNAMED
@@ -221,6 +221,20 @@ def test_memory_tells_noise_from_what_remembers(clean):
         for a, b in itertools.pairwise(run):
             slow[b, 1] = 0.7 * slow[a, 1] + 0.71 * slow[b, 1]
     assert of(slow) > 2 * np.max(white) > 0
+
+
+def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(clean):
+    runs = clean.loop.runs
+    short = runs.where((runs["run_id"] != "start1") | (runs["time_s"] < 0.5))
+    mixed = short.where(np.random.default_rng(0).permutation(len(short)))
+    observer = problem.series(mixed)
+    times, names = mixed["time_s"], mixed["run_id"]
+    for k, name in enumerate(np.unique(names)):
+        there = times[np.asarray(observer.knots[k])]
+        assert (np.diff(there) >= 0).all() and there[-1] == times[names == name].max()
+        assert set(names[np.asarray(observer.knots[k])]) == {name}
+        row = np.asarray(observer.rows[k])
+        assert (np.diff(times[row[row >= 0]]) > 0).all() and (row >= 0).sum() == (names == name).sum()
 
 
 # --- the door ----------------------------------------------------------------------------------------

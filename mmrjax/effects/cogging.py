@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from mmrjax import contact
 from mmrjax.effects.base import Effect
-from mmrjax.effects.periodic import Periodic
+from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Command, Signals
 
@@ -36,14 +36,7 @@ class Cogging(Periodic, Effect):
         source="a tenth of the no-load torque of 4.3 mN·m",
         amplitude=True,
     )
-    phase: Scalar = parameter(
-        0.0,
-        unit="rad",
-        meaning="phase φ of the wave at the start of the run",
-        bounds=(-4.0, 4.0),
-        sd=2.0,
-        source="how the parts stood at the start: anything",
-    )
+    phase: Scalar = phase_parameter()
     ripples: Scalar = parameter(
         26.0,
         unit="-",

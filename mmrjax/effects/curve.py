@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.effects.base import Effect
-from mmrjax.effects.periodic import Periodic
+from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
 
@@ -73,6 +73,18 @@ def _ordinate() -> Scalar:
     )
 
 
+def _size(unit: str, size: float) -> Scalar:
+    return parameter(
+        0.0,
+        unit=unit,
+        meaning="size of the discrepancy",
+        bounds=(-100 * size, 100 * size),
+        sd=size,
+        source="what the fit leaves; no cause is known",
+        amplitude=True,
+    )
+
+
 def _curve(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance."""
     unit, size, along = BALANCES[place]
@@ -86,15 +98,7 @@ def _curve(place: str, over: str) -> type[Effect]:
         memory_size: ClassVar[float | None] = 1.0 if over == "time" else None
         memory_unit: ClassVar[str] = unit_x
 
-        amplitude: Scalar = parameter(
-            0.0,
-            unit=unit,
-            meaning="size of the discrepancy",
-            bounds=(-100 * size, 100 * size),
-            sd=size,
-            source="what the fit leaves; no cause is known",
-            amplitude=True,
-        )
+        amplitude: Scalar = _size(unit, size)
         low: Scalar = parameter(
             first,
             unit=unit_x,
@@ -156,23 +160,8 @@ def _wave(place: str) -> type[Effect]:
         name: ClassVar[str] = f"wave_{place}"
         balance: ClassVar[str] = place
 
-        amplitude: Scalar = parameter(
-            0.0,
-            unit=unit,
-            meaning="size of the discrepancy",
-            bounds=(-100 * size, 100 * size),
-            sd=size,
-            source="what the fit leaves; no cause is known",
-            amplitude=True,
-        )
-        phase: Scalar = parameter(
-            0.0,
-            unit="rad",
-            meaning="phase φ of the wave at the start of the run",
-            bounds=(-4.0, 4.0),
-            sd=2.0,
-            source="how the parts stood at the start: anything",
-        )
+        amplitude: Scalar = _size(unit, size)
+        phase: Scalar = phase_parameter()
         order_shaft: Scalar = parameter(
             1.0,
             unit="-",

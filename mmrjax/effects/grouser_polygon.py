@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect
-from mmrjax.effects.periodic import Periodic
+from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
 
@@ -35,14 +35,7 @@ class GrouserPolygon(Periodic, Effect):
         source="a few percent of the weight of a side",
         amplitude=True,
     )
-    phase: Scalar = parameter(
-        0.0,
-        unit="rad",
-        meaning="phase φ of the wave at the start of the run",
-        bounds=(-4.0, 4.0),
-        sd=2.0,
-        source="how the parts stood at the start: anything",
-    )
+    phase: Scalar = phase_parameter()
     pitch: Scalar = parameter(
         35e-3,
         unit="m",

@@ -9,13 +9,25 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax import power
-from mmrjax.params import Scalar
+from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Command, Signals
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
 STEPS = 12  # integration steps in a period: derivatives at amplitude 0 are then right to 1e-5
+
+
+def phase_parameter() -> Scalar:
+    """The phase of a wave, a field of every periodic effect."""
+    return parameter(
+        0.0,
+        unit="rad",
+        meaning="phase φ of the wave at the start of the run",
+        bounds=(-4.0, 4.0),
+        sd=2.0,
+        source="how the parts stood at the start: anything",
+    )
 
 
 class Periodic(eqx.Module):

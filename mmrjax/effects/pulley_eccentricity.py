@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from mmrjax.effects.base import Effect
-from mmrjax.effects.periodic import Periodic
+from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
 
@@ -32,14 +32,7 @@ class PulleyEccentricity(Periodic, Effect):
         source="0.2 to 0.5 mm of run-out on a printed or pressed pulley of 38 mm",
         amplitude=True,
     )
-    phase: Scalar = parameter(
-        0.0,
-        unit="rad",
-        meaning="phase φ of the wave at the start of the run",
-        bounds=(-4.0, 4.0),
-        sd=2.0,
-        source="how the parts stood at the start: anything",
-    )
+    phase: Scalar = phase_parameter()
 
     def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
         return 1.0 / robot.gearbox.ratio
