@@ -160,6 +160,6 @@ def test_unnamed_asks_for_finer_steps_in_its_variable():
     found = SimpleNamespace(
         verdict="unnamed", unnamed=("track", "speed", ("track",)), base=SimpleNamespace(scores=scores)
     )
-    proposal = experiment.propose(SimpleNamespace(counts=np.ones(90)), found)
+    proposal = experiment.propose(SimpleNamespace(engine=SimpleNamespace(series=False), counts=np.ones(90)), found)
     assert "speed" in proposal.name and "track" in proposal.description
     assert proposal.expected_sigma == pytest.approx(np.sqrt(60 * 45 / 90))
