@@ -214,7 +214,7 @@ def _smoothness(length: float) -> np.ndarray:
 def _seen(linear: Linear, variable: str) -> np.ndarray:
     if variable in ORDERS:
         return ORDERS[variable][0] * np.asarray(linear.angle)
-    x = linear.time if variable == "time" else getattr(linear.signals, variable)
+    x = linear.series.time if variable == "time" else getattr(linear.signals, variable)
     return np.broadcast_to(np.asarray(x, float), (linear.rows,))
 
 

@@ -218,7 +218,7 @@ class Engine:
         self.fits = self._fits_series if series else eqx.filter_jit(self._fits)
         self.observe = eqx.filter_jit(lambda problem, z: problem.observation(z))
         self.costs = eqx.filter_jit(lambda problem, zs: jax.lax.map(lambda z: _cost(problem, z), zs, batch_size=16))
-        self.clock = eqx.filter_jit(lambda problem, z: problem.observe.clock(problem.robot(z)))
+        self.angle = eqx.filter_jit(lambda problem, z: problem.observe.angle(problem.robot(z)))
 
     def _fits(self, problem: Problem, which: Array, starts: Array, weights: Array) -> tuple[fit.Optimum, Observation]:
         """Fits of hypotheses, each to its own rows, and what each says of every row."""
@@ -348,9 +348,8 @@ class Loop:
         draws = np.random.default_rng(self.seed).standard_normal((DRAWS, p))
         order = np.argsort(np.asarray(self.engine.costs(bare, jnp.asarray(draws))))
         starts = np.concatenate([np.zeros((1, p)), draws[order[: SEARCHES - 1]]])
-        evaluate = lambda z: self.engine.evaluate(bare, jnp.zeros((SEARCHES, 0)), z, weights)  # noqa: E731
         weights = jnp.repeat(bare.data.weight[None], SEARCHES, 0)
-        found, _ = jax.device_get(fit.searches_long(evaluate, starts, bare.data, weights, STEPS_SERIES))
+        found, _ = jax.device_get(self.engine.fits(bare, jnp.zeros((SEARCHES, 0)), jnp.asarray(starts), weights))
         best = found.z[int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
         return np.repeat(best[None], self.engine.batch, 0)
 
@@ -535,7 +534,7 @@ class Loop:
         if not self.engine.series:
             return found
         observe = self.problem.observe
-        _, angle = self.engine.clock(self.problem, jnp.asarray(h.z[: len(self.coordinates.base)]))
+        angle = self.engine.angle(self.problem, jnp.asarray(h.z[: len(self.coordinates.base)]))
         return (
             *found,
             *curve_room.waves(columns, np.nan_to_num(angle), *map(np.asarray, (observe.rows, observe.knots))),

@@ -165,12 +165,17 @@ class Series(eqx.Module):
         there = jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), whole)
         return jax.tree.map(lambda x: x[self.run, self.instant], there)
 
-    def clock(self, robot: Robot) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
-        """Time [s] and angle of the driving shaft [rad] at every row, since the start of its run."""
+    @property
+    def time(self) -> Float[Array, " rows"]:
+        """Time of every row since the start of its run [s]."""
+        return self.times[self.run, self.instant]
+
+    def angle(self, robot: Robot) -> Float[Array, " rows"]:
+        """Angle of the driving shaft at every row, since the start of its run [rad]."""
         whole = jax.vmap(lambda c, t: histories(robot, c, t).speed_wheel)(self.commands, self.times)
         turned = 0.5 * (whole[:, 1:] + whole[:, :-1]) * jnp.diff(self.times)
         angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
-        return self.times[self.run, self.instant], angle[self.run, self.instant]
+        return angle[self.run, self.instant]
 
     def __call__(self, robot: Robot) -> Observation:
         reading = _stack(jax.vmap(lambda s: balances.sensor(robot, s))(self.signals(robot)))

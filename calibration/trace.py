@@ -64,7 +64,7 @@ class Linear(eqx.Module):
             (balances, rows, 3); of histories at each knot of a run, shape (balances, runs, knots, samples, 3).
         signals: of every row, at the fit.
         series: how the rows of histories lie in time; None for settled rows.
-        angle: of the driving shaft at every row of histories [rad]; time: of every row [s]; None for settled rows.
+        angle: of the driving shaft at every row of histories [rad]; None for settled rows.
     """
 
     residual: Float[Array, " residuals"]
@@ -74,7 +74,6 @@ class Linear(eqx.Module):
     signals: Signals
     series: Series | None = None
     angle: Float[Array, " rows"] | None = None
-    time: Float[Array, " rows"] | None = None
 
     @property
     def rows(self) -> int:
@@ -141,9 +140,7 @@ def _linearise_series(problem: Problem, z: Array, data: Data, candidates: tuple[
     the derivative of the run by the amplitude. All effects are in one run, once for each point of the shapes'
     grids; those that are there already keep their shape."""
     observe = problem.observe
-    function = fit.residuals(problem, data, fit.no_pin(z.size))
-    jacobian, residual = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
-    jacobian = jnp.where(jnp.all(jnp.isfinite(jacobian), 1, keepdims=True), jacobian, 0.0)
+    residual, jacobian, _ = fit.linearised(problem, z, data)
     robot = problem.robot(z)
     have = {e.name for e in robot.effects}
     whole = dataclasses.replace(
@@ -173,8 +170,9 @@ def _linearise_series(problem: Problem, z: Array, data: Data, candidates: tuple[
     scale = (data.weight / data.sd)[observe.rows]
     defects = jnp.where(observe.rows[:, None, :, None] < 0, 0.0, defects * scale[:, None])
     signatures = _finite(jnp.stack(parts, 1))
-    clock, angle = observe.clock(robot)
-    return Linear(residual, jacobian, signatures, _finite(defects), observe.signals(robot), observe, angle, clock)
+    return Linear(
+        residual, jacobian, signatures, _finite(defects), observe.signals(robot), observe, observe.angle(robot)
+    )
 
 
 def _finite(x: Array) -> Array:

@@ -174,7 +174,7 @@ def test_columns_are_differences_of_runs_with_a_curve(clean, balance):
 
     y = jnp.asarray([shape[f"y{k}"] for k in range(6)])
     along = np.asarray(linear.signals.direction if balance != "ground" else linear.signals.direction_travel)
-    over_time = np.asarray(weights(linear.time, 0.0, 0.8) @ y) * along
+    over_time = np.asarray(weights(linear.series.time, 0.0, 0.8) @ y) * along
     got = np.asarray(linear.columns(trace.PROBED.index(balance), jnp.asarray(over_time[:, None])))[:, 0]
     # linear between samples 20 ms apart; at the start the direction rises within the first of them
     assert np.linalg.norm(got - expected) < 0.05 * np.linalg.norm(expected)

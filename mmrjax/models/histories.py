@@ -2,9 +2,9 @@
 
 The same rates as `drive`, by an implicit method of fixed steps: SDIRK2, two stages, order 2, L-stable and
 stiffly accurate (Alexander, Diagonally implicit Runge-Kutta methods for stiff O.D.E.'s, SIAM J. Numer. Anal. 14
-(1977)). A derivative follows from the implicit function theorem stage by stage: it solves the linear equations
-whose matrix the last Newton step has factorised, so that a direction more costs one tangent of the rates a
-stage, instead of a rollout.
+(1977)). A derivative follows from the implicit function theorem stage by stage: linear equations with the matrix
+of Newton's method at the solution, so that a direction more costs one tangent of the rates a stage, instead of a
+rollout.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ def grid(times: Float[np.ndarray, " times"]) -> np.ndarray:
         young = np.log1p(GROWTH * np.minimum(t, knee) / FIRST) / GROWTH
         return young + np.maximum(t - knee, 0.0) / longest
 
-    at = clock(times)
+    at, at_knee = clock(times), clock(np.asarray(knee))
     parts = []
     for k in range(len(times) - 1):
         count = max(1, int(np.ceil(at[k + 1] - at[k] - 1e-9)))
         wanted = np.linspace(at[k], at[k + 1], count, endpoint=False)
-        young = FIRST / GROWTH * np.expm1(GROWTH * np.minimum(wanted, clock(np.asarray(knee))))
-        parts.append(young + np.maximum(wanted - clock(np.asarray(knee)), 0.0) * longest)
+        young = FIRST / GROWTH * np.expm1(GROWTH * np.minimum(wanted, at_knee))
+        parts.append(young + np.maximum(wanted - at_knee, 0.0) * longest)
         parts[-1][0] = times[k]
     return np.concatenate([*parts, times[-1:]])
 
