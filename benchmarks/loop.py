@@ -9,6 +9,7 @@ scorer alone. Every table is one line of `--out`, and a run that is started agai
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import multiprocessing
 import os
@@ -35,7 +36,7 @@ EQUATION = {
 MIMIC = 5.0
 #: Amplitudes of more than so many ordinary sizes are left out: no library should believe them.
 SIZES = 3.0
-#: Experiments that are carried out, one after the other, to resolve a class.
+#: Proposals that are carried out, one after the other, to resolve a class.
 EXPERIMENTS = 3
 #: The analyst's prior on the surface, which Table 5 does not know.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("tracked", "wheeled")}
@@ -100,7 +101,7 @@ def oracle(case: g.Case) -> list[dict]:
     return answers
 
 
-def one(engine, kind: str, seed: int, replicates: int) -> dict | None:
+def one(engine, kind: str, seed: int, replicates: int) -> dict:
     """A case made, looped over and scored against its label."""
     from calibration import loop, noise, records
 
@@ -164,33 +165,44 @@ def carried_out(case: g.Case, found, looped) -> list[dict]:
     seen = whole = experiment.prospect(looped, experiment.alternatives(looped, found))
     done: dict[str, dict] = {}
     said: list[dict] = []
-    while len(seen.names) > 1 and len(done) < EXPERIMENTS:
+    while len(seen.names) > 1 and len(said) < EXPERIMENTS:
         proposal = experiment.choose(seen)
-        if proposal.name in (experiment.NONE, *done):
-            said.append({"name": experiment.NONE, "left": seen.names})
+        new = [name for name in proposal.experiments if name not in (experiment.NONE, *done)]
+        if not new:
+            said.append({"experiments": [experiment.NONE], "left": seen.names})
             break
-        done[proposal.name] = case.carry_out(proposal.name, seed=1000 * len(done) + case.label["seed"])
+        for name in new:
+            done[name] = case.carry_out(name, seed=1000 * len(done) + case.label["seed"])
         says = experiment.supported(whole, done)
-        what = {k: getattr(proposal, k) for k in ("name", "expected_sigma", "settles", "separates")}
+        what = {k: getattr(proposal, k) for k in ("experiments", "expected_sigma", "settles", "separates")}
         said.append(what | {"chi2": says.chi2, "best": says.best, "left": says.left})
         seen = whole.among(says.left)
     return said
 
 
-def work(task: tuple) -> dict | None:
-    """One case in a worker that keeps its engine."""
-    kind, seed, replicates, nominal = task
-    global _ENGINE
-    if "_ENGINE" not in globals():
-        import jax
+@functools.cache
+def engine_of(robot: str, series: bool = False):
+    """What a worker compiles once for all its tables, or histories."""
+    import jax
 
-        jax.config.update("jax_enable_x64", True)
-        from calibration import loop
-        from mmrjax import nominal as robots
+    jax.config.update("jax_enable_x64", True)
+    from calibration import loop
+    from mmrjax import nominal
 
-        _ENGINE = loop.Engine(robots.ROBOTS[nominal]())
+    return loop.Engine(nominal.ROBOTS[robot](), series=series)
+
+
+def work(task: tuple) -> dict:
+    """One case in a worker."""
+    kind, seed, replicates, robot = task
+    return one(engine_of(robot), kind, seed, replicates)
+
+
+def _guarded(work, task: tuple) -> dict:
+    """What came of a case, or the error that it ended with."""
+    kind, seed, *_ = task
     try:
-        return one(_ENGINE, kind, seed, replicates)
+        return work(task)
     except Exception as error:
         return {"kind": kind, "seed": seed, "error": f"{type(error).__name__}: {error}"}
 
@@ -223,6 +235,9 @@ def summary(lines: list[dict]) -> list[str]:
     def placed(x: dict) -> bool:
         return x["verdict"] == "unnamed" and EQUATION[x["unnamed"][0]] == EQUATION[x["truth"][0]["balance"]]
 
+    def among(x: dict) -> bool:
+        return x["verdict"] == "unnamed" and x["truth"][0]["balance"] in x["unnamed"][2]
+
     say("clean: a false finding", of("clean"), lambda x: x["verdict"] != "none")
     library = of("library")
     say("library >= 5 sigma: something found", library, lambda x: x["verdict"] != "none")
@@ -251,6 +266,8 @@ def summary(lines: list[dict]) -> list[str]:
 
     proposed = [x for x in asked if "expected_sigma" in (x["experiments"] or [{}])[0]]
     say("class: an experiment is proposed", asked, lambda x: x in proposed)
+    two = [x for x in proposed if len(x["experiments"][0]["experiments"]) > 1]
+    say("  the first proposal is of two experiments", proposed, lambda x: x in two)
     say("  the first leaves the truth alone", proposed, lambda x: left(x, True) == [x["truth"][0]["class"]])
     say(f"  up to {EXPERIMENTS} leave the truth alone", proposed, lambda x: left(x) == [x["truth"][0]["class"]])
     say("  the truth is refuted", proposed, lambda x: x["truth"][0]["class"] not in left(x))
@@ -291,6 +308,7 @@ def summary(lines: list[dict]) -> list[str]:
         free,
         lambda x: x["verdict"] == "unnamed" and x["unnamed"][0] == x["truth"][0]["balance"],
     )
+    say("  the very balance among those said to act alike", free, among)
     say("outside, with a mimic: fooled (one name or class)", mimics, lambda x: len(x["classes"]) == 1)
     say("  unnamed in the right equation", mimics, placed)
 
@@ -311,7 +329,8 @@ def summary(lines: list[dict]) -> list[str]:
 def campaign(doc: str | None, kinds: tuple[str, ...], work, summary, out: str) -> None:
     """The command of a campaign: so many tables of each kind, one line of a file each, resumable.
 
-    `work((kind, seed, replicates, robot))` makes and judges a case; `summary(lines)` says the figures.
+    `work((kind, seed, replicates, robot))`, a function of a module, makes and judges a case in a process of its own;
+    `summary(lines)` says the figures.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     for kind in kinds:
@@ -333,14 +352,13 @@ def campaign(doc: str | None, kinds: tuple[str, ...], work, summary, out: str) -
         if (kind, seed) not in done
     ]
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    tasks.sort(key=lambda t: t[1])
+    tasks.sort(key=lambda t: (t[1] - given.first) / getattr(given, t[0]))  # kinds go on side by side
     began = time.monotonic()
     with multiprocessing.get_context("spawn").Pool(given.jobs) as pool, given.out.open("a") as file:
-        for k, line in enumerate(pool.imap_unordered(work, tasks)):
-            if line is not None:
-                lines.append(line)
-                file.write(json.dumps(line, default=float) + "\n")
-                file.flush()
+        for k, line in enumerate(pool.imap_unordered(functools.partial(_guarded, work), tasks)):
+            lines.append(line)
+            file.write(json.dumps(line, default=float) + "\n")
+            file.flush()
             if k % 50 == 0:
                 print(f"{k}/{len(tasks)} tables, {time.monotonic() - began:.0f} s", flush=True)
             if time.monotonic() - began > given.limit:

@@ -1,17 +1,13 @@
 """Plain selection on the tables of `loop.py`: stepwise by AICc and by BIC over the same library, and PySINDy.
 
-    python benchmarks/loop_baselines.py --clean 40 --library 66 --outside 36 --pairs 30
+    python benchmarks/loop_baselines.py --clean 40 --library 66 --outside 36 --pairs 30 --jobs 2
 
 Tables, priors and fits are the loop's; only the choice of effects is plain. PySINDy comes with the extra
-`bench`; `--without-sindy` does without. Every table is one line of `--out`, and a run that is started again
-goes on where it ended.
+`bench`. Every table is one line of `--out`, and a run that is started again goes on where it ended.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import tempfile
 import time
 import warnings
@@ -19,7 +15,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from loop import MIMIC, STATED, interval, make, oracle
+import pysindy
+from loop import MIMIC, STATED, campaign, engine_of, interval, make, oracle
 
 KINDS = ("clean", "library", "outside", "pairs")
 #: Effects that are refitted beside a fit: the loop's own number.
@@ -110,15 +107,6 @@ def stepwise(ladder: Ladder, criterion) -> list[str]:
 # --- PySINDy --------------------------------------------------------------------------------------------
 
 
-def pysindy():
-    """The package, or a clear end."""
-    try:
-        import pysindy
-    except ImportError as error:
-        raise SystemExit("PySINDy is missing: install the extra `bench`, or give --without-sindy") from error
-    return pysindy
-
-
 def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
     """Columns that STLSQ keeps at the threshold of the lowest BIC, which may be none.
 
@@ -126,7 +114,7 @@ def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
         theta: columns, shape (points, columns); target: shape (points,).
         known: whether the target's noise has an sd of 1; else BIC takes that of the residual.
     """
-    n, ps = len(target), pysindy()
+    n = len(target)
 
     def value(support: np.ndarray) -> float:
         left = target
@@ -141,7 +129,7 @@ def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
     for threshold in THRESHOLDS:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of thresholds that leave nothing
-            found = ps.STLSQ(threshold=threshold).fit(x, y[:, None])
+            found = pysindy.STLSQ(threshold=threshold).fit(x, y[:, None])
         supports.append(np.ravel(found.coef_) != 0)
     return min(supports, key=value)
 
@@ -196,7 +184,7 @@ def sindy_refit(looped, linear, scores) -> list[str]:
 # --- the campaign ---------------------------------------------------------------------------------------
 
 
-def one(engine, kind: str, seed: int, with_sindy: bool) -> dict:
+def one(engine, kind: str, seed: int) -> dict:
     """A case made, and what each method names."""
     from calibration import loop, noise, records
 
@@ -212,9 +200,10 @@ def one(engine, kind: str, seed: int, with_sindy: bool) -> dict:
     base = looped.base_fit()
     ladder = Ladder(looped, base)
     linear, scores = ladder.look(base)
-    named = {"aicc": stepwise(ladder, aicc), "bic": stepwise(ladder, bic)}
-    if with_sindy:
-        named |= {"sindy": sindy(looped, linear, scores), "sindy_refit": sindy_refit(looped, linear, scores)}
+    named = {
+        "aicc": stepwise(ladder, aicc), "bic": stepwise(ladder, bic),
+        "sindy": sindy(looped, linear, scores), "sindy_refit": sindy_refit(looped, linear, scores),
+    }  # fmt: skip
     truth = [
         {**{k: e[k] for k in ("name", "class", "balance", "sigmas", "sizes")}, **o}
         for e, o in zip(case.label["effects"], oracle(case), strict=True)
@@ -283,44 +272,11 @@ def summary(lines: list[dict]) -> list[str]:
     return out
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for kind in KINDS:
-        parser.add_argument(f"--{kind}", type=int, default=0, help="tables")
-    parser.add_argument("--robot", default="nominal")
-    parser.add_argument("--without-sindy", action="store_true")
-    parser.add_argument("--out", type=Path, default=Path("runs/baselines.jsonl"))
-    parser.add_argument("--limit", type=float, default=np.inf, help="seconds after which no table is begun")
-    given = parser.parse_args()
-    if not given.without_sindy:
-        pysindy()
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    from calibration import loop
-    from mmrjax import nominal as robots
-
-    given.out.parent.mkdir(parents=True, exist_ok=True)
-    lines = [json.loads(x) for x in given.out.read_text().splitlines()] if given.out.exists() else []
-    done = {(x["kind"], x["seed"]) for x in lines}
-    tasks = [(seed / getattr(given, kind), kind, seed) for kind in KINDS for seed in range(getattr(given, kind))]
-    tasks = sorted(t for t in tasks if t[1:] not in done)  # kinds go on side by side
-    engine = loop.Engine(robots.ROBOTS[given.robot]())
-    began = time.monotonic()
-    with given.out.open("a") as file:
-        for k, (_, kind, seed) in enumerate(tasks):
-            if time.monotonic() - began > given.limit:
-                break
-            line = one(engine, kind, seed, not given.without_sindy)
-            lines.append(line)
-            file.write(json.dumps(line, default=float) + "\n")
-            file.flush()
-            if k % 10 == 0:
-                print(f"{k}/{len(tasks)} tables, {time.monotonic() - began:.0f} s", flush=True)
-    print("\n".join(summary(lines)))
-    print(f"{time.monotonic() - began:.0f} s")
+def work(task: tuple) -> dict:
+    """One case in a worker that keeps its engine."""
+    kind, seed, _, robot = task
+    return one(engine_of(robot), kind, seed)
 
 
 if __name__ == "__main__":
-    main()
+    campaign(__doc__, KINDS, work, summary, "runs/baselines.jsonl")

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import generator as g
 import generator_series as gs
-from loop import EQUATION, SIZES, campaign, interval
+from loop import EQUATION, SIZES, campaign, engine_of, interval
 
 KINDS = ("clean", "library", "outside", "pairs")
 #: Effects of these histories; `thermal_drift` and `battery_sag` need longer ones and a battery.
@@ -52,35 +52,21 @@ def make(kind: str, seed: int) -> tuple[dict, dict] | None:
 
 
 def work(task: tuple) -> dict:
-    """One case in a worker that keeps its engine."""
-    kind, seed, replicates, nominal = task
-    global _ENGINE
-    if "_ENGINE" not in globals():
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
-        from calibration import loop
-        from mmrjax import nominal as robots
-
-        _ENGINE = loop.Engine(robots.ROBOTS[nominal](), series=True)
-    try:
-        case = make(kind, seed)
-        return {
-            "kind": kind,
-            "seed": seed,
-            **({"skipped": True} if case is None else judged(*case, seed, replicates)),
-        }
-    except Exception as error:
-        return {"kind": kind, "seed": seed, "error": f"{type(error).__name__}: {error}"}
+    """One case in a worker."""
+    kind, seed, replicates, robot = task
+    case = make(kind, seed)
+    if case is None:
+        return {"kind": kind, "seed": seed, "skipped": True}
+    return {"kind": kind, "seed": seed, **judged(engine_of(robot, series=True), *case, seed, replicates)}
 
 
-def judged(table: dict, label: dict, seed: int, replicates: int) -> dict:
+def judged(engine, table: dict, label: dict, seed: int, replicates: int) -> dict:
     """The loop over a case, verdict and label side by side."""
     from calibration import loop, loop_outcome, noise, records
 
     runs = records.Runs("sealed", dict(table))
     began = time.perf_counter()
-    looped = loop.Loop(_ENGINE, runs, noise.of(runs).sd, stated=STATED, replicates=replicates, seed=seed)
+    looped = loop.Loop(engine, runs, noise.of(runs).sd, stated=STATED, replicates=replicates, seed=seed)
     found = looped.run()
     seconds = time.perf_counter() - began
     name = looped.engine.names

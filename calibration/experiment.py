@@ -5,12 +5,15 @@ with the covariance S = diag(sd²) + J C Jᵀ: of the instruments, and to first 
 C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner and Verdinelli, Bayesian experimental design,
 Statistical Science 10 (1995)). Two alternatives A, B are √(dᵀ S⁻¹ d) apart, d = y_A - y_B, with the S of the
 two that leaves less (Hunter and Reiner, Designs for discriminating between two rival models, Technometrics 7
-(1965)).
+(1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ, σ being that distance, so that the
+chance that the false one is refuted is Φ((σ² - REFUTED) / 2σ). What is proposed is what refutes the largest
+expected share of all pairs; where one experiment does not do, two.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy import stats
 
 from calibration import fit, menu, priors
 from calibration.loop import Finding, Hypothesis, Loop, free_names
@@ -26,9 +30,11 @@ from calibration.normal import cholesky, forward
 from calibration.problem import Problem
 from mmrjax.tables import CONFIGURATIONS
 
-#: Separation from which an experiment is worth while, from which it is said to tell two apart, and beyond which
-#: more is no gain, so that the effort decides [σ].
-WORTH, APART, ENOUGH = 2.0, 3.0, 5.0
+#: Separation from which an experiment is worth while, and from which it is said to tell two apart [σ].
+WORTH, APART = 2.0, 3.0
+#: Share of the pairs told apart beyond which more is no gain, so that the effort decides; what a second experiment
+#: has to add to it to be worth its effort.
+ENOUGH, GAIN = 0.95, 0.05
 #: Rise of χ² by which an alternative is refuted, two sigmas.
 REFUTED = 4.0
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
@@ -54,10 +60,10 @@ class Prospect:
     sd: np.ndarray
     there: np.ndarray
 
-    def apart(self, a: int, b: int, experiment: str) -> float:
-        """Expected separation of two alternatives by an experiment [σ]."""
-        k = menu.spans()[experiment]
-        at = np.flatnonzero(self.there[k]) + k.start
+    def apart(self, a: int, b: int, *experiments: str) -> float:
+        """Expected separation of two alternatives by experiments, all carried out [σ]."""
+        spans = [menu.spans()[e] for e in experiments]
+        at = np.concatenate([np.flatnonzero(self.there[k]) + k.start for k in spans])
         d = self.value[a, at] - self.value[b, at]
         squares = [d @ np.linalg.solve(_covariance(self.half[x, at], self.sd[at]), d) for x in (a, b)]
         return float(np.sqrt(max(min(squares), 0.0)))
@@ -76,14 +82,15 @@ def _covariance(half: np.ndarray, sd: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """One experiment of the menu.
+    """One experiment of the menu, or several carried out together.
 
     Attributes:
-        name: of the experiment; sigma: from the best fit to each other alternative, in their order [σ].
-        separates: alternatives that it tells from the best fit, at `APART`.
+        experiments: their names; sigma: between every two alternatives, the pairs of the best fit first, as
+            `itertools.combinations` has them [σ].
+        separates: alternatives that they tell from the best fit, at `APART`.
     """
 
-    name: str
+    experiments: tuple[str, ...]
     sigma: tuple[float, ...]
     separates: tuple[str, ...]
 
@@ -97,25 +104,37 @@ class Ranked:
         """Separations that are worth while."""
         return tuple(s for s in self.sigma if s >= WORTH)
 
+    @property
+    def chance(self) -> float:
+        """Expected share of the pairs of which the false one is refuted, if either is true."""
+        sigma = np.maximum(self.sigma, 1e-9)
+        return float(np.mean(stats.norm.cdf((sigma**2 - REFUTED) / (2 * sigma)))) if len(sigma) else 0.0
+
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """The next experiment.
+    """The next experiment, or two where one does not do.
 
     Attributes:
-        name, description: what to do and what to read; the name is `NONE` where the menu holds nothing.
+        experiments: names of what to carry out; `NONE` alone where the menu holds nothing.
+        description: what to do and what to read.
         separates: alternatives that it tells from the best fit.
         expected_sigma: the smallest separation of a pair that it is worth doing for; 0 for none.
-        settles: whether it tells every alternative from the best fit.
+        settles: whether it tells every two alternatives apart, at `APART`.
         table: the whole menu, the most useful experiment first.
     """
 
-    name: str
+    experiments: tuple[str, ...]
     description: str
     separates: tuple[str, ...]
     expected_sigma: float
     settles: bool
     table: tuple[Ranked, ...]
+
+    @property
+    def name(self) -> str:
+        """Of all of it."""
+        return " and ".join(self.experiments)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,31 +228,38 @@ def prospect(looped: Loop, hypotheses: Mapping[str, Hypothesis]) -> Prospect:
 # --- the choice -------------------------------------------------------------------------------------
 
 
-def _rank(r: Ranked) -> tuple[float, float]:
-    return -len(r.told), -min(min(r.told, default=r.smallest), ENOUGH)
+def _ranked(seen: Prospect, *experiments: str) -> Ranked:
+    pairs = itertools.combinations(range(len(seen.names)), 2)
+    sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
+    others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
+    return Ranked(experiments, sigma, tuple(n for n, s in others if s >= APART))
+
+
+def _use(r: Ranked) -> float:
+    return min(r.chance, ENOUGH)
 
 
 def ranked(seen: Prospect) -> tuple[Ranked, ...]:
-    """The whole menu: by the number of alternatives that an experiment tells from the best fit, then by the pair
-    that it tells apart worst, and of those that do so well `ENOUGH`, in the menu's order, the least effort first."""
-    table = []
-    for e in menu.MENU:
-        sigma = tuple(seen.apart(0, k, e.name) for k in range(1, len(seen.names)))
-        separates = tuple(n for n, s in zip(seen.names[1:], sigma, strict=True) if s >= APART)
-        table.append(Ranked(e.name, sigma, separates))
-    return tuple(sorted(table, key=_rank))
+    """The whole menu by the expected share of the pairs that an experiment tells apart; of those that tell
+    `ENOUGH`, in the menu's order, the least effort first."""
+    return tuple(sorted((_ranked(seen, e.name) for e in menu.MENU), key=_use, reverse=True))
 
 
 def choose(seen: Prospect) -> Proposal:
-    """The experiment that tells most alternatives from the best fit, and of these the one that does so best."""
+    """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
     table = ranked(seen)
-    first = table[0]
-    if not first.told:
+    plan = table[0]
+    if not plan.told:
         text = f"No experiment of the menu tells {' and '.join(seen.names)} apart by {WORTH:g} sigma"
-        return Proposal(NONE, text, (), 0.0, False, table)
-    what = next(e for e in menu.MENU if e.name == first.name)
-    settles = len(first.told) == len(first.sigma)
-    return Proposal(what.name, what.description, first.separates, min(first.told), settles, table)
+        return Proposal((NONE,), text, (), 0.0, False, table)
+    if plan.chance < ENOUGH:
+        both = (_ranked(seen, *plan.experiments, e.name) for e in menu.MENU if e.name not in plan.experiments)
+        more = max(both, key=_use)
+        plan = more if _use(more) > plan.chance + GAIN else plan
+    said = {e.name: e.description for e in menu.MENU}
+    text = ". And: ".join(said[name] for name in plan.experiments)
+    settles = plan.smallest >= APART
+    return Proposal(plan.experiments, text, plan.separates, min(plan.told), settles, table)
 
 
 #: How the variable of a curve is covered more densely and further out.
@@ -272,9 +298,9 @@ def denser(looped: Loop, found: Finding) -> Proposal:
     name = f"finer steps in {variable}" if variable in DENSER else f"steady speeds for {variable}"
     if sigma < WORTH:
         return Proposal(
-            NONE, f"A series in {variable} would show what is missing by {sigma:.1f} sigma", (), 0.0, False, ()
+            (NONE,), f"A series in {variable} would show what is missing by {sigma:.1f} sigma", (), 0.0, False, ()
         )
-    return Proposal(name, text, (f"{balance} curve in {variable}",), sigma, False, ())
+    return Proposal((name,), text, (f"{balance} curve in {variable}",), sigma, False, ())
 
 
 def propose(looped: Loop, found: Finding) -> Proposal | None:

@@ -25,6 +25,10 @@ DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
 #: it does; the second for rollouts.
 PATIENCE = 12
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
+#: How many times the decrease that its linearisation predicts a search of rollouts is given the hope of.
+HOPELESS = 10.0
+#: How many of them have to end in one place, to within so much of the objective, for it to be the optimum.
+AGREE, SAME = 3, 0.01
 
 Z = Float[Array, " parameters"]
 
@@ -242,7 +246,7 @@ def _optima(jacobian: Array, r: Array, z: Array, data: Data, weights: Array, ste
 
 
 def searches_long(
-    evaluate: Evaluate, starts: Array, data: Data, weights: Array, max_steps: int
+    evaluate: Evaluate, starts: Array, data: Data, weights: Array, max_steps: int, *, rivals: bool = False
 ) -> tuple[Optimum, Observation]:
     """A batch of `levenberg_marquardt` with the steps taken from outside, so that rollouts are compiled once in all.
 
@@ -250,6 +254,8 @@ def searches_long(
         evaluate: residuals, their Jacobian and the observation of every member at its z, compiled; leading axis the
             batch.
         starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, 3).
+        rivals: whether all search the same optimum, so that all end once `AGREE` have ended in the lowest place, and
+            those that cannot come down to it (by `HOPELESS` times what their step predicts) before.
 
     Returns:
         Where each search ended, and what the model says there.
@@ -258,21 +264,25 @@ def searches_long(
     starts = jnp.asarray(starts)
     r, jacobian, seen = evaluate(starts)
     y, at, state = starts, starts, _begun(solver, starts, r, jacobian)
-    best, over, taken = (r, jacobian, seen), np.zeros(len(starts), bool), np.zeros(len(starts), int)
+    there, over, taken = (r, jacobian, seen), np.zeros(len(starts), bool), np.zeros(len(starts), int)
     for steps in range(1, max_steps + 1):
         # A step judges what was found where the last one led; what is accepted becomes y.
         new_y, state, done = _steps(solver, y, state, r, jacobian)
         moved = np.asarray(jnp.all(new_y == at, 1)) & ~over
-        y, best = _where(moved, (new_y, (r, jacobian, seen)), (y, best))
+        y, there = _where(moved, (new_y, (r, jacobian, seen)), (y, there))
         taken = np.where(over, taken, steps)
-        found = _optima(best[1], best[0], y, data, weights, jnp.asarray(taken))
+        found = _optima(there[1], there[0], y, data, weights, jnp.asarray(taken))
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost)
         over = over | np.asarray(done) | np.asarray(moved & (found.decrement < small))
+        if rivals:
+            cost, reach = np.asarray(found.cost), HOPELESS * np.asarray(found.decrement)
+            lowest = np.min(cost[over], initial=np.inf)
+            over = over | (cost - reach > lowest) | (np.sum(over & (cost < lowest + SAME)) >= AGREE)
         if over.all():
             break
         at = jnp.where(over[:, None], y, state.y_eval)
         r, jacobian, seen = evaluate(at)
-    return found, best[2]
+    return found, there[2]
 
 
 @jax.jit

@@ -218,7 +218,7 @@ class Engine:
         self.fits = self._fits_series if series else eqx.filter_jit(self._fits)
         self.observe = eqx.filter_jit(lambda problem, z: problem.observation(z))
         self.costs = eqx.filter_jit(lambda problem, zs: jax.lax.map(lambda z: _cost(problem, z), zs, batch_size=16))
-        self.angle = eqx.filter_jit(lambda problem, z: problem.observe.angle(problem.robot(z)))
+        self.angle = eqx.filter_jit(_angle)
 
     def _fits(self, problem: Problem, which: Array, starts: Array, weights: Array) -> tuple[fit.Optimum, Observation]:
         """Fits of hypotheses, each to its own rows, and what each says of every row."""
@@ -232,11 +232,11 @@ class Engine:
         return jax.vmap(one)(which, starts, weights)
 
     def _fits_series(
-        self, problem: Problem, which: Array, starts: Array, weights: Array
+        self, problem: Problem, which: Array, starts: Array, weights: Array, rivals: bool = False
     ) -> tuple[fit.Optimum, Observation]:
         """As `_fits`, of histories; their runs are compiled once for all steps."""
         evaluate = lambda z: self.evaluate(problem, which, z, weights)  # noqa: E731
-        return fit.searches_long(evaluate, starts, problem.data, weights, STEPS_SERIES)
+        return fit.searches_long(evaluate, starts, problem.data, weights, STEPS_SERIES, rivals=rivals)
 
 
 def _evaluate(problem: Problem, which: Array, z: Array, weights: Array) -> tuple[Array, Array, Observation]:
@@ -248,6 +248,10 @@ def _evaluate(problem: Problem, which: Array, z: Array, weights: Array) -> tuple
         return fit.linearised(there, z, dataclasses.replace(problem.data, weight=weight))
 
     return jax.vmap(one)(which, z, weights)
+
+
+def _angle(problem: Problem, z: Array) -> Array:
+    return problem.observe.angle(problem.observe.whole(problem.robot(z)))
 
 
 def _cost(problem: Problem, z: Array) -> Array:
@@ -297,6 +301,7 @@ class Loop:
         self.numbers = np.arange(1, len(runs) + 1) if numbers is None else numbers
         self.unusable: tuple[int, ...] = ()
         self.outliers: tuple[int, ...] = ()
+        self._looked: tuple | None = None  # the last look: outliers and the gate ask for the same
 
     # --- fits ---------------------------------------------------------------------------------------
 
@@ -326,14 +331,9 @@ class Loop:
 
         Rows that it cannot reach at all are kept out, and it is fitted again.
         """
-        p, empty, batch = len(self.coordinates.base), (-1,) * self.engine.size, self.engine.batch
-        starts = np.zeros((batch, len(self.coordinates)))
-        if self.engine.series:
-            starts[:, :p] = self._starts_series()
-        else:
-            starts[1:, :p] = np.random.default_rng(self.seed).standard_normal((batch - 1, p))
+        empty = (-1,) * self.engine.size
         while True:
-            found, seen = self._batch([empty] * batch, starts, [self.weight] * batch)
+            found, seen = self._searches_series() if self.engine.series else self._searches()
             k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
             lost = self.problem.unreachable(seen.status[k]) & self.counts
             if not lost.any():
@@ -341,17 +341,24 @@ class Loop:
                 return dataclasses.replace(self._hypothesis(empty, best), reading=seen.reading[k])
             self._set_aside(lost)
 
-    def _starts_series(self) -> np.ndarray:
-        """Where the best search of the bare base, from the prior mean and from its best draws, ends; shape (batch,
-        parameters)."""
+    def _searches(self) -> tuple[fit.Optimum, Observation]:
+        """Where searches of the base end, from the prior mean and from draws of the prior, and what it says there."""
+        p, empty, batch = len(self.coordinates.base), (-1,) * self.engine.size, self.engine.batch
+        starts = np.zeros((batch, len(self.coordinates)))
+        starts[1:, :p] = np.random.default_rng(self.seed).standard_normal((batch - 1, p))
+        return self._batch([empty] * batch, starts, [self.weight] * batch)
+
+    def _searches_series(self) -> tuple[fit.Optimum, Observation]:
+        """As `_searches`, of histories: without slots, and from the best of many draws."""
         bare, p = self._weighted(self.problem), len(self.coordinates.base)
         draws = np.random.default_rng(self.seed).standard_normal((DRAWS, p))
         order = np.argsort(np.asarray(self.engine.costs(bare, jnp.asarray(draws))))
         starts = np.concatenate([np.zeros((1, p)), draws[order[: SEARCHES - 1]]])
-        weights = jnp.repeat(bare.data.weight[None], SEARCHES, 0)
-        found, _ = jax.device_get(self.engine.fits(bare, jnp.zeros((SEARCHES, 0)), jnp.asarray(starts), weights))
-        best = found.z[int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))]
-        return np.repeat(best[None], self.engine.batch, 0)
+        weights, none = jnp.repeat(bare.data.weight[None], SEARCHES, 0), jnp.zeros((SEARCHES, 0))
+        found, seen = jax.device_get(self.engine.fits(bare, none, jnp.asarray(starts), weights, rivals=True))
+        slots = np.zeros((SEARCHES, 2 * self.engine.size))
+        z, sd = (np.concatenate(x, 1) for x in ((found.z, slots), (found.sd, slots + 1.0)))
+        return dataclasses.replace(found, z=z, sd=sd), seen
 
     def _set_aside(self, lost: np.ndarray) -> None:
         self.unusable = tuple(sorted({*self.unusable, *map(int, np.flatnonzero(lost))}))
@@ -443,8 +450,12 @@ class Loop:
 
     def look(self, h: Hypothesis, curves: tuple[Curves, ...]) -> tuple[Linear, Scores, Summary]:
         """A fit linearised, and what candidates could explain of its residual."""
-        problem = self.problem_of(h)
-        return jax.device_get(self.engine.tracer.look(problem, jnp.asarray(h.z), problem.data, curves))  # type: ignore[attr-defined]
+        key = (h.which, np.asarray(h.z).tobytes(), self.counts.tobytes(), curve_room.names(curves))
+        if self._looked is None or self._looked[0] != key:
+            problem = self.problem_of(h)
+            seen = self.engine.tracer.look(problem, jnp.asarray(h.z), problem.data, curves)  # type: ignore[attr-defined]
+            self._looked = key, jax.device_get(seen)
+        return self._looked[1]
 
     def null(self, h: Hypothesis, curves: tuple[Curves, ...]) -> Summary:
         """Bootstrap of the base fit: the strongest statistics of tables in which nothing is missing."""

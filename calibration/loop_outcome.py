@@ -181,10 +181,14 @@ def next_experiment(loop: Loop, found: Finding) -> dict[str, Any] | None:
     if proposal is None:
         return None
     return {
-        "name": proposal.name, "description": proposal.description, "separates": list(proposal.separates),
+        "name": proposal.name, "experiments": list(proposal.experiments), "description": proposal.description,
+        "separates": list(proposal.separates),
         "expected_sigma": proposal.expected_sigma, "settles": proposal.settles,
         "menu": [
-            {"name": r.name, "expected_sigma": r.smallest, "separates": list(r.separates)}
+            {
+                "name": " and ".join(r.experiments), "expected_sigma": r.smallest, "separates": list(r.separates),
+                "share_told_apart": r.chance,
+            }
             for r in proposal.table
         ],
     }  # fmt: skip

@@ -159,26 +159,29 @@ class Series(eqx.Module):
         instants = self.instant[jnp.where(self.rows < 0, 0, self.rows)]
         return jnp.moveaxis(jax.vmap(one)(self.commands, self.times, clock, instants), 0, 1)
 
-    def signals(self, robot: Robot) -> Signals:
+    def whole(self, robot: Robot) -> Signals:
+        """Every signal of every run at every instant, shape (runs, instants)."""
+        found = jax.vmap(lambda c, t: histories(robot, c, t))(self.commands, self.times)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), found)
+
+    def at_rows(self, whole: Signals) -> Signals:
         """Every signal at every row."""
-        whole = jax.vmap(lambda c, t: histories(robot, c, t))(self.commands, self.times)
-        there = jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), whole)
-        return jax.tree.map(lambda x: x[self.run, self.instant], there)
+        return jax.tree.map(lambda x: x[self.run, self.instant], whole)
 
     @property
     def time(self) -> Float[Array, " rows"]:
         """Time of every row since the start of its run [s]."""
         return self.times[self.run, self.instant]
 
-    def angle(self, robot: Robot) -> Float[Array, " rows"]:
+    def angle(self, whole: Signals) -> Float[Array, " rows"]:
         """Angle of the driving shaft at every row, since the start of its run [rad]."""
-        whole = jax.vmap(lambda c, t: histories(robot, c, t).speed_wheel)(self.commands, self.times)
-        turned = 0.5 * (whole[:, 1:] + whole[:, :-1]) * jnp.diff(self.times)
+        speed = whole.speed_wheel
+        turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
         angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
         return angle[self.run, self.instant]
 
     def __call__(self, robot: Robot) -> Observation:
-        reading = _stack(jax.vmap(lambda s: balances.sensor(robot, s))(self.signals(robot)))
+        reading = _stack(jax.vmap(lambda s: balances.sensor(robot, s))(self.at_rows(self.whole(robot))))
         followed = jnp.all(jnp.isfinite(reading), 1)
         return Observation(reading, jnp.zeros(self.run.shape), jnp.where(followed, CONVERGED, FAILED))
 

@@ -170,9 +170,9 @@ def _linearise_series(problem: Problem, z: Array, data: Data, candidates: tuple[
     scale = (data.weight / data.sd)[observe.rows]
     defects = jnp.where(observe.rows[:, None, :, None] < 0, 0.0, defects * scale[:, None])
     signatures = _finite(jnp.stack(parts, 1))
-    return Linear(
-        residual, jacobian, signatures, _finite(defects), observe.signals(robot), observe, observe.angle(robot)
-    )
+    runs = observe.whole(robot)
+    signals, angle = observe.at_rows(runs), observe.angle(runs)
+    return Linear(residual, jacobian, signatures, _finite(defects), signals, observe, angle)
 
 
 def _finite(x: Array) -> Array:

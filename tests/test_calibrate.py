@@ -193,6 +193,7 @@ def test_infeasible_starts_are_refused_with_the_rows(measured):
         quick(measured, fix=["tracked.ground.friction.static"])
 
 
+@pytest.mark.slow
 def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     """Among them one on which the calibrated robot could not start: docs/benchmarks.md."""
     rows = measured.where(np.array([1, 3, 4]))

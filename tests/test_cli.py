@@ -245,6 +245,7 @@ def test_drive_ends_clearly_when_the_battery_is_empty(mmrjax, tmp_path):
     assert any(ran) and not ran[-1] and ran == sorted(ran, reverse=True)  # numbers up to one instant, none after
 
 
+@pytest.mark.slow
 def test_simulate_track_writes_every_reaction(mmrjax, tmp_path):
     code, _, _ = mmrjax("simulate", "--model", "track", "--duration", "0.1", "--no-report", "--out", "t")
     assert code == 3  # still accelerating

@@ -99,6 +99,7 @@ def test_settled_travel_shows_nothing_of_a_wave():
     np.testing.assert_array_equal(jax.jit(_steady)(waves), jax.jit(_steady)(nominal.nominal()))
 
 
+@pytest.mark.slow
 def test_curves_act_in_drive_and_at_zero_change_nothing():
     sizes = jnp.asarray([laws.size(e) for e in DRIVEN.values()])
     both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * sizes,)))

@@ -169,6 +169,7 @@ def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regain
     check_settled(run, point, [1])
 
 
+@pytest.mark.slow
 def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
     """Also on the slope where a start from standstill slides; above the limit it slides all the same."""
     runs = command(voltage=[24.0, 24.0, 24.0], slope=np.radians([5.0, 12.0, 20.0]), wheeled=[1.0, 0.0, 0.0])

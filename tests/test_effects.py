@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import inspect
 import pkgutil
@@ -138,27 +139,39 @@ def floats(tree) -> jax.Array:
     return jnp.stack([x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)])
 
 
-def outputs_steady(bare, of):
-    """Numbers of `steady` with the effects `of(amplitude)`, and their derivative by the amplitude."""
-
-    def numbers(amplitude):
-        robot = dataclasses.replace(bare, effects=of(amplitude))
-        return jax.vmap(lambda c: floats(steady(robot, c)))(CONDITIONS)
-
-    return jax.jit(lambda a: jax.jvp(numbers, (a,), (jnp.ones_like(a),)))
+def outputs_steady(robot):
+    """Numbers of `steady`."""
+    return jax.vmap(lambda c: floats(steady(robot, c)))(CONDITIONS)
 
 
-def outputs_start(bare, of):
-    """As `outputs_steady`, of the readings through a start: for what settled travel does not show."""
+def outputs_start(robot):
+    """Readings through a start: for what settled travel does not show."""
     times = jnp.asarray([0.0, 0.002, 0.01, 0.1, 0.4])
+    signals = jax.vmap(lambda c: drive(robot, c, times).signals)(CONDITIONS)
+    readings = jnp.stack(jax.tree.leaves(balances.sensor(robot, signals)), -1)[:, 1:]
+    return readings.reshape(-1, 3)
 
-    def numbers(amplitude):
-        robot = dataclasses.replace(bare, effects=of(amplitude))
-        signals = jax.vmap(lambda c: drive(robot, c, times).signals)(CONDITIONS)
-        readings = jnp.stack(jax.tree.leaves(balances.sensor(robot, signals)), -1)[:, 1:]
-        return readings.reshape(-1, 3)
 
-    return jax.jit(lambda a: jax.jvp(numbers, (a,), (jnp.ones_like(a),)))
+@functools.cache
+def compiled(outputs, those: tuple[type[Effect], ...]):
+    """Outputs, and their derivatives, as functions of the amplitudes of effects."""
+
+    def numbers(amplitudes):
+        there = tuple(fitted(e, a) for e, a in zip(those, amplitudes, strict=True))
+        return outputs(dataclasses.replace(nominal.nominal(), effects=there))
+
+    return jax.jit(numbers), jax.jit(jax.jacfwd(numbers))
+
+
+@functools.cache
+def at_zero(outputs, those: tuple[type[Effect], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Outputs and their slopes where all amplitudes are zero."""
+    return tuple(np.asarray(f(jnp.zeros(len(those)))) for f in compiled(outputs, those))
+
+
+def company(effect: type[Effect]) -> tuple[type[Effect], ...]:
+    """Effects with which one is compiled: the whole library at once; a mutant by itself."""
+    return ALL if effect in ALL else (effect,)
 
 
 # --- the laws: each takes an effect class and raises AssertionError ------------------------------------
@@ -181,16 +194,16 @@ def law_declared(effect: type[Effect]) -> None:
 
 def law_absent_at_zero(effect: type[Effect]) -> None:
     """Zero amplitude changes no number of the steady state, to the last bits."""
-    with_it, _ = outputs_steady(nominal.nominal(), lambda a: (fitted(effect, a),))(jnp.asarray(0.0))
-    without, _ = outputs_steady(nominal.nominal(), lambda a: ())(jnp.asarray(0.0))
-    np.testing.assert_allclose(with_it, without, rtol=1e-13, atol=1e-13)
+    bare = compiled(outputs_steady, ())[0](jnp.zeros(0))
+    np.testing.assert_allclose(at_zero(outputs_steady, company(effect))[0], bare, rtol=1e-13, atol=1e-13)
     assert (terms(effect()) == 0).all()
 
 
 def law_alive_at_zero(effect: type[Effect]) -> None:
     """The derivative at zero is finite everywhere and not zero where the effect acts."""
-    outputs = outputs_start if effect.transient else outputs_steady
-    values, slopes = outputs(nominal.nominal(), lambda a: (fitted(effect, a),))(jnp.asarray(0.0))
+    there = company(effect)
+    values, slopes = at_zero(outputs_start if effect.transient else outputs_steady, there)
+    slopes = slopes[..., there.index(effect)]
     assert np.isfinite(values).all() and np.isfinite(slopes).all()
     moved = np.abs(slopes[:, :3]) * size(effect) / np.abs(values[:, :3])  # the readings
     assert moved.max() > 1e-6, "dead gradient"
@@ -485,8 +498,8 @@ def test_drive_and_steady_both_feel(k, drive_readings):
     assert (np.abs(moved - base) / np.abs(base)).max() > (1e-6 if ALL[k].transient else 1e-5)
     if ALL[k].transient:
         return
-    of_steady = outputs_steady(nominal.nominal(), lambda a: (fitted(ALL[k], a),))
-    base, moved = of_steady(jnp.asarray(0.0))[0], of_steady(jnp.asarray(share))[0]
+    of_steady = compiled(outputs_steady, ALL)[0]
+    base, moved = of_steady(jnp.zeros(len(ALL))), of_steady(jnp.zeros(len(ALL)).at[k].set(share))
     assert (np.abs(moved - base)[:, :3] / np.abs(base[:, :3])).max() > 1e-5
 
 

@@ -111,7 +111,7 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
     proposal = experiment.choose(seen[pair][3])
     assert proposal.name in PAIRS[pair]
     assert proposal.settles and proposal.separates == (pair[1],) and proposal.expected_sigma > 3
-    assert len(proposal.table) == len(menu.MENU) and proposal.table[0].name == proposal.name
+    assert len(proposal.table) == len(menu.MENU) and proposal.table[0].experiments == proposal.experiments
 
 
 @pytest.mark.parametrize("pair", PAIRS)
@@ -123,10 +123,59 @@ def test_proposal_carried_out_resolves_the_class(pair, seen):
     assert all(pair[0] in v.left for v in verdicts)
 
 
+def foreseeing(sigma):
+    """A prospect in which each experiment of the menu shows alternative k `sigma[name][k]` sds off, without doubt."""
+    spans = menu.spans()
+    readings = spans[menu.MENU[-1].name].stop
+    members = len(next(iter(sigma.values())))
+    value = np.zeros((members, readings))
+    for name, at in sigma.items():
+        value[:, spans[name].start] = at
+    names = tuple("abcdef"[:members])
+    return experiment.Prospect(
+        names, value, np.zeros((members, readings, 1)), np.ones(readings), np.ones(readings, bool)
+    )
+
+
 def test_less_effort_is_preferred_where_more_sigmas_are_no_gain():
-    far, near = (experiment.Ranked("", (s,), ()) for s in (40.0, 6.0))
-    weak = experiment.Ranked("", (3.0,), ())
-    assert experiment._rank(far) == experiment._rank(near) < experiment._rank(weak)
+    assert experiment.choose(foreseeing({"weigh": [0, 6.0], "stall": [0, 40.0]})).experiments == ("weigh",)
+    assert experiment.choose(foreseeing({"weigh": [0, 3.0], "stall": [0, 40.0]})).experiments == ("stall",)
+
+
+def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
+    seen = foreseeing({"stall": [0, 2.5]})
+    at, rng = menu.spans()["stall"], np.random.default_rng(0)
+    refuted = [
+        "b"
+        in experiment.supported(
+            seen, {"stall": {"value": rng.standard_normal(at.stop - at.start), "sd": np.ones(2)}}
+        ).refuted
+        for _ in range(4000)
+    ]
+    one = next(r for r in experiment.ranked(seen) if r.experiments == ("stall",))
+    assert np.mean(refuted) == pytest.approx(one.chance, abs=0.025)  # three sds of the draws
+
+
+def test_every_two_alternatives_count_not_only_those_with_the_best_fit():
+    # `stall` tells both others from the best fit but not from one another; `shunt` tells all three apart
+    proposal = experiment.choose(foreseeing({"stall": [0, 9.0, 9.0], "shunt": [0, 6.0, 12.0]}))
+    assert proposal.experiments == ("shunt",) and proposal.settles
+
+
+def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
+    proposal = experiment.choose(
+        foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 7.0], "timing": [0, 0.0, 1.0]})
+    )
+    assert set(proposal.experiments) == {"stall", "weigh"} and proposal.settles
+    assert proposal.expected_sigma == pytest.approx(7.0) and proposal.separates == ("b", "c")
+    assert "scales" in proposal.description and "vice" in proposal.description and proposal.name.count(" and ") == 1
+
+
+def test_a_second_experiment_that_adds_nothing_is_not():
+    proposal = experiment.choose(foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 0.5]}))
+    assert (
+        proposal.experiments == ("stall",) and not proposal.settles and proposal.expected_sigma == pytest.approx(9.0)
+    )
 
 
 def test_alternatives_that_agree_give_none(seen):

@@ -74,6 +74,7 @@ def test_jacobian_of_steady_is_the_finite_difference(posed, truth):
     np.testing.assert_allclose(jacobian, np.stack(columns, 1), rtol=1e-5, atol=1e-5 * np.abs(jacobian).max())
 
 
+@pytest.mark.slow
 def test_the_objective_is_finite_where_the_robot_slides_and_leads_back(posed):
     nominal_z = jnp.zeros(len(posed.coordinates))
     seen = posed.observation(nominal_z)
@@ -118,6 +119,7 @@ def test_lbfgs_reaches_the_same_optimum(posed, clean, truth):
         np.testing.assert_allclose(other.z, lm.z, atol=0.02)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth(posed, truth):
     measured = dataclasses.replace(
         posed, data=dataclasses.replace(posed.data, measured=posed.observation(truth).reading)
@@ -263,6 +265,7 @@ def test_histories_calibrate_with_drive():
     assert np.all(np.abs(np.asarray(best.z - truth)) < 4 * about.sd)
 
 
+@pytest.mark.slow
 def test_lbfgs_reaches_the_same_optimum_through_a_rollout():
     """One start-up history of `drive`, one parameter that it tells."""
     base = nominal.nominal()

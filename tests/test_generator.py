@@ -35,12 +35,15 @@ def package():
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
     run = command(GRID.U, GRID.slope, GRID.payload, GRID.wheeled, total_mass=GRID.mass)
 
+    every = {p.name: p.value for p in params.walk(full)}
+
     def read(constants=None, term=None):
-        values = dict(constants or {})
+        values = every | (constants or {})
         if term is not None:
-            values[f"effects.{term.name}.amplitude"] = jnp.asarray(term.amplitude)
-            values |= {f"effects.{term.name}.{SHAPES[k]}": jnp.asarray(v) for k, v in term.shapes.items()}
-        r = steady_batch(params.replace(full, values), run).reading
+            values[f"effects.{term.name}.amplitude"] = term.amplitude
+            values |= {f"effects.{term.name}.{SHAPES[k]}": v for k, v in term.shapes.items()}
+        # all of one type, so that one compiled program serves every call
+        r = steady_batch(params.replace(full, {k: jnp.asarray(v, float) for k, v in values.items()}), run).reading
         return np.stack([r.total_current, r.motor_speed, r.speed])
 
     return read

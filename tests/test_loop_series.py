@@ -99,6 +99,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
     )
 
 
+@pytest.mark.slow
 def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     found = oval.found
     curve = discover.discover(oval.loop, found.base.hypothesis, found.base.linear, "track", found.unnamed[1])

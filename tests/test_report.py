@@ -236,7 +236,10 @@ def test_sweep_that_slides_everywhere_says_so(tmp_path):
     assert _drawn(page) == PAPER_FIGURES | SWEEP_FIGURES
 
 
-@pytest.mark.parametrize("shape", ["line over slope", "line over voltage", "large grid", "scattered"])
+@pytest.mark.parametrize(
+    "shape",
+    ["line over slope", "scattered", *(pytest.param(s, marks=pytest.mark.slow) for s in ("line over voltage", "large grid"))],
+)
 def test_other_grids_are_drawn(shape, tmp_path):
     runs = {
         "line over slope": lambda: _runs("4W2T", 24.0, 2.0, np.linspace(-10, 25, 8)),

@@ -38,6 +38,7 @@ def test_largest_step_falls_with_stiffness(robot):
     assert (hard < 0.95 * soft).all()
 
 
+@pytest.mark.slow
 def test_beyond_the_largest_step_a_run_goes_wrong_and_below_it_does_not(robot):
     """Uphill on wheels: three times over the limit they chatter and lose speed, at half of it they do not."""
     steep = dataclasses.replace(TWO, slope=jnp.radians(jnp.asarray([10.0, 10.0])))
@@ -130,6 +131,7 @@ def test_member_that_blows_up_fails_alone(robot):
     assert np.isnan(float(answer.reading.speed[0])) and np.isfinite(float(answer.reading.speed[1]))
 
 
+@pytest.mark.slow
 def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
     options = {"model": "track", "step_s": 1.3e-4, "chunk": 2, "slopes_deg": (0.0,)}
     config = configuration.resolve(configuration.Sweep, None, options)

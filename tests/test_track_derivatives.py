@@ -97,6 +97,7 @@ def test_no_parameter_is_dead(forward):
     assert wheeled[PARAMETERS.index("track.guide_friction")] == 0.0  # wheels carry no load on the guides
 
 
+@pytest.mark.slow
 def test_reverse_derivatives_are_forward_ones(averages, commands, at, forward):
     slope = jax.jit(jax.vmap(jax.jacrev(averages, has_aux=True), in_axes=(None, 0)))
     reverse = np.asarray(slope(at, commands)[0])

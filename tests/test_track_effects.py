@@ -83,6 +83,7 @@ def start_slopes():
     return np.asarray(jax.jit(jax.jacfwd(history))(jnp.zeros(len(TRANSIENT))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(len(TRANSIENT)), ids=[effect.name for effect in TRANSIENT])
 def test_transient_effect_is_felt_in_a_start(start_slopes, k):
     assert np.isfinite(start_slopes[..., k]).all()

@@ -110,6 +110,7 @@ def averages(robot):
     return lambda gear, step: np.asarray(settled(gear, step))
 
 
+@pytest.mark.slow
 def test_averages_do_not_depend_on_the_step(averages):
     """Halved: less than 0.3 %."""
     gear = RunningGear()

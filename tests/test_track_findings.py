@@ -169,6 +169,7 @@ def test_averages_are_over_whole_periods(runs, robot):
     assert runs.steady.periods[UNPOWERED] == 0
 
 
+@pytest.mark.slow
 def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     """Within 1.5 % on current and both speeds, at the share of the weight that the track model puts out.
 
@@ -207,6 +208,7 @@ def test_batch_is_its_members(robot):
     np.testing.assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_batch_compiles_once(robot, compilations):
     commands = command(voltage=jnp.asarray([33.0, 15.0]), wheeled=jnp.asarray([0.0, 1.0]))
     keywords = dict(duration=0.02, sample=1e-3)
@@ -216,6 +218,7 @@ def test_batch_compiles_once(robot, compilations):
     assert len(compilations) == before
 
 
+@pytest.mark.slow
 def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
     from mmrjax.models.track import PARTS, _batch
