@@ -309,6 +309,9 @@ def summary(lines: list[dict]) -> list[str]:
         lambda x: x["verdict"] == "unnamed" and x["unnamed"][0] == x["truth"][0]["balance"],
     )
     say("  the very balance among those said to act alike", free, among)
+    placed_among = [len(x["unnamed"][2]) for x in free if among(x)]
+    if placed_among:
+        out.append(f"  balances said to act alike: mean {np.mean(placed_among):.1f}")
     say("outside, with a mimic: fooled (one name or class)", mimics, lambda x: len(x["classes"]) == 1)
     say("  unnamed in the right equation", mimics, placed)
 

@@ -13,8 +13,9 @@ from calibration.trace import PROBED, Curves
 from mmrjax.tables import CONFIGURATIONS
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
-#: also loads the contact. What `supply`, `motor` and `gearbox` lack has the same shape in these.
+#: also loads the contact; and those for which they stand, as what these lack has the same shape in them.
 BALANCES = ("electrical", "track", "ground", "slip")
+STANDS_FOR = {"electrical": ("supply",), "track": ("gearbox", "motor")}
 #: Variables of a curve, fields of `Signals` (and the time of histories), with the column that measures each.
 VARIABLES = {
     "voltage": "supply_voltage_V",

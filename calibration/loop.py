@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -696,7 +697,8 @@ class Loop:
         return np.asarray(scores.curve if self.engine.series else scores.explained)
 
     def _locate(self, scores: Scores, curves: tuple[Curves, ...]) -> tuple[str, str, tuple[str, ...]]:
-        """Balance and variable of the curve that explains most, and the balances in which one explains as much."""
+        """Balance and variable of the curve that explains most, and the balances in which one explains as much, or
+        would if it had curves of its own."""
         names = curve_room.names(curves)
         deviate, said = np.asarray(scores.curve), self._said_by(scores)
         k = int(deviate.argmax())
@@ -705,5 +707,5 @@ class Loop:
             key=lambda j: said[j],
         )
         best = {b: max(deviate[j] for j, n in enumerate(names) if n[0] == b) for b in curve_room.BALANCES}
-        alike = tuple(b for b, d in best.items() if d > deviate[k] - 1.0)
-        return names[k][0], names[variable][1], alike
+        alike = [(b, *curve_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - 1.0]
+        return names[k][0], names[variable][1], tuple(itertools.chain(*alike))

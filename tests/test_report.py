@@ -238,7 +238,11 @@ def test_sweep_that_slides_everywhere_says_so(tmp_path):
 
 @pytest.mark.parametrize(
     "shape",
-    ["line over slope", "scattered", *(pytest.param(s, marks=pytest.mark.slow) for s in ("line over voltage", "large grid"))],
+    [
+        "line over slope",
+        "scattered",
+        *(pytest.param(s, marks=pytest.mark.slow) for s in ("line over voltage", "large grid")),
+    ],
 )
 def test_other_grids_are_drawn(shape, tmp_path):
     runs = {
