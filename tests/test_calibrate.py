@@ -119,6 +119,7 @@ def test_too_few_rows_are_refused(measured):
         quick(measured.where(np.array([0])), noise="current=2%,motor_speed=1%,speed=1%")
 
 
+@pytest.mark.slow
 def test_a_configuration_without_rows_is_refused_where_named_and_left_out_where_not(measured):
     tracked = measured.where(measured["configuration"] == "6T2A")
     with pytest.raises(
@@ -134,6 +135,7 @@ def test_a_stuck_channel_is_refused(measured):
         quick(changed(measured, motor_speed_rpm=np.full(20, 5000.0)))
 
 
+@pytest.mark.slow
 def test_a_constant_condition_is_said(measured):
     flat = measured.where((measured["slope_deg"] == 10) | (measured["slope_deg"] == 5))
     level = changed(flat, slope_deg=np.full(8, 5.0), supply_voltage_V=flat["supply_voltage_V"])

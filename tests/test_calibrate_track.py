@@ -49,6 +49,7 @@ def made(seen):
     return dataclasses.replace(conditions, source="made", columns={**conditions.columns, **columns})
 
 
+@pytest.mark.slow
 def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
     np.testing.assert_allclose(seen[1].steady.guide_share, GUIDED, atol=0.01)
 
@@ -75,6 +76,7 @@ def found(base, made, told):
     return calibrate(made, base, model="track", free=free, noise=STATED, starts=2, tell=told.append)
 
 
+@pytest.mark.slow
 def test_jacobian_through_the_rollout_is_the_central_difference(found):
     at, step = jnp.asarray([0.5, -0.5]), 1e-4
     _, jacobian, seen = fit.linearised(found.problem, at, found.problem.data)
@@ -87,6 +89,7 @@ def test_jacobian_through_the_rollout_is_the_central_difference(found):
     assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
 
 
+@pytest.mark.slow
 def test_track_calibration_recovers_the_guide_friction(found, made, told):
     document = outcome.document(found)
     answer = document["parameters"][GUIDE_FRICTION]
@@ -100,11 +103,13 @@ def test_track_calibration_recovers_the_guide_friction(found, made, told):
     assert "the track model puts 98% of the weight on them" in said and "2 of 2 parameters lie within" in said
 
 
+@pytest.mark.slow
 def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
     current = steady_batch(found.robot, made.command()).reading.total_current
     np.testing.assert_allclose(current, made["total_current_A"], rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_friction_law_too_stiff_for_the_step_is_said(base, made):
     stiff = params.replace(base, {CREEP: jnp.asarray(0.02)})
     (said,) = checks.too_stiff(made, stiff)

@@ -74,6 +74,7 @@ def test_drive_derivatives_at_rest_are_finite(name, jacobians):
     assert TIMES[0] == 0 and np.isfinite(forward[:, 0]).all() and np.isfinite(values[:, 0]).all()
 
 
+@pytest.mark.slow
 def test_drive_bad_members_leave_neighbours_derivatives_alone(rebuild, theta, scales):
     """Along one direction in which every parameter moves."""
     keep = jnp.asarray([True, False, True, False, True, False])

@@ -110,6 +110,7 @@ def test_64_starts_on_the_packaged_data_agree(posed):
     np.testing.assert_allclose(found.cost, np.asarray(found.cost).min(), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_lbfgs_reaches_the_same_optimum(posed, clean, truth):
     for problem_, start in ((clean, truth + 0.5), (posed, jnp.zeros(len(truth)))):
         lm = solve(problem_, start, problem_.data)
@@ -249,6 +250,7 @@ def series_runs(robot, seed=None, noise_share=0.01):
     return records.Runs("made", columns)
 
 
+@pytest.mark.slow
 def test_histories_calibrate_with_drive():
     """A start tells the inductance and the rotor's inertia, which no steady row can."""
     base = nominal.nominal()

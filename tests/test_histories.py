@@ -56,7 +56,10 @@ def test_histories_follow_drive():
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"effects.cogging.amplitude": 3e-4, "effects.pulley_eccentricity.amplitude": 0.02}],
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"effects.cogging.amplitude": 3e-4, "effects.pulley_eccentricity.amplitude": 0.02},
+    ],
     ids=["bare", "waves"],
 )
 def test_derivatives_are_those_of_what_is_computed(changes):

@@ -187,6 +187,7 @@ def test_report_tells_the_story_in_order(done):
 # --- effects of the user's own, and thin data --------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_users_effect_is_scored_and_named(quick, tmp_path):
     written(tmp_path / "runs.csv", g.case(["guide_binding"], 12.0, seed=5, grid=loaded).table)
     (tmp_path / "mine.py").write_text(MINE)
@@ -316,6 +317,7 @@ def started(quick, tmp_path_factory):
     return SimpleNamespace(folder=folder, label=label["effects"][0], answer=answer)
 
 
+@pytest.mark.slow
 def test_histories_go_through_the_command(started):
     assert started.answer.code == 0, started.answer.err
     r = json.loads((started.folder / "found" / "result.json").read_text())
@@ -333,6 +335,7 @@ def test_histories_go_through_the_command(started):
     assert set(r["held_out_by"]) == {"slope", "run"}
 
 
+@pytest.mark.slow
 def test_robot_found_in_histories_starts_with_the_effect(started):
     robot = tomllib.loads((started.folder / "found" / "robot.toml").read_text())
     assert robot["effects"]["churning"]["amplitude"] > 0
@@ -341,6 +344,7 @@ def test_robot_found_in_histories_starts_with_the_effect(started):
     assert run.code in (0, 3), run.err
 
 
+@pytest.mark.slow
 def test_report_of_histories_shows_what_only_they_tell(started):
     page = (started.folder / "found" / "report.html").read_text()
     for words in ("What only histories tell", "Ljung and Box", "246 of 246 samples", "t [s]"):

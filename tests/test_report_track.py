@@ -49,6 +49,7 @@ def period(written):
     return 0.035 / (run.signals.speed_wheel[0, run.time[0] > SECONDS - 0.3].mean() * 0.84 / (7 * np.pi))
 
 
+@pytest.mark.slow
 def test_report_shows_the_running_gear_with_the_track_model(written):
     folder, text, run = written
     assert (run.result.status == CONVERGED).all()
@@ -63,6 +64,7 @@ def test_report_without_the_track_model_has_none_of_it(robot, tmp_path):
     assert not list((tmp_path / "figures").glob("track_*"))
 
 
+@pytest.mark.slow
 def test_ripple_table_has_the_period_of_equation_34(written, period):
     cells = re.search(r'id="ripple">.*?<tr><td class="words">6T2A</td>(.*?)</tr>', written[1], re.S).group(1)
     found, expected, current, speed, reaction, guide = map(float, re.findall(r"<td>([^<]+)</td>", cells))
@@ -72,6 +74,7 @@ def test_ripple_table_has_the_period_of_equation_34(written, period):
     assert guide == pytest.approx(100 * written[2].steady.guide_share[0], abs=0.06)
 
 
+@pytest.mark.slow
 def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, written):
     from mmrjax.models.steady import steady
     from mmrjax.signals import command as one
@@ -83,6 +86,7 @@ def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, wri
     assert float(here) > 1.2 * float(there) and "0.3 for this robot" in said
 
 
+@pytest.mark.slow
 def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(robot, written, period):
     run = written[2]
     figure, _ = figures_track.ripple_of_current(robot, run)
@@ -98,6 +102,7 @@ def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(robot, writte
     assert max(agreement(period * share) for share in (1 / 4, 1 / 3, 1 / 2, 2 / 3)) < 0.8
 
 
+@pytest.mark.slow
 def test_figure_26_marks_a_touchdown_each_pitch(robot, written, period):
     upper, lower = figures_track.touchdown(robot, written[2]).axes
     for axes in (upper, lower):
@@ -109,6 +114,7 @@ def test_figure_26_marks_a_touchdown_each_pitch(robot, written, period):
     np.testing.assert_allclose(total, written[2].reactions.grouser[0, -len(total) :].sum(-1))
 
 
+@pytest.mark.slow
 def test_figure_27_ripples_on_tracks_and_not_on_wheels(written):
     tracked, wheeled = figures_track.reactions(written[2]).axes
     swing = [np.ptp(axes.lines[0].get_ydata()) / np.mean(axes.lines[0].get_ydata()) for axes in (tracked, wheeled)]
@@ -117,6 +123,7 @@ def test_figure_27_ripples_on_tracks_and_not_on_wheels(written):
     assert all(0.8 * half < np.mean(axes.lines[0].get_ydata()) < 1.2 * half for axes in (tracked, wheeled))
 
 
+@pytest.mark.slow
 def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written, tmp_path, monkeypatch):
     run = written[2]
     broken = dataclasses.replace(

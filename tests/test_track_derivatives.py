@@ -76,6 +76,7 @@ def forward(averages, commands, at):
     return np.asarray(jacobian)
 
 
+@pytest.mark.slow
 def test_forward_derivatives_are_central_differences(averages, commands, at, forward):
     runs = jax.jit(jax.vmap(jax.vmap(averages, in_axes=(None, 0)), in_axes=(0, None)))
     h = 2e-5  # the averages are smooth, but they curve over the phase at which a run ends
@@ -89,6 +90,7 @@ def test_forward_derivatives_are_central_differences(averages, commands, at, for
     assert error.max() < 0.01, f"point {worst[0]}, {OUTPUTS[worst[1]]} by {PARAMETERS[worst[2]]}: {error.max():.3g}"
 
 
+@pytest.mark.slow
 def test_no_parameter_is_dead(forward):
     tracked = np.abs(forward[:4]).max(axis=(0, 1))
     wheeled = np.abs(forward[4:]).max(axis=(0, 1))
