@@ -266,10 +266,14 @@ def summary(lines: list[dict]) -> list[str]:
 
     proposed = [x for x in asked if "expected_sigma" in (x["experiments"] or [{}])[0]]
     say("class: an experiment is proposed", asked, lambda x: x in proposed)
-    two = [x for x in proposed if len(x["experiments"][0]["experiments"]) > 1]
+    two = [x for x in proposed if len(x["experiments"][0].get("experiments", ())) > 1]
     say("  the first proposal is of two experiments", proposed, lambda x: x in two)
     say("  the first leaves the truth alone", proposed, lambda x: left(x, True) == [x["truth"][0]["class"]])
-    say(f"  up to {EXPERIMENTS} leave the truth alone", proposed, lambda x: left(x) == [x["truth"][0]["class"]])
+    say(
+        f"  up to {EXPERIMENTS} proposals leave the truth alone",
+        proposed,
+        lambda x: left(x) == [x["truth"][0]["class"]],
+    )
     say("  the truth is refuted", proposed, lambda x: x["truth"][0]["class"] not in left(x))
     say("  nearest is the truth", proposed, nearest)
     done = [x for x in library if "held_out" in x and contains(x)]
@@ -309,9 +313,9 @@ def summary(lines: list[dict]) -> list[str]:
         lambda x: x["verdict"] == "unnamed" and x["unnamed"][0] == x["truth"][0]["balance"],
     )
     say("  the very balance among those said to act alike", free, among)
-    placed_among = [len(x["unnamed"][2]) for x in free if among(x)]
-    if placed_among:
-        out.append(f"  balances said to act alike: mean {np.mean(placed_among):.1f}")
+    listed = [len(x["unnamed"][2]) for x in free if x["verdict"] == "unnamed"]
+    if listed:
+        out.append(f"  balances said to act alike: mean {np.mean(listed):.1f}")
     say("outside, with a mimic: fooled (one name or class)", mimics, lambda x: len(x["classes"]) == 1)
     say("  unnamed in the right equation", mimics, placed)
 
@@ -347,6 +351,7 @@ def campaign(doc: str | None, kinds: tuple[str, ...], work, summary, out: str) -
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)
     lines = [json.loads(x) for x in given.out.read_text().splitlines()] if given.out.exists() else []
+    lines = [x for x in lines if "error" not in x]  # they are tried again
     done = {(x["kind"], x["seed"]) for x in lines}
     tasks = [
         (kind, seed, given.replicates, given.robot)

@@ -266,7 +266,9 @@ def summary(lines: list[dict]) -> list[str]:
                 out.append(f"{kind}: effects named, mean {np.mean([len(names(x)) for x in of(kind)]):.2f}")
     spent = [x["seconds"] for x in lines if "seconds" in x]
     done = {k: sum(x["kind"] == k and "named" in x for x in lines) for k in KINDS}
-    out.append(f"tables {done}, skipped {sum('skipped' in x for x in lines)}")
+    out.append(
+        f"tables {done}, skipped {sum('skipped' in x for x in lines)}, errors {sum('error' in x for x in lines)}"
+    )
     if spent:
         out.append(f"seconds a table, all methods: median {np.median(spent):.2f}, mean {np.mean(spent):.2f}")
     return out

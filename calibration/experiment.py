@@ -6,8 +6,8 @@ C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner and Verdinelli,
 Statistical Science 10 (1995)). Two alternatives A, B are √(dᵀ S⁻¹ d) apart, d = y_A - y_B, with the S of the
 two that leaves less (Hunter and Reiner, Designs for discriminating between two rival models, Technometrics 7
 (1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ, σ being that distance, so that the
-chance that the false one is refuted is Φ((σ² - REFUTED) / 2σ). What is proposed is what refutes the largest
-expected share of all pairs; where one experiment does not do, two.
+chance that the false one is refuted is Φ((σ² - REFUTED) / 2σ). What is proposed is what is expected to tell the
+most of all pairs apart; where one experiment does not do, two.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from mmrjax.tables import CONFIGURATIONS
 
 #: Separation from which an experiment is worth while, and from which it is said to tell two apart [σ].
 WORTH, APART = 2.0, 3.0
-#: Share of the pairs told apart beyond which more is no gain, so that the effort decides; what a second experiment
-#: has to add to it to be worth its effort.
-ENOUGH, GAIN = 0.95, 0.05
+#: Chance that a pair is told apart beyond which more is no gain, so that the effort decides; how much a second
+#: experiment has to add to the number of pairs that are expected to be told apart.
+ENOUGH, GAIN = 0.95, 0.2
 #: Rise of χ² by which an alternative is refuted, two sigmas.
 REFUTED = 4.0
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
@@ -69,7 +69,7 @@ class Prospect:
         return float(np.sqrt(max(min(squares), 0.0)))
 
     def among(self, names: Sequence[str]) -> Prospect:
-        """Of these alternatives alone."""
+        """Of these alternatives alone, in their order; the first is the best fit only while that is among them."""
         kept = [k for k, n in enumerate(self.names) if n in names]
         return dataclasses.replace(
             self, names=tuple(self.names[k] for k in kept), value=self.value[kept], half=self.half[kept]
@@ -105,10 +105,10 @@ class Ranked:
         return tuple(s for s in self.sigma if s >= WORTH)
 
     @property
-    def chance(self) -> float:
-        """Expected share of the pairs of which the false one is refuted, if either is true."""
+    def chances(self) -> np.ndarray:
+        """For each pair, that the false one is refuted if either is true."""
         sigma = np.maximum(self.sigma, 1e-9)
-        return float(np.mean(stats.norm.cdf((sigma**2 - REFUTED) / (2 * sigma)))) if len(sigma) else 0.0
+        return stats.norm.cdf((sigma**2 - REFUTED) / (2 * sigma))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,13 +235,14 @@ def _ranked(seen: Prospect, *experiments: str) -> Ranked:
     return Ranked(experiments, sigma, tuple(n for n, s in others if s >= APART))
 
 
-def _use(r: Ranked) -> float:
-    return min(r.chance, ENOUGH)
+def _use(r: Ranked) -> tuple[bool, float]:
+    """Whether it is worth while for any pair, and how many pairs it is expected to tell apart."""
+    return bool(r.told), float(np.sum(np.minimum(r.chances, ENOUGH)))
 
 
 def ranked(seen: Prospect) -> tuple[Ranked, ...]:
-    """The whole menu by the expected share of the pairs that an experiment tells apart; of those that tell
-    `ENOUGH`, in the menu's order, the least effort first."""
+    """The whole menu by the number of pairs that an experiment is expected to tell apart; of those that tell as many
+    by `ENOUGH`, in the menu's order, the least effort first."""
     return tuple(sorted((_ranked(seen, e.name) for e in menu.MENU), key=_use, reverse=True))
 
 
@@ -249,17 +250,17 @@ def choose(seen: Prospect) -> Proposal:
     """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
     table = ranked(seen)
     plan = table[0]
+    (first,) = plan.experiments
+    both = (_ranked(seen, first, e.name) for e in menu.MENU if e.name != first)
+    more = max(both, key=_use)
+    if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + GAIN):
+        plan = more
     if not plan.told:
         text = f"No experiment of the menu tells {' and '.join(seen.names)} apart by {WORTH:g} sigma"
         return Proposal((NONE,), text, (), 0.0, False, table)
-    if plan.chance < ENOUGH:
-        both = (_ranked(seen, *plan.experiments, e.name) for e in menu.MENU if e.name not in plan.experiments)
-        more = max(both, key=_use)
-        plan = more if _use(more) > plan.chance + GAIN else plan
     said = {e.name: e.description for e in menu.MENU}
     text = ". And: ".join(said[name] for name in plan.experiments)
-    settles = plan.smallest >= APART
-    return Proposal(plan.experiments, text, plan.separates, min(plan.told), settles, table)
+    return Proposal(plan.experiments, text, plan.separates, min(plan.told), plan.smallest >= APART, table)
 
 
 #: How the variable of a curve is covered more densely and further out.

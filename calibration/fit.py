@@ -158,8 +158,9 @@ def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observ
     """All that is asked of a rollout at z, in one program: residuals (misfit, then prior), Jacobian, observation.
 
     Where a rollout's step is too long for its friction law (V_s small beside μ_s) the run shakes and its
-    derivative grows without limit; such a reading counts as one that could not be computed.
+    derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
     """
+    counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + z.size, bool)])
 
     def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
         seen = problem.observation(z)
@@ -168,7 +169,7 @@ def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observ
 
     jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
     known = jnp.all(jnp.isfinite(jacobian), axis=1)
-    return jnp.where(known, r, MISSING), jnp.where(known[:, None], jacobian, 0.0), seen
+    return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0), seen
 
 
 def evaluated(problem: Problem, z: Z, data: Data) -> Array:
@@ -254,8 +255,8 @@ def searches_long(
         evaluate: residuals, their Jacobian and the observation of every member at its z, compiled; leading axis the
             batch.
         starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, 3).
-        rivals: whether all search the same optimum, so that all end once `AGREE` have ended in the lowest place, and
-            those that cannot come down to it (by `HOPELESS` times what their step predicts) before.
+        rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
+            lower, and those that cannot come down to it (by `HOPELESS` times what their step predicts) before.
 
     Returns:
         Where each search ended, and what the model says there.
@@ -277,7 +278,8 @@ def searches_long(
         if rivals:
             cost, reach = np.asarray(found.cost), HOPELESS * np.asarray(found.decrement)
             lowest = np.min(cost[over], initial=np.inf)
-            over = over | (cost - reach > lowest) | (np.sum(over & (cost < lowest + SAME)) >= AGREE)
+            agree = np.sum(over & (cost < lowest + SAME)) >= AGREE and not np.any(~over & (cost < lowest - SAME))
+            over = over | (cost - reach > lowest) | agree
         if over.all():
             break
         at = jnp.where(over[:, None], y, state.y_eval)

@@ -357,8 +357,8 @@ class Loop:
         starts = np.concatenate([np.zeros((1, p)), draws[order[: SEARCHES - 1]]])
         weights, none = jnp.repeat(bare.data.weight[None], SEARCHES, 0), jnp.zeros((SEARCHES, 0))
         found, seen = jax.device_get(self.engine.fits(bare, none, jnp.asarray(starts), weights, rivals=True))
-        slots = np.zeros((SEARCHES, 2 * self.engine.size))
-        z, sd = (np.concatenate(x, 1) for x in ((found.z, slots), (found.sd, slots + 1.0)))
+        empty = np.zeros((SEARCHES, 2 * self.engine.size))
+        z, sd = (np.concatenate(x, 1) for x in ((found.z, empty), (found.sd, empty + 1.0)))
         return dataclasses.replace(found, z=z, sd=sd), seen
 
     def _set_aside(self, lost: np.ndarray) -> None:
@@ -460,10 +460,13 @@ class Loop:
 
     def null(self, h: Hypothesis, curves: tuple[Curves, ...]) -> Summary:
         """Bootstrap of the base fit: the strongest statistics of tables in which nothing is missing."""
-        problem, z = self._weighted(self.problem), jnp.asarray(h.z[: len(self.coordinates.base)])
-        if self.engine.series:  # by the program of `look`
-            problem, z = self.problem_of(h), jnp.asarray(h.z)
-        return trace.bootstrap(self.engine.tracer, problem, z, problem.data, curves, self.replicates, self.seed)
+        if self.engine.series:
+            linear, data = self.look(h, curves)[0], self.problem_of(h).data
+            one = lambda keys: self.engine.tracer.null_linear(linear, data, curves, keys)  # type: ignore[attr-defined]  # noqa: E731
+        else:
+            problem, z = self._weighted(self.problem), jnp.asarray(h.z[: len(self.coordinates.base)])
+            one = lambda keys: self.engine.tracer.null(problem, z, problem.data, curves, keys)  # type: ignore[attr-defined]  # noqa: E731
+        return trace.bootstrap(one, self.replicates, self.seed)
 
     def gate(self, h: Hypothesis, curves: tuple[Curves, ...], null: Summary) -> Round:
         """Look at a fit, and test what it leaves."""

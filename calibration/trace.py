@@ -9,6 +9,7 @@ with one degree of freedom where nothing is missing (Rao 1948).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -437,30 +438,19 @@ def beside_curve(linear: Linear, curves: tuple[Curves, ...], chosen: int) -> Sum
 _score_jit = eqx.filter_jit(score)
 
 
-def bootstrap(
-    tracer: Tracer,
-    problem: Problem,
-    z: Array,
-    data: Data,
-    curves: tuple[Curves, ...],
-    replicates: int,
-    seed: int,
-    chunk: int = 64,
-) -> Summary:
+def bootstrap(null: Callable[[Array], Summary], replicates: int, seed: int, chunk: int = 64) -> Summary:
     """Statistics of `replicates` tables drawn from the fitted model and fitted again; shape (replicates,).
 
     A replicate draws readings with their sds, and the bench values too: a prior is a measurement made
     beforehand. Replicates whose refit did not settle are left out; there may be fewer than asked for.
     Histories have hundreds of readings a parameter and their refits stay where the model is linear: there the
     refit is the linear one.
+
+    Args:
+        null: of random keys, the statistics of as many replicates: `Tracer.null` or `Tracer.null_linear`.
     """
-    if isinstance(problem.observe, Series):
-        linear = tracer.look(problem, z, data, curves)[0]  # type: ignore[attr-defined]
-        one = lambda keys: tracer.null_linear(linear, data, curves, keys)  # type: ignore[attr-defined]  # noqa: E731
-    else:
-        one = lambda keys: tracer.null(problem, z, data, curves, keys)  # type: ignore[attr-defined]  # noqa: E731
     count = -(-replicates // chunk)
     keys = jax.random.split(jax.random.key(seed), (count, chunk))
-    parts = [jax.device_get(one(k)) for k in keys]
+    parts = [jax.device_get(null(k)) for k in keys]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)

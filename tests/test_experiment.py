@@ -131,7 +131,7 @@ def foreseeing(sigma):
     value = np.zeros((members, readings))
     for name, at in sigma.items():
         value[:, spans[name].start] = at
-    names = tuple("abcdef"[:members])
+    names = tuple("abcdefgh"[:members])
     return experiment.Prospect(
         names, value, np.zeros((members, readings, 1)), np.ones(readings), np.ones(readings, bool)
     )
@@ -153,13 +153,34 @@ def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
         for _ in range(4000)
     ]
     one = next(r for r in experiment.ranked(seen) if r.experiments == ("stall",))
-    assert np.mean(refuted) == pytest.approx(one.chance, abs=0.025)  # three sds of the draws
+    assert np.mean(refuted) == pytest.approx(one.chances[0], abs=0.025)  # three sds of the draws
 
 
 def test_every_two_alternatives_count_not_only_those_with_the_best_fit():
-    # `stall` tells both others from the best fit but not from one another; `shunt` tells all three apart
-    proposal = experiment.choose(foreseeing({"stall": [0, 9.0, 9.0], "shunt": [0, 6.0, 12.0]}))
-    assert proposal.experiments == ("shunt",) and proposal.settles
+    # `shunt`, the lesser effort, tells both others from the best fit but not from one another; `stall` all three
+    proposal = experiment.choose(foreseeing({"shunt": [0, 9.0, 9.0], "stall": [0, 6.0, 12.0]}))
+    assert proposal.experiments == ("stall",) and proposal.settles
+
+
+def test_less_effort_is_preferred_also_beside_a_pair_that_nothing_tells():
+    assert experiment.choose(foreseeing({"weigh": [0, 6.0, 6.0], "stall": [0, 40.0, 40.0]})).experiments == ("weigh",)
+
+
+def test_one_pair_of_many_alternatives_counts():
+    far = [9.0 * k for k in range(1, 6)]
+    proposal = experiment.choose(foreseeing({"weigh": [0, 0.0, *far], "stall": [0, *(9.0 * k for k in range(1, 7))]}))
+    assert proposal.experiments == ("stall",) and proposal.settles
+
+
+def test_pair_that_one_experiment_tells_is_worth_more_than_three_that_none_does():
+    # three pairs 1.9 sigma apart at most by `stall`; `weigh` tells one of them by 3
+    proposal = experiment.choose(foreseeing({"stall": [0, 1.9, 0.95], "weigh": [0, 1.5, 3.0]}))
+    assert "weigh" in proposal.experiments and proposal.expected_sigma >= 2.0
+
+
+def test_two_weak_experiments_are_proposed_together():
+    proposal = experiment.choose(foreseeing({"stall": [0, 1.9], "weigh": [0, 1.9]}))
+    assert set(proposal.experiments) == {"stall", "weigh"} and proposal.expected_sigma == pytest.approx(1.9 * 2**0.5)
 
 
 def test_a_second_experiment_is_proposed_where_one_leaves_two_together():

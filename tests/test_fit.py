@@ -289,3 +289,31 @@ def test_series_pads_runs_of_different_length():
     np.testing.assert_allclose(seen, whole[kept], rtol=1e-8)
     # against `drive`, which made them: tests/test_histories.py says how close
     np.testing.assert_allclose(seen, runs.measured()[kept], rtol=5e-4, atol=1e-4)
+
+
+def test_rival_searches_end_where_three_agree_unless_one_is_lower():
+    """Members 0-2 rest in a basin of 30, 3 and 4 descend a curved valley to 0, 5 creeps at a cost of 2000."""
+
+    def residual(k, z):
+        valley = jnp.stack([10 * (z[1] - z[0] ** 2), 1 - z[0]])
+        basin = jnp.stack([z[0], jnp.sqrt(60.0)])
+        creeps = jnp.stack([jnp.sqrt(4000.0), 0.5 * jnp.sqrt(1 + (z[0] - 50) ** 2)])
+        return jnp.concatenate([jnp.where(k < 3, basin, jnp.where(k < 5, valley, creeps)), jnp.zeros(2), 1e-3 * z])
+
+    @jax.jit
+    def evaluate(z):
+        members = jnp.arange(len(z))
+        r, jacobian = jax.vmap(residual)(members, z), jax.vmap(jax.jacfwd(residual, 1))(members, z)
+        return r, jacobian, members
+
+    one = jnp.ones((1, 3))
+    data = problem.Data(0 * one, one, one, jnp.zeros(2), jnp.asarray(1.0))
+    begin = jnp.asarray([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [-1.2, 1.0], [-1.9, 2.0], [0.0, 0.0]])
+    weights = jnp.ones((6, 1, 3))
+    found, _ = fit.searches_long(evaluate, begin, data, weights, 40, rivals=True)
+    np.testing.assert_allclose(found.cost[:5], [30, 30, 30, 0, 0], atol=1e-3)
+    assert found.converged[:5].all() and found.steps[3] > found.steps[0]
+    alone, _ = fit.searches_long(evaluate, begin, data, weights, 40)
+    assert found.steps[5] < alone.steps[5]
+    same, _ = fit.searches_long(evaluate, begin[:3], data, weights[:3], 40, rivals=True)
+    assert (same.steps <= found.steps[:3]).all()

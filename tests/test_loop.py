@@ -301,13 +301,27 @@ def test_column_within_the_fit_scores_nothing(toy):
     assert scores.single[0] == scores.amplitude[0] == 0 < abs(toy.scores.single).min()
 
 
+def test_a_look_is_taken_anew_where_anything_changed(clean):
+    there, h = clean.loop, clean.found.base.hypothesis
+    first = there.look(h, there.curves)
+    assert there.look(h, there.curves) is first
+    moved = there.look(dataclasses.replace(h, z=h.z + 0.1), there.curves)
+    assert not np.allclose(moved[0].residual, first[0].residual)
+    counts = there.counts
+    there.counts = counts & (np.arange(len(counts)) > 0)
+    fewer = there.look(h, there.curves)
+    there.counts = counts
+    assert (np.asarray(fewer[0].residual)[:3] == 0).all() and (np.asarray(first[0].residual)[:3] != 0).any()
+
+
 def test_null_of_one_column_is_normal(clean):
     """|score| of one effect in tables drawn from the fit and fitted again is that of a standard normal."""
     there = clean.loop
     one = slots.scored(next(e for e in there.engine.effects if e.name == "ammeter_offset"))
     problem = there._weighted(there.problem)
     z = jnp.asarray(clean.found.base.hypothesis.z[: len(problem.coordinates)])
-    null = trace.bootstrap(trace.Tracer((one,)), problem, z, problem.data, there.curves[:1], 384, 0)
+    tracer = trace.Tracer((one,))
+    null = trace.bootstrap(lambda keys: tracer.null(problem, z, problem.data, there.curves[:1], keys), 384, 0)
     assert len(null.single) > 370
     assert stats.kstest(null.single, stats.halfnorm.cdf).pvalue > 0.02
     for factor in (0.8, 1.25):  # the test can fail

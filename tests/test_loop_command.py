@@ -134,7 +134,14 @@ def test_result_has_the_schema_of_the_issue(done):
     assert isinstance(r["cannot_see"], list) and isinstance(r["alternatives"], list)
     assert set(r["cannot_see"]) <= set(BY_NAME) and "cogging" in r["needs_series"]
     following = r["next_experiment"]
-    assert following is None or {"description", "separates", "expected_sigma"} <= set(following)
+    assert following is None or {
+        "experiments",
+        "description",
+        "separates",
+        "expected_sigma",
+        "settles",
+        "menu",
+    } <= set(following)
     assert following is not None or r["verdict"] == "named"
     for when in ("before", "after"):
         for seen in ("fitted", "held_out"):
