@@ -265,14 +265,14 @@ def searches_long(
     starts = jnp.asarray(starts)
     r, jacobian, seen = evaluate(starts)
     y, at, state = starts, starts, _begun(solver, starts, r, jacobian)
-    there, over, taken = (r, jacobian, seen), np.zeros(len(starts), bool), np.zeros(len(starts), int)
+    best, over, taken = (r, jacobian, seen), np.zeros(len(starts), bool), np.zeros(len(starts), int)
     for steps in range(1, max_steps + 1):
         # A step judges what was found where the last one led; what is accepted becomes y.
         new_y, state, done = _steps(solver, y, state, r, jacobian)
         moved = np.asarray(jnp.all(new_y == at, 1)) & ~over
-        y, there = _where(moved, (new_y, (r, jacobian, seen)), (y, there))
+        y, best = _where(moved, (new_y, (r, jacobian, seen)), (y, best))
         taken = np.where(over, taken, steps)
-        found = _optima(there[1], there[0], y, data, weights, jnp.asarray(taken))
+        found = _optima(best[1], best[0], y, data, weights, jnp.asarray(taken))
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost)
         over = over | np.asarray(done) | np.asarray(moved & (found.decrement < small))
         if rivals:
@@ -284,7 +284,7 @@ def searches_long(
             break
         at = jnp.where(over[:, None], y, state.y_eval)
         r, jacobian, seen = evaluate(at)
-    return found, there[2]
+    return found, best[2]
 
 
 @jax.jit

@@ -186,7 +186,7 @@ def next_experiment(loop: Loop, found: Finding) -> dict[str, Any] | None:
         "expected_sigma": proposal.expected_sigma, "settles": proposal.settles,
         "menu": [
             {
-                "name": " and ".join(r.experiments), "smallest_sigma": r.smallest, "separates": list(r.separates),
+                "name": r.experiments[0], "smallest_sigma": r.smallest, "separates": list(r.separates),
                 "chance_worst": float(r.chances.min()), "chance_mean": float(r.chances.mean()),
             }
             for r in proposal.table

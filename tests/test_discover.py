@@ -29,7 +29,9 @@ def engine():
     return loop.Engine(nominal.nominal(), {"churning": BY_NAME["churning"]}, size=1)
 
 
-@pytest.fixture(scope="module", params=["commutation_step", pytest.param("guide_binding", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=[pytest.param(c, marks=pytest.mark.slow) if k else c for k, c in enumerate(CASES)]
+)
 def found(request, engine, tmp_path_factory):
     """A case of 12 sigmas, its loop after the base fit, and what is discovered."""
     case = g.case([request.param], 12.0, seed=1)
