@@ -20,11 +20,15 @@ import numpy as np  # noqa: E402
 import reference  # noqa: E402  (tests/reference.py, plain NumPy and SciPy)
 from scipy.optimize import least_squares, root  # noqa: E402
 
-from calibration import fit, identifiability, noise, outcome, priors, problem, records  # noqa: E402
-from calibration.calibrate import calibrate  # noqa: E402
-from calibration.residual import relative_error, summary  # noqa: E402
+from calibration.data import noise  # noqa: E402
+from calibration.data import runs as records  # noqa: E402
+from calibration.inference import identifiability, priors, problem  # noqa: E402
+from calibration.inference import optimizers as fit  # noqa: E402
+from calibration.inference import result as outcome  # noqa: E402
+from calibration.inference.calibrate import calibrate  # noqa: E402
+from calibration.inference.errors import relative_error, summary  # noqa: E402
 from mmrjax import nominal, params  # noqa: E402
-from mmrjax.models.steady import steady_batch  # noqa: E402
+from mmrjax.fidelities.steady import steady_batch  # noqa: E402
 
 STATED = "current=2%,motor_speed=0.5%,speed=1%"
 CLIMBS = {"tracked.ground.friction.static": 0.6, "wheeled.ground.friction.static": 0.6}

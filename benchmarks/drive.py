@@ -91,7 +91,7 @@ def main() -> None:
     import jax.numpy as jnp
 
     from mmrjax import nominal
-    from mmrjax.models.drive import drive_batch
+    from mmrjax.fidelities.drive import drive_batch
     from mmrjax.signals import FAILED, command
 
     robot, times = nominal.nominal(), jnp.asarray(INSTANTS)

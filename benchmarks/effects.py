@@ -16,8 +16,8 @@ import numpy as np
 
 from mmrjax import balances, nominal, params
 from mmrjax.effects import ALL, Effect
-from mmrjax.models.drive import drive
-from mmrjax.models.steady import steady
+from mmrjax.fidelities.drive import drive
+from mmrjax.fidelities.steady import steady
 from mmrjax.robot import Robot
 from mmrjax.signals import Command, command
 

@@ -32,8 +32,8 @@ import numpy as np
 
 from mmrjax import balances, mjcf, params
 from mmrjax.contact import force_contact, step
-from mmrjax.models.ripple import period_pitch, ripple
-from mmrjax.models.track import _batch
+from mmrjax.fidelities.ripple import period_pitch, ripple
+from mmrjax.fidelities.track import _batch
 from mmrjax.nominal import nominal
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 from mmrjax.signals import GRAVITY, State, command

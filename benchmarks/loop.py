@@ -103,7 +103,9 @@ def oracle(case: g.Case) -> list[dict]:
 
 def one(engine, kind: str, seed: int, replicates: int) -> dict:
     """A case made, looped over and scored against its label."""
-    from calibration import loop, noise, records
+    from calibration.data import noise
+    from calibration.data import runs as records
+    from calibration.discovery import loop
 
     case = make(kind, seed)
     if case is None:
@@ -140,7 +142,7 @@ def judged(case: g.Case, found, looped) -> dict:
 
 def after(case: g.Case, found, looped) -> dict:
     """Errors held out by slope before and after, over the noise's sd, and the bias of the base parameters."""
-    from calibration import holdout
+    from calibration.inference import blocks as holdout
 
     masks = list(holdout.blocks(looped.runs, "slope").values())
     rows = len(looped.runs)
@@ -160,7 +162,7 @@ def after(case: g.Case, found, looped) -> dict:
 
 def carried_out(case: g.Case, found, looped) -> list[dict]:
     """Experiments proposed and carried out one after the other, until one alternative or nothing to do is left."""
-    from calibration import experiment
+    from calibration.discovery import experiments as experiment
 
     seen = whole = experiment.prospect(looped, experiment.alternatives(looped, found))
     done: dict[str, dict] = {}
@@ -186,7 +188,7 @@ def engine_of(robot: str, series: bool = False):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from calibration import loop
+    from calibration.discovery import loop
     from mmrjax import nominal
 
     return loop.Engine(nominal.ROBOTS[robot](), series=series)

@@ -146,8 +146,8 @@ def sindy(looped, linear, scores) -> list[str]:
 
     A term of another balance, or of an instrument, is taken as the defects that change the readings as it does.
     """
-    from calibration.loop_outcome import defects
-    from calibration.trace import PROBED
+    from calibration.discovery.result import defects
+    from calibration.discovery.score_tests import PROBED
 
     found = defects(looped, SimpleNamespace(linear=linear))
     signatures = columns(looped, linear, scores)
@@ -186,7 +186,9 @@ def sindy_refit(looped, linear, scores) -> list[str]:
 
 def one(engine, kind: str, seed: int) -> dict:
     """A case made, and what each method names."""
-    from calibration import loop, noise, records
+    from calibration.data import noise
+    from calibration.data import runs as records
+    from calibration.discovery import loop
 
     case = make(kind, seed)
     if case is None:

@@ -220,7 +220,7 @@ def ours(batch: int, duration: float) -> dict:
     import jax
     import numpy as np
 
-    from mmrjax.models.track import track_batch
+    from mmrjax.fidelities.track import track_batch
     from mmrjax.nominal import nominal
     from mmrjax.signals import command
 

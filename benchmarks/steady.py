@@ -28,7 +28,7 @@ def main() -> None:
     import jax.numpy as jnp
 
     from mmrjax import nominal
-    from mmrjax.models.steady import steady_batch
+    from mmrjax.fidelities.steady import steady_batch
     from mmrjax.signals import CONVERGED, command
 
     robot = nominal.nominal()

@@ -26,7 +26,8 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mujoco import sysid  # noqa: E402
 
-from calibration import fit, priors, problem  # noqa: E402
+from calibration.inference import optimizers as fit  # noqa: E402
+from calibration.inference import priors, problem  # noqa: E402
 from mmrjax import nominal, params  # noqa: E402
 from mmrjax.signals import command  # noqa: E402
 

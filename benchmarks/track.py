@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import nominal, params
-from mmrjax.models.stability import largest_step
-from mmrjax.models.track import _batch, track
+from mmrjax.fidelities.stability import largest_step
+from mmrjax.fidelities.track import _batch, track
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import STATUSES, command
 

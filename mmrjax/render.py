@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mmrjax import params
 from mmrjax.belt import Path, tips
-from mmrjax.models.track import Trajectory
+from mmrjax.fidelities.track import Trajectory
 from mmrjax.robot import Robot
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, RunningGear
 from mmrjax.signals import GRAVITY, Command

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import nominal, params
-from mmrjax.models.steady import steady_batch
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.signals import STATUSES, command
 
 # %% [markdown]

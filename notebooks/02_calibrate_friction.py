@@ -32,8 +32,10 @@ import numpy as np
 from IPython.display import Image
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from calibration import outcome, priors, records
-from calibration.calibrate import calibrate
+from calibration.data import runs as records
+from calibration.inference import priors
+from calibration.inference import result as outcome
+from calibration.inference.calibrate import calibrate
 from mmrjax import nominal
 
 runs = records.read("measured")

@@ -37,10 +37,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import calibration
-from calibration import records
+from calibration.data import runs as records
 from mmrjax import nominal, params
-from mmrjax.models.steady import steady_batch
-from mmrjax.models.track import track
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.fidelities.track import track
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import STATUSES
 

@@ -7,9 +7,12 @@ from typing import Any
 
 from rich.table import Table
 
-from calibration import holdout, outcome, priors, robot_file
-from calibration.calibrate import calibrate as run
-from calibration.records import CHANNELS
+from calibration.data import robot_file
+from calibration.data.runs import CHANNELS
+from calibration.inference import blocks as holdout
+from calibration.inference import priors
+from calibration.inference import result as outcome
+from calibration.inference.calibrate import calibrate as run
 from sweeps import commands
 from sweeps import config as configuration
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calibration.doors import DoorError
+from calibration.data.errors import DoorError
 from mmrjax import __version__
 
 INTERRUPTED = 130
@@ -377,7 +377,7 @@ def _prepared(resolved: Any) -> Any:
 
 def _one_run(configuration: str, voltage: float, slope: float, payload: float, mass: float | None,
              surface: str) -> Any:  # fmt: skip
-    from calibration import records
+    from calibration.data import runs as records
 
     cells: dict[str, Any] = {
         "configuration": configuration, "supply_voltage_V": voltage, "payload_kg": payload, "slope_deg": slope,

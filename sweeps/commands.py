@@ -16,10 +16,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from calibration import effect_file, records, residual, robot_file
-from calibration.doors import BadConfiguration, BadData
+from calibration.data import effect_file, robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.inference import errors as residual
 from mmrjax import __version__, balances, params
-from mmrjax.models.drive import drive_batch
+from mmrjax.fidelities.drive import drive_batch
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration

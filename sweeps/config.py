@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.doors import BadConfiguration, choices
-from calibration.records import CONDITIONS
+from calibration.data.errors import BadConfiguration, choices
+from calibration.data.runs import CONDITIONS
 from mmrjax.tables import BENCH, CONFIGURATIONS, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 
 Model = Literal["steady", "drive", "track"]
@@ -34,7 +34,7 @@ class Simulation(BaseModel):
         step_s: integration step of `track` [s].
         robot: name of a robot, or path of its TOML file.
         set: parameters to change, by dotted name, in SI units.
-        effects: Python files with effects of the user's own, see `calibration.effect_file`.
+        effects: Python files with effects of the user's own, see `calibration.data.effect_file`.
         battery: run on the on-board battery instead of the external supply.
         discharge_mAh: charge already taken from the battery.
         chunk: runs in one vmapped call; None takes `CHUNK`.

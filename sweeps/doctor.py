@@ -56,7 +56,7 @@ def _run() -> str:
     import jax.numpy as jnp
 
     from mmrjax import nominal, params
-    from mmrjax.models.steady import steady_batch
+    from mmrjax.fidelities.steady import steady_batch
     from mmrjax.signals import command
 
     robot = nominal.nominal()
@@ -74,7 +74,7 @@ def _derivative() -> str:
     import jax
 
     from mmrjax import nominal, params
-    from mmrjax.models.steady import steady
+    from mmrjax.fidelities.steady import steady
     from mmrjax.signals import command
 
     robot, run = nominal.nominal(), command()

@@ -8,9 +8,9 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.calibrate import Calibration
-from calibration.identifiability import Z95
-from calibration.records import CHANNELS
+from calibration.data.runs import CHANNELS
+from calibration.inference.calibrate import Calibration
+from calibration.inference.identifiability import Z95
 from sweeps.figures_style import BLUE, CHANNEL_WORDS, FAINT, INK, ORANGE, VERMILION, figure
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration import records, residual
-from calibration.records import MM, RPM
+from calibration.data import runs as records
+from calibration.data.runs import MM, RPM
+from calibration.inference import errors as residual
 from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def operating_points(robot: Robot, conditions: Command) -> Columns:
     """Steady operating points of a batch, in the columns of `runs.csv`."""
     import jax
 
-    from mmrjax.models.steady import steady_batch
+    from mmrjax.fidelities.steady import steady_batch
     from sweeps import outputs
 
     rows = conditions.voltage.shape[0]
@@ -220,7 +221,7 @@ class Start:
 
 def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[Start]:
     """From standstill on the flat with `drive`, both configurations, stages read from the signals."""
-    from mmrjax.models.drive import drive_batch
+    from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
     run = drive_batch(robot, command(robot, configuration=np.array(CONFIGURATIONS), voltage=voltage), times)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.discover import Discrepancy
-from calibration.loop import Finding, Loop
-from calibration.records import CHANNELS, MM, RPM
+from calibration.data.runs import CHANNELS, MM, RPM
+from calibration.discovery.discrepancy import Discrepancy
+from calibration.discovery.loop import Finding, Loop
 from sweeps.figures_calibration import short
 from sweeps.figures_style import (
     BLUE,

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration import residual
+from calibration.inference import errors as residual
 from mmrjax.tables import CONFIGURATIONS
 from sweeps import figures_data as data
 from sweeps.figures import words_robot

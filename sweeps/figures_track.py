@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from mmrjax.models import ripple
-from mmrjax.models.stability import largest_step
-from mmrjax.models.track import STEP, Trajectory, track_batch
+from mmrjax.fidelities import ripple
+from mmrjax.fidelities.stability import largest_step
+from mmrjax.fidelities.track import STEP, Trajectory, track_batch
 from mmrjax.robot import CONFIGURATIONS, Robot
 from mmrjax.signals import CONVERGED, NOT_SETTLED, SLIDES
 from mmrjax.tables import PITCH_GROUSER, PITCH_TOOTH

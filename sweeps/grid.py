@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from calibration.records import Runs
+from calibration.data.runs import Runs
 from sweeps.config import Sweep
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration import checks, effect_file, loop_outcome, priors, robot_file
-from calibration import noise as noise_room
-from calibration.doors import BadData
-from calibration.loop import Engine, Finding, Loop
-from calibration.problem import is_series
-from calibration.records import CHANNELS, Runs
+from calibration.data import checks, effect_file, robot_file
+from calibration.data import noise as noise_room
+from calibration.data.errors import BadData
+from calibration.data.runs import CHANNELS, Runs
+from calibration.discovery import result as loop_outcome
+from calibration.discovery.loop import Engine, Finding, Loop
+from calibration.inference import priors
+from calibration.inference.problem import is_series
 from sweeps import commands
 from sweeps import config as configuration
 
@@ -114,7 +116,7 @@ def _distinct(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
 
 def _long(runs: Runs) -> list[str]:
     """What to say of runs so long that the steps of the model are."""
-    from mmrjax.models.histories import LONGEST, STEPS
+    from mmrjax.fidelities.histories import LONGEST, STEPS
 
     step = runs["time_s"].max() / STEPS
     if step <= 2 * LONGEST:

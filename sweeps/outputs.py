@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.records import MM, RPM
+from calibration.data.runs import MM, RPM
 from mmrjax.signals import FLAGS, STATUSES, Result
 
 #: Number columns: name → (number out of a result, unit as a factor).

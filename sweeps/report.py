@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jinja2
 import numpy as np
 
-from calibration import residual
+from calibration.inference import errors as residual
 from mmrjax import __version__
 from mmrjax.robot import CONFIGURATIONS
 from sweeps import figures, figures_data, figures_runs, figures_sweep, report_tables

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calibration import outcome
-from calibration.calibrate import Calibration
+from calibration.inference import result as outcome
+from calibration.inference.calibrate import Calibration
 from sweeps import figures_calibration, figures_sweep
 from sweeps.report import COLUMNS, Album, render, words_shown
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calibration import loop_outcome
-from calibration.discover import Discrepancy
-from calibration.loop import Finding, Loop
+from calibration.discovery import result as loop_outcome
+from calibration.discovery.discrepancy import Discrepancy
+from calibration.discovery.loop import Finding, Loop
 from sweeps import figures_loop
 from sweeps.report import COLUMNS, Album, render, words_shown
 

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration import records, residual
+from calibration.data import runs as records
+from calibration.inference import errors as residual
 from mmrjax import params
 from mmrjax.tables import CONFIGURATIONS
 from sweeps import figures_data as data

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.doors import BadConfiguration
-from calibration.records import Runs
-from mmrjax.models.drive import drive_batch
-from mmrjax.models.steady import steady_batch
+from calibration.data.errors import BadConfiguration
+from calibration.data.runs import Runs
+from mmrjax.fidelities.drive import drive_batch
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import CONFIGURATIONS, Robot
 from mmrjax.signals import STATUSES, Command
@@ -21,7 +21,7 @@ from sweeps.config import Simulation
 from sweeps.store import RunFolder
 
 if TYPE_CHECKING:
-    from mmrjax.models.track import Trajectory
+    from mmrjax.fidelities.track import Trajectory
 
 
 def simulate(
@@ -48,7 +48,7 @@ def track_runs(
     Raises:
         BadConfiguration: no whole number of steps, or a step too large for the stiffness.
     """
-    from mmrjax.models import track  # mujoco is imported only where it is used
+    from mmrjax.fidelities import track  # mujoco is imported only where it is used
 
     try:
         return track.track_batch(
@@ -60,7 +60,7 @@ def track_runs(
 
 def _bear(robot: Robot, runs: Runs, config: Simulation) -> None:
     """Refuse a step that some run of any chunk cannot bear, before the first is simulated."""
-    from mmrjax.models import stability, track
+    from mmrjax.fidelities import stability, track
     from mmrjax.running_gear import RunningGear
 
     try:

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.doors import BadConfiguration, DoorError
-from calibration.records import Runs
+from calibration.data.errors import BadConfiguration, DoorError
+from calibration.data.runs import Runs
 from mmrjax import __version__
 
 #: Packages whose versions are part of a result.

@@ -17,8 +17,8 @@ import pytest
 
 from mmrjax import nominal, params
 from mmrjax.effects import ALL, BY_NAME
-from mmrjax.models.drive import drive, drive_batch
-from mmrjax.models.steady import steady, steady_batch
+from mmrjax.fidelities.drive import drive, drive_batch
+from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.signals import Command, Result, command
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the

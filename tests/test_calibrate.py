@@ -8,11 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from calibration import noise, outcome, records, robot_file
-from calibration.calibrate import calibrate
-from calibration.doors import BadConfiguration, BadData
+from calibration.data import noise, robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.inference import result as outcome
+from calibration.inference.calibrate import calibrate
 from mmrjax import nominal
-from mmrjax.models.steady import steady_batch
+from mmrjax.fidelities.steady import steady_batch
 
 
 @pytest.fixture(scope="module")

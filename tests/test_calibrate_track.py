@@ -7,12 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration import checks, fit, outcome, priors, records
-from calibration.calibrate import calibrate
-from calibration.priors import GUIDE_FRICTION, GUIDE_SHARE, GUIDED
+from calibration.data import checks
+from calibration.data import runs as records
+from calibration.inference import optimizers as fit
+from calibration.inference import priors
+from calibration.inference import result as outcome
+from calibration.inference.calibrate import calibrate
+from calibration.inference.priors import GUIDE_FRICTION, GUIDE_SHARE, GUIDED
 from mmrjax import nominal, params
-from mmrjax.models.steady import steady_batch
-from mmrjax.models.track import track
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.fidelities.track import track
 from mmrjax.signals import CONVERGED
 
 STATIC = "tracked.ground.friction.static"

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import test_effects as laws
 
-from calibration import curves, robot_file
-from calibration.doors import BadConfiguration
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
+from calibration.discovery import bases as curves
 from mmrjax import balances, effects, nominal, params
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
-from mmrjax.models.drive import drive
+from mmrjax.fidelities.drive import drive
 from mmrjax.signals import Signals
 
 EACH = pytest.mark.parametrize("effect", CURVES.values(), ids=list(CURVES))

@@ -11,11 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration import curves, discover, loop, noise, records, robot_file
-from calibration.trace import PROBED
+from calibration.data import noise, robot_file
+from calibration.data import runs as records
+from calibration.discovery import bases as curves
+from calibration.discovery import discrepancy as discover
+from calibration.discovery import loop
+from calibration.discovery.score_tests import PROBED
 from mmrjax import nominal, params
 from mmrjax.effects import BY_NAME
-from mmrjax.models.steady import steady_batch
+from mmrjax.fidelities.steady import steady_batch
 
 #: An effect that no library holds → balance and variable that it acts through.
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}

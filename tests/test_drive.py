@@ -11,8 +11,8 @@ from scipy.integrate import cumulative_simpson
 
 from mmrjax import balances, params
 from mmrjax.effects.thermal_drift import ThermalDrift
-from mmrjax.models.drive import drive, drive_batch
-from mmrjax.models.steady import steady, steady_batch
+from mmrjax.fidelities.drive import drive, drive_batch
+from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.signals import CONVERGED, STATUSES, State, command
 
 STATES = ("current", "speed_motor", "speed", "discharge")

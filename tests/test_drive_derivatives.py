@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.models.drive import drive
+from mmrjax.fidelities.drive import drive
 from mmrjax.signals import STATUSES, command
 
 RUNS = {

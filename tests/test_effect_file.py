@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibration import effect_file, robot_file
-from calibration.doors import BadConfiguration
+from calibration.data import effect_file, robot_file
+from calibration.data.errors import BadConfiguration
 from mmrjax import params
 from mmrjax.effects import BY_NAME
-from mmrjax.models.steady import steady_batch
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.signals import command
 
 GOOD = '''

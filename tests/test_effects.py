@@ -17,8 +17,8 @@ import pytest
 
 from mmrjax import balances, effects, nominal, params
 from mmrjax.effects import ALL, BY_NAME, Effect
-from mmrjax.models.drive import drive
-from mmrjax.models.steady import steady, steady_batch
+from mmrjax.fidelities.drive import drive
+from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Reading, Signals, State, command
 

@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 from test_generator import SHAPES
 
-from calibration import experiment, loop, menu, noise, records
+from calibration.data import noise
+from calibration.data import runs as records
+from calibration.discovery import experiments as experiment
+from calibration.discovery import loop, menu
 from mmrjax import nominal, params
 from mmrjax.effects import BY_NAME
 

@@ -8,8 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration import fit, holdout, identifiability, noise, priors, problem, records
-from calibration.normal import backward, cholesky, forward
+from calibration.data import noise
+from calibration.data import runs as records
+from calibration.inference import blocks as holdout
+from calibration.inference import identifiability, priors, problem
+from calibration.inference import optimizers as fit
+from calibration.inference.normal_equations import backward, cholesky, forward
 from mmrjax import nominal
 from mmrjax.signals import CONVERGED, SLIDES
 
@@ -223,7 +227,7 @@ def test_drive_and_steady_agree_on_settled_rows(measured, truth, posed):
 
 def series_runs(robot, seed=None, noise_share=0.01):
     """Starts of both configurations as a table of histories, from `drive`."""
-    from mmrjax.models.drive import drive_batch
+    from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0.0002, 0.004, 8), np.linspace(0.02, 0.6, 12)])
     conditions = records.Runs(

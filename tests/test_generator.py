@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration import records
+from calibration.data import runs as records
 from mmrjax import nominal, params
 from mmrjax.effects import ALL, BY_NAME
-from mmrjax.models.steady import steady_batch
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.signals import command
 
 GRID = g.table8(payloads=nominal.PAYLOADS_KG)

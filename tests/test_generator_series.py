@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration import records
+from calibration.data import runs as records
 from mmrjax import nominal, params
 from mmrjax.effects import ALL, BY_NAME
-from mmrjax.models.drive import drive_batch
+from mmrjax.fidelities.drive import drive_batch
 from mmrjax.signals import command
 
 RUNS = gs.starts(g.CLIMBING)

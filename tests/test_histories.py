@@ -10,8 +10,8 @@ from jax.flatten_util import ravel_pytree
 
 from mmrjax import nominal, params
 from mmrjax.effects import BY_NAME
-from mmrjax.models.drive import drive
-from mmrjax.models.histories import FIRST, LONGEST, grid, histories
+from mmrjax.fidelities.drive import drive
+from mmrjax.fidelities.histories import FIRST, LONGEST, grid, histories
 from mmrjax.signals import command
 
 RUNS = command(

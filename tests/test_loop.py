@@ -12,7 +12,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibration import curves, loop, noise, records, slots, trace
+from calibration.data import noise
+from calibration.data import runs as records
+from calibration.discovery import active_set as slots
+from calibration.discovery import bases as curves
+from calibration.discovery import loop
+from calibration.discovery import score_tests as trace
 from mmrjax import nominal, params
 from mmrjax.effects import BY_NAME
 

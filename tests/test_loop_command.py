@@ -16,7 +16,8 @@ import generator_series as gs
 import numpy as np
 import pytest
 
-from calibration import curves, effect_file
+from calibration.data import effect_file
+from calibration.discovery import bases as curves
 from mmrjax.effects import BY_NAME
 from sweeps import cli
 from sweeps import loop as room

@@ -11,8 +11,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibration import checks, curves, discover, loop, loop_outcome, noise, problem, records, slots, trace
-from calibration.doors import BadData
+from calibration.data import checks, noise
+from calibration.data import runs as records
+from calibration.data.errors import BadData
+from calibration.discovery import active_set as slots
+from calibration.discovery import bases as curves
+from calibration.discovery import discrepancy as discover
+from calibration.discovery import loop
+from calibration.discovery import result as loop_outcome
+from calibration.discovery import score_tests as trace
+from calibration.inference import problem
 from mmrjax import nominal, params
 from mmrjax.effects import BY_NAME, UNNAMED
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration import priors
-from calibration.doors import BadConfiguration
+from calibration.data.errors import BadConfiguration
+from calibration.inference import priors
 from mmrjax import nominal, params
 from mmrjax.effects import ALL
 

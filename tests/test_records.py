@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from calibration import records
-from calibration.doors import BadData
+from calibration.data import runs as records
+from calibration.data.errors import BadData
 
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"

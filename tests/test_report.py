@@ -15,10 +15,11 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 import pytest
 
-from calibration import records, residual
+from calibration.data import runs as records
+from calibration.inference import errors as residual
 from mmrjax import params
 from mmrjax.effects import BY_NAME
-from mmrjax.models.steady import steady_batch
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.nominal import ROBOTS
 from sweeps import figures_data, figures_sweep, outputs, report, report_tables
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mmrjax import params
-from mmrjax.models.stability import largest_step
+from mmrjax.fidelities.stability import largest_step
 from mmrjax.signals import CONVERGED, FAILED
 from sweeps import figures_track, report
 from sweeps.figures_data import command
@@ -76,7 +76,7 @@ def test_ripple_table_has_the_period_of_equation_34(written, period):
 
 @pytest.mark.slow
 def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, written):
-    from mmrjax.models.steady import steady
+    from mmrjax.fidelities.steady import steady
     from mmrjax.signals import command as one
 
     said = re.search(r'id="guide-share">(.*?)</p>', written[1], re.S).group(1)

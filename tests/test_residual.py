@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration import residual
+from calibration.inference import errors as residual
 
 
 def test_relative_error_is_equation_35_with_simulated_below():

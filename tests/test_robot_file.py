@@ -2,8 +2,8 @@
 
 import pytest
 
-from calibration import robot_file
-from calibration.doors import BadConfiguration
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
 from mmrjax import effects, nominal, params
 
 

@@ -9,8 +9,8 @@ import pytest
 import reference
 
 from mmrjax import params
-from mmrjax.models.drive import drive_batch
-from mmrjax.models.steady import steady, steady_batch
+from mmrjax.fidelities.drive import drive_batch
+from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.signals import FLAGS, STATUSES, Command, command
 
 CHANNELS = ("total_current", "motor_speed", "speed")

@@ -75,7 +75,7 @@ def test_steady_derivatives_at_zero_slip_are_finite(theta, steady_numbers, free)
 
 def test_steady_second_derivatives_are_central_differences(rebuild, theta, free, scales):
     """Of the speed by three parameters, through the implicit derivative twice."""
-    from mmrjax.models.steady import steady
+    from mmrjax.fidelities.steady import steady
 
     names = [p.name for p in free]
     chosen = [names.index(n) for n in ("motor.resistance", "tracked.mass", "tracked.ground.friction.static")]

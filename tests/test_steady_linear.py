@@ -6,7 +6,7 @@ import lineax as lx
 import numpy as np
 import pytest
 
-from mmrjax.models.linear import SmallDense, factorise, substitute
+from mmrjax.fidelities.linear import SmallDense, factorise, substitute
 
 RNG = np.random.default_rng(1)
 EXCHANGE = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # no pivot on the diagonal at all

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.doors import BadConfiguration
+from calibration.data.errors import BadConfiguration
 from mmrjax import params
-from mmrjax.models.half_robot import margin, stand, system
-from mmrjax.models.stability import _whole, largest_step
-from mmrjax.models.track import _batch, track_batch
+from mmrjax.fidelities.half_robot import margin, stand, system
+from mmrjax.fidelities.stability import _whole, largest_step
+from mmrjax.fidelities.track import _batch, track_batch
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import FAILED, command
 from sweeps import config as configuration
@@ -47,7 +47,7 @@ def test_beyond_the_largest_step_a_run_goes_wrong_and_below_it_does_not(robot):
     speed = [
         float(_batch(robot, steep, gear, 0.5, step, 1e-3, True).result.reading.speed[1]) for step in (5e-5, 5e-4)
     ]
-    from mmrjax.models.steady import steady
+    from mmrjax.fidelities.steady import steady
 
     right = float(steady(robot, jax.tree.map(lambda x: x[1], steep)).reading.speed)
     assert speed[0] == pytest.approx(right, rel=5e-4)
@@ -98,7 +98,7 @@ def test_posture_that_cannot_stand_has_a_negative_margin(robot):
 
 def test_standing_robot_is_in_balance(robot):
     """Weight and moment to 1e-9, on a slope with a payload off centre; then no force is left over."""
-    from mmrjax.models.half_robot import instant
+    from mmrjax.fidelities.half_robot import instant
 
     gear = params.replace(RunningGear(), {"payload_offset": jnp.asarray(0.05)})
     for wheeled in (0.0, 1.0):
@@ -115,7 +115,7 @@ def test_member_that_blows_up_fails_alone(robot):
 
     @jax.jit
     def both(stiffness, damping):
-        from mmrjax.models.track import track
+        from mmrjax.fidelities.track import track
 
         def one(c, b):
             own = dataclasses.replace(gear, contact_stiffness=c, contact_damping=b)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mmrjax import params
-from mmrjax.models.track import track
+from mmrjax.fidelities.track import track
 from mmrjax.signals import CONVERGED, command
 
 PARAMETERS = (

@@ -9,8 +9,8 @@ import pytest
 
 from mmrjax import nominal, params
 from mmrjax.effects import ALL
-from mmrjax.models.steady import steady
-from mmrjax.models.track import track
+from mmrjax.fidelities.steady import steady
+from mmrjax.fidelities.track import track
 from mmrjax.signals import command
 
 SETTLED = tuple(e for e in ALL if not e.transient)

@@ -8,8 +8,8 @@ import pytest
 
 from mmrjax import params
 from mmrjax.belt import travel
-from mmrjax.models.half_robot import advance, centre, instant, stand, system
-from mmrjax.models.track import track
+from mmrjax.fidelities.half_robot import advance, centre, instant, stand, system
+from mmrjax.fidelities.track import track
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import GRAVITY, command
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mmrjax.belt import Path
-from mmrjax.models.ripple import period_pitch, ripple, stages, touchdowns
-from mmrjax.models.track import track_batch
+from mmrjax.fidelities.ripple import period_pitch, ripple, stages, touchdowns
+from mmrjax.fidelities.track import track_batch
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import STATUSES, command
 
@@ -35,7 +35,7 @@ def runs(robot):
     wheeled, slope, payload, voltage = np.array(RUNS, float).T
     commands = command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
     # Not through the door's check of the step, whose own compilation test_track_bad_input pays.
-    from mmrjax.models.track import _batch
+    from mmrjax.fidelities.track import _batch
 
     return jax.tree.map(np.asarray, _batch(robot, commands, RunningGear(), 1.5, 1e-4, 1e-3, False))
 
@@ -178,8 +178,8 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     `drive` ends on `steady` (test_drive).
     """
     from mmrjax import params
-    from mmrjax.models.steady import steady
-    from mmrjax.models.track import _batch
+    from mmrjax.fidelities.steady import steady
+    from mmrjax.fidelities.track import _batch
 
     rows = grid[grid[:, 1] <= np.where(grid[:, 0] > 0.5, 15.0, 10.0)]
     wheeled, slope, payload, voltage = rows.T
@@ -199,7 +199,7 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
 
 def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
-    from mmrjax.models.track import _batch
+    from mmrjax.fidelities.track import _batch
 
     two = command(voltage=jnp.asarray([33.0, 15.0]), wheeled=jnp.asarray([0.0, 1.0]))
     twin = jax.tree.map(lambda x: x[::-1], two)
@@ -221,7 +221,7 @@ def test_batch_compiles_once(robot, compilations):
 @pytest.mark.slow
 def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
-    from mmrjax.models.track import PARTS, _batch
+    from mmrjax.fidelities.track import PARTS, _batch
 
     two = command(voltage=jnp.asarray([33.0, 15.0]), wheeled=jnp.asarray([0.0, 1.0]))
     shares = []

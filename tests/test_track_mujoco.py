@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mmrjax import balances, mjcf, params
-from mmrjax.models.half_robot import advance, generalized, instant, stand, system
+from mmrjax.fidelities.half_robot import advance, generalized, instant, stand, system
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import State, command
 

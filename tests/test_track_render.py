@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mmrjax.models.track import _batch
+from mmrjax.fidelities.track import _batch
 from mmrjax.render import render, scene
 from mmrjax.running_gear import RunningGear
 from mmrjax.signals import command

@@ -1,0 +1,1 @@
+"""The closed loop: what a fitted model lacks, traced to a balance and, where one fits, to an effect."""

@@ -1,0 +1,340 @@
+"""The next experiment: of a menu, the one that best tells apart what a finished loop could not.
+
+Alternatives are hypotheses that explain the same table equally well. Each foresees every reading y of the menu,
+with the covariance S = diag(sd²) + J C Jᵀ: of the instruments, and to first order of its fitted coordinates,
+C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner and Verdinelli, Bayesian experimental design,
+Statistical Science 10 (1995)). Two alternatives A, B are √(dᵀ S⁻¹ d) apart, d = y_A - y_B, with the S of the
+two that leaves less (Hunter and Reiner, Designs for discriminating between two rival models, Technometrics 7
+(1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ, σ being that distance, so that the
+chance that the false one is refuted is Φ((σ² - REFUTED) / 2σ). What is proposed is what is expected to tell the
+most of all pairs apart; where one experiment does not do, two.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy import stats
+
+from calibration.discovery import menu
+from calibration.discovery.loop import Finding, Hypothesis, Loop, free_names
+from calibration.inference import optimizers as fit
+from calibration.inference import priors
+from calibration.inference.normal_equations import cholesky, forward
+from calibration.inference.problem import Problem
+from mmrjax.tables import CONFIGURATIONS
+
+#: Separation from which an experiment is worth while, and from which it is said to tell two apart [σ].
+WORTH, APART = 2.0, 3.0
+#: Chance that a pair is told apart beyond which more is no gain, so that the effort decides; how much a second
+#: experiment has to add to the number of pairs that are expected to be told apart.
+ENOUGH, GAIN = 0.95, 0.2
+#: Rise of χ² by which an alternative is refuted, two sigmas.
+REFUTED = 4.0
+#: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
+PAD = 4
+NONE = "none on this menu"
+
+
+@dataclasses.dataclass(frozen=True)
+class Prospect:
+    """What every alternative foresees of every reading of the menu.
+
+    Attributes:
+        names: of the alternatives, the best fit first.
+        value: readings [SI], shape (alternatives, readings); sd: of the instruments [SI], shape (readings,).
+        half: J C^½, so that the covariance that the fit leaves is half halfᵀ; shape
+            (alternatives, readings, coordinates).
+        there: readings that exist for every alternative, shape (readings,).
+    """
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    half: np.ndarray
+    sd: np.ndarray
+    there: np.ndarray
+
+    def apart(self, a: int, b: int, *experiments: str) -> float:
+        """Expected separation of two alternatives by experiments, all carried out [σ]."""
+        spans = [menu.spans()[e] for e in experiments]
+        at = np.concatenate([np.flatnonzero(self.there[k]) + k.start for k in spans])
+        d = self.value[a, at] - self.value[b, at]
+        squares = [d @ np.linalg.solve(_covariance(self.half[x, at], self.sd[at]), d) for x in (a, b)]
+        return float(np.sqrt(max(min(squares), 0.0)))
+
+    def among(self, names: Sequence[str]) -> Prospect:
+        """Of these alternatives alone, in their order; the first is the best fit only while that is among them."""
+        kept = [k for k, n in enumerate(self.names) if n in names]
+        return dataclasses.replace(
+            self, names=tuple(self.names[k] for k in kept), value=self.value[kept], half=self.half[kept]
+        )
+
+
+def _covariance(half: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    return half @ half.T + np.diag(sd**2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranked:
+    """One experiment of the menu, or several carried out together.
+
+    Attributes:
+        experiments: their names; sigma: between every two alternatives, the pairs of the best fit first, as
+            `itertools.combinations` has them [σ].
+        separates: alternatives that they tell from the best fit, at `APART`.
+    """
+
+    experiments: tuple[str, ...]
+    sigma: tuple[float, ...]
+    separates: tuple[str, ...]
+
+    @property
+    def smallest(self) -> float:
+        """Separation of the pair that is told apart worst [σ]."""
+        return min(self.sigma, default=0.0)
+
+    @property
+    def told(self) -> tuple[float, ...]:
+        """Separations that are worth while."""
+        return tuple(s for s in self.sigma if s >= WORTH)
+
+    @property
+    def chances(self) -> np.ndarray:
+        """For each pair, that the false one is refuted if either is true."""
+        sigma = np.maximum(self.sigma, 1e-9)
+        return stats.norm.cdf((sigma**2 - REFUTED) / (2 * sigma))
+
+
+@dataclasses.dataclass(frozen=True)
+class Proposal:
+    """The next experiment, or two where one does not do.
+
+    Attributes:
+        experiments: names of what to carry out; `NONE` alone where the menu holds nothing.
+        description: what to do and what to read.
+        separates: alternatives that it tells from the best fit.
+        expected_sigma: the smallest separation of a pair that it is worth doing for; 0 for none.
+        settles: whether it tells every two alternatives apart, at `APART`.
+        table: the whole menu, the most useful experiment first.
+    """
+
+    experiments: tuple[str, ...]
+    description: str
+    separates: tuple[str, ...]
+    expected_sigma: float
+    settles: bool
+    table: tuple[Ranked, ...]
+
+    @property
+    def name(self) -> str:
+        """Of all of it."""
+        return " and ".join(self.experiments)
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What readings of experiments say of alternatives.
+
+    Attributes:
+        chi2: of each alternative, by name; best: whose is the smallest.
+        refuted: alternatives whose χ² is larger by `REFUTED` or more.
+        resolved: whether the best alone is left.
+    """
+
+    chi2: dict[str, float]
+    best: str
+    refuted: tuple[str, ...]
+
+    @property
+    def resolved(self) -> bool:
+        """Whether one alternative is left."""
+        return len(self.refuted) == len(self.chi2) - 1
+
+    @property
+    def left(self) -> tuple[str, ...]:
+        """Alternatives that are not refuted."""
+        return tuple(n for n in self.chi2 if n not in self.refuted)
+
+
+# --- alternatives -----------------------------------------------------------------------------------
+
+
+def alternatives(looped: Loop, found: Finding) -> dict[str, Hypothesis]:
+    """The hypotheses that a table leaves, by the names of their effects; the best fit first."""
+    best = found.after.hypothesis
+    fitted = {tuple(sorted(h.which)): h for h in sorted(found.ladder, key=lambda h: -h.cost)}
+    kept = {best.which: best}
+    for slot, members in enumerate(found.classes):
+        for k in members[1:]:
+            which = tuple(k if s == slot else w for s, w in enumerate(best.which))
+            kept[which] = fitted[tuple(sorted(which))]
+    return {" + ".join(looped.engine.names[k] for k in h.effects): h for h in kept.values()}
+
+
+# --- what they foresee ------------------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def _foreseen(
+    problem: Problem, other: priors.Coordinates | None, which: Array, z: Array
+) -> tuple[Array, Array, Array]:
+    """Readings of the menu, what the fit leaves of their covariance, and which exist, by alternative.
+
+    `other` are coordinates of what the table does not show at all, known by their priors alone.
+    """
+    rows = fit.informing(problem.data)
+
+    def one(w: Array, z: Float[Array, " coordinates"]) -> tuple[Array, Array, Array]:
+        here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(w))
+
+        def residual(x: Array) -> Array:
+            return jnp.concatenate([here.misfit(x, here.data), x - here.data.centre])
+
+        def reading(x: Array) -> tuple[Array, tuple[Array, Bool[Array, " readings"]]]:
+            base = here.base if other is None else other.robot(here.base, x[z.size :])
+            value, there = menu.readings(here.coordinates.robot(base, x[: z.size]))
+            return value, (value, there)
+
+        informed = jax.jacfwd(residual)(z)[rows]
+        lower = cholesky(informed.T @ informed)
+        wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
+        slopes, (value, there) = jax.jacfwd(reading, has_aux=True)(wide)
+        half = jnp.concatenate([forward(lower, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
+        return value, half, there & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(value)
+
+    return jax.vmap(one)(which, z)
+
+
+def prospect(looped: Loop, hypotheses: Mapping[str, Hypothesis]) -> Prospect:
+    """What these alternatives foresee of the menu, with instruments as good as those of the table."""
+    names, those = list(hypotheses), list(hypotheses.values())
+    those += [those[0]] * (-len(those) % PAD)
+    problem = looped.slotted
+    more = [n for n in free_names(CONFIGURATIONS) if n not in looped.coordinates.base.names]
+    other = priors.coordinates(looped.engine.base, more) if more else None
+    which, z = (jnp.asarray(np.stack(x)) for x in ([h.which for h in those], [h.z for h in those]))
+    found = jax.device_get(_foreseen(problem, other, which, z))
+    value, half, there = (np.asarray(x)[: len(names)] for x in found)
+    sd = np.median(np.asarray(problem.data.sd), 0)
+    return Prospect(tuple(names), np.nan_to_num(value), np.nan_to_num(half), menu.sds(sd), there.all(0))
+
+
+# --- the choice -------------------------------------------------------------------------------------
+
+
+def _ranked(seen: Prospect, *experiments: str) -> Ranked:
+    pairs = itertools.combinations(range(len(seen.names)), 2)
+    sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
+    others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
+    return Ranked(experiments, sigma, tuple(n for n, s in others if s >= APART))
+
+
+def _use(r: Ranked) -> tuple[bool, float]:
+    """Whether it is worth while for any pair, and how many pairs it is expected to tell apart."""
+    return bool(r.told), float(np.sum(np.minimum(r.chances, ENOUGH)))
+
+
+def ranked(seen: Prospect) -> tuple[Ranked, ...]:
+    """The whole menu by the number of pairs that an experiment is expected to tell apart; of those that tell as many
+    by `ENOUGH`, in the menu's order, the least effort first."""
+    return tuple(sorted((_ranked(seen, e.name) for e in menu.MENU), key=_use, reverse=True))
+
+
+def choose(seen: Prospect) -> Proposal:
+    """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
+    table = ranked(seen)
+    plan = table[0]
+    (first,) = plan.experiments
+    both = (_ranked(seen, first, e.name) for e in menu.MENU if e.name != first)
+    more = max(both, key=_use)
+    if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + GAIN):
+        plan = more
+    if not plan.told:
+        text = f"No experiment of the menu tells {' and '.join(seen.names)} apart by {WORTH:g} sigma"
+        return Proposal((NONE,), text, (), 0.0, False, table)
+    said = {e.name: e.description for e in menu.MENU}
+    text = ". And: ".join(said[name] for name in plan.experiments)
+    return Proposal(plan.experiments, text, plan.separates, min(plan.told), plan.smallest >= APART, table)
+
+
+#: How the variable of a curve is covered more densely and further out.
+DENSER = {
+    "voltage": "Repeat at one slope and payload with the supply voltage from 8 to 36 V in steps of 2 V",
+    "current": "Repeat at one voltage with payload and slope raised in small steps, so that the current rises evenly "
+    "from no load to its largest",
+    "speed_motor": "Repeat on the level, unladen, with the supply voltage in steps of 2 V from crawl to top speed",
+    "slope": "Repeat at one voltage and payload with the slope from 0 to 20 deg in steps of 1 deg, and downhill",
+    "payload": "Repeat at one voltage and slope with the payload from 0 to 12 kg in steps of 1 kg",
+    "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest",
+    "time": "Record one condition from a cold start for ten minutes, and again at once while everything is warm",
+}
+#: The same for a wave.
+STEADY_SPEEDS = (
+    "Mark the driving shaft, start every run from the mark, and record steady travel at three speeds with at least "
+    "20 samples a wave: what keeps its {variable} at every speed turns with that part"
+)
+#: Runs of such a series, and repeats of each that are averaged.
+SERIES, REPEATS = 15, 3
+
+
+def denser(looped: Loop, found: Finding) -> Proposal:
+    """More runs along the variable of a discrepancy without a name.
+
+    Its expected separation from nothing is that of the table [σ], whose curve explains so much a run, over the
+    runs of the series.
+    """
+    balance, variable, _ = found.unnamed  # type: ignore[misc]
+    scores = found.base.scores
+    explained = float(np.asarray(scores.explained)[int(np.argmax(np.asarray(scores.curve)))])
+    runs = len(looped.problem.observe.rows) if looped.engine.series else looped.counts.sum()
+    sigma = float(np.sqrt(max(explained, 0.0) * SERIES * REPEATS / max(runs, 1)))
+    how = DENSER.get(variable) or STEADY_SPEEDS.format(variable=variable)
+    text = f"{how}; read all three channels. What the {balance} balance lacks then shows its shape"
+    name = f"finer steps in {variable}" if variable in DENSER else f"steady speeds for {variable}"
+    if sigma < WORTH:
+        return Proposal(
+            (NONE,), f"A series in {variable} would show what is missing by {sigma:.1f} sigma", (), 0.0, False, ()
+        )
+    return Proposal((name,), text, (f"{balance} curve in {variable}",), sigma, False, ())
+
+
+def propose(looped: Loop, found: Finding) -> Proposal | None:
+    """The next experiment after a finished loop; None where nothing is missing or it has one name."""
+    if found.verdict == "unnamed":
+        return denser(looped, found)
+    left = alternatives(looped, found)
+    return choose(prospect(looped, left)) if found.classes and len(left) > 1 else None
+
+
+# --- what came of it --------------------------------------------------------------------------------
+
+
+def supported(seen: Prospect, carried_out: Mapping[str, Mapping[str, Any]]) -> Verdict:
+    """Which alternative the readings of experiments support.
+
+    Args:
+        seen: what was foreseen.
+        carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
+            NaN for what was not read.
+    """
+    spans = menu.spans()
+    at = np.concatenate([np.arange(len(seen.sd))[spans[name]] for name in carried_out])
+    value, sd = (
+        np.concatenate([np.asarray(r[what], float) for r in carried_out.values()]) for what in ("value", "sd")
+    )
+    read = seen.there[at] & np.isfinite(value)
+    at, value, sd = at[read], value[read], sd[read]
+    chi2 = {}
+    for k, name in enumerate(seen.names):
+        d = value - seen.value[k, at]
+        chi2[name] = float(d @ np.linalg.solve(_covariance(seen.half[k, at], sd), d))
+    best = min(chi2, key=chi2.__getitem__)
+    return Verdict(chi2, best, tuple(n for n, c in chi2.items() if c - chi2[best] >= REFUTED))

@@ -1,0 +1,1 @@
+"""Calibration: what is free, how it is observed, fitted and judged."""

@@ -1,0 +1,54 @@
+"""How far a simulation is from measurements: equation (35), its summary per channel, and R² of (A1)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.data.runs import CHANNELS
+
+
+def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """δCV = (CV - EV) / CV · 100 [%], eq. (35), with CV simulated and EV measured; any shape."""
+    return 100.0 * (simulated - measured) / simulated
+
+
+def summary(errors: np.ndarray) -> dict[str, float | int]:
+    """Root mean square and worst of the errors (35) [%] over the rows that have one, and their count."""
+    there = errors[np.isfinite(errors)]
+    if there.size == 0:
+        return {"rows": 0, "rms_percent": float("nan"), "max_percent": float("nan")}
+    return {
+        "rows": int(there.size),
+        "rms_percent": float(np.sqrt(np.mean(there**2))),
+        "max_percent": float(np.abs(there).max()),
+    }
+
+
+def certainty(measured: np.ndarray, approximated: np.ndarray) -> float:
+    """R² of eq. (A1) [-]: 1 - Σ(y - Y)² / (ΣY² - (ΣY)²/n), Y measured, y the approximation.
+
+    NaN where the measured values do not vary, or fewer than two rows have both.
+    """
+    both = np.isfinite(measured) & np.isfinite(approximated)
+    y, approximation = measured[both], approximated[both]
+    if y.size < 2:
+        return float("nan")
+    spread = float(np.sum(y**2) - np.sum(y) ** 2 / y.size)
+    return float(1 - np.sum((approximation - y) ** 2) / spread) if spread > 0 else float("nan")
+
+
+def channel_errors(simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> dict[str, dict[str, float | int]]:
+    """Errors (35) [%] and in sigmas of every channel over the rows that have a simulated value.
+
+    Args:
+        simulated, measured, sd: current [A], motor speed [rad/s], speed [m/s], shape (rows, 3).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = relative_error(simulated, measured)
+    sigma = (simulated - measured) / sd
+    answer = {}
+    for k, channel in enumerate(CHANNELS):
+        there = sigma[np.isfinite(sigma[:, k]), k]
+        rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
+        answer[channel] = {**summary(percent[:, k]), "rms_sigma": rms}
+    return answer

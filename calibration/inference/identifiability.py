@@ -1,0 +1,226 @@
+"""What the data say of each parameter and what only its prior says: covariance, rank, profiles, coverage."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from calibration.inference import optimizers as fit
+from calibration.inference.optimizers import Pin
+from calibration.inference.problem import Data, Problem
+
+#: Two-sided 95 % of the standard normal distribution.
+Z95 = 1.959963984540054
+#: Posterior over prior variance above which the prior says more of a parameter than the data do [-].
+HELD = 0.5
+#: Correlations reported.
+CORRELATED = 0.9
+#: Steps of a profile, in posterior sds from the optimum.
+PROFILE_STEPS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Identifiability:
+    """The linear analysis at the optimum, in coordinates z (one prior sd each).
+
+    Attributes:
+        names: of the parameters.
+        covariance: posterior, of z; shape (parameters, parameters).
+        sd: posterior sd of z, thus the square root of the posterior over the prior variance.
+        singular_values: of the whitened Jacobian of the readings alone: prior sd over data sd along each
+            direction, largest first; above 1 the data say more than the prior.
+        directions: right singular vectors, one a row.
+        rank: singular values above 1e-8 of the largest.
+        sensitivity: norm of each column of that Jacobian: how many data sds one prior sd moves the
+            readings; 0 for a parameter that nothing measures.
+        leverage: share of each reading's variance that the fit explains, shape (rows, 3).
+    """
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+    sd: np.ndarray
+    singular_values: np.ndarray
+    directions: np.ndarray
+    rank: int
+    sensitivity: np.ndarray
+    leverage: np.ndarray
+
+    @property
+    def correlation(self) -> np.ndarray:
+        """Posterior correlations of z."""
+        return self.covariance / np.outer(self.sd, self.sd)
+
+    @property
+    def held_by_prior(self) -> np.ndarray:
+        """Whether the prior says more of a parameter than the data do."""
+        return self.sd**2 > HELD
+
+    def correlated(self) -> list[tuple[str, str, float]]:
+        """Pairs with |correlation| above `CORRELATED`, strongest first."""
+        c = self.correlation
+        pairs = [
+            (self.names[i], self.names[j], float(c[i, j])) for i, j in zip(*np.triu_indices(len(c), 1), strict=True)
+        ]
+        return sorted((p for p in pairs if abs(p[2]) > CORRELATED), key=lambda p: -abs(p[2]))
+
+    def weak_directions(self) -> list[tuple[float, dict[str, float]]]:
+        """Directions of which the prior says more than the data: singular value, main components in prior sds."""
+        weak = []
+        for s, v in zip(self.singular_values, self.directions, strict=True):
+            if s < 1:
+                main = {n: float(x) for n, x in zip(self.names, v, strict=True) if abs(x) > 0.1}
+                weak.append((float(s), main))
+        return weak
+
+
+@eqx.filter_jit
+def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
+    whole = fit.residuals(problem, data, fit.no_pin(z.shape[0]))
+    jacobian = jax.jacfwd(whole)(z)
+    return jacobian[fit.informing(data)], jacobian[: data.measured.size]
+
+
+def analyse(problem: Problem, z: Array, data: Data | None = None) -> Identifiability:
+    """The linear analysis of `problem` at coordinates z, from readings and priors alone.
+
+    Where the adhesion limit holds z the limit is one-sided, which is for the profile to show: no sd does.
+    """
+    data = problem.data if data is None else data
+    if problem.long:
+        jacobian = np.asarray(fit.linearised(problem, z, data)[1])
+        whole, readings = jacobian[fit.informing(data)], jacobian[: data.measured.size]
+    else:
+        whole, readings = (np.asarray(j) for j in _jacobians(problem, z, data))
+    _, s, v = np.linalg.svd(whole, full_matrices=False)
+    covariance = (v.T / s**2) @ v
+    _, singular, directions = np.linalg.svd(readings, full_matrices=False)
+    leverage = np.einsum("ij,jk,ik->i", readings, covariance, readings)
+    return Identifiability(
+        names=problem.coordinates.names,
+        covariance=covariance,
+        sd=np.sqrt(np.diag(covariance)),
+        singular_values=singular,
+        directions=directions,
+        rank=int(np.sum(singular > 1e-8 * singular.max())),
+        sensitivity=np.linalg.norm(readings, axis=0),
+        leverage=leverage.reshape(data.measured.shape),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Profile:
+    """Profile likelihood of each parameter: the objective minimised over all others.
+
+    Attributes:
+        z: coordinate of the profiled parameter, shape (parameters, points), increasing.
+        value: the parameter there [SI].
+        rise: twice the objective's rise above the optimum [σ²], χ² with one degree of freedom.
+        low, high: ends of the 95 % interval, where the rise is 3.84 [SI]; shape (parameters,).
+        open: whether an end lies beyond the last point (the interval is at least so wide), (parameters, 2).
+        better: the largest fall below the given optimum found on the way [½σ²]; 0 if it is the best.
+    """
+
+    z: np.ndarray
+    value: np.ndarray
+    rise: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    open: np.ndarray
+    better: float
+
+
+@eqx.filter_jit
+def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> fit.Optimum:
+    return jax.vmap(lambda z, pin: fit.levenberg_marquardt(problem, z, data, pin))(starts, pins)
+
+
+def profile(problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None) -> Profile:
+    """Profiles of all parameters, every point of every profile in one vmapped batch of refits.
+
+    Each refit starts on the line along which the linear analysis says the others move. The end of an
+    interval is interpolated on the signed root of the rise, which is straight for a linear model.
+    """
+    data = problem.data if data is None else data
+    z, size = np.asarray(z), len(about.names)
+    steps = np.concatenate([-np.asarray(PROFILE_STEPS[::-1]), PROFILE_STEPS])
+    at = z[:, None] + about.sd[:, None] * steps  # (parameters, points)
+    along = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
+    starts = z + along[:, None, :] * (at - z[:, None])[..., None]
+    held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
+    pins = Pin(jnp.asarray(held.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
+    found = _profiles(problem, data, pins.at, pins)
+    rise = 2 * (np.asarray(found.cost).reshape(at.shape) - cost)
+    root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
+    middle = len(PROFILE_STEPS)
+    at_all = np.insert(at, middle, z, axis=1)
+    root_all = np.insert(root, middle, 0.0, axis=1)
+    ends = np.array([_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
+    value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T
+    low, high = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(ends.T)))
+    is_open = np.stack([root_all[:, 0] > -Z95, root_all[:, -1] < Z95], 1)
+    return Profile(at_all, value, root_all**2, low, high, is_open, float(max(0.0, -rise.min() / 2)))
+
+
+def _ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
+    """Where a profile's signed root reaches ∓Z95; its last point where it does not."""
+    rising = np.maximum.accumulate(root)
+    return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))
+
+
+@eqx.filter_jit
+def _redraw(problem: Problem, truth: Array, data: Data, keys: Array, profiles: bool) -> tuple[fit.Optimum, Array]:
+    clean = problem.observation(truth).reading
+
+    def draw(key: Array) -> tuple[fit.Optimum, Array]:
+        one, two = jax.random.split(key)
+        noisy = dataclasses.replace(
+            data,
+            measured=clean + data.sd * jax.random.normal(one, clean.shape),
+            centre=truth + jax.random.normal(two, truth.shape),
+        )
+        best = fit.levenberg_marquardt(problem, truth, noisy)
+        if not profiles:
+            return best, jnp.zeros_like(truth)
+        held = jnp.eye(truth.shape[0], dtype=bool)
+        pinned = jax.vmap(lambda h: fit.levenberg_marquardt(problem, truth, noisy, Pin(h, truth)))(held)
+        return best, 2 * (pinned.cost - best.cost)
+
+    return jax.vmap(draw)(keys)
+
+
+@dataclasses.dataclass(frozen=True)
+class Coverage:
+    """How often 95 % intervals hold a known truth.
+
+    Attributes:
+        linear: share of draws with the truth within z ± 1.96 sd, shape (parameters,).
+        profile: share with the truth within the profile interval (NaN if not asked for).
+        z: where each draw's fit ended, shape (draws, parameters).
+        converged: whether it did, shape (draws,).
+    """
+
+    linear: np.ndarray
+    profile: np.ndarray
+    z: np.ndarray
+    converged: np.ndarray
+
+
+def coverage(problem: Problem, truth: Array, draws: int, seed: int, profiles: bool = False) -> Coverage:
+    """Coverage of the 95 % intervals over noise draws, all in one vmapped batch.
+
+    Each draw takes new readings (with their sds) and new bench values (the prior means, with theirs): a
+    prior is a measurement made beforehand, and intervals that use it cover only if it errs as it says.
+    The truth lies within a profile interval where the objective, refitted with the parameter held at its
+    truth, rises by less than the 95 % quantile of χ² with one degree of freedom; that is one refit more
+    for each parameter and draw.
+    """
+    keys = jax.random.split(jax.random.key(seed), draws)
+    found, rise = _redraw(problem, truth, problem.data, keys, profiles)
+    inside = np.abs(np.asarray(found.z - truth)) <= Z95 * np.asarray(found.sd)
+    within = (np.asarray(rise) < Z95**2).mean(0) if profiles else np.full(truth.shape[0], np.nan)
+    return Coverage(inside.mean(0), within, np.asarray(found.z), np.asarray(found.converged))

@@ -1,0 +1,348 @@
+"""Maximum a posteriori by Levenberg-Marquardt with exact Jacobians, from many starts at once; L-BFGS beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from calibration.inference.normal_equations import Normal, cholesky, forward
+from calibration.inference.problem import MISSING, Data, Observation, Problem
+from mmrjax.robot import Robot
+
+#: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
+#: a twentieth of a posterior sd, about what the integrator's tolerance leaves of a rollout), and as a share.
+DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
+#: Rejected steps in a row after which a search ends, and change of z (and of the objective, relative) at which
+#: it does; the second for rollouts.
+PATIENCE = 12
+TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
+#: How many times the decrease that its linearisation predicts a search of rollouts is given the hope of.
+HOPELESS = 10.0
+#: How many of them have to end in one place, to within so much of the objective, for it to be the optimum.
+AGREE, SAME = 3, 0.01
+
+Z = Float[Array, " parameters"]
+
+
+class Pin(eqx.Module):
+    """Coordinates held at a value: `z[k] = at[k]` where `held[k]`."""
+
+    held: Bool[Array, " parameters"]
+    at: Z
+
+    def apply(self, z: Z) -> Z:
+        return jnp.where(self.held, self.at, z)
+
+
+def no_pin(size: int) -> Pin:
+    """Nothing held."""
+    return Pin(jnp.zeros(size, bool), jnp.zeros(size))
+
+
+class Optimum(eqx.Module):
+    """Where one search ended.
+
+    Attributes:
+        z: coordinates, shape (parameters,).
+        sd: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,).
+        cost: objective, half the sum of squares of misfit and prior [-].
+        decrement: decrease that the Gauss-Newton step from here still predicts [-].
+        converged: whether the decrement is small (see `DECREMENT`); holds whatever the solver said.
+        steps: iterations taken.
+    """
+
+    z: Z
+    sd: Z
+    cost: Float[Array, ""]
+    decrement: Float[Array, ""]
+    converged: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+
+def with_jacobian(function: Callable[[Z], Array]) -> Callable[[Z], Array]:
+    """`function` with its Jacobian computed once, forward, wherever it is differentiated (either mode).
+
+    Exact: implicit through the root of `steady`, through the rollout of `drive`. One evaluation of value
+    and Jacobian together then serves every product with it, which a solver would else recompute.
+    """
+
+    @jax.custom_jvp
+    def value(z: Z) -> Array:
+        return function(z)
+
+    @value.defjvp
+    def derivative(primals: tuple[Z], tangents: tuple[Z]) -> tuple[Array, Array]:
+        (z,), (dz,) = primals, tangents
+        jacobian, out = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
+        return out, jacobian @ dz
+
+    return value
+
+
+def residuals(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], Array]:
+    """Residuals as a function of z: misfit, then prior; a held coordinate has a prior residual that keeps
+    it where it is, so that the Jacobian has full rank."""
+
+    def function(z: Z) -> Array:
+        held = pin.apply(z)
+        prior = jnp.where(pin.held, z - pin.at, z - data.centre)
+        return jnp.concatenate([problem.misfit(held, data), prior])
+
+    return with_jacobian(function)
+
+
+def informing(data: Data) -> np.ndarray:
+    """Indices of the residuals that carry information: readings and priors, not the penalty on adhesion."""
+    readings, rows = data.measured.size, data.measured.shape[0]
+    return np.r_[:readings, readings + rows : readings + rows + data.centre.size]
+
+
+def _finish(function: Callable[[Z], Array], z: Z, data: Data, pin: Pin, steps: Array) -> Optimum:
+    jacobian, r = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
+    return _optimum(jacobian, r, z, data, pin, steps)
+
+
+def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
+    informed = jacobian[informing(data)]
+    lower = cholesky(informed.T @ informed)
+    sd = jnp.linalg.norm(forward(lower, jnp.eye(z.shape[0])), axis=0)
+    lower = cholesky(jacobian.T @ jacobian)
+    decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
+    held = jnp.where(pin.held, pin.at - data.centre, 0.0)
+    cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))
+    return Optimum(pin.apply(z), sd, cost, decrement, decrement < DECREMENT + DECREMENT_SHARE * cost, steps)
+
+
+class Search(optx.LevenbergMarquardt):
+    """Levenberg-Marquardt that also ends after `PATIENCE` steps in a row that did not lower the objective.
+
+    Each rejected step is a quarter of the one before, so nothing is left to gain but rounding (or, of a
+    rollout, the integrator's tolerance); `Optimum.converged` says whether that place is an optimum.
+    """
+
+    def terminate(
+        self, fn: Any, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
+    ) -> tuple[Array, optx.RESULTS]:
+        done, result = super().terminate(fn, y, args, options, state, tags)
+        return done | (state.num_steps_since_acceptance >= PATIENCE), result
+
+
+def levenberg_marquardt(
+    problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
+) -> Optimum:
+    """One search by `optimistix.LevenbergMarquardt`. To be vmapped over starts, data and pins."""
+    pin = no_pin(start.shape[0]) if pin is None else pin
+    function = residuals(problem, data, pin)
+    tolerance = TOLERANCE_LONG if problem.long else TOLERANCE
+    solution = optx.least_squares(
+        lambda z, _: function(z),
+        Search(rtol=tolerance, atol=tolerance, linear_solver=Normal()),
+        pin.apply(start),
+        max_steps=max_steps,
+        throw=False,
+    )
+    return _finish(function, solution.value, data, pin, solution.stats["num_steps"])
+
+
+@eqx.filter_jit
+def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    """All that is asked of a rollout at z, in one program: residuals (misfit, then prior), Jacobian, observation.
+
+    Where a rollout's step is too long for its friction law (V_s small beside μ_s) the run shakes and its
+    derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
+    """
+    counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + z.size, bool)])
+
+    def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
+        seen = problem.observation(z)
+        r = jnp.concatenate([problem.whitened(seen, data), z - data.centre])
+        return r, (r, seen)
+
+    jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
+    known = jnp.all(jnp.isfinite(jacobian), axis=1)
+    return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0), seen
+
+
+def evaluated(problem: Problem, z: Z, data: Data) -> Array:
+    """The residuals of `linearised` alone, by the program of `read`: a rollout less to compile."""
+    seen = read(problem, problem.robot(z))
+    return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
+
+
+@eqx.filter_jit
+def _step(solver: Search, y: Z, state: Any, r: Array, jacobian: Array) -> tuple[Z, Any, Array]:
+    def tangent(z: Z, _: None) -> tuple[Array, None]:
+        return r + jacobian @ (z - state.y_eval), None  # evaluated at y_eval alone
+
+    y, state, _ = solver.step(tangent, y, None, {}, state, frozenset())
+    return y, state, solver.terminate(tangent, y, None, {}, state, frozenset())[0]
+
+
+def search_long(
+    problem: Problem, start: Z, data: Data, max_steps: int = 100, tell: Callable[[str], None] = lambda _: None
+) -> tuple[Optimum, Observation, Observation]:
+    """`levenberg_marquardt` with the steps taken from outside, so that a rollout is compiled once in all.
+
+    It ends too where the step from a point would gain nothing that counts (a tenth of `DECREMENT`).
+
+    Returns:
+        Where the search ended, and what the model says where it started and where it ended.
+    """
+    pin, solver = no_pin(start.shape[0]), Search(rtol=TOLERANCE_LONG, atol=TOLERANCE_LONG, linear_solver=Normal())
+    y, state, first, best, accepted = start, None, None, None, True
+    for steps in range(1, max_steps + 1):
+        at = start if state is None else state.y_eval
+        # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
+        r = None if accepted else evaluated(problem, at, data)
+        if r is None or 0.5 * jnp.sum(r**2) < best[0].cost:
+            r, jacobian, seen = linearised(problem, at, data)
+        if state is None:
+            shape = jax.eval_shape(lambda: r)  # noqa: B023
+            tangent = lambda z, _: (r + jacobian @ (z - start), None)  # noqa: B023, E731
+            state, first = solver.init(tangent, y, None, {}, shape, None, frozenset()), seen
+        y, state, done = _step(solver, y, state, r, jacobian)
+        accepted = np.array_equal(y, at)
+        if accepted:
+            best = _optimum(jacobian, r, y, data, pin, jnp.asarray(steps)), seen
+            done |= best[0].decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best[0].cost)
+        tell(f"step {steps}: objective {float(best[0].cost):.4f}")
+        if done:
+            break
+    return best[0], first, best[1]
+
+
+Evaluate = Callable[[Array], tuple[Array, Array, Observation]]
+
+
+@eqx.filter_jit
+def _begun(solver: Search, starts: Array, r: Array, jacobian: Array) -> Any:
+    def one(y: Array, r: Array, jacobian: Array) -> Any:
+        shape = jax.eval_shape(lambda: r)
+        return solver.init(lambda z, _: (r + jacobian @ (z - y), None), y, None, {}, shape, None, frozenset())
+
+    return eqx.filter_vmap(one)(starts, r, jacobian)
+
+
+@eqx.filter_jit
+def _steps(solver: Search, y: Array, state: Any, r: Array, jacobian: Array) -> tuple[Array, Any, Array]:
+    return eqx.filter_vmap(lambda *x: _step(solver, *x))(y, state, r, jacobian)
+
+
+@eqx.filter_jit
+def _optima(jacobian: Array, r: Array, z: Array, data: Data, weights: Array, steps: Array) -> Optimum:
+    def one(jacobian: Array, r: Array, z: Array, weight: Array, steps: Array) -> Optimum:
+        there = dataclasses.replace(data, weight=weight)
+        return _optimum(jacobian, r, z, there, no_pin(z.shape[0]), steps)
+
+    return jax.vmap(one)(jacobian, r, z, weights, steps)
+
+
+def searches_long(
+    evaluate: Evaluate, starts: Array, data: Data, weights: Array, max_steps: int, *, rivals: bool = False
+) -> tuple[Optimum, Observation]:
+    """A batch of `levenberg_marquardt` with the steps taken from outside, so that rollouts are compiled once in all.
+
+    Args:
+        evaluate: residuals, their Jacobian and the observation of every member at its z, compiled; leading axis the
+            batch.
+        starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, 3).
+        rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
+            lower, and those that cannot come down to it (by `HOPELESS` times what their step predicts) before.
+
+    Returns:
+        Where each search ended, and what the model says there.
+    """
+    solver = Search(rtol=TOLERANCE_LONG, atol=TOLERANCE_LONG, linear_solver=Normal())
+    starts = jnp.asarray(starts)
+    r, jacobian, seen = evaluate(starts)
+    y, at, state = starts, starts, _begun(solver, starts, r, jacobian)
+    best, over, taken = (r, jacobian, seen), np.zeros(len(starts), bool), np.zeros(len(starts), int)
+    for steps in range(1, max_steps + 1):
+        # A step judges what was found where the last one led; what is accepted becomes y.
+        new_y, state, done = _steps(solver, y, state, r, jacobian)
+        moved = np.asarray(jnp.all(new_y == at, 1)) & ~over
+        y, best = _where(moved, (new_y, (r, jacobian, seen)), (y, best))
+        taken = np.where(over, taken, steps)
+        found = _optima(best[1], best[0], y, data, weights, jnp.asarray(taken))
+        small = 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost)
+        over = over | np.asarray(done) | np.asarray(moved & (found.decrement < small))
+        if rivals:
+            cost, reach = np.asarray(found.cost), HOPELESS * np.asarray(found.decrement)
+            lowest = np.min(cost[over], initial=np.inf)
+            agree = np.sum(over & (cost < lowest + SAME)) >= AGREE and not np.any(~over & (cost < lowest - SAME))
+            over = over | (cost - reach > lowest) | agree
+        if over.all():
+            break
+        at = jnp.where(over[:, None], y, state.y_eval)
+        r, jacobian, seen = evaluate(at)
+    return found, best[2]
+
+
+@jax.jit
+def _where(which: Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+
+
+def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) -> Optimum:
+    """One search of the same objective by `optax.lbfgs`; its gradient is Jᵀr with the forward Jacobian.
+
+    For many parameters, or where the Jacobian is too large to factorise.
+    """
+    pin = no_pin(start.shape[0])
+    function = residuals(problem, data, pin)
+
+    def cost(z: Z) -> Array:
+        return 0.5 * jnp.sum(function(z) ** 2)
+
+    solver = optax.lbfgs(memory_size=20)
+    value_and_grad = optax.value_and_grad_from_state(cost)
+
+    def step(carry: tuple) -> tuple:
+        z, state, k, _ = carry
+        value, gradient = value_and_grad(z, state=state)
+        updates, state = solver.update(gradient, state, z, value=value, grad=gradient, value_fn=cost)
+        return optax.apply_updates(z, updates), state, k + 1, jnp.max(jnp.abs(gradient))
+
+    def go_on(carry: tuple) -> Array:
+        return (carry[2] < max_steps) & (carry[3] > 1e-5)
+
+    carry = (start, solver.init(start), jnp.asarray(0), jnp.asarray(jnp.inf))
+    z, _, k, _ = jax.lax.while_loop(go_on, step, carry)
+    return _finish(function, z, data, pin, k)
+
+
+@eqx.filter_jit
+def searches(
+    problem: Problem, starts: Float[Array, "starts parameters"], data: Data
+) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
+    """Levenberg-Marquardt from every start in one vmapped batch.
+
+    Returns:
+        Where each search ended, and the status of every row where it started and where it ended.
+    """
+
+    def search(z: Z) -> tuple[Optimum, Array, Array]:
+        found = levenberg_marquardt(problem, z, data)
+        return found, problem.observation(z).status, problem.observation(found.z).status
+
+    return jax.vmap(search)(starts)
+
+
+@eqx.filter_jit
+def read(problem: Problem, robot: Robot) -> Observation:
+    """What the model says of every row of the problem for any robot, compiled."""
+    return problem.observe(robot)
+
+
+def observation(problem: Problem, z: Z) -> Observation:
+    """What the model says of every row at z, by a program that the search has compiled already if it is long."""
+    return linearised(problem, z, problem.data)[2] if problem.long else read(problem, problem.robot(z))

@@ -1,0 +1,286 @@
+"""Which parameters are free, what is known of them beforehand, and the coordinates in which they are fitted."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from calibration.data.errors import BadConfiguration, choices, number
+from mmrjax import params
+from mmrjax.params import Parameter
+from mmrjax.robot import Robot
+
+#: Freed by default, for each configuration that has rows: friction, with the makers' electrics, the
+#: gearbox and motor losses of Table 2, the ratio, radii and masses held where their tables put them.
+#: Guide friction μ_t stays at Table 4 because only its product with `guide_share` acts.
+FRICTION = {
+    "tracked": (
+        "track.loss_coulomb",
+        "track.loss_viscous",
+        "track.guide_share",
+        "ground.rolling_resistance",
+        "ground.friction.static",
+        "ground.friction.speed_static",
+    ),
+    "wheeled": (
+        "track.loss_coulomb",
+        "track.loss_viscous",
+        "ground.rolling_resistance",
+        "ground.friction.static",
+        "ground.friction.speed_static",
+    ),
+}
+#: Share of the weight that the guides of 6T2A carry in the track model, where it is an output (docs/track-model.md).
+GUIDED = 0.98
+GUIDE_SHARE, GUIDE_FRICTION = "tracked.track.guide_share", "tracked.track.guide_friction"
+#: Parameters whose source states a ratio to another one, which they keep while they are not freed themselves.
+TIED = {
+    f"{chassis}.ground.friction.{follower}": f"{chassis}.ground.friction.{leader}"
+    for chassis in FRICTION
+    for follower, leader in (("dynamic", "static"), ("speed_dynamic", "speed_static"))
+}
+
+_SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
+
+
+class Coordinates(eqx.Module):
+    """Free parameters θ as coordinates z whose prior is the standard normal distribution.
+
+    u = location + spread · z, and θ = clip(u), or exp(clip(u)) for a scale parameter, where
+    clip(u) = u + w S((low - u)/w) - w S((u - high)/w), S softplus, w = spread / 20.
+
+    A parameter whose field states a relative sd and cannot be negative is a scale: its prior is
+    log-normal with the nominal value as median. Every other one is normal. The clip is the identity
+    inside the bounds (to e^-20 an sd away), has slope ½ on a bound, and is never flat: an amplitude with
+    prior mean zero, or a share whose nominal value is its bound, starts with a live gradient. What lies
+    beyond a bound is held by the prior, which is on z and pulls wherever z is.
+
+    Attributes:
+        location, spread, low, high: in units of θ, or of log θ for a scale; shape (parameters,).
+        names, units, scale: of each parameter.
+        tied: (follower, index of its leader, ratio) of each parameter that follows a free one.
+        stated: names whose prior the user has stated.
+    """
+
+    location: Float[Array, " parameters"]
+    spread: Float[Array, " parameters"]
+    low: Float[Array, " parameters"]
+    high: Float[Array, " parameters"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    scale: tuple[bool, ...] = eqx.field(static=True)
+    tied: tuple[tuple[str, int, float], ...] = eqx.field(static=True, default=())
+    stated: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def value(self, z: Float[Array, "... parameters"]) -> Float[Array, "... parameters"]:
+        """Parameters θ [SI] at coordinates z."""
+        u = self.location + self.spread * z
+        w = _SOFTNESS * self.spread
+        u = u + w * jax.nn.softplus((self.low - u) / w) - w * jax.nn.softplus((u - self.high) / w)
+        u = jnp.clip(u, self.low, self.high)  # of rounding, far outside
+        return jnp.where(jnp.asarray(self.scale), jnp.exp(u), u)
+
+    def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
+        """dθ/dz [SI]."""
+        return jax.jvp(self.value, (z,), (jnp.ones_like(z),))[1]
+
+    def robot(self, base: Robot, z: Float[Array, " parameters"]) -> Robot:
+        """`base` with the free parameters, and those tied to them, at coordinates z."""
+        theta = self.value(z)
+        values = {name: theta[k] for k, name in enumerate(self.names)}
+        values |= {follower: ratio * theta[k] for follower, k, ratio in self.tied}
+        return params.replace(base, values)  # type: ignore[return-value]
+
+    def beyond(self, z: np.ndarray) -> np.ndarray:
+        """-1 or 1 where z lies on or beyond its lower or upper bound, else 0; shape (parameters,)."""
+        u = np.asarray(self.location + self.spread * z)
+        return np.where(u <= self.low, -1, np.where(u >= self.high, 1, 0))
+
+
+def known(robot: Robot) -> dict[str, Parameter]:
+    """Every parameter of the robot by its dotted name."""
+    return {p.name: p for p in params.walk(robot)}
+
+
+def default_names(configurations: Iterable[str], robot: Robot, model: str = "steady") -> tuple[str, ...]:
+    """The default set of free parameters for data of these configurations (6T2A, 4W2T).
+
+    In the track model the guides' share is an output, so the guide friction μ_t stands in its place.
+    """
+    present = set(configurations)
+    chassis = [c for c, word in (("tracked", "6T2A"), ("wheeled", "4W2T")) if word in present]
+    names = [f"{c}.{name}" for c in chassis for name in FRICTION[c]]
+    if model == "track":
+        names = [GUIDE_FRICTION if name == GUIDE_SHARE else name for name in names]
+    return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects))
+
+
+def guided(robot: Robot) -> tuple[Robot, dict[str, tuple[float, float]]]:
+    """`robot` with the share that the track model's guides carry, and what is known of its guide friction.
+
+    The prior is that of the product of friction and share, on which all fidelities agree: Table 4 measured
+    the friction alone, and its 0.20 on all of the weight contradicts every measured current.
+
+    Returns:
+        The robot, and (mean, sd) of the guide friction by its name.
+    """
+    field = known(robot)
+    friction, share = float(field[GUIDE_FRICTION].value), float(field[GUIDE_SHARE].value)
+    sd = friction * field[GUIDE_SHARE].spec.prior_sd(share) / GUIDED
+    turned = params.replace(robot, {GUIDE_SHARE: jnp.asarray(GUIDED)})
+    return turned, {GUIDE_FRICTION: (friction * share / GUIDED, sd)}  # type: ignore[return-value]
+
+
+def choose(
+    robot: Robot, default: Sequence[str], free: Sequence[str] = (), fix: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Names of the free parameters: `free` if it says any (with `default` among it standing for that set),
+    else the default set; less `fix`.
+
+    A name ending in `.*` stands for all parameters below it.
+
+    Raises:
+        BadConfiguration: an unknown name (with the choices), a name that is both freed and fixed by name,
+            or nothing left to fit.
+    """
+    everything = list(known(robot))
+    chosen: list[str] = []
+    for word in free:
+        chosen += default if word == "default" else _expand(word, everything, "--free")
+    fixed = [n for word in fix for n in _expand(word, everything, "--fix")]
+    both = [word for word in free if word in fix]
+    if both:
+        raise BadConfiguration(f"--free and --fix both name {both[0]}; name it once")
+    names = [n for n in dict.fromkeys(chosen if free else default) if n not in fixed]
+    if not names:
+        raise BadConfiguration("--fix leaves no parameter to fit; name at least one with --free")
+    return tuple(names)
+
+
+def _expand(word: str, everything: list[str], option: str) -> list[str]:
+    if word.endswith(".*"):
+        below = [n for n in everything if n.startswith(word[:-1])]
+        if below:
+            return below
+        groups = sorted({n.rsplit(".", 1)[0] + ".*" for n in everything})
+        raise BadConfiguration(f"{option} {word}: no parameters below it; {choices(word, groups)}")
+    if word not in everything:
+        raise BadConfiguration(f"{option} {word}: no such parameter; {choices(word, _near(word, everything))}")
+    return [word]
+
+
+def _near(word: str, everything: list[str]) -> list[str]:
+    """The names to list for an unknown one: those that share its last part or its group, else all."""
+    last = word.rsplit(".", 1)[-1]
+    near = [n for n in everything if last and (n.endswith(f".{last}") or last in n)]
+    return near or [n for n in everything if n.split(".")[0] == word.split(".")[0]] or everything
+
+
+_PRIOR = re.compile(r"^(?P<name>[\w.]+)=(?P<value>[^±]+?)(?:±|\+-|\+/-)(?P<sd>.+)$")
+
+
+def parse_prior(text: str) -> tuple[str, float, float]:
+    """`name=value±sd` (also `+-`, and an sd in %) as name, mean and sd in SI units.
+
+    Raises:
+        BadConfiguration: another form, no number, or an sd that is not positive.
+    """
+    form = "expected name=value±sd in SI units, e.g. tracked.ground.friction.static=0.45±0.05 or ...=0.45±10%"
+    match = _PRIOR.match(text.strip())
+    if match is None:
+        raise BadConfiguration(f"--prior {text}: {form}")
+    try:
+        mean = float(match["value"])
+        stated = match["sd"].strip()
+        sd = abs(mean) * float(stated[:-1]) / 100 if stated.endswith("%") else float(stated)
+    except ValueError:
+        raise BadConfiguration(f"--prior {text}: {form}") from None
+    if not (math.isfinite(mean) and math.isfinite(sd) and sd > 0):
+        raise BadConfiguration(f"--prior {text}: the sd must be a positive number; {form}")
+    return match["name"], mean, sd
+
+
+def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Name → (mean, sd) of stated priors, each as `parse_prior`.
+
+    Raises:
+        BadConfiguration: as `parse_prior`, or a name that is given twice.
+    """
+    stated: dict[str, tuple[float, float]] = {}
+    for text in texts:
+        name, mean, sd = parse_prior(text)
+        if name in stated:
+            raise BadConfiguration(f"--prior {name}: given twice; give it once")
+        stated[name] = (mean, sd)
+    return stated
+
+
+def coordinates(
+    robot: Robot, names: Sequence[str], stated: dict[str, tuple[float, float]] | None = None
+) -> Coordinates:
+    """Coordinates of the named parameters: prior from their fields around `robot`'s values, or as stated.
+
+    Args:
+        robot: its values are the prior means (medians for scales).
+        names: of the free parameters, from `choose`.
+        stated: name → (mean, sd) [SI] that replace the field's.
+
+    Raises:
+        BadConfiguration: a stated prior for an unknown or a fixed parameter, a mean out of bounds, or a
+            free parameter whose prior has no width (nominal value 0 with a relative sd).
+    """
+    stated = stated or {}
+    fields = known(robot)
+    for name in stated:
+        if name not in fields:
+            raise BadConfiguration(f"--prior {name}: no such parameter; {choices(name, _near(name, list(fields)))}")
+        if name not in names:
+            raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
+    rows = [_row(fields[name], stated.get(name)) for name in names]
+    location, spread, low, high, scale = zip(*rows, strict=True)
+    tied = tuple(
+        (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
+        for follower, leader in TIED.items()
+        if leader in names and follower not in names
+    )
+    return Coordinates(
+        jnp.asarray(location),
+        jnp.asarray(spread),
+        jnp.asarray(low),
+        jnp.asarray(high),
+        tuple(names),
+        tuple(fields[name].spec.unit for name in names),
+        scale,
+        tied,
+        tuple(stated),
+    )
+
+
+def _row(parameter: Parameter, stated: tuple[float, float] | None) -> tuple[float, float, float, float, bool]:
+    """Location, spread, low and high [θ or log θ] and whether the parameter is a scale."""
+    spec = parameter.spec
+    low, high = spec.bounds
+    mean, sd = stated or (float(parameter.value), spec.prior_sd(float(parameter.value)))
+    if not low <= mean <= high:
+        raise BadConfiguration(
+            f"--prior {parameter.name}: got {number(mean)}; expected {number(low)} to {number(high)} {spec.unit}"
+        )
+    if sd <= 0:
+        raise BadConfiguration(
+            f"--free {parameter.name}: its prior has no width (nominal value 0 with a relative sd); "
+            f"state one with --prior {parameter.name}=value±sd"
+        )
+    if spec.relative_sd is None or low < 0 or mean <= 0:
+        return mean, sd, low, high, False
+    spread = math.sqrt(math.log1p((sd / mean) ** 2))
+    return math.log(mean), spread, math.log(low) if low > 0 else -math.inf, math.log(high), True

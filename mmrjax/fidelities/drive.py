@@ -1,0 +1,181 @@
+"""Fidelity `drive`: the ODE of drives and chassis, with slip, inductance and battery."""
+
+from __future__ import annotations
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from mmrjax import balances
+from mmrjax.fidelities.result import result, withhold
+from mmrjax.fidelities.rosenbrock import Rodas4
+from mmrjax.fidelities.steady import operating_signals
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import (
+    BATTERY_EMPTY,
+    CONVERGED,
+    FAILED,
+    NOT_SETTLED,
+    SLIDES,
+    STALLED,
+    Command,
+    Result,
+    Signals,
+    State,
+)
+
+# Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
+# The memories of those effects that have one follow, each in its own unit.
+_UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
+
+
+class Trajectory(eqx.Module):
+    """A run.
+
+    Attributes:
+        time: [s], shape (times,).
+        distance: travelled along the slope [m], shape (times,).
+        signals: every signal at those times; each field has shape (times,).
+        time_end: last of those times before the battery is empty, else of the run [s].
+        result: the state at the end, with the run's status.
+    """
+
+    time: Float[Array, " times"]
+    distance: Float[Array, " times"]
+    signals: Signals
+    time_end: Float[Array, ""]
+    result: Result
+
+
+def _units(robot: Robot) -> tuple[float, ...]:
+    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering)
+
+
+def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
+    """The state that a vector of unknowns stands for."""
+    y = y * jnp.asarray(_units(robot), y.dtype)
+    memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
+    return State(y[0], y[1], y[2], y[4], memory)
+
+
+def rates(robot: Robot, command: Command, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+    """Rates of the unknowns, in their units [1/s]."""
+    signals = balances.moving(robot, command, state_of(robot, y))
+    current_battery = robot.battery.current(signals.total_current) * (command.battery > 0.5)  # eq. (11)
+    rates = [
+        signals.voltage_left / signals.inductance,
+        signals.acceleration_wheel * robot.gearbox.ratio,
+        signals.acceleration,
+        signals.speed,
+        current_battery,
+        *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
+    ]
+    return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
+
+
+def _norm(error: Float[Array, " unknowns"]) -> Scalar:
+    """Root mean square of the drive's own unknowns; memories add to it and never dilute it."""
+    return optx.rms_norm(error) * (error.shape[0] / len(_UNITS)) ** 0.5
+
+
+def _step_longest(robot: Robot, command: Command) -> Scalar | None:
+    """The longest step that still resolves every effect with a memory [s]; None where none has one."""
+    limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in robot.remembering]
+    return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
+
+
+def start(robot: Robot, command: Command, rolling: bool = False) -> Float[Array, " unknowns"]:
+    """At rest; or as the steady fidelity travels, what effects remember settled too, at rest where it has no root."""
+    units = jnp.asarray(_units(robot), jnp.result_type(command.voltage))
+    rest = jnp.zeros_like(units).at[4].set(command.discharge / units[4])
+    if not rolling:
+        return rest
+    settled = operating_signals(robot, command)
+    memory = [effect.settled(robot, settled) for effect in robot.remembering]
+    state = [settled.current, settled.speed_motor, settled.speed, 0.0, command.discharge, *memory]
+    state = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
+    return jnp.where(jnp.all(jnp.isfinite(state)), state, rest)
+
+
+def drive(
+    robot: Robot,
+    command: Command,
+    times: Float[Array, " times"],
+    tolerance: float = 1e-6,
+    max_steps: int = 4096,
+    *,
+    rolling: bool = False,
+) -> Trajectory:
+    """Run one robot from standstill (or rolling) under a constant command and keep the given times.
+
+    Args:
+        robot: any robot; its parameters may be tracers.
+        command: one run, scalar fields.
+        times: increasing, from 0 [s]; the last one ends the run.
+        tolerance: relative and (in units of 10 A, 1000 rad/s, 1 m/s) absolute error of a step.
+        max_steps: integration steps after which a run has `failed`.
+        rolling: start at the operating point of the steady fidelity, or with the contact held at V_s where it
+            would slide; derivatives pass through it. Else from standstill.
+
+    Returns:
+        The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
+        tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
+        when the movers spin beyond V_s and the robot gains no speed; `battery_empty` when the charge has
+        run out: signals after `time_end` and the result's numbers are NaN; `failed` when
+        the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
+    """
+    y0 = start(robot, command, rolling)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda _, y, conditions: rates(*conditions, y)),
+        Rodas4(),
+        times[0],
+        times[-1],
+        dt0=jnp.asarray(1e-4, y0.dtype),
+        y0=y0,
+        args=(robot, command),
+        saveat=diffrax.SaveAt(ts=times),
+        max_steps=max_steps,
+        throw=False,
+        stepsize_controller=diffrax.PIDController(
+            rtol=tolerance, atol=tolerance, norm=_norm, dtmax=_step_longest(robot, command)
+        ),
+        adjoint=diffrax.ForwardMode(),
+    )
+    assert solution.ys is not None
+    ys = solution.ys
+    signals = jax.vmap(lambda y: balances.moving(robot, command, state_of(robot, y)))(ys)
+    end = jax.tree.map(lambda x: x[-1], signals)
+    status = _status(robot, command, end, solution.result == diffrax.RESULTS.successful)
+    # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
+    going = (command.battery < 0.5) | ~robot.battery.empty(signals.discharge)
+    signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
+    time_end = jnp.max(jnp.where(going, times, times[0]))
+    there = (status != BATTERY_EMPTY) & (status != FAILED)
+    answer = withhold(result(robot, end, status), there, status != FAILED)
+    return Trajectory(times, distance, signals, time_end, answer)
+
+
+def _status(robot: Robot, command: Command, end: Signals, done: Array) -> Array:
+    friction = robot.chassis(command.wheeled).ground.friction
+    settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
+    status = jnp.where(settling, NOT_SETTLED, CONVERGED)
+    stands = jnp.minimum(end.direction, end.direction_travel) < 1.0
+    status = jnp.where(stands & (end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
+    spinning = jnp.abs(end.speed_sliding) > friction.speed_static
+    gaining = end.acceleration * end.speed_sliding > 1e-3 * jnp.abs(end.speed_sliding)  # 1 mm/s²
+    status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
+    empty = (command.battery > 0.5) & robot.battery.empty(end.discharge)
+    status = jnp.where(empty, BATTERY_EMPTY, status)
+    return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
+
+
+@eqx.filter_jit
+def drive_batch(
+    robot: Robot, commands: Command, times: Float[Array, " times"], tolerance: float = 1e-6, max_steps: int = 4096
+) -> Trajectory:
+    """`drive` over a batch of commands (leading axis of every field) for one robot, compiled."""
+    return jax.vmap(lambda c: drive(robot, c, times, tolerance, max_steps))(commands)

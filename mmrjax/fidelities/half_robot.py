@@ -1,0 +1,208 @@
+"""Half a robot in motion: its state, all its forces at an instant, one step, and where a run starts.
+
+MJX carries chassis and pulleys (5 degrees of freedom, `mjcf`); grousers or wheels, guides and belt
+(`undercarriage`, `belt`) and the drive (`balances`) enter as generalized forces.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax import balances, mjcf, undercarriage
+from mmrjax.belt import Path
+from mmrjax.chassis import Chassis, inertia_reduced
+from mmrjax.fidelities.steady import steady
+from mmrjax.mjcf import Masses, mjx
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.running_gear import RunningGear
+from mmrjax.signals import CONVERGED, GRAVITY, Command, Signals, State
+from mmrjax.undercarriage import Pull, Touch
+
+
+class Motion(eqx.Module):
+    """State of half a robot: what a step advances.
+
+    Attributes:
+        q, v: coordinates and velocities, see `undercarriage`.
+        current: of one motor [A].
+        discharge: charge taken from the battery [C].
+        memory: of each effect that has one, by its name.
+    """
+
+    q: Float[Array, " 5"]
+    v: Float[Array, " 5"]
+    current: Scalar
+    discharge: Scalar
+    memory: dict[str, Scalar] = eqx.field(default_factory=dict)
+
+
+class System(eqx.Module):
+    """One run's constants: what `rate` and `advance` need beside the motion.
+
+    Attributes:
+        model, data: MJX model with this member's constants, and the data whose structure it needs.
+    """
+
+    robot: Robot
+    gear: RunningGear
+    command: Command
+    path: Path
+    half: Masses
+    model: Any
+    data: Any
+    step: float = eqx.field(static=True)
+
+
+def system(robot: Robot, command: Command, gear: RunningGear, step: float) -> System:
+    """Constants of one run (scalar fields); robot and gear may hold tracers."""
+    rest = State(*(jnp.zeros_like(command.voltage) for _ in range(4)))
+    mass = balances.begin(robot, command, rest).mass
+    half = mjcf.masses(robot, gear, command, mass)
+    model, data = mjcf.template()
+    model = mjcf.member(model, half, command.slope, gear.wheelbase, step)
+    return System(robot, gear, command, Path(robot.tracked.radius, gear), half, model, data, step)
+
+
+class _Mover(eqx.Module):
+    path: Path
+    at: Touch
+    height: Scalar
+
+    @property
+    def normal(self) -> Scalar:
+        return self.at.normal
+
+    def pull(self, chassis: Chassis, signals: Signals) -> Pull:
+        return undercarriage.pull(self.path, chassis, signals, self.at, self.height)
+
+
+def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
+    """All signals, contacts and forces of an instant."""
+    at = undercarriage.touch(run.path, run.robot.wheeled.radius, run.command.wheeled, motion.q, motion.v)
+    state = State(motion.current, run.robot.gearbox.ratio * motion.v[3], motion.v[0], motion.discharge, motion.memory)
+    mover = _Mover(run.path, at, motion.q[1])
+    signals, pulled = balances.resolved(run.robot, run.command, state, mover, run.half.inertia_pulley)
+    return signals, at, pulled
+
+
+def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
+    """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
+    force = jnp.insert(pulled.generalized, 3, signals.torque_net)
+    motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
+    rotating = inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
+    return force, jnp.zeros_like(force).at[3].set(rotating)
+
+
+def current_after(run: System, signals: Signals) -> Scalar:
+    """Motor current one step on [A]: exponential Euler, exact for a winding at constant speed.
+
+    L dI/dt = U_left(I); I + Δt U_left / L · (e^z - 1) / z with z = Δt U_left' / L. The electrical time
+    constant (0.2 ms) is of the order of the step, so the winding's own decay is integrated exactly; U_left'
+    comes from the balances, so a battery or an effect that changes the slope is in it.
+    """
+
+    def left(current: Scalar) -> Scalar:
+        shifted = dataclasses.replace(signals, current=current, total_current=run.robot.sides * current)
+        return balances.electrical(run.robot, balances.supply(run.robot, run.command, shifted)).voltage_left
+
+    voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
+    z = run.step * slope / signals.inductance
+    return signals.current + run.step / signals.inductance * voltage * jnp.expm1(z) / z
+
+
+def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
+    """One step of MJX (semi-implicit Euler) and of the winding; signals are those before the step."""
+    signals, _, pulled = instant(run, motion)
+    force, armature = generalized(run, signals, pulled)
+    data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
+    data = mjx.step(run.model.replace(dof_armature=armature), data)
+    charge = run.robot.battery.current(signals.total_current) * (run.command.battery > 0.5)
+    memory = {
+        effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
+        for effect in run.robot.remembering
+    }
+    discharge = motion.discharge + run.step * charge
+    after = Motion(data.qpos, data.qvel, current_after(run, signals), discharge, memory)
+    return after, signals, pulled
+
+
+def margin(run: System) -> Scalar:
+    """How far the line of gravity meets the ground inside the outermost contacts [m]; negative: it tips."""
+    forward, up, _ = centre(run)
+    meets = forward - jnp.tan(run.command.slope) * (up + axle_height(run))
+    return run.gear.wheelbase / 2 - jnp.abs(meets)
+
+
+def centre(run: System) -> tuple[Scalar, Scalar, Scalar]:
+    """Centre of mass ahead of and above the middle of the wheelbase [m], and the mass of half a robot [kg]."""
+    total = run.half.chassis + 2 * run.half.pulley
+    share = run.half.chassis / total
+    return run.half.forward * share, run.half.up * share, total
+
+
+def axle_height(run: System) -> Scalar:
+    """Height of the axles over the ground where the contacts just touch [m]."""
+    tracked = run.path.radius + run.gear.grouser_height
+    return jnp.where(run.command.wheeled > 0.5, run.robot.wheeled.radius, tracked)
+
+
+def stand(run: System) -> Motion:
+    """At rest on the ground, the contacts bearing the weight: Newton in height and pitch.
+
+    A robot that tips starts level, its lowest contacts just touching.
+    """
+    forward, up, total = centre(run)
+    weight = total * GRAVITY
+    cos, sin = jnp.cos(run.command.slope), jnp.sin(run.command.slope)
+    axle = axle_height(run)
+    zeros = jnp.zeros(5, jnp.result_type(axle))
+
+    def unbalanced(y: Float[Array, " 2"]) -> Float[Array, " 2"]:
+        q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
+        at = undercarriage.touch(run.path, run.robot.wheeled.radius, run.command.wheeled, q, zeros)
+        moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
+        return jnp.stack([(at.normal - weight * cos) / weight, moment / weight])
+
+    def newton(y: Float[Array, " 2"], _: None) -> tuple[Float[Array, " 2"], None]:
+        residual, jacobian = unbalanced(y), jax.jacfwd(unbalanced)(y)
+        (a, b), (c, d) = jacobian
+        det = a * d - b * c
+        det = jnp.where(jnp.abs(det) > 1e-9, det, 1e-9)
+        move = jnp.stack([d * residual[0] - b * residual[1], a * residual[1] - c * residual[0]]) / det
+        limit = jnp.asarray([2e-4, 2e-3])
+        return y - jnp.clip(move, -limit, limit), None
+
+    y0 = jnp.asarray([2e-4, 0.0], zeros.dtype)
+    y, _ = jax.lax.scan(newton, y0, None, length=30)
+    y = jnp.where(margin(run) > 0, y, jnp.zeros_like(y))
+    q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
+    memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
+    return Motion(q, zeros, jnp.zeros_like(axle), run.command.discharge * jnp.ones_like(axle), memory)
+
+
+def roll(run: System) -> Motion:
+    """Rolling on its contacts at the speed of the steady fidelity, or at no load where that has none.
+
+    Derivatives pass through it, so that those of a short run are those of what was run.
+    """
+    start = stand(run)
+    guess = steady(run.robot, run.command)
+    solved = guess.status == CONVERGED
+    ratio, radius = run.robot.gearbox.ratio, run.robot.chassis(run.command.wheeled).radius
+    no_load = run.command.voltage / run.robot.motor.torque_constant
+    shown, speed_wheel = guess.reading, guess.theoretical_speed / radius  # the reading may carry a sensor's error
+    motor = jnp.where(solved, ratio * speed_wheel, no_load)
+    speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)
+    current = jnp.where(solved, shown.total_current / run.robot.sides, 0.0)
+    v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor / ratio)
+    start = dataclasses.replace(start, v=v, current=current)
+    signals, _, _ = instant(run, start)  # what effects remember is settled too
+    memory = {e.name: e.settled(run.robot, signals) * jnp.ones_like(current) for e in run.robot.remembering}
+    return dataclasses.replace(start, memory=memory)

@@ -1,0 +1,106 @@
+"""Rodas4: a stiff integrator for diffrax that solves linear systems only, for small autonomous ODEs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from diffrax import RESULTS
+from jaxtyping import Array, Float
+
+from mmrjax.fidelities.linear import factorise, substitute
+
+#: Unknowns up to which elimination is written out; beyond, its program takes too long to compile.
+_WRITTEN_OUT = 8
+
+_GAMMA = 0.25
+_A = (
+    (1.544000000000000,),
+    (0.9466785280815826, 0.2557011698983284),
+    (3.314825187068521, 2.896124015972201, 0.9986419139977817),
+    (1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950),
+)
+_C = (
+    (-5.668800000000000,),
+    (-2.430093356833875, -0.2063599157091915),
+    (-0.1073529058151375, -9.594562251023355, -20.47028614809616),
+    (7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160),
+    (8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054),
+)
+# Weights of the stages in the two coefficients of the dense output.
+_D = (
+    (10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662),
+    (-0.6762803392806898, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872),
+)
+
+
+class RodasInterpolation(diffrax.AbstractLocalInterpolation):
+    """The method's own dense output, of order 3: y0 (1 - s) + s (y1 + (1 - s) (c2 + s c3)).
+
+    A Hermite cubic would not do: its slopes are right-hand sides, in which a stiff component multiplies
+    the error of its value, so that it swings between the ends of a long step.
+    """
+
+    t0: Any
+    t1: Any
+    y0: Any
+    y1: Any
+    c2: Any
+    c3: Any
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+        if t1 is not None:
+            return self.evaluate(t1) - self.evaluate(t0)
+        width = self.t1 - self.t0
+        s = (t0 - self.t0) / jnp.where(width == 0, 1.0, width)
+        return self.y0 * (1 - s) + s * (self.y1 + (1 - s) * (self.c2 + s * self.c3))
+
+
+class Rodas4(diffrax.AbstractAdaptiveSolver):
+    """Stiffly accurate, L-stable Rosenbrock method of order 4(3) with six stages.
+
+    Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
+    Only for autonomous right-hand sides of one flat vector: the Jacobian in time is taken to be zero.
+    """
+
+    term_structure: ClassVar[Any] = diffrax.ODETerm
+    interpolation_cls: ClassVar[Callable[..., Any]] = RodasInterpolation
+
+    def order(self, terms: Any) -> int:
+        return 4
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        return None
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        h = t1 - t0
+
+        def rate(y: Any) -> Any:
+            return terms.vf(t0, y, args)
+
+        f0 = rate(y0)
+        matrix = jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jax.jacfwd(rate)(y0)
+        solve = _solver(matrix)
+        u = [solve(f0)]
+        y = y0
+        for stage in range(1, 6):
+            y = y + u[-1] if stage == 5 else y0 + sum(a * v for a, v in zip(_A[stage - 1], u, strict=True))
+            u.append(solve(rate(y) + sum(c * v for c, v in zip(_C[stage - 1], u, strict=True)) / h))
+        y1 = y + u[-1]
+        c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
+        dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
+        return y1, u[-1], dense, None, RESULTS.successful
+
+
+def _solver(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
+    if matrix.shape[0] <= _WRITTEN_OUT:
+        written = factorise(matrix)
+        return lambda vector: substitute(written, vector)
+    factors = jax.scipy.linalg.lu_factor(matrix)
+    return lambda vector: jax.scipy.linalg.lu_solve(factors, vector)

@@ -1,0 +1,298 @@
+"""Fidelity `track`: half a robot as multibody dynamics in MJX, its contacts resolved one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from mmrjax import contact, undercarriage
+from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
+from mmrjax.fidelities.result import result, withhold
+from mmrjax.fidelities.stability import refuse
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.running_gear import RunningGear
+from mmrjax.signals import (
+    BATTERY_EMPTY,
+    CONVERGED,
+    FAILED,
+    NOT_SETTLED,
+    SLIDES,
+    STALLED,
+    TIPS,
+    Command,
+    Result,
+    Signals,
+)
+from mmrjax.undercarriage import Reactions
+
+STEP = 1e-4  # [s]
+SAMPLE = 1e-3  # [s]
+WINDOW = 0.4  # share of a run at its end over which it is averaged
+PARTS = 20  # of a run between which progress is told
+SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
+
+
+class Steady(eqx.Module):
+    """Averages over the last whole number of grouser periods of a run.
+
+    Attributes:
+        signals: means.
+        guide_share: of the ground's normal reaction that the lower guides carry [-]: an output here, a
+            parameter in the other fidelities.
+        periods: grouser periods averaged [-]; 0: the plain window, the belt hardly moved.
+        change: largest relative change of current, motor speed and speed between the window's halves [-].
+    """
+
+    signals: Signals
+    guide_share: Scalar
+    periods: Int[Array, ""]
+    change: Scalar
+
+
+class Record(eqx.Module):
+    """What is kept of each sample: motion and loads at its end, means over it (`guided`: of the guides' load)."""
+
+    motions: Motion
+    signals: Signals
+    guided: Float[Array, " samples"]
+    reactions: Reactions
+
+
+class Trajectory(eqx.Module):
+    """A run.
+
+    Attributes:
+        time: ends of the sample intervals [s], shape (samples,).
+        q, v: coordinates and velocities at those times (see `undercarriage`), shape (samples, 5).
+        signals: means over each interval; each field has shape (samples,).
+        reactions: loads at those times, of one side.
+        steady: averages at the end of the run.
+        result: the observation of those averages, with the run's status.
+    """
+
+    time: Float[Array, " samples"]
+    q: Float[Array, "samples 5"]
+    v: Float[Array, "samples 5"]
+    signals: Signals
+    reactions: Reactions
+    steady: Steady
+    result: Result
+
+
+def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Array]) -> Steady:
+    # Weights over the belt's travel that rise over one pitch and fall over another by the cubic step, which
+    # adds up to one with its neighbour a pitch on: the mean of an orbit that repeats with the pitch is exact
+    # and varies smoothly with the place at which the run happens to end.
+    pitch, end = run.path.pitch, travelled[-1]
+    middle = (travelled[1:] + travelled[:-1]) / 2
+    plain = (time[1:] > time[-1] - WINDOW * (time[-1] - time[0])).astype(time.dtype)
+    first = travelled[jnp.searchsorted(time, time[-1] - WINDOW * (time[-1] - time[0]))]
+    periods = jnp.floor(jax.lax.stop_gradient((end - first) / pitch))
+    periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
+
+    def mean(begin: Array, until: Array, otherwise: Array) -> Any:
+        rise = contact.step(middle, end - begin * pitch, 0.0, end - (begin - 1) * pitch, 1.0)
+        fall = contact.step(middle, end - (until + 1) * pitch, 1.0, end - until * pitch, 0.0)
+        weight = jnp.where(periods > 0, rise * fall, otherwise)
+        return jax.tree.map(lambda x: jnp.sum(weight * x) / jnp.sum(weight), sums)
+
+    half = jnp.floor(periods / 2) + 1
+    early = plain * (jnp.cumsum(plain) <= jnp.sum(plain) / 2)
+    signals, guided = mean(periods, 0.0, plain)
+    earlier, later = mean(periods, periods - half, early)[0], mean(half, 0.0, plain - early)[0]
+    changes = [
+        jnp.abs(getattr(later, f) - getattr(earlier, f)) / jnp.maximum(jnp.abs(getattr(signals, f)), 1e-3)
+        for f in ("total_current", "speed_motor", "speed")
+    ]
+    share = guided / jnp.maximum(signals.normal, 1e-9)
+    return Steady(signals, share, periods.astype(int), jnp.max(jnp.stack(changes)))
+
+
+def _status(run: System, steady: Steady, end: Motion) -> Array:
+    robot, command, signals = run.robot, run.command, steady.signals
+    friction = robot.chassis(command.wheeled).ground.friction
+    status = jnp.where(steady.change > SETTLED, NOT_SETTLED, CONVERGED)
+    status = jnp.where(signals.direction < 0.999, STALLED, status)
+    spinning = jnp.abs(signals.speed_sliding) > friction.speed_static
+    gaining = signals.acceleration > 1e-2  # m/s², on average over the window
+    status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
+    empty = (command.battery > 0.5) & robot.battery.empty(end.discharge)
+    status = jnp.where(empty, BATTERY_EMPTY, status)
+    status = jnp.where(margin(run) < 0, TIPS, status)
+    finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
+    # A run that has left the ground, sunk through it or turned over has numbers that mean nothing.
+    grounded = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) & (jnp.abs(end.q[2]) < 0.5)
+    sane = grounded | (status == TIPS)
+    return jnp.where(finite & sane, status, FAILED)
+
+
+def track(
+    robot: Robot,
+    command: Command,
+    gear: RunningGear | None = None,
+    *,
+    duration: float = 1.5,
+    step: float = STEP,
+    sample: float = SAMPLE,
+    rolling: bool = False,
+) -> Trajectory:
+    """Run one robot under a constant command, from standstill or rolling.
+
+    Pure and traceable: differentiable forward and backward, vmappable over every argument's leaves.
+
+    Args:
+        robot: any robot; its parameters may be tracers. Its `guide_share` is not used: it is an output.
+        command: one run, scalar fields.
+        gear: running gear; None takes the paper's.
+        duration: of the run [s]; step, sample: intervals of integration and of the record [s].
+        rolling: start at the steady fidelity's speed, which settles sooner; else from standstill.
+
+    Returns:
+        The trajectory. Status: `converged` when current and speeds change by less than 0.1 % from one half
+        of the averaging window to the other, else `not_settled`; `stalled` the shafts do not turn forward;
+        `slides` the movers spin beyond V_s and the robot gains no speed; `tips` the line of gravity passes
+        outside the contacts; `battery_empty`; `failed` the numbers are no longer finite, or the robot has
+        left the ground or turned over though gravity alone would not turn it. `failed` and `tips` withhold
+        the result's numbers.
+    """
+    run = system(robot, command, RunningGear() if gear is None else gear, step)
+    start = roll(run) if rolling else stand(run)
+    end, record = _record(run, start, sample, round(duration / sample))
+    return _trajectory(run, start, end, record, sample)
+
+
+def _record(run: System, start: Motion, sample: float, samples: int) -> tuple[Motion, Record]:
+    def small(motion: Motion, _: None) -> tuple[Motion, tuple[Signals, Array]]:
+        after, signals, pulled = advance(run, motion)
+        return after, (signals, pulled.guided)
+
+    @jax.checkpoint  # reverse mode keeps one motion a sample and recomputes the steps between
+    def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
+        after, every = jax.lax.scan(small, motion, None, length=round(sample / run.step))
+        signals, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
+        _, at, pulled = instant(run, after)
+        return after, Record(after, signals, guided, undercarriage.reactions(run.path, at, pulled))
+
+    return jax.lax.scan(interval, start, None, length=samples)
+
+
+def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample: float) -> Trajectory:
+    motions = record.motions
+    time = sample * jnp.arange(len(motions.q) + 1)
+    travelled = run.path.radius * jnp.concatenate([start.q[None, 3], motions.q[:, 3]])
+    averages = _average(run, time, travelled, (record.signals, record.guided))
+    status = _status(run, averages, end)
+    there = (status != FAILED) & (status != TIPS)
+    answer = withhold(result(run.robot, averages.signals, status), there, status != FAILED)
+    return Trajectory(time[1:], motions.q, motions.v, record.signals, record.reactions, averages, answer)
+
+
+def track_batch(
+    robot: Robot,
+    commands: Command,
+    gear: RunningGear | None = None,
+    *,
+    duration: float = 1.5,
+    step: float = STEP,
+    sample: float = SAMPLE,
+    rolling: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Trajectory:
+    """`track` over a batch of commands (leading axis of every field) for one robot, compiled once.
+
+    Args:
+        progress: told now and then the share of the runs' time that is done; between its calls the runs can be
+            interrupted. None makes one call of XLA of it, which cannot.
+
+    Raises:
+        ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
+            ground; the step is above the largest stable one, which the message states.
+    """
+    gear = RunningGear() if gear is None else gear
+    if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
+        raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
+    if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
+        raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
+    refuse(robot, commands, gear, step, sample)
+    if progress is not None:
+        return _in_parts(robot, commands, gear, duration, step, sample, rolling, progress)
+    return _batch(robot, commands, gear, duration, step, sample, rolling)
+
+
+@eqx.filter_jit
+def _batch(
+    robot: Robot,
+    commands: Command,
+    gear: RunningGear,
+    duration: float,
+    step: float,
+    sample: float,
+    rolling: bool,
+) -> Trajectory:
+    def one(command: Command) -> Trajectory:
+        return track(robot, command, gear, duration=duration, step=step, sample=sample, rolling=rolling)
+
+    return jax.vmap(one)(commands)
+
+
+def _in_parts(
+    robot: Robot,
+    commands: Command,
+    gear: RunningGear,
+    duration: float,
+    step: float,
+    sample: float,
+    rolling: bool,
+    progress: Callable[[float], None],
+) -> Trajectory:
+    # All parts are of one length, for one compilation; what the last one has too many is cut off.
+    samples = round(duration / sample)
+    length = math.ceil(samples / PARTS)
+    start = motion = _begin(robot, commands, gear, step, rolling)
+    records = []
+    for done in range(0, samples, length):
+        motion, record = jax.block_until_ready(_part(robot, commands, gear, motion, step, sample, length))
+        records.append(record)
+        progress(min((done + length) / samples, 1.0))
+    return _end(robot, commands, gear, start, records, step, sample, samples)
+
+
+@eqx.filter_jit
+def _begin(robot: Robot, commands: Command, gear: RunningGear, step: float, rolling: bool) -> Motion:
+    return jax.vmap(lambda command: (roll if rolling else stand)(system(robot, command, gear, step)))(commands)
+
+
+@eqx.filter_jit
+def _part(
+    robot: Robot, commands: Command, gear: RunningGear, motions: Motion, step: float, sample: float, samples: int
+) -> tuple[Motion, Record]:
+    def one(command: Command, motion: Motion) -> tuple[Motion, Record]:
+        return _record(system(robot, command, gear, step), motion, sample, samples)
+
+    return jax.vmap(one)(commands, motions)
+
+
+@eqx.filter_jit
+def _end(
+    robot: Robot,
+    commands: Command,
+    gear: RunningGear,
+    starts: Motion,
+    records: list[Record],
+    step: float,
+    sample: float,
+    samples: int,
+) -> Trajectory:
+    def one(command: Command, start: Motion, parts: list[Record]) -> Trajectory:
+        record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
+        end = jax.tree.map(lambda x: x[-1], record.motions)
+        return _trajectory(system(robot, command, gear, step), start, end, record, sample)
+
+    return jax.vmap(one)(commands, starts, records)
