@@ -31,7 +31,7 @@ from mmrjax import nominal, params  # noqa: E402
 from mmrjax.fidelities.steady import steady_batch  # noqa: E402
 
 STATED = "current=2%,motor_speed=0.5%,speed=1%"
-CLIMBS = {"tracked.ground.friction.static": 0.6, "wheeled.ground.friction.static": 0.6}
+CLIMBS = {"6T2A.ground.friction.static": 0.6, "4W2T.ground.friction.static": 0.6}
 
 
 def accuracy(runs: records.Runs) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def timed(call: Any, repeats: int) -> float:
 
 def speed(runs: records.Runs, starts: int) -> dict[str, Any]:
     """Jacobian of 20 rows x 12 parameters and a whole fit: ours, SciPy on our jitted model, SciPy throughout."""
-    posed = pose(runs, ("tracked.track.guide_friction",))
+    posed = pose(runs, ("6T2A.track.guide_friction",))
     size = len(posed.coordinates)
     whole = jax.jit(fit.residuals(posed, posed.data, fit.no_pin(size)))
     jacobian = jax.jit(jax.jacfwd(lambda z: posed.misfit(z, posed.data)))

@@ -91,8 +91,9 @@ def main() -> None:
     import jax.numpy as jnp
 
     from mmrjax import nominal
+    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.drive import drive_batch
-    from mmrjax.signals import FAILED, command
+    from mmrjax.signals import FAILED
 
     robot, times = nominal.nominal(), jnp.asarray(INSTANTS)
 
@@ -104,7 +105,7 @@ def main() -> None:
 
     def batch(size: int):
         wheeled, slope, payload, voltage = conditions(size).T
-        return command(voltage=voltage, slope=slope, payload=payload, wheeled=wheeled)
+        return Conditions(voltage=voltage, slope_deg=np.degrees(slope), payload=payload, configuration=wheeled)
 
     def prepare(size: int):
         runs = jax.block_until_ready(batch(size))

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import balances, nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.robot import Robot
-from mmrjax.signals import Command, command
 
 jax.config.update("jax_enable_x64", True)
 
@@ -57,15 +57,15 @@ def amplitude(effect: type[Effect]) -> params.Spec:
     return next(p.spec for p in params.walk(effect()) if p.spec.amplitude)
 
 
-def examples(battery: float = 0.0) -> Command:
+def examples(battery: float = 0.0) -> Conditions:
     """6T2A, unladen, at 15 V on the level and at 33 V on 20 degrees."""
-    return command(voltage=[15.0, 33.0], slope=np.radians([0.0, 20.0]), battery=battery)
+    return Conditions(voltage=[15.0, 33.0], slope_deg=[0.0, 20.0], battery=battery)
 
 
-def table8() -> Command:
+def table8() -> Conditions:
     axes = (0.0, 1.0), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
     w, s, m, v = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4).T
-    return command(v, np.radians(s), m, w)
+    return Conditions(v, np.radians(s), m, w)
 
 
 def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -31,12 +31,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import balances, mjcf, params
+from mmrjax.conditions import Conditions
 from mmrjax.contact import force_contact, step
 from mmrjax.fidelities.ripple import period_pitch, ripple
 from mmrjax.fidelities.track import _batch
 from mmrjax.nominal import nominal
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
-from mmrjax.signals import GRAVITY, State, command
+from mmrjax.signals import GRAVITY, State
 
 STEP = 1e-6  # [s]; half of it changes the share by less than the scatter of two windows
 SAMPLE = 500  # steps
@@ -85,12 +86,19 @@ class Chain(NamedTuple):
 
 def chain(gear: RunningGear) -> Chain:
     """The nominal robot's 6T2A on the flat, with `gear`."""
-    robot, run = nominal(), command(voltage=33.0)
+    robot, run = nominal(), Conditions(voltage=33.0)
     rest = State(*(jnp.zeros(()) for _ in range(4)))
     half = mjcf.masses(robot, gear, run, balances.begin(robot, run, rest).mass)
-    link = (2 * gear.wheelbase + 2 * jnp.pi * robot.tracked.radius) / TEETH_BELT
+    link = (2 * gear.wheelbase + 2 * jnp.pi * robot.configurations["6T2A"].radius) / TEETH_BELT
     radius = link / (2 * jnp.sin(jnp.pi / TEETH_PULLEY))
-    return Chain(gear, half, robot.tracked.ground, robot.tracked.track.guide_friction, radius, link)
+    return Chain(
+        gear,
+        half,
+        robot.configurations["6T2A"].ground,
+        robot.configurations["6T2A"].track.guide_friction,
+        radius,
+        link,
+    )
 
 
 def _turn(vector, angle):
@@ -297,7 +305,7 @@ def harmonics(values: np.ndarray, periods: int, count: int = 4) -> dict:
 
 def beside(gears: list[RunningGear]) -> list[dict]:
     """The track model at the same recesses, 33 V on the flat: what the chain is compared with."""
-    runs = command(voltage=np.full(1, 33.0))
+    runs = Conditions(voltage=np.full(1, 33.0))
     found = []
     for gear in gears:
         answer = _batch(nominal(), runs, gear, 0.8, 1e-4, 1e-3, True)

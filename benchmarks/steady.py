@@ -28,14 +28,17 @@ def main() -> None:
     import jax.numpy as jnp
 
     from mmrjax import nominal
+    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady_batch
-    from mmrjax.signals import CONVERGED, command
+    from mmrjax.signals import CONVERGED
 
     robot = nominal.nominal()
 
     def batch(size: int):
         wheeled, slope, payload, voltage = conditions(size).T
-        return command(voltage=voltage, slope=slope, payload=payload, wheeled=np.round(wheeled))
+        return Conditions(
+            voltage=voltage, slope_deg=np.degrees(slope), payload=payload, configuration=np.round(wheeled)
+        )
 
     def prepare(size: int):
         runs = jax.block_until_ready(batch(size))

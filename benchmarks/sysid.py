@@ -29,12 +29,12 @@ from mujoco import sysid  # noqa: E402
 from calibration.inference import optimizers as fit  # noqa: E402
 from calibration.inference import priors, problem  # noqa: E402
 from mmrjax import nominal, params  # noqa: E402
-from mmrjax.signals import command  # noqa: E402
+from mmrjax.conditions import Conditions
 
 VOLTAGES = (12.0, 24.0)
 STEP, SAMPLES = 5e-4, 200  # [s]
 NOISE = 0.01  # sd of the shaft's speed [rad/s], 0.05-0.1 % of what it settles at
-NAMES = ("motor.inertia", "tracked.track.loss_viscous", "tracked.track.loss_coulomb")
+NAMES = ("motor.inertia", "6T2A.track.loss_viscous", "6T2A.track.loss_coulomb")
 OFF = (2.0, 0.5, 1.5)  # start over truth
 
 MODEL = """
@@ -57,8 +57,8 @@ def lifted() -> Any:
     """The robot: nominal, its gearbox without load-proportional loss, its windings without inductance to speak of
     (a hinge has neither), and nothing that rubs under its weight."""
     changes = {
-        "gearbox.efficiency_load": 1.0, "motor.inductance": 1e-7, "tracked.track.guide_share": 0.0,
-        "tracked.ground.rolling_resistance": 0.0,
+        "gearbox.efficiency_load": 1.0, "motor.inductance": 1e-7, "6T2A.track.guide_share": 0.0,
+        "6T2A.ground.rolling_resistance": 0.0,
     }  # fmt: skip
     return params.replace(nominal.nominal(), {k: jnp.asarray(v) for k, v in changes.items()})
 
@@ -69,7 +69,7 @@ def constants(robot: Any) -> dict[str, float]:
     ratio = float(gear.ratio)
     return {
         "ratio": ratio,
-        "inertia": float(robot.tracked.inertia),
+        "inertia": float(robot.configurations["6T2A"].inertia),
         "damping": ratio**2 * float(motor.torque_constant**2 / motor.resistance + motor.friction_viscous
                                     + gear.friction_viscous),
         "friction": ratio * float(motor.friction_coulomb + gear.friction_coulomb),
@@ -93,7 +93,7 @@ def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
     count, samples = len(VOLTAGES), len(times)
     run, sample = np.repeat(np.arange(count), samples), np.tile(np.arange(1, samples + 1), count)
     clock = jnp.asarray(np.tile(np.r_[0.0, times], (count, 1)))
-    observe = problem.Series(command(voltage=VOLTAGES, adhesion=0.0), clock, jnp.asarray(run), jnp.asarray(sample))
+    observe = problem.Series(Conditions(voltage=VOLTAGES, adhesion=0.0), clock, jnp.asarray(run), jnp.asarray(sample))
     only_speed = jnp.asarray([0.0, 1.0, 0.0])
     rows = count * samples
 

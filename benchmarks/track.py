@@ -21,15 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.stability import largest_step
 from mmrjax.fidelities.track import _batch, track
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import STATUSES, command
+from mmrjax.signals import STATUSES
 
 DERIVED = (
     "motor.resistance",
-    "tracked.track.guide_friction",
-    "tracked.track.loss_coulomb",
+    "6T2A.track.guide_friction",
+    "6T2A.track.loss_coulomb",
     "gearbox.efficiency_load",
 )
 ASSUMED = {
@@ -51,7 +52,7 @@ def table8(size: int = 180):
     axes = (0.0, 1.0), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
     rows = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
     wheeled, slope, payload, voltage = np.tile(rows, (-(-size // len(rows)), 1))[:size].T
-    return command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+    return Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
 
 
 def timed(call) -> tuple[float, float]:
@@ -102,7 +103,7 @@ def derivatives() -> dict:
 def assumptions() -> dict:
     """Guide share, current, speed and ripple of 6T2A at 33 V over each constant that the paper does not print."""
     robot, found = nominal.nominal(), {}
-    runs = command(voltage=33.0, slope=np.radians([0.0, 5.0]), payload=jnp.asarray([0.0, 8.0]))
+    runs = Conditions(voltage=33.0, slope_deg=[0.0, 5.0], payload=jnp.asarray([0.0, 8.0]))
 
     @jax.jit
     def settled(gears):

@@ -11,12 +11,13 @@ from typing import Any, Protocol
 
 import jax.numpy as jnp
 
+from mmrjax import channels, contact, ground, power
 from mmrjax import chassis as chassis_room
-from mmrjax import contact, ground, power
 from mmrjax.chassis import Chassis
+from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import GRAVITY, Command, Reading, Signals, State
+from mmrjax.signals import GRAVITY, Signals, State
 
 #: Every balance with its unit and what it closes.
 BALANCES = {
@@ -35,8 +36,13 @@ BALANCES = {
 
 
 def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
-    """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit."""
-    terms = [e.term(robot, signals) for e in robot.effects if e.balance == balance and e.channel == channel]
+    """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit; an effect adds nothing
+    in configurations on which it does not act."""
+    entering = [e for e in robot.effects if e.balance == balance and e.channel == channel]
+    terms = [
+        e.term(robot, signals) if e.acts_everywhere else e.acts(robot, signals) * e.term(robot, signals)
+        for e in entering
+    ]
     return sum(terms) if terms else 0.0  # type: ignore[return-value]
 
 
@@ -44,18 +50,19 @@ def _fill(signals: Signals, **values: Any) -> Signals:
     return dataclasses.replace(signals, **values)
 
 
-def begin(robot: Robot, command: Command, state: State, direction: Scalar | None = None) -> Signals:
+def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
     """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
-    chassis = robot.chassis(command.wheeled)
+    chassis = robot.chassis(conditions.configuration)
     speed_wheel = state.speed_motor / robot.gearbox.ratio
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.ground.friction.speed_rest
     signals = Signals(
-        wheeled=command.wheeled,
-        slope=command.slope,
-        payload=command.payload,
-        adhesion=command.adhesion,
-        battery=command.battery,
+        configuration=conditions.configuration,
+        on_tracks=chassis.on_tracks,
+        slope=conditions.slope,
+        payload=conditions.payload,
+        adhesion=conditions.adhesion,
+        battery=conditions.battery,
         discharge=state.discharge,
         memory=state.memory,
         current=state.current,
@@ -67,16 +74,16 @@ def begin(robot: Robot, command: Command, state: State, direction: Scalar | None
         speed_theoretical=speed_theoretical,
         total_current=robot.sides * state.current,
     )
-    stated = chassis.mass + command.payload if command.total_mass is None else command.total_mass
+    stated = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     mass = stated + added(robot, _fill(signals, mass=stated), "mass")
-    normal = chassis_room.normal_load(mass, command.slope, GRAVITY, robot.sides)
+    normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
     return _fill(signals, mass=mass, normal=normal)
 
 
-def supply(robot: Robot, command: Command, signals: Signals) -> Signals:
+def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     """Voltage at the motors [V]."""
     source = power.voltage_source(
-        robot.battery, command.voltage, command.battery, signals.total_current, signals.discharge
+        robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
     )
     return _fill(signals, voltage=source - added(robot, signals, "supply"))
 
@@ -172,9 +179,9 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
     )
 
 
-def _to_slip(robot: Robot, command: Command, chassis: Chassis, signals: Signals) -> Signals:
+def _to_slip(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
     """The balances between kinematics and traction, in their order."""
-    signals = electrical(robot, supply(robot, command, signals))
+    signals = electrical(robot, supply(robot, conditions, signals))
     return slip(robot, travel(robot, chassis, motor(robot, signals)))
 
 
@@ -184,10 +191,10 @@ def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
     return _fill(signals, traction=traction, acceleration=acceleration)
 
 
-def moving(robot: Robot, command: Command, state: State) -> Signals:
+def moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
     """All signals of a robot in motion: traction follows from sliding by the friction law."""
-    chassis = robot.chassis(command.wheeled)
-    signals = _to_slip(robot, command, chassis, begin(robot, command, state))
+    chassis = robot.chassis(conditions.configuration)
+    signals = _to_slip(robot, conditions, chassis, begin(robot, conditions, state))
     traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
     signals = _pulled(robot, signals, traction)
     return gearbox(robot, chassis, track(robot, chassis, signals))
@@ -206,7 +213,9 @@ class Mover(Protocol):
         ...
 
 
-def resolved(robot: Robot, command: Command, state: State, mover: Mover, inertia: Scalar) -> tuple[Signals, Any]:
+def resolved(
+    robot: Robot, conditions: Conditions, state: State, mover: Mover, inertia: Scalar
+) -> tuple[Signals, Any]:
     """All signals of a robot in motion whose normal load, traction and guide load come from its contacts.
 
     Args:
@@ -216,9 +225,9 @@ def resolved(robot: Robot, command: Command, state: State, mover: Mover, inertia
     Returns:
         The signals, and what `mover.pull` gave.
     """
-    chassis = dataclasses.replace(robot.chassis(command.wheeled), inertia=inertia)
-    signals = _fill(begin(robot, command, state), normal=mover.normal)
-    signals = _to_slip(robot, command, chassis, signals)
+    chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
+    signals = _fill(begin(robot, conditions, state), normal=mover.normal)
+    signals = _to_slip(robot, conditions, chassis, signals)
     pull = mover.pull(chassis, signals)
     traction, guide = pull.traction, jnp.sum(pull.guide)
     signals = _pulled(robot, signals, traction)
@@ -226,25 +235,23 @@ def resolved(robot: Robot, command: Command, state: State, mover: Mover, inertia
     return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
 
 
-def settled(robot: Robot, command: Command, state: State) -> tuple[Signals, Scalar]:
+def settled(robot: Robot, conditions: Conditions, state: State) -> tuple[Signals, Scalar]:
     """All signals of steady forward travel: traction is the demand.
 
     Returns:
         The signals, and the sliding speed at which the friction law carries that demand [m/s], which
         `signals.speed_sliding` has to meet.
     """
-    chassis = robot.chassis(command.wheeled)
-    signals = begin(robot, command, state, direction=jnp.ones_like(state.speed_motor))
-    signals = _to_slip(robot, command, chassis, signals)
-    signals = _fill(signals, traction=signals.demand)
+    chassis = robot.chassis(conditions.configuration)
+    signals = begin(robot, conditions, state, direction=jnp.ones_like(state.speed_motor))
+    signals = _to_slip(robot, conditions, chassis, signals)
+    # Nothing changes in steady travel: the rates that other fidelities compute are zero.
+    still = jnp.zeros_like(signals.demand)
+    signals = _fill(signals, traction=signals.demand, acceleration=still)
     creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
     return gearbox(robot, chassis, track(robot, chassis, signals)), creep
 
 
-def sensor(robot: Robot, signals: Signals) -> Reading:
-    """What the instruments show of current [A], motor speed [rad/s] and speed [m/s]."""
-    return Reading(
-        total_current=signals.total_current + added(robot, signals, "sensor", "total_current"),
-        motor_speed=signals.speed_motor + added(robot, signals, "sensor", "motor_speed"),
-        speed=signals.speed + added(robot, signals, "sensor", "speed"),
-    )
+def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+    """What the instruments show of every channel [SI], by its name."""
+    return {c.name: c.read(robot, signals) + added(robot, signals, "sensor", c.name) for c in channels.CHANNELS}

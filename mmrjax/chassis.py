@@ -6,15 +6,20 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax.ground import Ground
-from mmrjax.params import Scalar, parameter
+from mmrjax.params import Scalar, as_float, parameter
 from mmrjax.track import Track
 
 
 class Chassis(eqx.Module):
-    """The running gear and mass of one configuration, 6T2A or 4W2T."""
+    """The running gear and mass of one configuration.
+
+    Attributes:
+        on_tracks: 1 on tracks, 0 on wheels [-].
+    """
 
     track: Track
     ground: Ground
+    on_tracks: Scalar = eqx.field(converter=as_float)
     mass: Scalar = parameter(
         unit="kg",
         meaning="mass of the robot without payload",

@@ -15,10 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import GRAVITY, Command
+from mmrjax.signals import GRAVITY
 from mmrjax.undercarriage import lever_tip
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -48,17 +49,18 @@ class Masses(eqx.Module):
     inertia_pulley: Scalar
 
 
-def masses(robot: Robot, gear: RunningGear, command: Command, mass: Scalar) -> Masses:
+def masses(robot: Robot, gear: RunningGear, conditions: Conditions, mass: Scalar) -> Masses:
     """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin` gives it.
 
     The moment of inertia of Table 7 is the whole robot's in transport posture; from it the levers' share is
     taken there and put back at their angles, and the pulleys' share is taken out.
     """
-    wheeled = command.wheeled
-    tracked = 1 - wheeled
+    kind = robot.chassis(conditions.configuration)
+    tracked = kind.on_tracks
+    wheeled = 1 - tracked
     lever = gear.lever_mass * tracked
     pulley = gear.pulley_mass + gear.wheel_mass * wheeled
-    payload = command.payload / robot.sides
+    payload = conditions.payload / robot.sides
     chassis = mass / robot.sides - 2 * pulley
     bare = chassis - payload - 2 * lever
     half = gear.wheelbase / 2
@@ -68,7 +70,7 @@ def masses(robot: Robot, gear: RunningGear, command: Command, mass: Scalar) -> M
         parts.append((lever, (side * half + tip[0]) / 2, tip[1] / 2))
     forward = sum(m * a for m, a, _ in parts) / chassis
     up = sum(m * c for m, _, c in parts) / chassis
-    inertia_pulley = robot.chassis(wheeled).inertia / 2
+    inertia_pulley = kind.inertia / 2
     whole = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
     folded = half - gear.lever_length / 2  # centre of a folded lever from the middle
     body = whole - 2 * inertia_pulley - 2 * pulley * half**2 - 2 * lever * folded**2
@@ -76,18 +78,19 @@ def masses(robot: Robot, gear: RunningGear, command: Command, mass: Scalar) -> M
     return Masses(chassis, forward, up, inertia, pulley, inertia_pulley)
 
 
-def text(robot: Robot, gear: RunningGear, command: Command, mass: float, step: float = 1e-4) -> str:
-    """MJCF of half a robot under one command (scalar fields); `mass` total [kg], `step` [s].
+def text(robot: Robot, gear: RunningGear, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
+    """MJCF of half a robot under some conditions (scalar fields); `mass` total [kg], `step` [s].
 
     The shapes are for the eye and show both sides; masses and inertias are stated and are of one side.
     """
-    half = masses(robot, gear, command, jnp.asarray(mass))
+    half = masses(robot, gear, conditions, jnp.asarray(mass))
     m = {name: float(getattr(half, name)) for name in vars(half)}
-    wheeled = bool(command.wheeled > 0.5)
-    radius, base = float(robot.tracked.radius), float(gear.wheelbase)
-    axle = float(robot.wheeled.radius) if wheeled else radius + float(gear.grouser_height)
-    outer = float(robot.wheeled.radius) if wheeled else radius
-    sin, cos = float(jnp.sin(command.slope)), float(jnp.cos(command.slope))
+    chassis = robot.chassis(conditions.configuration)
+    wheeled = bool(chassis.on_tracks < 0.5)
+    radius, base = float(robot.radius_pulley), float(gear.wheelbase)
+    axle = float(chassis.radius) if wheeled else radius + float(gear.grouser_height)
+    outer = float(chassis.radius) if wheeled else radius
+    sin, cos = float(jnp.sin(conditions.slope)), float(jnp.cos(conditions.slope))
     levers = ""
     if not wheeled:
         for side, angle in ((1.0, gear.lever_front), (-1.0, gear.lever_rear)):
@@ -110,7 +113,7 @@ def text(robot: Robot, gear: RunningGear, command: Command, mass: float, step: f
         for y in (-0.122, 0.122)
         for z in (-radius, radius)
     )
-    return f"""<mujoco model="half robot {"4W2T" if wheeled else "6T2A"}">
+    return f"""<mujoco model="half robot {robot.configurations.names[int(conditions.configuration)]}">
   <compiler inertiafromgeom="false"/>
   <option timestep="{step:.9g}" integrator="Euler" gravity="{-GRAVITY * sin:.17g} 0 {-GRAVITY * cos:.17g}">
     <flag contact="disable" constraint="disable" eulerdamp="disable"/>
@@ -144,10 +147,9 @@ def _planar(inertia: float) -> str:
 @functools.cache
 def _template(double: bool) -> tuple[Any, Any]:
     from mmrjax.nominal import nominal  # topology only: every number is replaced per member
-    from mmrjax.signals import command
 
     with jax.ensure_compile_time_eval():
-        model = mujoco.MjModel.from_xml_string(text(nominal(), RunningGear(), command(), 13.1))
+        model = mujoco.MjModel.from_xml_string(text(nominal(), RunningGear(), Conditions(), 13.1))
         return mjx.put_model(model), mjx.make_data(model)
 
 

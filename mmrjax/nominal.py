@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 from mmrjax import params
@@ -16,11 +15,12 @@ from mmrjax.robot import Robot
 from mmrjax.tables import (
     BENCH,
     PAYLOADS_KG,
-    PITCH_TOOTH,
+    RADIUS_PULLEY,
     SLOPES_DEG,
     SURFACES,
-    TEETH_PULLEY,
+    TRACKED,
     VOLTAGES_V,
+    WHEELED,
     adhesion_ratio,
 )
 from mmrjax.track import Track
@@ -38,7 +38,6 @@ __all__ = [
     "sm2",
 ]
 
-RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 RADIUS_WHEEL = 50e-3  # D_w / 2, Table 6
 
 DYNAMIC_SHARE = 0.8  # μ_d / μ_s, assumed; the paper prints none
@@ -57,6 +56,7 @@ def nominal() -> Robot:
     tracked = Chassis(
         track=Track(loss_coulomb=0.350, loss_viscous=0.016, guide_share=GUIDE_SHARE),
         ground=Ground(_friction(bench.tracked_x), rolling_resistance=0.06),
+        on_tracks=1.0,
         mass=13.1,
         radius=RADIUS_PULLEY,
         inertia=75e-6 + 140e-6 + belt + belts_flippers,
@@ -64,11 +64,12 @@ def nominal() -> Robot:
     wheeled = Chassis(
         track=Track(loss_coulomb=0.070, loss_viscous=0.003, guide_share=0.0),
         ground=Ground(_friction(bench.wheeled_x), rolling_resistance=0.03),
+        on_tracks=0.0,
         mass=11.5,
         radius=RADIUS_WHEEL,
         inertia=75e-6 + 140e-6 + belt + 2 * 152e-6,
     )
-    return Robot(Battery(), Motor(), Gearbox(), tracked, wheeled)
+    return Robot(Battery(), Motor(), Gearbox(), {TRACKED: tracked, WHEELED: wheeled})
 
 
 def _simplified(track_torque: float) -> Robot:
@@ -79,10 +80,10 @@ def _simplified(track_torque: float) -> Robot:
         "gearbox.friction_coulomb": 0.0,
         "gearbox.friction_viscous": 0.0,
         "gearbox.efficiency_load": 0.75,
-        "tracked.track.loss_coulomb": track_torque,
-        "tracked.track.loss_viscous": 0.0,
-        "wheeled.track.loss_coulomb": track_torque * 70 / 350,
-        "wheeled.track.loss_viscous": 0.0,
+        f"{TRACKED}.track.loss_coulomb": track_torque,
+        f"{TRACKED}.track.loss_viscous": 0.0,
+        f"{WHEELED}.track.loss_coulomb": track_torque * 70 / 350,
+        f"{WHEELED}.track.loss_viscous": 0.0,
         "battery.voltage_full": 33.6 / 8,
         "battery.curvature": 0.0,
         "battery.slope": 0.0,
@@ -102,5 +103,5 @@ def sm2() -> Robot:
     return _simplified(0.300)
 
 
-#: Robots by the name that the command line takes.
+#: Robots by the name that the conditions line takes.
 ROBOTS: dict[str, Callable[[], Robot]] = {"nominal": nominal, "sm1": sm1, "sm2": sm2}

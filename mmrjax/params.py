@@ -52,10 +52,11 @@ def parameter(
         raise ValueError("a parameter states either relative_sd or sd")
     spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude)
     keywords: dict[str, Any] = {} if default is None else {"default": default}
-    return eqx.field(converter=_as_float, metadata={"spec": spec}, kw_only=True, **keywords)
+    return eqx.field(converter=as_float, metadata={"spec": spec}, kw_only=True, **keywords)
 
 
-def _as_float(value: Any) -> Any:
+def as_float(value: Any) -> Any:
+    """A number as a float array; anything that is already an array passes."""
     # Anything that is already an array (or a tracer, or a placeholder of a tree transformation) passes.
     return jnp.asarray(value, dtype=float) if isinstance(value, int | float) else value
 
@@ -72,13 +73,17 @@ class Parameter:
 def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
     """Yield every parameter below `component`, depth first, by dotted name.
 
-    A tuple of modules (the effects) is walked by each member's `name`.
+    A tuple of modules (the effects) is walked by each member's `name`; a collection of modules by name (the
+    configurations) by those names alone: `6T2A.mass`.
     """
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         name = f"{prefix}{field.name}"
         if "spec" in field.metadata:
             yield Parameter(name, value, field.metadata["spec"])
+        elif hasattr(value, "items"):
+            for key, member in value.items():
+                yield from walk(member, f"{prefix}{key}.")
         elif isinstance(value, eqx.Module):
             yield from walk(value, f"{name}.")
         elif isinstance(value, tuple):
@@ -104,6 +109,9 @@ def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         name = f"{prefix}{field.name}"
+        if hasattr(value, "items"):
+            changes[field.name] = type(value)({k: _replace(m, values, f"{prefix}{k}.") for k, m in value.items()})
+            continue
         if not any(key == name or key.startswith(f"{name}.") for key in values):
             continue
         if "spec" in field.metadata:

@@ -13,10 +13,11 @@ from jaxtyping import Float
 
 from mmrjax import params
 from mmrjax.belt import Path, tips
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.track import Trajectory
 from mmrjax.robot import Robot
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, RunningGear
-from mmrjax.signals import GRAVITY, Command
+from mmrjax.signals import GRAVITY
 from mmrjax.undercarriage import lever_tip
 
 FORMATS = (".png", ".gif", ".mp4")
@@ -32,7 +33,8 @@ class Scene(NamedTuple):
     """What the pictures of one run need, as plain arrays.
 
     Attributes:
-        slope: [rad]; wheeled: whether on wheels; axle: half the wheelbase [m]; wheel: its radius [m].
+        slope: [rad]; name: of the configuration; wheeled: whether on wheels; axle: half the wheelbase [m];
+            wheel: its radius [m].
         path: of the belt; levers: tips in the chassis frame, empty on wheels.
         time, q, total_current, speed, theoretical: over the run.
         place, normal, guided, support: reactions over the run, of one side.
@@ -40,6 +42,7 @@ class Scene(NamedTuple):
     """
 
     slope: float
+    name: str
     wheeled: bool
     axle: float
     wheel: float
@@ -59,8 +62,8 @@ class Scene(NamedTuple):
     weight: float
 
 
-def scene(robot: Robot, command: Command, run: Trajectory, gear: RunningGear | None = None) -> Scene:
-    """Gather one run (scalar command, one member of a batch) for drawing.
+def scene(robot: Robot, conditions: Conditions, run: Trajectory, gear: RunningGear | None = None) -> Scene:
+    """Gather one run (scalar conditions, one member of a batch) for drawing.
 
     Raises:
         ValueError: the run holds numbers that are not finite (a failed member).
@@ -68,14 +71,16 @@ def scene(robot: Robot, command: Command, run: Trajectory, gear: RunningGear | N
     gear = RunningGear() if gear is None else gear
     if not np.isfinite(np.asarray(run.q)).all():
         raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
-    path, wheeled = Path(robot.tracked.radius, gear), bool(command.wheeled > 0.5)
+    chassis = robot.chassis(conditions.configuration)
+    path, wheeled = Path(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
     levers = [] if wheeled else [lever_tip(gear, gear.lever_front, 1.0), lever_tip(gear, gear.lever_rear, -1.0)]
     signals, reactions = run.signals, run.reactions
     return Scene(
-        slope=float(command.slope),
+        slope=float(conditions.slope),
+        name=robot.configurations.names[int(conditions.configuration)],
         wheeled=wheeled,
         axle=float(gear.wheelbase) / 2,
-        wheel=float(robot.wheeled.radius),
+        wheel=float(chassis.radius),
         path=path,
         levers=[(float(x), float(z)) for x, z in levers],
         time=np.asarray(run.time),
@@ -201,9 +206,8 @@ def figure(view: Scene, k: int) -> Any:
     span, rise = 0.31, 0.31 * np.sin(abs(view.slope))
     upper.set(xlim=(-span, span), ylim=(-0.15 - rise * 0.55, 0.16 + rise * 0.55), aspect="equal")
     upper.axis("off")
-    name = "4W2T" if view.wheeled else "6T2A"
     upper.set_title(
-        f"{name}, slope {np.degrees(view.slope):.0f}°, t = {view.time[k]:.3f} s, x = {view.q[k, 0]:.3f} m, "
+        f"{view.name}, slope {np.degrees(view.slope):.0f}°, t = {view.time[k]:.3f} s, x = {view.q[k, 0]:.3f} m, "
         f"V = {view.speed[k]:.2f} m/s",
         fontsize=11,
     )

@@ -1,41 +1,102 @@
-"""The robot: its components and its effects, one pytree."""
+"""The robot: its drive, its configurations and its effects, one pytree."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int
 
 from mmrjax.chassis import Chassis
-from mmrjax.effects import Effect
 from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
 from mmrjax.params import Scalar
 from mmrjax.power import Battery
-from mmrjax.tables import CONFIGURATIONS
+from mmrjax.tables import RADIUS_PULLEY
 
-__all__ = ["CONFIGURATIONS", "Robot"]
+if TYPE_CHECKING:
+    from mmrjax.effects import Effect
+
+
+class Configurations(eqx.Module):
+    """Chassis by name, in a fixed order; conditions hold the index of one.
+
+    Attributes:
+        names: in order; members: the chassis, alike.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    members: tuple[Chassis, ...]
+
+    def __init__(self, by_name: Mapping[str, Chassis]) -> None:
+        self.names, self.members = tuple(by_name), tuple(by_name.values())
+
+    def index(self, name: str) -> int:
+        """Position of a configuration.
+
+        Raises:
+            KeyError: no such configuration; the message lists those that there are.
+        """
+        if name not in self.names:
+            raise KeyError(f"no configuration {name}; the robot has {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def __getitem__(self, name: str) -> Chassis:
+        return self.members[self.index(name)]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def items(self) -> Iterator[tuple[str, Chassis]]:
+        """Names with their chassis, in order."""
+        return zip(self.names, self.members, strict=True)
+
+
+def _configurations(value: Any) -> Any:
+    return Configurations(value) if isinstance(value, Mapping) else value
 
 
 class Robot(eqx.Module):
     """Battery, one motor and gearbox per side, a chassis for each configuration, and effects.
 
     Attributes:
+        configurations: chassis by name, at least one; given as a mapping.
         effects: terms beyond the paper's model; the empty tuple is the paper's model.
-        sides: tractive drives; all per-side quantities are alike (assumption 3).
+        sides: motors driven alike; all per-side quantities are of one of them (assumption 3).
     """
 
     battery: Battery
     motor: Motor
     gearbox: Gearbox
-    tracked: Chassis
-    wheeled: Chassis
+    configurations: Configurations = eqx.field(converter=_configurations)
     effects: tuple[Effect, ...] = ()
     sides: int = eqx.field(default=2, static=True)
 
-    def chassis(self, wheeled: Scalar) -> Chassis:
-        """The chassis in use: `tracked` where `wheeled` is 0, else `wheeled`; traceable and batchable."""
-        return jax.tree.map(lambda t, w: jnp.where(wheeled > 0.5, w, t), self.tracked, self.wheeled)
+    def chassis(self, configuration: Int[Array, ""]) -> Chassis:
+        """The chassis of the configuration with this index; traceable and batchable."""
+        first, *others = self.configurations.members
+        chosen = first
+        for k, other in enumerate(others, 1):
+            chosen = jax.tree.map(lambda a, b: jnp.where(configuration == k, b, a), chosen, other)  # noqa: B023
+        return chosen
+
+    @property
+    def radius_pulley(self) -> Scalar:
+        """Pitch radius of the pulleys that carry the belts [m]: the rolling radius of the first configuration on
+        tracks, 48 teeth of 5 mm for a robot that has none."""
+        radius: Scalar = jnp.asarray(RADIUS_PULLEY)
+        for chassis in reversed(self.configurations.members):
+            radius = jnp.where(chassis.on_tracks > 0.5, chassis.radius, radius)
+        return radius
 
     @property
     def remembering(self) -> tuple[Effect, ...]:

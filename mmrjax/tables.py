@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
-#: Configurations in the order of `Command.wheeled`.
-CONFIGURATIONS = ("6T2A", "4W2T")
+#: Configurations of the packaged robot: on tracks, and on wheels.
+TRACKED, WHEELED = CONFIGURATIONS = ("6T2A", "4W2T")
 
 #: Main track of one side: teeth of belt and pulley, grousers (Section 3.4.4); pitches [m] (Section 3.2.4).
 TEETH_BELT, TEETH_PULLEY, GROUSERS = 168, 48, 24
 PITCH_TOOTH, PITCH_GROUSER = 5e-3, 35e-3
+RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 
 #: Axes of Table 8.
 SLOPES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
@@ -37,7 +39,7 @@ SURFACES = {
 BENCH = "lacquered_wood"
 
 
-def adhesion_ratio(surface: str, wheeled: bool) -> float:
+def adhesion_ratio(surface: str, on_tracks: bool) -> float:
     """Adhesion of `surface` over that of the bench [-], Table 5; right for a robot whose friction is the bench's."""
     here, bench = SURFACES[surface], SURFACES[BENCH]
-    return here.wheeled_x / bench.wheeled_x if wheeled else here.tracked_x / bench.tracked_x
+    return here.tracked_x / bench.tracked_x if on_tracks else here.wheeled_x / bench.wheeled_x

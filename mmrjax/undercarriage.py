@@ -70,7 +70,7 @@ def _geometry(
     )
 
 
-def touch(path: Path, radius_wheel: Scalar, wheeled: Scalar, q: Float[Array, " 5"], v: Float[Array, " 5"]) -> Touch:
+def touch(path: Path, chassis: Chassis, q: Float[Array, " 5"], v: Float[Array, " 5"]) -> Touch:
     """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
 
     Where the belt hangs free between pulley and guide it yields under the grouser as a string of tension
@@ -78,15 +78,14 @@ def touch(path: Path, radius_wheel: Scalar, wheeled: Scalar, q: Float[Array, " 5
 
     Args:
         path: the belt's path.
-        radius_wheel: of the wheels [m] (4W2T).
-        wheeled: 0 grousers bear, 1 wheels bear.
+        chassis: on tracks the grousers bear, on wheels the wheels, of its radius.
         q, v: coordinates and velocities, see the module.
     """
     gear = path.gear
     belt = runs(path, q[3:5], v[3:5])
     place, weight = path.place(q[3], q[4])
     where = tips(path, place)
-    x, z, rate_x, rate_z, weight = _geometry(path, where, weight, q[2], radius_wheel)
+    x, z, rate_x, rate_z, weight = _geometry(path, where, weight, q[2], chassis.radius)
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed
@@ -94,7 +93,9 @@ def touch(path: Path, radius_wheel: Scalar, wheeled: Scalar, q: Float[Array, " 5
     compliance = jnp.concatenate([where.compliance / taut, jnp.zeros(WHEELS)])
     depth = jnp.maximum(-gap, 1e-9)
     yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
-    bears = jnp.concatenate([jnp.full(GROUSERS, 1.0) * (1 - wheeled), jnp.full(WHEELS, 1.0) * wheeled])
+    bears = jnp.concatenate(
+        [jnp.full(GROUSERS, 1.0) * chassis.on_tracks, jnp.full(WHEELS, 1.0) * (1 - chassis.on_tracks)]
+    )
     force = force_contact(
         gap,
         gap_rate,

@@ -27,8 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.signals import STATUSES, command
+from mmrjax.signals import STATUSES
 
 # %% [markdown]
 # ## One operating point
@@ -36,7 +37,7 @@ from mmrjax.signals import STATUSES, command
 
 # %%
 robot = nominal.nominal()
-one = command(voltage=jnp.array([15.0]), slope=jnp.radians(jnp.array([5.0])), total_mass=jnp.array([13.1]))
+one = Conditions(voltage=jnp.array([15.0]), slope_deg=jnp.array([5.0]), total_mass=jnp.array([13.1]))
 answer = steady_batch(robot, one)
 
 print(f"status       {STATUSES[int(answer.status[0])]}")
@@ -51,7 +52,7 @@ print(f"speed        {float(answer.reading.speed[0]) * 1e3:.0f} mm/s  (measured:
 
 # %%
 slopes = np.linspace(0.0, 25.0, 1001)
-climbs = steady_batch(robot, command(voltage=15.0, slope=jnp.radians(slopes), total_mass=13.1))
+climbs = steady_batch(robot, Conditions(voltage=15.0, slope_deg=slopes, total_mass=13.1))
 slides = np.asarray(climbs.status) == STATUSES.index("slides")
 print(f"steady up to {slopes[~slides].max():.1f} deg, slides from {slopes[slides].min():.1f} deg")
 
@@ -86,7 +87,7 @@ show(figure)
 # twice is only how we check.
 
 # %%
-name = "tracked.ground.rolling_resistance"
+name = "6T2A.ground.rolling_resistance"
 
 
 def current(resistance):

@@ -142,5 +142,5 @@ assert found.converged and found.starts.agree == 64
 assert np.all(found.status_after == 0)  # the calibrated robot climbs every row
 assert document["errors"]["after"]["fitted"]["total_current"]["rms_percent"] < 9.5
 assert document["errors"]["after"]["fitted"]["motor_speed"]["rms_percent"] > 5  # friction cannot mend the electrics
-assert document["parameters"]["tracked.ground.friction.static"]["interval"][0] > np.tan(np.radians(20))
+assert document["parameters"]["6T2A.ground.friction.static"]["interval"][0] > np.tan(np.radians(20))
 assert abs(float(exact[2]) - float(twice)) < 1e-5

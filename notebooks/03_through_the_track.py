@@ -66,10 +66,10 @@ def show(figure):
 measured = records.read("measured")
 rows = measured.where((measured["configuration"] == "6T2A") & (measured["supply_voltage_V"] == 33)
                       & (measured["slope_deg"] < 20))  # fmt: skip
-friction, share = "tracked.track.guide_friction", "tracked.track.guide_share"
+friction, share = "6T2A.track.guide_friction", "6T2A.track.guide_share"
 robot = params.replace(
     nominal.nominal(),
-    {"tracked.ground.friction.static": jnp.asarray(0.6), share: jnp.asarray(0.98)},
+    {"6T2A.ground.friction.static": jnp.asarray(0.6), share: jnp.asarray(0.98)},
 )
 
 

@@ -33,7 +33,7 @@ _Robot = Annotated[
 ]
 _Set = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change a parameter, SI units, repeatable: tracked.ground.friction.static=0.6."),
+    typer.Option("--set", help="Change a parameter, SI units, repeatable: 6T2A.ground.friction.static=0.6."),
 ]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
@@ -117,7 +117,7 @@ def simulate(
 
 @app.command(
     epilog="Example: mmrjax sweep --slopes 0:20:0.5 --payloads 0,4,8 --voltages 24 --configurations 6T2A "
-    "--set tracked.ground.friction.static=0.6"
+    "--set 6T2A.ground.friction.static=0.6"
 )
 def sweep(
     configurations: Annotated[str | None, typer.Option(help="Comma-separated.  \\[default: 6T2A,4W2T]")] = None,
@@ -176,7 +176,7 @@ def sweep(
     return commands.sweep(resolved, out, force)
 
 
-@app.command(epilog="Example: mmrjax compare measured --robot sm1 --set tracked.ground.friction.static=0.6")
+@app.command(epilog="Example: mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")
 def compare(
     data: Annotated[
         str, typer.Argument(help="A CSV of measured runs, or measured, or simulated_by_paper.")
@@ -261,7 +261,7 @@ def calibrate(
     fix: Annotated[list[str] | None, typer.Option(help="Parameters to hold, comma-separated.")] = None,
     prior: Annotated[
         list[str] | None,
-        typer.Option(help="A prior in SI units, repeatable: tracked.ground.friction.static=0.45±0.05."),
+        typer.Option(help="A prior in SI units, repeatable: 6T2A.ground.friction.static=0.45±0.05."),
     ] = None,
     noise: Annotated[
         str | None,

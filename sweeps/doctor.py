@@ -56,14 +56,14 @@ def _run() -> str:
     import jax.numpy as jnp
 
     from mmrjax import nominal, params
+    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady_batch
-    from mmrjax.signals import command
 
     robot = nominal.nominal()
     losses = [p.name for p in params.walk(robot) if "friction_" in p.name or "loss_" in p.name or "rolling" in p.name]
-    ideal = params.replace(robot, {name: jnp.asarray(0.0) for name in [*losses, "tracked.track.guide_share"]})
+    ideal = params.replace(robot, {name: jnp.asarray(0.0) for name in [*losses, "6T2A.track.guide_share"]})
     start = time.perf_counter()
-    answer = steady_batch(ideal, command(voltage=jnp.array([24.0])))  # type: ignore[arg-type]
+    answer = steady_batch(ideal, Conditions(voltage=jnp.array([24.0])))  # type: ignore[arg-type]
     found, known = float(answer.reading.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
     if not math.isclose(found, known, rel_tol=1e-9):
         raise ArithmeticError(f"no-load speed {found} rad/s; known {known} rad/s")
@@ -74,10 +74,10 @@ def _derivative() -> str:
     import jax
 
     from mmrjax import nominal, params
+    from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady
-    from mmrjax.signals import command
 
-    robot, run = nominal.nominal(), command()
+    robot, run = nominal.nominal(), Conditions()
 
     def current(friction: jax.Array) -> jax.Array:
         return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).reading.total_current  # type: ignore[arg-type]

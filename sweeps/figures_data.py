@@ -13,8 +13,8 @@ from calibration.inference import errors as residual
 from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
 
 if TYPE_CHECKING:
+    from mmrjax.conditions import Conditions
     from mmrjax.robot import Robot
-    from mmrjax.signals import Command
 
 Columns = dict[str, np.ndarray]
 
@@ -37,18 +37,19 @@ def command(
     adhesion: Any = 1.0,
     battery: Any = 0.0,
     discharge: Any = 0.0,
-) -> Command:
+) -> Conditions:
     """A batch of conditions in the report's units; the total mass is stated for every row."""
-    from mmrjax import signals
 
     wheeled = np.asarray(np.asarray(configuration) == CONFIGURATIONS[1], float)
-    own = np.array([float(robot.tracked.mass), float(robot.wheeled.mass)])[wheeled.astype(int)]
+    own = np.array([float(robot.configurations["6T2A"].mass), float(robot.configurations["4W2T"].mass)])[
+        wheeled.astype(int)
+    ]
     mass = own + np.asarray(payload) if total_mass is None else total_mass
     slope = np.radians(slope_deg)
-    return signals.command(voltage, slope, payload, wheeled, battery, discharge, adhesion, mass)
+    return Conditions(voltage, slope, payload, wheeled, battery, discharge, adhesion, mass)
 
 
-def operating_points(robot: Robot, conditions: Command) -> Columns:
+def operating_points(robot: Robot, conditions: Conditions) -> Columns:
     """Steady operating points of a batch, in the columns of `runs.csv`."""
     import jax
 
@@ -107,15 +108,15 @@ def rows(robot: Robot) -> Rows:
         "payload": table["payload_kg"],
         "slope_deg": table["slope_deg"],
     }
-    plain = operating_points(robot, command(robot, total_mass=table["total_mass_kg"], **asked))
+    plain = operating_points(robot, Conditions(robot, total_mass=table["total_mass_kg"], **asked))
     ratio = {}
     for c in CONFIGURATIONS:
         largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
         listed = adhesion_ratio(RAISED_SURFACE, c == CONFIGURATIONS[1])
         ratio[c] = max(listed, RAISED_MARGIN * largest) if largest > 1 else 1.0
     adhesion = np.array([ratio[c] for c in kind])
-    raised = operating_points(robot, command(robot, total_mass=table["total_mass_kg"], adhesion=adhesion, **asked))
-    weighed = operating_points(robot, command(robot, adhesion=adhesion, **asked))
+    raised = operating_points(robot, Conditions(robot, total_mass=table["total_mass_kg"], adhesion=adhesion, **asked))
+    weighed = operating_points(robot, Conditions(robot, adhesion=adhesion, **asked))
     return Rows(table, stacked(table.columns), stacked(paper.columns), plain, raised, weighed, ratio)
 
 
@@ -179,7 +180,7 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
     from mmrjax import balances
     from mmrjax.signals import State
 
-    conditions = command(robot, configuration=np.full(speed_wheel.shape, configuration))
+    conditions = Conditions(robot, configuration=np.full(speed_wheel.shape, configuration))
     chassis = robot.chassis(float(configuration == CONFIGURATIONS[1]))
     zero = np.zeros_like(speed_wheel)
 
@@ -224,7 +225,7 @@ def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[St
     from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    run = drive_batch(robot, command(robot, configuration=np.array(CONFIGURATIONS), voltage=voltage), times)
+    run = drive_batch(robot, Conditions(robot, configuration=np.array(CONFIGURATIONS), voltage=voltage), times)
     return starts_of(robot, run)
 
 
@@ -266,7 +267,7 @@ def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray
     kinds, voltage, payload, adhesion = (
         np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in asked), strict=True)
     )
-    conditions = command(
+    conditions = Conditions(
         robot,
         configuration=kinds,
         voltage=voltage.astype(float),
@@ -290,7 +291,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
         if battery and mode == 1:
             continue
         there = table.where(pick)
-        conditions = command(
+        conditions = Conditions(
             robot,
             configuration=there["configuration"],
             voltage=voltage,
@@ -308,7 +309,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
 SPLIT = ("winding", "motor friction", "gearbox", "track and guides", "slip", "rolling resistance", "lift")
 
 
-def energy_split(robot: Robot, conditions: Command) -> tuple[Columns, Columns]:
+def energy_split(robot: Robot, conditions: Conditions) -> tuple[Columns, Columns]:
     """Operating points and the power [W] that each item of `SPLIT` takes of the supply's power.
 
     Returns:

@@ -52,7 +52,7 @@ def _pitch(k: int) -> tuple[float, str]:
 def _period(robot: Robot, run: Trajectory, k: int) -> float:
     """Eq. (34) [s], at the mean speed of the driving pulley; the belt runs on the pulley on wheels too."""
     speed = float(run.signals.speed_wheel[k, _tail(run, TAIL)].mean())
-    return ripple.period_pitch(_pitch(k)[0], speed, float(robot.tracked.radius))
+    return ripple.period_pitch(_pitch(k)[0], speed, float(robot.configurations["6T2A"].radius))
 
 
 def ripple_of_current(robot: Robot, run: Trajectory) -> tuple[Figure, list[dict[str, Any]]]:

@@ -129,8 +129,8 @@ def _running_gear(album: Album, robot: Robot) -> dict[str, Any]:
     return {
         "left_out": None,
         "rows": facts,
-        "share": float(robot.tracked.track.guide_share),
-        "friction": float(robot.tracked.track.guide_friction),
+        "share": float(robot.configurations["6T2A"].track.guide_share),
+        "friction": float(robot.configurations["6T2A"].track.guide_friction),
         "currents": (float(lumped["total_current_A"][0]), float(resolved)),
     }
 

@@ -220,14 +220,17 @@ def facts(nominal: Robot, rows: data.Rows) -> dict[str, Any]:
         return float(values.min()), float(values.max())
 
     return {
-        "adhesion": (float(nominal.tracked.ground.friction.static), float(nominal.wheeled.ground.friction.static)),
+        "adhesion": (
+            float(nominal.configurations["6T2A"].ground.friction.static),
+            float(nominal.configurations["4W2T"].ground.friction.static),
+        ),
         "used_tracked_15": float(used[tracked & (slope == 15)][0]),
         "used_tracked_20": float(used[tracked & (slope == 20)][0]),
         "used_wheeled_20": float(used[~tracked & (slope == 20)][0]),
         "extra_slow": span(extra[~tracked & slow]),
         "extra_fast": span(extra[~tracked & ~slow]),
         "extra_flat": span(extra[~tracked & (slope == 0)]),
-        "guide_share": float(nominal.tracked.track.guide_share),
+        "guide_share": float(nominal.configurations["6T2A"].track.guide_share),
         "gap": span(gap),
         "resistance": float(nominal.motor.resistance),
         "paper_slow": span(of_paper[tracked & slow]),

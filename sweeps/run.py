@@ -11,11 +11,12 @@ import numpy as np
 
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import CONFIGURATIONS, Robot
-from mmrjax.signals import STATUSES, Command
+from mmrjax.signals import STATUSES
 from sweeps import outputs
 from sweeps.config import Simulation
 from sweeps.store import RunFolder
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    robot: Robot, command: Command, config: Simulation, progress: Callable[[float], None]
+    robot: Robot, command: Conditions, config: Simulation, progress: Callable[[float], None]
 ) -> dict[str, np.ndarray]:
     """One batch in the fidelity that the configuration names: the columns that it adds to its runs.
 
@@ -41,7 +42,7 @@ def simulate(
 
 
 def track_runs(
-    robot: Robot, command: Command, config: Simulation, *, rolling: bool, progress: Callable[[float], None]
+    robot: Robot, command: Conditions, config: Simulation, *, rolling: bool, progress: Callable[[float], None]
 ) -> Trajectory:
     """Runs of the track model, from standstill or rolling at the steady fidelity's speed.
 
@@ -127,7 +128,7 @@ def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
         columns["total_mass_kg"] = runs["total_mass_kg"]
     else:
         tracked = runs["configuration"] == CONFIGURATIONS[0]
-        own = np.where(tracked, float(robot.tracked.mass), float(robot.wheeled.mass))
+        own = np.where(tracked, float(robot.configurations["6T2A"].mass), float(robot.configurations["4W2T"].mass))
         columns["total_mass_kg"] = own + runs["payload_kg"]
     columns |= {key: runs[key] for key in ("payload_kg", "slope_deg")}
     columns |= {key: runs[key] for key in ("surface", "run_id") if runs.has(key)}

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from mmrjax import nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.signals import Command, Result, command
+from mmrjax.signals import Result
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.
@@ -55,9 +56,9 @@ def grid():
 
 
 @pytest.fixture(scope="session")
-def table8(grid) -> Command:
+def table8(grid) -> Conditions:
     wheeled, slope, payload, voltage = grid.T
-    return command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+    return Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
 
 
 @pytest.fixture(scope="session")

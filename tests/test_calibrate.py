@@ -127,7 +127,7 @@ def test_a_configuration_without_rows_is_refused_where_named_and_left_out_where_
     with pytest.raises(
         BadConfiguration, match=r"--free wheeled.mass: measured has no 4W2T rows, so nothing measures it"
     ):
-        quick(tracked, free=["default", "wheeled.mass"])
+        quick(tracked, free=["default", "4W2T.mass"])
     names = quick(tracked).identifiability.names
     assert names and all(n.startswith("tracked.") for n in names)
 
@@ -180,10 +180,10 @@ def test_unknown_fidelity_lists_the_choices(measured):
 
 
 def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
-    made = quick(measured, free=["default", "motor.inductance", "tracked.mass"])
+    made = quick(measured, free=["default", "motor.inductance", "6T2A.mass"])
     said = " ".join(made.notes)
     assert "motor.inductance: nothing in these data measures it" in said and "start-up current" in said
-    assert "tracked.mass: nothing in these data measures it" in said and "a scale" in said
+    assert "6T2A.mass: nothing in these data measures it" in said and "a scale" in said
     entry = outcome.parameters(made)["motor.inductance"]
     assert entry["held_by_prior"] and not entry["measured_by_data"]
     assert entry["variance_ratio"] == pytest.approx(1.0)
@@ -194,14 +194,14 @@ def test_infeasible_starts_are_refused_with_the_rows(measured):
     with pytest.raises(
         BadConfiguration, match=says + r".*tracked.ground.friction.static = 0.32 .*free it, or raise it"
     ):
-        quick(measured, fix=["tracked.ground.friction.static"])
+        quick(measured, fix=["6T2A.ground.friction.static"])
 
 
 @pytest.mark.slow
 def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     """Among them one on which the calibrated robot could not start: docs/benchmarks.md."""
     rows = measured.where(np.array([1, 3, 4]))
-    free = ["tracked.ground.friction.static", "tracked.track.guide_share"]
+    free = ["6T2A.ground.friction.static", "6T2A.track.guide_share"]
     made = quick(rows, model="drive", free=free, noise="current=10%,motor_speed=6%,speed=4%")
     assert made.converged and made.starts.agree == 2 and (made.status_after == 0).all()
     assert made.adhesion_used[2] > 0.9
@@ -235,7 +235,7 @@ def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypa
     assert result["schema"] == "mmrjax.calibrate/1" and result["optimizer"]["status"] == "converged"
     assert len(rows_of(tmp_path / "c" / "rows.csv")) == 20
     page = (tmp_path / "c" / "report.html").read_text()
-    assert "http://" not in page.replace("http://www.w3.org", "") and "tracked.track.guide_share" in page
+    assert "http://" not in page.replace("http://www.w3.org", "") and "6T2A.track.guide_share" in page
     code, out, _ = mmrjax("compare", "measured", "--robot", "c/robot.toml", "--no-report", "--out", "d")
     assert code == 0
     errors = json.loads((tmp_path / "d" / "result.json").read_text())["errors"]["all"]

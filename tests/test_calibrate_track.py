@@ -19,8 +19,8 @@ from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.signals import CONVERGED
 
-STATIC = "tracked.ground.friction.static"
-CREEP = "tracked.ground.friction.speed_static"
+STATIC = "6T2A.ground.friction.static"
+CREEP = "6T2A.ground.friction.speed_static"
 STATED = "current=1%,motor_speed=0.5%,speed=1%"
 TRUTH = 0.12
 

@@ -5,7 +5,8 @@ import pytest
 import reference
 
 from mmrjax import balances, chassis, params
-from mmrjax.signals import State, command
+from mmrjax.conditions import Conditions
+from mmrjax.signals import State
 
 RNG = np.random.default_rng(31)
 
@@ -34,7 +35,7 @@ def test_mass_factor_without_rotating_parts_is_one():
 @pytest.mark.parametrize("wheeled", [0.0, 1.0])
 def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
     """(1) with (2), (4): where wheel and robot accelerate alike, m δ a = M_d i η / r - M_t / r - F_f - G."""
-    run = command(voltage=24.0, slope=0.05, wheeled=wheeled)
+    run = Conditions(voltage=24.0, slope_deg=np.degrees(0.05), configuration=wheeled)
     body = robot.chassis(wheeled)
     # find by bisection the sliding speed at which V' = r ω_k', at 300 rad/s and 1.5 A
     low, high = 0.0, float(body.ground.friction.speed_static)
@@ -57,8 +58,8 @@ def test_mass_factor_is_that_of_acceleration_without_sliding(robot, wheeled):
 
 def test_total_mass_stated_overrides_robot_and_payload(robot):
     state = State(0.0, 0.0, 0.0, 0.0)
-    assert float(balances.begin(robot, command(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
-    assert float(balances.begin(robot, command(payload=3.0, total_mass=20.0), state).mass) == 20.0
+    assert float(balances.begin(robot, Conditions(payload=3.0), state).mass) == pytest.approx(16.1, rel=1e-15)
+    assert float(balances.begin(robot, Conditions(payload=3.0, total_mass=20.0), state).mass) == 20.0
 
 
 def test_table7_motor_side_is_the_reflected_rotor(robot):
@@ -69,4 +70,4 @@ def test_table7_motor_side_is_the_reflected_rotor(robot):
 
 def test_masses_are_table7(robot):
     values = {p.name: float(p.value) for p in params.walk(robot)}
-    assert (values["tracked.mass"], values["wheeled.mass"]) == (13.1, 11.5)
+    assert (values["6T2A.mass"], values["4W2T.mass"]) == (13.1, 11.5)

@@ -16,7 +16,7 @@ MMRJAX = [sys.executable, "-c", "from sweeps.cli import main; main()"]
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
 )
-CLIMBS = ["--set", "tracked.ground.friction.static=0.6", "--set", "wheeled.ground.friction.static=0.6"]
+CLIMBS = ["--set", "6T2A.ground.friction.static=0.6", "--set", "4W2T.ground.friction.static=0.6"]
 
 
 @pytest.fixture
@@ -162,7 +162,7 @@ USAGE = {
         r"--set, motor\.resistanse: no such parameter; did you mean motor\.resistance",
     ),
     "negative mass set": (
-        ["sweep", "--set", "tracked.mass=-1"],
+        ["sweep", "--set", "6T2A.mass=-1"],
         r"--set, tracked\.mass: got -1; expected 0\.5 to 200 kg",
     ),
     "no config file": (["sweep", "--config", "none.toml"], r"none\.toml: not a readable TOML file"),

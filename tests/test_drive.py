@@ -10,10 +10,11 @@ import reference
 from scipy.integrate import cumulative_simpson
 
 from mmrjax import balances, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects.thermal_drift import ThermalDrift
 from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.signals import CONVERGED, STATUSES, State, command
+from mmrjax.signals import CONVERGED, STATUSES, State
 
 STATES = ("current", "speed_motor", "speed", "discharge")
 
@@ -33,7 +34,13 @@ def test_rates_match_reference_at_random_states(robot, grid):
     states = rng.uniform((-8, -1300, -1.3, 0), (50, 1300, 1.3, 7000), (n, 4)) * rng.choice([0, 1e-3, 1], (n, 1))
     on_battery = rng.integers(0, 2, n)
     slopes = np.radians(rows[:, 1]) * rng.choice([-1, 1], n)
-    runs = command(voltage=rows[:, 3], slope=slopes, payload=rows[:, 2], wheeled=rows[:, 0], battery=on_battery)
+    runs = Conditions(
+        voltage=rows[:, 3],
+        slope_deg=np.degrees(slopes),
+        payload=rows[:, 2],
+        configuration=rows[:, 0],
+        battery=on_battery,
+    )
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
     s = moving(robot, runs, State(*jnp.asarray(states.T)))
     inductance, ratio = 0.000119, 48.0
@@ -63,11 +70,11 @@ def expected_runs(grid):
 def test_drive_matches_solve_ivp(robot, grid, expected_runs, tolerance, error):
     """To `error` of each state's largest value in the run, at every instant; SciPy's Radau at 1e-10."""
     w, s, p, v = grid[list(ROWS)].T
-    runs = command(
+    runs = Conditions(
         voltage=np.append(v, 0.0),
-        slope=np.append(np.radians(s), 0.05),
+        slope_deg=np.degrees(np.append(np.radians(s), 0.05)),
         payload=np.append(p, 2.0),
-        wheeled=np.append(w, 0.0),
+        configuration=np.append(w, 0.0),
         battery=np.append(0 * w, 1.0),
         discharge=np.append(0 * w, 1000.0),
     )
@@ -96,7 +103,9 @@ def energies(robot, grid, run):
         "lift": sides * s.gravity * s.speed,
     }
     integral = {k: cumulative_simpson(np.asarray(p), x=np.asarray(run.time[0]), initial=0) for k, p in powers.items()}
-    inertia = np.where(grid[:, :1] > 0, float(robot.wheeled.inertia), float(robot.tracked.inertia))
+    inertia = np.where(
+        grid[:, :1] > 0, float(robot.configurations["4W2T"].inertia), float(robot.configurations["6T2A"].inertia)
+    )
     integral["stored"] = 0.5 * (
         np.asarray(s.mass) * np.asarray(s.speed) ** 2
         + sides * inertia * np.asarray(s.speed_wheel) ** 2
@@ -162,7 +171,9 @@ def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regain
     grip = 1.05 * need / (0.8 * 0.32)
     slope = np.radians(12.0)
     robot, go = small
-    runs = command(voltage=24.0, slope=slope, adhesion=[1.0, grip, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    runs = Conditions(
+        voltage=24.0, slope_deg=np.degrees(slope), adhesion=[1.0, grip, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    )
     run, point = go(runs, 60.0), steady_batch(robot, runs)
     assert names(point)[:2] == ["converged", "converged"]
     assert names(run.result)[:2] == ["slides", "converged"]
@@ -172,7 +183,7 @@ def test_drive_that_breaks_away_between_static_and_dynamic_friction_never_regain
 @pytest.mark.slow
 def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
     """Also on the slope where a start from standstill slides; above the limit it slides all the same."""
-    runs = command(voltage=[24.0, 24.0, 24.0], slope=np.radians([5.0, 12.0, 20.0]), wheeled=[1.0, 0.0, 0.0])
+    runs = Conditions(voltage=[24.0, 24.0, 24.0], slope_deg=[5.0, 12.0, 20.0], configuration=[1.0, 0.0, 0.0])
     go = jax.jit(lambda r: jax.vmap(lambda c: drive(r, c, jnp.asarray([0.0, 4.0]), rolling=True).result)(runs))
     answer, point = go(robot), steady_batch(robot, runs)
     assert names(answer) == names(point) == ["converged", "converged", "slides"]
@@ -181,7 +192,7 @@ def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
         np.testing.assert_allclose(here[:2], there[:2], rtol=1e-6)
 
     def speed(model, static):
-        changed = params.replace(robot, {"tracked.ground.friction.static": static})
+        changed = params.replace(robot, {"6T2A.ground.friction.static": static})
         return model(changed).reading.speed[1]
 
     slopes = [
@@ -194,7 +205,7 @@ def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
 
 def test_drive_that_starts_rolling_remembers_as_if_it_had_long_been(robot):
     warm = dataclasses.replace(robot, effects=(ThermalDrift(amplitude=jnp.asarray(1.0)),))
-    run = command(voltage=24.0, slope=0.1)
+    run = Conditions(voltage=24.0, slope_deg=np.degrees(0.1))
     answer = jax.jit(lambda r: drive(r, run, jnp.asarray([0.0, 1.0]), rolling=True))(warm)
     here, point, bare = answer.result.reading, steady(warm, run).reading, steady(robot, run).reading
     assert abs(point.motor_speed / bare.motor_speed - 1) > 1e-4
@@ -229,10 +240,10 @@ def small(robot):
 
 def test_drive_statuses(small):
     _, go = small
-    runs = command(
+    runs = Conditions(
         voltage=[24.0, 0.3, 24.0, 24.0, np.nan, 0.0, 24.0, 36.0, 15.0],
-        slope=np.radians([0.0, 0.0, 20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.7]),
-        wheeled=[0.0, 0, 0, 0, 0, 0, 1, 1, 0],
+        slope_deg=[0.0, 0.0, 20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.7],
+        configuration=[0.0, 0, 0, 0, 0, 0, 1, 1, 0],
         payload=[0.0, 0, 0, 0, 0, 0, 0, 0, 70.0],
         battery=[0.0, 0, 0, 1, 0, 0, 0, 0, 0],
         discharge=[0.0, 0, 0, 7919, 0, 0, 0, 0, 0],
@@ -249,14 +260,14 @@ def test_drive_statuses(small):
 
 
 def test_drive_out_of_steps_has_failed(robot):
-    run = drive_batch(robot, command(voltage=[24.0]), jnp.linspace(0.0, 1.0, 3), 1e-6, 5)
+    run = drive_batch(robot, Conditions(voltage=[24.0]), jnp.linspace(0.0, 1.0, 3), 1e-6, 5)
     assert names(run.result) == ["failed"]
 
 
 def test_drive_discharges_a_full_battery_to_its_clear_end(small):
     """Charge is what flowed; the voltage falls all the way; past the capacity the run says so."""
     robot, go = small
-    runs = command(wheeled=[0.0, 1.0, 0, 0, 0, 0, 0, 0, 0], battery=1.0, voltage=0.0)
+    runs = Conditions(configuration=[0.0, 1.0, 0, 0, 0, 0, 0, 0, 0], battery=1.0, voltage=0.0)
     run = go(runs, 1200.0)
     assert names(run.result)[0] == "converged"
     s = jax.tree.map(lambda x: np.asarray(x[0]), run.signals)
@@ -266,8 +277,8 @@ def test_drive_discharges_a_full_battery_to_its_clear_end(small):
     np.testing.assert_allclose(np.trapezoid(flow[1:], run.time[0, 1:]), s.discharge[-1] - s.discharge[1], rtol=1e-4)
     end = go(runs, 4000.0)
     assert names(end.result) == ["battery_empty"] * 9
-    assert names(steady_batch(robot, command(battery=[1.0], discharge=s.discharge[-1])))[0] == "converged"
-    point = steady_batch(robot, command(battery=[1.0], discharge=s.discharge[-1]))
+    assert names(steady_batch(robot, Conditions(battery=[1.0], discharge=s.discharge[-1])))[0] == "converged"
+    point = steady_batch(robot, Conditions(battery=[1.0], discharge=s.discharge[-1]))
     np.testing.assert_allclose(run.result.reading.speed[0], point.reading.speed[0], rtol=1e-3)
 
 
@@ -286,10 +297,10 @@ def test_drive_batch_equals_loop(robot, table8, drive_table8, times_fine):
 
 def test_drive_compiles_once_for_other_numbers(robot, small, compilations):
     _, go = small
-    runs = command(voltage=np.linspace(10, 30, 9))
+    runs = Conditions(voltage=np.linspace(10, 30, 9))
     jax.block_until_ready(go(runs, 1.0))
-    other = params.replace(robot, {"motor.resistance": 0.9, "tracked.mass": 14})
-    runs, later = command(voltage=np.linspace(12, 33, 9), slope=0.02), jnp.linspace(0.0, 1.5, 21)
+    other = params.replace(robot, {"motor.resistance": 0.9, "6T2A.mass": 14})
+    runs, later = Conditions(voltage=np.linspace(12, 33, 9), slope_deg=np.degrees(0.02)), jnp.linspace(0.0, 1.5, 21)
     compilations.clear()
     jax.block_until_ready(drive_batch(other, runs, later))
     assert not compilations
@@ -298,12 +309,12 @@ def test_drive_compiles_once_for_other_numbers(robot, small, compilations):
 def test_drive_bad_members_leave_neighbours_alone(small):
     _, go = small
     clean = dict(voltage=np.full(9, 24.0), slope=np.linspace(0, 0.1, 9), payload=np.zeros(9))
-    alone = go(command(**clean), 1.0)
+    alone = go(Conditions(**clean), 1.0)
     bad = {k: v.copy() for k, v in clean.items()}
     bad["voltage"][[1, 3]] = [np.nan, 0.0]
     bad["slope"][5] = 0.6
     bad["payload"][7] = np.nan
-    mixed = go(command(**bad), 1.0)
+    mixed = go(Conditions(**bad), 1.0)
     assert names(mixed.result)[1] == names(mixed.result)[7] == "failed"
     for k in (0, 2, 4, 6, 8):
         for a, b in zip(jax.tree.leaves(mixed.signals), jax.tree.leaves(alone.signals), strict=True):

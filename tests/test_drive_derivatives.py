@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive
-from mmrjax.signals import STATUSES, command
+from mmrjax.signals import STATUSES
 
 RUNS = {
     "tracked_24V": dict(voltage=24.0, slope=0.03, payload=2.0),
@@ -52,13 +53,13 @@ def run_derivatives(drive_numbers, scales):
 def jacobians(theta, run_derivatives):
     """Values and forward derivatives of every run: the signals, then the result; last axis the parameters."""
     forward, _ = run_derivatives
-    return {name: jax.tree.map(np.asarray, forward(theta, command(**run))) for name, run in RUNS.items()}
+    return {name: jax.tree.map(np.asarray, forward(theta, Conditions(**run))) for name, run in RUNS.items()}
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_drive_derivatives_are_central_differences(name, theta, jacobians, run_derivatives):
     """To 1e-5 of a signal's largest value or derivative in the run."""
-    central = run_derivatives[1](theta, command(**RUNS[name]))
+    central = run_derivatives[1](theta, Conditions(**RUNS[name]))
     for values, forward, differences in zip(*jacobians[name], central, strict=True):
         assert np.isfinite(values).all() and np.isfinite(forward).all()
         instants = tuple(range(1, forward.ndim))
@@ -91,8 +92,8 @@ def test_drive_bad_members_leave_neighbours_derivatives_alone(rebuild, theta, sc
         (_, status), (tangent, _) = jax.jvp(total, (theta,), (direction,))
         return tangent, status
 
-    clean, _ = slope(command(voltage=[15.0, 20.0, 24.0, 28.0, 33.0, 33.0]))
-    mixed, status = slope(command(voltage=[15.0, np.nan, 24.0, 0.0, 33.0, 33.0], payload=[0, 0, 0, 0, 0, -13.1]))
+    clean, _ = slope(Conditions(voltage=[15.0, 20.0, 24.0, 28.0, 33.0, 33.0]))
+    mixed, status = slope(Conditions(voltage=[15.0, np.nan, 24.0, 0.0, 33.0, 33.0], payload=[0, 0, 0, 0, 0, -13.1]))
     assert STATUSES[int(status[1])] == "failed"
     assert np.isfinite(clean).all() and (np.abs(clean) > 0).all()
     np.testing.assert_array_equal(mixed, clean)
@@ -107,18 +108,18 @@ NOT_IN_STEADY = {
     "battery.capacity": "a threshold",
     "motor.inductance": "no voltage across it at constant current",
     "motor.inertia": "no torque at constant speed",
-    "tracked.inertia": "no torque at constant speed",
-    "wheeled.inertia": "no torque at constant speed",
-    "tracked.ground.friction.dynamic": "below V_s only static friction acts",
-    "wheeled.ground.friction.dynamic": "below V_s only static friction acts",
-    "tracked.ground.friction.speed_dynamic": "below V_s only static friction acts",
-    "wheeled.ground.friction.speed_dynamic": "below V_s only static friction acts",
-    "wheeled.track.guide_friction": "times a guide share of 0: the wheels carry the weight",
+    "6T2A.inertia": "no torque at constant speed",
+    "4W2T.inertia": "no torque at constant speed",
+    "6T2A.ground.friction.dynamic": "below V_s only static friction acts",
+    "4W2T.ground.friction.dynamic": "below V_s only static friction acts",
+    "6T2A.ground.friction.speed_dynamic": "below V_s only static friction acts",
+    "4W2T.ground.friction.speed_dynamic": "below V_s only static friction acts",
+    "4W2T.track.guide_friction": "times a guide share of 0: the wheels carry the weight",
     "effects.rotating_inertia.amplitude": "no torque at constant speed",
     "effects.pulley_eccentricity.amplitude": "zero on the average of a turn",
 }
 #: Alive only away from the nominal value of another parameter.
-ALIVE_WITH = {"wheeled.track.guide_friction": ("wheeled.track.guide_share", 0.2)}
+ALIVE_WITH = {"4W2T.track.guide_friction": ("4W2T.track.guide_share", 0.2)}
 
 
 def test_every_free_parameter_changes_drive(free, theta, jacobians):
@@ -137,9 +138,9 @@ def test_every_free_parameter_changes_steady(free, theta, steady_numbers, scales
     conditions = [dict(voltage=24.0, slope=0.05), dict(voltage=24.0, wheeled=1.0, slope=0.05)]
     conditions += [dict(battery=1.0, discharge=3600.0)]
     jacobian = jax.jit(jax.jacfwd(steady_numbers))
-    found = [np.abs(np.asarray(jacobian(theta, command(**c))) * scales).max(0) > 1e-8 for c in conditions]
+    found = [np.abs(np.asarray(jacobian(theta, Conditions(**c))) * scales).max(0) > 1e-8 for c in conditions]
     dead = {n for n, alive in zip(names, np.any(found, 0), strict=True) if not alive}
     assert dead == set(NOT_IN_STEADY)
     for name, (other, value) in ALIVE_WITH.items():
         vector = theta.at[names.index(other)].set(value)
-        assert np.abs(np.asarray(jacobian(vector, command(**conditions[1])))[:, names.index(name)]).max() > 1e-8
+        assert np.abs(np.asarray(jacobian(vector, Conditions(**conditions[1])))[:, names.index(name)]).max() > 1e-8

@@ -8,9 +8,9 @@ import pytest
 from calibration.data import effect_file, robot_file
 from calibration.data.errors import BadConfiguration
 from mmrjax import params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.signals import command
 
 GOOD = '''
 from typing import ClassVar
@@ -47,8 +47,8 @@ def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text("[effects.seal_drag]\namplitude = 0.05\n")
     robot = robot_file.load(str(path), library)
-    more = params.replace(robot_file.load("nominal"), {"tracked.track.loss_coulomb": 0.4})
-    run = command(voltage=[15.0])
+    more = params.replace(robot_file.load("nominal"), {"6T2A.track.loss_coulomb": 0.4})
+    run = Conditions(voltage=[15.0])
     got, expected = (steady_batch(r, run).reading.total_current for r in (robot, more))
     np.testing.assert_allclose(got, expected, rtol=1e-10)
     robot_file.write(robot, tmp_path / "again.toml")

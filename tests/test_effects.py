@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 from mmrjax import balances, effects, nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.params import Scalar, parameter
-from mmrjax.signals import Reading, Signals, State, command
+from mmrjax.signals import Signals, State
 
 # --- units --------------------------------------------------------------------------------------------
 
@@ -95,11 +96,11 @@ CONJUGATE = {
     "ground": "speed",
     "slip": "traction",
 }
-CONDITIONS = command(
+CONDITIONS = Conditions(
     voltage=[33.0, 15.0, 24.0, 24.0, 24.0],
-    slope=[0.09, 0.0, 0.05, -0.1, 0.12],
+    slope_deg=np.degrees([0.09, 0.0, 0.05, -0.1, 0.12]),
     payload=[8.0, 0.0, 3.0, 0.0, 5.0],
-    wheeled=[0.0, 1.0, 0.0, 1.0, 1.0],
+    configuration=[0.0, 1.0, 0.0, 1.0, 1.0],
     battery=[0.0, 0.0, 1.0, 0.0, 1.0],
     discharge=[0.0, 0.0, 3000.0, 0.0, 100.0],
 )
@@ -112,7 +113,7 @@ def random_states(n=400):
     current, motor, speed, charge, voltage, slope, payload, adhesion = rng.uniform(low, high, (n, 8)).T
     memory = {e.name: jnp.asarray(e.memory_size * rng.uniform(0, 1, n)) for e in ALL if e.memory_size is not None}
     motor[:40] *= 1e-4  # through rest
-    run = command(voltage, slope, payload, rng.integers(0, 2, n), rng.integers(0, 2, n), charge, adhesion)
+    run = Conditions(voltage, slope, payload, rng.integers(0, 2, n), rng.integers(0, 2, n), charge, adhesion)
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
     return moving(nominal.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge)), memory))
 
@@ -522,7 +523,7 @@ def test_series_resistance_is_winding_resistance():
 
 
 def test_mass_offset_is_mass_of_the_wheeled_robot():
-    _same(_steady_with(mass_offset=1.6), _steady_with({"wheeled.mass": 11.5 + 1.6}))
+    _same(_steady_with(mass_offset=1.6), _steady_with({"4W2T.mass": 11.5 + 1.6}))
 
 
 def test_winding_heating_is_resistance_at_the_settled_temperature():
@@ -538,7 +539,7 @@ def test_churning_is_viscous_loss_that_grows_with_speed():
     with_it = _steady_with(churning=3e-4)
     for k in range(CONDITIONS.voltage.size):
         turn = 3e-4 * float(with_it.reading.motor_speed[k]) / 48.0
-        viscous = {"tracked.track.loss_viscous": 0.016 + turn, "wheeled.track.loss_viscous": 0.003 + turn}
+        viscous = {"6T2A.track.loss_viscous": 0.016 + turn, "4W2T.track.loss_viscous": 0.003 + turn}
         more = _steady_with(viscous)
         np.testing.assert_allclose(with_it.reading.total_current[k], more.reading.total_current[k], rtol=1e-9)
 

@@ -158,7 +158,7 @@ def test_what_only_its_prior_holds_is_said(measured):
     names = (
         *priors.default_names(measured["configuration"], robot),
         "motor.inductance",
-        "tracked.track.guide_friction",
+        "6T2A.track.guide_friction",
     )
     posed = pose(measured, robot, names)
     z = solve(posed, jnp.zeros(len(names)), posed.data).z
@@ -168,7 +168,7 @@ def test_what_only_its_prior_holds_is_said(measured):
     assert about.sensitivity[names.index("motor.inductance")] == 0
     assert about.rank == len(names) - 2  # inductance, and the product guide_friction x guide_share
     weakest = [v for s, v in about.weak_directions() if s < 1e-6 and "motor.inductance" not in v]
-    assert set(weakest[0]) == {"tracked.track.guide_friction", "tracked.track.guide_share"}
+    assert set(weakest[0]) == {"6T2A.track.guide_friction", "6T2A.track.guide_share"}
 
 
 def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
@@ -192,7 +192,7 @@ def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data)
     about = identifiability.analyse(posed, best.z)
     profile = identifiability.profile(posed, best.z, float(best.cost), about)
-    k = posed.coordinates.names.index("wheeled.ground.friction.static")
+    k = posed.coordinates.names.index("4W2T.ground.friction.static")
     value = float(posed.coordinates.value(best.z)[k])
     assert value - profile.low[k] < 0.2 * (profile.high[k] - value)
     assert profile.better < 1e-3
@@ -258,7 +258,7 @@ def series_runs(robot, seed=None, noise_share=0.01):
 def test_histories_calibrate_with_drive():
     """A start tells the inductance and the rotor's inertia, which no steady row can."""
     base = nominal.nominal()
-    names = ("motor.inductance", "motor.inertia", "tracked.track.loss_coulomb", "tracked.ground.friction.static")
+    names = ("motor.inductance", "motor.inertia", "6T2A.track.loss_coulomb", "6T2A.ground.friction.static")
     c = priors.coordinates(base, names)
     truth = jnp.asarray([1.0, -0.8, 1.2, 1.8])
     runs = series_runs(c.robot(base, truth), seed=5)

@@ -12,9 +12,9 @@ import pytest
 
 from calibration.data import runs as records
 from mmrjax import nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.signals import command
 
 GRID = g.table8(payloads=nominal.PAYLOADS_KG)
 #: What the generator calls a shape parameter, and what the library does.
@@ -33,7 +33,7 @@ def package():
     """Readings of `steady` on GRID, shape (3, rows), for constants and a term of the library."""
     base = params.replace(nominal.nominal(), g.CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
-    run = command(GRID.U, GRID.slope, GRID.payload, GRID.wheeled, total_mass=GRID.mass)
+    run = Conditions(GRID.U, GRID.slope, GRID.payload, GRID.wheeled, total_mass=GRID.mass)
 
     every = {p.name: p.value for p in params.walk(full)}
 

@@ -10,9 +10,9 @@ import pytest
 
 from calibration.data import runs as records
 from mmrjax import nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive_batch
-from mmrjax.signals import command
 
 RUNS = gs.starts(g.CLIMBING)
 DURATION, EVERY = 0.6, 0.01
@@ -30,7 +30,7 @@ def package():
     every = {p.name: p.value for p in params.walk(full)}
 
     def read(battery, values=None):
-        run = command(RUNS.U, RUNS.slope, RUNS.payload, RUNS.wheeled, battery=battery, total_mass=RUNS.mass)
+        run = Conditions(RUNS.U, RUNS.slope, RUNS.payload, RUNS.wheeled, battery=battery, total_mass=RUNS.mass)
         # all of one type, so that one compiled program serves every call
         changed = params.replace(full, {k: jnp.asarray(v, float) for k, v in (every | (values or {})).items()})
         s = drive_batch(changed, run, times, 1e-9, 20000).signals

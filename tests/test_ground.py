@@ -62,6 +62,9 @@ def test_ground_traction_equals_adhesion_at_its_largest():
     ],
 )
 def test_adhesion_ratio_restores_table5(robot, surface, tracked, wheeled):
-    for is_wheeled, body, phi in ((False, robot.tracked, tracked), (True, robot.wheeled, wheeled)):
+    for is_wheeled, body, phi in (
+        (False, robot.configurations["6T2A"], tracked),
+        (True, robot.configurations["4W2T"], wheeled),
+    ):
         ratio = nominal.adhesion_ratio(surface, is_wheeled)
         np.testing.assert_allclose(body.ground.force_adhesion(1.0, ratio), phi, rtol=1e-12)

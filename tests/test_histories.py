@@ -9,16 +9,16 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from mmrjax import nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.histories import FIRST, LONGEST, grid, histories
-from mmrjax.signals import command
 
-RUNS = command(
+RUNS = Conditions(
     voltage=np.array([15.0, 33.0, 24.0]),
-    slope=np.radians([0.0, 10.0, 5.0]),
+    slope_deg=[0.0, 10.0, 5.0],
     payload=np.array([0.0, 8.0, 3.0]),
-    wheeled=np.array([0.0, 0.0, 1.0]),
+    configuration=np.array([0.0, 0.0, 1.0]),
 )
 TIMES = np.concatenate([np.linspace(2e-4, 4e-3, 8), np.arange(0.02, 0.8001, 0.02)])
 GRID = grid(TIMES)
@@ -67,7 +67,7 @@ def test_derivatives_are_those_of_what_is_computed(changes):
     robot = dataclasses.replace(nominal.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
     robot = params.strong(params.replace(robot, {k: jnp.asarray(v) for k, v in changes.items()}))
     names = [
-        "motor.resistance", "motor.inertia", "motor.inductance", "tracked.ground.friction.static", "wheeled.radius",
+        "motor.resistance", "motor.inertia", "motor.inductance", "6T2A.ground.friction.static", "4W2T.radius",
         *(f"effects.{n}.amplitude" for n in EFFECTS),
     ]  # fmt: skip
     known = {p.name: p for p in params.walk(robot)}

@@ -87,5 +87,5 @@ def test_simplified_robots_are_table_a4(build, torque):
     robot = build()
     assert float(robot.motor.torque_loss(0.0, 1.0)) == float(robot.motor.torque_loss(1200.0, 1.0)) == 4.2e-3
     assert float(robot.gearbox.efficiency(0.03, 900.0)) == 0.75
-    assert float(robot.tracked.track.torque_loss(20.0, 1.0)) == torque
+    assert float(robot.configurations["6T2A"].track.torque_loss(20.0, 1.0)) == torque
     np.testing.assert_allclose(robot.battery.voltage(5.0, 3000.0), 33.6, rtol=1e-12)

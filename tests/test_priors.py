@@ -24,7 +24,7 @@ def every(robot_with_effects):
 def test_coordinates_start_at_the_nominal_robot(every, robot_with_effects):
     nominal = np.array([float(p.value) for p in params.walk(robot_with_effects)])
     value = np.asarray(every.value(jnp.zeros(len(every))))
-    on_bound = np.array([p.name == "wheeled.track.guide_share" for p in params.walk(robot_with_effects)])
+    on_bound = np.array([p.name == "4W2T.track.guide_share" for p in params.walk(robot_with_effects)])
     sd = np.array([p.spec.prior_sd(float(p.value)) for p in params.walk(robot_with_effects)])
     assert np.all(np.abs(value - nominal)[~on_bound] <= 1e-5 * sd[~on_bound])  # nearest bound: half an sd
     assert 0 < value[on_bound] < 0.01  # its nominal value is its bound
@@ -48,7 +48,7 @@ def test_amplitudes_have_a_full_gradient_at_zero(every):
 
 
 def test_slope_on_a_bound_is_half(robot):
-    c = priors.coordinates(robot, ["wheeled.track.guide_share"])
+    c = priors.coordinates(robot, ["4W2T.track.guide_share"])
     np.testing.assert_allclose(c.slope(jnp.zeros(1)) / c.spread, 0.5, rtol=1e-6)
     assert c.beyond(np.array([-1.0])) == -1 and c.beyond(np.array([1.0])) == 0 and c.beyond(np.array([9.0])) == 1
 
@@ -62,7 +62,7 @@ def test_slope_is_the_finite_difference(every):
 
 
 def test_relative_prior_is_log_normal_with_that_spread(robot):
-    c = priors.coordinates(robot, ["tracked.ground.rolling_resistance", "tracked.track.guide_share"])
+    c = priors.coordinates(robot, ["6T2A.ground.rolling_resistance", "6T2A.track.guide_share"])
     assert c.scale == (True, False)
     draws = np.asarray(jax.vmap(c.value)(jax.random.normal(jax.random.key(0), (200_000, 2))))
     np.testing.assert_allclose(draws[:, 0].std() / 0.06, 0.15 * np.sqrt(1.0225), rtol=0.01)
@@ -71,10 +71,10 @@ def test_relative_prior_is_log_normal_with_that_spread(robot):
 
 def test_friction_pairs_keep_their_ratio_unless_freed(robot):
     z = jnp.ones(1)
-    moved = priors.coordinates(robot, ["tracked.ground.friction.static"]).robot(robot, z).tracked.ground.friction
+    moved = priors.coordinates(robot, ["6T2A.ground.friction.static"]).robot(robot, z).tracked.ground.friction
     np.testing.assert_allclose(moved.dynamic / moved.static, 0.8)
     assert moved.static > 0.4
-    both = ["tracked.ground.friction.static", "tracked.ground.friction.dynamic"]
+    both = ["6T2A.ground.friction.static", "6T2A.ground.friction.dynamic"]
     assert priors.coordinates(robot, both).tied == ()
 
 
@@ -96,7 +96,7 @@ def test_choose_takes_default_groups_and_fixes(robot):
         (
             ["rolling_resistance"],
             [],
-            r"allowed: tracked.ground.rolling_resistance, wheeled.ground.rolling_resistance",
+            r"allowed: 6T2A.ground.rolling_resistance, wheeled.ground.rolling_resistance",
         ),
         (["engine.*"], [], r"--free engine.\*: no parameters below it; .*motor.\*"),
         ([], ["gearbox.raito"], r"--fix gearbox.raito: .*did you mean gearbox.ratio\?"),
@@ -110,7 +110,7 @@ def test_choose_refuses_with_the_choices(robot, free, fix, says):
 
 
 def test_parse_prior_reads_all_forms():
-    name = "tracked.ground.friction.static"
+    name = "6T2A.ground.friction.static"
     assert priors.parse_prior(f"{name}=0.45±0.05") == (name, 0.45, 0.05)
     assert priors.parse_prior(f"{name}=4.5e-1+-0.05") == (name, 0.45, 0.05)
     assert priors.parse_prior(f"{name} =0.45 ± 10%".replace(" =", "="))[2] == pytest.approx(0.045)
@@ -142,6 +142,6 @@ def test_coordinates_refuse_a_prior_without_width():
 
 
 def test_stated_prior_moves_the_centre(robot):
-    c = priors.coordinates(robot, ["tracked.ground.friction.static"], {"tracked.ground.friction.static": (0.5, 0.05)})
+    c = priors.coordinates(robot, ["6T2A.ground.friction.static"], {"6T2A.ground.friction.static": (0.5, 0.05)})
     np.testing.assert_allclose(c.value(jnp.zeros(1)), 0.5)
     np.testing.assert_allclose(c.slope(jnp.zeros(1)), 0.05, rtol=0.01)

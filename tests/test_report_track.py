@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from mmrjax import params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.stability import largest_step
 from mmrjax.signals import CONVERGED, FAILED
 from sweeps import figures_track, report
-from sweeps.figures_data import command
 
 FIGURES = {
     "track_fig23_24_from_standstill",
@@ -144,6 +144,6 @@ def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
     taken = {}
     monkeypatch.setattr(figures_track, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords))
     figures_track.runs(stiff)
-    limit = largest_step(stiff, command(stiff, configuration=np.array(["6T2A", "4W2T"]), voltage=33.0)).min()
+    limit = largest_step(stiff, Conditions(stiff, configuration=np.array(["6T2A", "4W2T"]), voltage=33.0)).min()
     assert taken["step"] <= limit < 1e-4
     assert (taken["sample"] / taken["step"]) == pytest.approx(round(taken["sample"] / taken["step"]))

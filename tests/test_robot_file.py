@@ -47,7 +47,7 @@ REFUSED = {
     "other schema": ("schema = 'x/9'", r"schema: got x/9; expected mmrjax\.robot/1"),
     "not TOML": ("motor = [", r"not a readable TOML file"),
     "friction speeds reversed": (
-        "[tracked.ground.friction]\nspeed_static = 0.5\nspeed_dynamic = 0.1",
+        "[6T2A.ground.friction]\nspeed_static = 0.5\nspeed_dynamic = 0.1",
         r"tracked\.ground\.friction\.speed_dynamic: got 0\.1; expected more than speed_static, 0\.5",
     ),
 }

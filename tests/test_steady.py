@@ -9,9 +9,10 @@ import pytest
 import reference
 
 from mmrjax import params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
-from mmrjax.signals import FLAGS, STATUSES, Command, command
+from mmrjax.signals import FLAGS, STATUSES
 
 CHANNELS = ("total_current", "motor_speed", "speed")
 
@@ -47,7 +48,7 @@ def test_steady_matches_reference_root_on_battery(robot, grid):
     rows = grid[::3]  # voltage plays no part
     for charge in (0.0, 3000.0, 7000.0):
         wheeled, slope, payload, _ = rows.T
-        runs = command(slope=np.radians(slope), payload=payload, wheeled=wheeled, battery=1.0, discharge=charge)
+        runs = Conditions(slope_deg=slope, payload=payload, configuration=wheeled, battery=1.0, discharge=charge)
         answer = steady_batch(robot, runs)
         got = readings(answer)
         for k, (w, s, p, _) in enumerate(rows):
@@ -66,7 +67,7 @@ def test_steady_matches_reference_root_for_random_robots(robot):
         slope, payload, wheeled = rng.uniform(-0.25, 0.12), rng.uniform(0, 8), rng.integers(2)
         side = reference.Side(24.0, slope, payload, bool(wheeled), p=values)
         other = params.replace(robot, values)
-        runs = command(voltage=[24.0], slope=slope, payload=payload, wheeled=float(wheeled))
+        runs = Conditions(voltage=[24.0], slope_deg=np.degrees(slope), payload=payload, configuration=float(wheeled))
         answer = steady_batch(other, runs)
         if side.steady() is not None:
             np.testing.assert_allclose(readings(answer)[0], expected_readings(side), rtol=1e-9)
@@ -95,14 +96,16 @@ BOTH = dict(wheeled=[0.0, 1.0])
 
 
 def test_steady_without_friction_runs_at_no_load_speed(robot):
-    answer = steady_batch(params.replace(robot, FRICTIONLESS), command(voltage=24.0, **BOTH))
+    answer = steady_batch(params.replace(robot, FRICTIONLESS), Conditions(voltage=24.0, **BOTH))
     np.testing.assert_allclose(answer.reading.total_current, 0.0, atol=1e-10)
     np.testing.assert_allclose(answer.reading.motor_speed, 24.0 / 0.0259, rtol=1e-12)
     np.testing.assert_allclose(answer.slip, 0.0, atol=1e-12)
 
 
 def test_steady_without_friction_lifts_with_all_but_heat_and_creep(robot):
-    answer = steady_batch(params.replace(robot, FRICTIONLESS), command(voltage=24.0, slope=0.1, **BOTH))
+    answer = steady_batch(
+        params.replace(robot, FRICTIONLESS), Conditions(voltage=24.0, slope_deg=np.degrees(0.1), **BOTH)
+    )
     heat = 0.611 * np.asarray(answer.reading.total_current) ** 2 / 2
     np.testing.assert_allclose(answer.power_supply, answer.power_motor + heat, rtol=1e-12)
     np.testing.assert_allclose(answer.power_gear, answer.power_motor, rtol=1e-9)
@@ -123,7 +126,7 @@ def test_steady_power_chain_only_loses(steady_table8):
 
 def test_steady_downhill_gearbox_never_gives_power(robot):
     slopes = np.linspace(-0.25, 0.0, 26)
-    answer = steady_batch(robot, command(voltage=24.0, slope=slopes, wheeled=1.0))
+    answer = steady_batch(robot, Conditions(voltage=24.0, slope_deg=np.degrees(slopes), configuration=1.0))
     assert set(names(answer)) == {"converged"}
     assert (np.asarray(answer.power_motor) >= np.asarray(answer.power_gear)).all()
     assert (np.asarray(answer.power_gear) < 0).any()  # the robot does overhaul its drive
@@ -134,7 +137,7 @@ def test_steady_downhill_gearbox_never_gives_power(robot):
 
 
 def one(robot, **conditions):
-    return jax.tree.map(lambda x: x[0], steady_batch(robot, command(**{"voltage": [24.0], **conditions})))
+    return jax.tree.map(lambda x: x[0], steady_batch(robot, Conditions(**{"voltage": [24.0], **conditions})))
 
 
 @pytest.mark.parametrize(
@@ -186,7 +189,7 @@ def test_steady_stalls_exactly_below_the_voltage_that_breaks_away(robot):
 def test_steady_stands_until_shafts_and_robot_are_faster_than_rest(robot):
     """A tenth of V_s = 2 mm/s: below, the fidelities resolve friction at rest differently, so both say `stalled`."""
     voltages = np.linspace(0.64, 1.2, 113)
-    runs = command(voltage=voltages, slope=np.radians(5.0))
+    runs = Conditions(voltage=voltages, slope_deg=5.0)
     answer = steady_batch(robot, runs)
     slow = np.minimum(np.asarray(answer.reading.speed), np.asarray(answer.theoretical_speed)) < 2e-3
     assert slow.any() and not slow.all()
@@ -227,8 +230,13 @@ def test_steady_batch_equals_loop(robot, table8, steady_table8):
 
 def test_steady_compiles_once_for_other_numbers(robot, table8, compilations):
     jax.block_until_ready(steady_batch(robot, table8))
-    other = params.replace(robot, {"motor.resistance": 0.9, "tracked.mass": 14})
-    runs = command(voltage=table8.voltage * 0.9, slope=table8.slope, payload=table8.payload, wheeled=table8.wheeled)
+    other = params.replace(robot, {"motor.resistance": 0.9, "6T2A.mass": 14})
+    runs = Conditions(
+        voltage=table8.voltage * 0.9,
+        slope_deg=np.degrees(table8.slope),
+        payload=table8.payload,
+        configuration=table8.wheeled,
+    )
     compilations.clear()
     jax.block_until_ready(steady_batch(other, runs))
     assert not compilations
@@ -249,7 +257,7 @@ BAD = dict(
 )
 
 
-def _join(first: Command, second: Command) -> Command:
+def _join(first: Conditions, second: Conditions) -> Conditions:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, second)
 
 
@@ -276,8 +284,8 @@ def test_steady_bad_members_leave_neighbours_values_and_gradients(theta, speed_a
     plain = dict(voltage=24.0, slope=0.05, payload=2.0, wheeled=0.0, battery=0.0, discharge=0.0, adhesion=1.0)
     bad = [{**plain, **b} for b in BAD.values()]
     good = [{**plain, "slope": s, "wheeled": w} for s, w in zip(np.linspace(0, 0.15, len(bad)), [0.0, 1.0] * 6)]  # noqa: B905
-    mixed = command(**{f: [row[f] for pair in zip(good, bad, strict=True) for row in pair] for f in fields})
-    clean = command(**{f: [row[f] for row in good for _ in range(2)] for f in fields})
+    mixed = Conditions(**{f: [row[f] for pair in zip(good, bad, strict=True) for row in pair] for f in fields})
+    clean = Conditions(**{f: [row[f] for row in good for _ in range(2)] for f in fields})
     keep = jnp.asarray([True, False] * len(bad))
     answer, reverse, forward = speed_and_gradients(theta, mixed, keep)
     wanted, reverse_wanted, forward_wanted = speed_and_gradients(theta, clean, keep)

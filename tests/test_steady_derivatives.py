@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.signals import command
+from mmrjax.conditions import Conditions
 
 #: Conditions at which the numbers are smooth: driving, on battery, overhauling, stalled.
 POINTS = {
@@ -45,7 +45,7 @@ def derivatives(steady_numbers, scales):
 
 @pytest.mark.parametrize("point", sorted(POINTS))
 def test_steady_derivatives_are_central_differences(point, theta, derivatives):
-    values, forward, reverse, central = (np.asarray(x) for x in derivatives(theta, command(**POINTS[point])))
+    values, forward, reverse, central = (np.asarray(x) for x in derivatives(theta, Conditions(**POINTS[point])))
     assert np.isfinite(values).all() and np.isfinite(forward).all()
     # relative to the derivative; where a parameter hardly moves an output, 1e-9 of the output or SI unit
     allowed = 1e-5 * np.maximum(np.abs(central), 1e-4 * (np.abs(values)[:, None] + 1.0))
@@ -59,14 +59,14 @@ def test_steady_derivatives_are_central_differences(point, theta, derivatives):
     ids=["slides", "nan_voltage", "battery_empty", "zero_voltage"],
 )
 def test_steady_derivatives_without_an_answer_are_finite(conditions, theta, derivatives):
-    _, forward, reverse, _ = derivatives(theta, command(**{"voltage": 24.0, **conditions}))
+    _, forward, reverse, _ = derivatives(theta, Conditions(**{"voltage": 24.0, **conditions}))
     assert np.isfinite(forward).all() and np.isfinite(reverse).all()
     np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
 
 
 def test_steady_derivatives_at_zero_slip_are_finite(theta, steady_numbers, free):
     """A slope at which nothing has to be held: demand, sliding and slip are all zero."""
-    run = command(voltage=24.0, slope=-np.arctan(0.06))
+    run = Conditions(voltage=24.0, slope_deg=np.degrees(-np.arctan(0.06)))
     vector = theta
     values = steady_numbers(vector, run)
     jacobian = np.asarray(jax.jit(jax.jacrev(steady_numbers))(vector, run))
@@ -78,8 +78,8 @@ def test_steady_second_derivatives_are_central_differences(rebuild, theta, free,
     from mmrjax.fidelities.steady import steady
 
     names = [p.name for p in free]
-    chosen = [names.index(n) for n in ("motor.resistance", "tracked.mass", "tracked.ground.friction.static")]
-    run = command(voltage=24.0, slope=0.08)
+    chosen = [names.index(n) for n in ("motor.resistance", "6T2A.mass", "6T2A.ground.friction.static")]
+    run = Conditions(voltage=24.0, slope_deg=np.degrees(0.08))
     size = jnp.asarray(scales)[jnp.asarray(chosen)]
 
     def speed(x):

@@ -22,8 +22,8 @@ def test_track_laws_match_reference(sign):
 
 def test_track_loss_of_three_and_one_is_table3(robot):
     # 350 + 16 ω and 70 + 3 ω mN·m at 20 rad/s
-    np.testing.assert_allclose(robot.tracked.track.torque_loss(20.0, 1.0), 0.670, rtol=1e-12)
-    np.testing.assert_allclose(robot.wheeled.track.torque_loss(20.0, 1.0), 0.130, rtol=1e-12)
+    np.testing.assert_allclose(robot.configurations["6T2A"].track.torque_loss(20.0, 1.0), 0.670, rtol=1e-12)
+    np.testing.assert_allclose(robot.configurations["4W2T"].track.torque_loss(20.0, 1.0), 0.130, rtol=1e-12)
 
 
 def test_track_without_friction_loses_nothing():

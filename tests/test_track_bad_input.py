@@ -9,16 +9,19 @@ import pytest
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import margin, stand, system
 from mmrjax.fidelities.stability import _whole, largest_step
 from mmrjax.fidelities.track import _batch, track_batch
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import FAILED, command
+from mmrjax.signals import FAILED
 from sweeps import config as configuration
 from sweeps import run
 from sweeps.grid import grid
 
-TWO = command(voltage=jnp.asarray([33.0, 33.0]), payload=jnp.asarray([0.0, 8.0]), wheeled=jnp.asarray([0.0, 1.0]))
+TWO = Conditions(
+    voltage=jnp.asarray([33.0, 33.0]), payload=jnp.asarray([0.0, 8.0]), configuration=jnp.asarray([0.0, 1.0])
+)
 
 
 def test_step_too_large_is_refused_with_the_largest_stable_one(robot):
@@ -92,7 +95,7 @@ def test_times_that_do_not_fit_are_refused(robot, keywords, message):
 def test_posture_that_cannot_stand_has_a_negative_margin(robot):
     gear = params.replace(RunningGear(), {"payload_offset": jnp.asarray(-0.45), "payload_height": jnp.asarray(0.4)})
     for payload, stands in ((0.0, True), (8.0, False)):
-        run = command(slope=np.radians(20.0), payload=payload)
+        run = Conditions(slope_deg=20.0, payload=payload)
         assert (float(margin(system(robot, run, gear, 1e-4))) > 0) is stands
 
 
@@ -102,7 +105,7 @@ def test_standing_robot_is_in_balance(robot):
 
     gear = params.replace(RunningGear(), {"payload_offset": jnp.asarray(0.05)})
     for wheeled in (0.0, 1.0):
-        run = system(robot, command(slope=0.1, payload=5.0, wheeled=wheeled), gear, 1e-4)
+        run = system(robot, Conditions(slope_deg=np.degrees(0.1), payload=5.0, configuration=wheeled), gear, 1e-4)
         _, at, _ = instant(run, stand(run))
         weight = (run.half.chassis + 2 * run.half.pulley) * 9.80665 * np.cos(0.1)
         assert float(at.normal) == pytest.approx(float(weight), rel=1e-9)
@@ -119,7 +122,7 @@ def test_member_that_blows_up_fails_alone(robot):
 
         def one(c, b):
             own = dataclasses.replace(gear, contact_stiffness=c, contact_damping=b)
-            return track(robot, command(), own, duration=0.2, rolling=True).result
+            return track(robot, Conditions(), own, duration=0.2, rolling=True).result
 
         return jax.vmap(one)(stiffness, damping)
 

@@ -9,13 +9,14 @@ import pytest
 
 from mmrjax import balances, params, undercarriage
 from mmrjax.belt import POLYGON, Path, runs, tension_along, tips, travel
+from mmrjax.conditions import Conditions
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, RunningGear
-from mmrjax.signals import State, command
+from mmrjax.signals import State
 
 
 @pytest.fixture(scope="module")
 def path(robot):
-    return Path(robot.tracked.radius, RunningGear())
+    return Path(robot.configurations["6T2A"].radius, RunningGear())
 
 
 def test_belt_is_840_mm_with_grousers_every_35(path):
@@ -101,7 +102,7 @@ def test_tension_jumps_by_the_force_on_the_belt(path):
 
 
 def _posture(path, wheeled, robot):
-    axle = float(robot.wheeled.radius) if wheeled else float(path.radius + path.gear.grouser_height)
+    axle = float(robot.configurations["4W2T"].radius) if wheeled else float(path.radius + path.gear.grouser_height)
     return jnp.asarray([0.0, axle - 3e-4, 2e-3, 0.3012, 0.3]), jnp.asarray([0.9, -0.01, 0.02, 25.0, 24.9])
 
 
@@ -109,8 +110,8 @@ def _posture(path, wheeled, robot):
 def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     """Power of the generalized forces = power at the contact points - friction on the guide + belt, rate by rate."""
     q, v = _posture(path, wheeled, robot)
-    run = command(wheeled=wheeled)
-    radius = robot.wheeled.radius
+    run = Conditions(configuration=wheeled)
+    radius = robot.configurations["4W2T"].radius
     at = undercarriage.touch(path, radius, run.wheeled, q, v)
     signals = balances.begin(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
     signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0))
@@ -138,8 +139,8 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
     for wheeled, pairs in ((0.0, 720), (1.0, 4)):
         q, v = _posture(path, wheeled, robot)
         q = q.at[1].add(-1.0).at[2].set(0.0)  # under the ground, so that every contact that can bear does
-        run = command(wheeled=wheeled)
-        at = undercarriage.touch(path, robot.wheeled.radius, run.wheeled, q, 0 * v)
+        run = Conditions(configuration=wheeled)
+        at = undercarriage.touch(path, robot.configurations["4W2T"].radius, run.wheeled, q, 0 * v)
         signals = balances.begin(robot, run, State(*(jnp.asarray(0.0) for _ in range(4))))
         done = undercarriage.pull(path, robot.chassis(run.wheeled), signals, at, q[1])
         teeth = undercarriage.reactions(path, at, done).teeth(path)
@@ -150,9 +151,11 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
 
 def test_teeth_carry_what_the_guide_carries(path, robot):
     q, v = _posture(path, 0.0, robot)
-    at = undercarriage.touch(path, robot.wheeled.radius, jnp.asarray(0.0), q, v)
-    signals = balances.begin(robot, command(), State(*(jnp.asarray(0.0) for _ in range(4))))
-    loads = undercarriage.reactions(path, at, undercarriage.pull(path, robot.tracked, signals, at, q[1]))
+    at = undercarriage.touch(path, robot.configurations["4W2T"].radius, jnp.asarray(0.0), q, v)
+    signals = balances.begin(robot, Conditions(), State(*(jnp.asarray(0.0) for _ in range(4))))
+    loads = undercarriage.reactions(
+        path, at, undercarriage.pull(path, robot.configurations["6T2A"], signals, at, q[1])
+    )
     lower, upper = loads.teeth(path)
     assert lower.shape == upper.shape == (168,)
     assert float(jnp.sum(lower)) == pytest.approx(float(loads.guide))

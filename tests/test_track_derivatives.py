@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from mmrjax import params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.track import track
-from mmrjax.signals import CONVERGED, command
+from mmrjax.signals import CONVERGED
 
 PARAMETERS = (
     "track.guide_friction",
@@ -60,7 +61,7 @@ def averages(robot):
 @pytest.fixture(scope="module")
 def commands():
     wheeled, slope, payload, voltage = POINTS.T
-    return command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+    return Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
 
 
 @pytest.fixture(scope="module")

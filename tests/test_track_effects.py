@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from mmrjax import nominal, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL
 from mmrjax.fidelities.steady import steady
 from mmrjax.fidelities.track import track
-from mmrjax.signals import command
 
 SETTLED = tuple(e for e in ALL if not e.transient)
 TRANSIENT = tuple(e for e in ALL if e.transient)
 OUTPUTS = ("total_current", "motor_speed", "speed")
-RUNS = command(
+RUNS = Conditions(
     voltage=jnp.asarray([33.0, 24.0]),
-    slope=jnp.radians(jnp.asarray([3.0, 5.0])),
+    slope_deg=jnp.asarray([3.0, 5.0]),
     payload=jnp.asarray([3.0, 0.0]),
-    wheeled=jnp.asarray([0.0, 1.0]),
+    configuration=jnp.asarray([0.0, 1.0]),
     battery=jnp.asarray([0.0, 1.0]),  # 4W2T on its battery, whose effects act there alone
 )
 
@@ -34,7 +34,7 @@ def slopes():
 
     def robot(theta, share):
         amplitudes = {name: theta[k] * sizes[k] for k, name in enumerate(names)}
-        return params.replace(bare, amplitudes | {"tracked.track.guide_share": share})
+        return params.replace(bare, amplitudes | {"6T2A.track.guide_share": share})
 
     def observed(reading):
         return jnp.stack([getattr(reading, name) for name in OUTPUTS])

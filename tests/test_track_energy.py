@@ -8,16 +8,17 @@ import pytest
 
 from mmrjax import params
 from mmrjax.belt import travel
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import advance, centre, instant, stand, system
 from mmrjax.fidelities.track import track
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import GRAVITY, command
+from mmrjax.signals import GRAVITY
 
-RUNS = command(
+RUNS = Conditions(
     voltage=jnp.asarray([33.0, 15.0, 24.0, 33.0]),
-    slope=jnp.radians(jnp.asarray([0.0, 5.0, 5.0, 0.0])),
+    slope_deg=jnp.asarray([0.0, 5.0, 5.0, 0.0]),
     payload=jnp.asarray([0.0, 8.0, 3.0, 8.0]),
-    wheeled=jnp.asarray([0.0, 0.0, 1.0, 1.0]),
+    configuration=jnp.asarray([0.0, 0.0, 1.0, 1.0]),
 )
 
 
@@ -93,11 +94,11 @@ def test_every_loss_takes_energy(ledger):
 
 @pytest.fixture(scope="module")
 def averages(robot):
-    runs = command(
+    runs = Conditions(
         voltage=jnp.asarray([33.0, 33.0, 15.0, 33.0]),
-        slope=jnp.radians(jnp.asarray([0.0, 10.0, 5.0, 10.0])),
+        slope_deg=jnp.asarray([0.0, 10.0, 5.0, 10.0]),
         payload=jnp.asarray([0.0, 8.0, 0.0, 8.0]),
-        wheeled=jnp.asarray([0.0, 0.0, 0.0, 1.0]),
+        configuration=jnp.asarray([0.0, 0.0, 0.0, 1.0]),
     )
 
     @eqx.filter_jit

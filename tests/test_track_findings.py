@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from mmrjax.belt import Path
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.ripple import period_pitch, ripple, stages, touchdowns
 from mmrjax.fidelities.track import track_batch
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import STATUSES, command
+from mmrjax.signals import STATUSES
 
 #: (wheeled, slope [deg], payload [kg], voltage [V]), from standstill.
 RUNS = [
@@ -33,7 +34,7 @@ TAIL = slice(1100, None)  # the last 0.4 s
 @pytest.fixture(scope="module")
 def runs(robot):
     wheeled, slope, payload, voltage = np.array(RUNS, float).T
-    commands = command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+    commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
     # Not through the door's check of the step, whose own compilation test_track_bad_input pays.
     from mmrjax.fidelities.track import _batch
 
@@ -72,10 +73,10 @@ def test_unpowered_robot_stands_still(runs):
 @pytest.mark.parametrize("name", ["total_current", "speed"])
 def test_tracked_ripple_has_the_grousers_period(runs, robot, k, name):
     """Eq. (34) within 2 %."""
-    path = Path(robot.tracked.radius, RunningGear())
+    path = Path(robot.configurations["6T2A"].radius, RunningGear())
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
     assert tail(runs, k, name).period == pytest.approx(
-        period_pitch(float(path.pitch), wheel, float(robot.tracked.radius)), rel=0.02
+        period_pitch(float(path.pitch), wheel, float(robot.configurations["6T2A"].radius)), rel=0.02
     )
 
 
@@ -83,7 +84,7 @@ def test_tracked_ripple_has_the_grousers_period(runs, robot, k, name):
 def test_wheeled_ripple_has_the_teeth_s_period(runs, robot, k):
     """Eq. (34) with S_t in place of S_g, within 2 %."""
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
-    expected = period_pitch(5e-3, wheel, float(robot.tracked.radius))
+    expected = period_pitch(5e-3, wheel, float(robot.configurations["6T2A"].radius))
     assert tail(runs, k, "total_current").period == pytest.approx(expected, rel=0.02)
 
 
@@ -111,7 +112,7 @@ def test_current_peaks_when_a_grouser_touches_down(runs, robot, k):
     time = runs.time[k, TAIL]
     lands = touchdowns(time, runs.reactions.grouser[k, TAIL], runs.reactions.place[k, TAIL])
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
-    period = period_pitch(0.035, wheel, float(robot.tracked.radius))
+    period = period_pitch(0.035, wheel, float(robot.configurations["6T2A"].radius))
     np.testing.assert_allclose(np.diff(lands), period, rtol=0.04)  # one touchdown a pitch, to a sample
     phase = (time - lands[0]) / period
     bins = ((phase % 1) * 10).astype(int)
@@ -183,12 +184,12 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
 
     rows = grid[grid[:, 1] <= np.where(grid[:, 0] > 0.5, 15.0, 10.0)]
     wheeled, slope, payload, voltage = rows.T
-    commands = command(voltage=voltage, slope=np.radians(slope), payload=payload, wheeled=wheeled)
+    commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
     ours = _batch(robot, commands, RunningGear(), 0.6, 1e-4, 5e-3, True)
     assert {STATUSES[s] for s in np.asarray(ours.result.status)} == {"converged"}
 
     def lumped(share, run):
-        return steady(params.replace(robot, {"tracked.track.guide_share": share}), run)
+        return steady(params.replace(robot, {"6T2A.track.guide_share": share}), run)
 
     theirs = jax.jit(jax.vmap(lumped))(ours.steady.guide_share, commands)
     for name in ("total_current", "motor_speed", "speed"):
@@ -201,7 +202,7 @@ def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
     from mmrjax.fidelities.track import _batch
 
-    two = command(voltage=jnp.asarray([33.0, 15.0]), wheeled=jnp.asarray([0.0, 1.0]))
+    two = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
     twin = jax.tree.map(lambda x: x[::-1], two)
     a = _batch(robot, two, RunningGear(), 0.05, 1e-4, 1e-3, False)
     b = _batch(robot, twin, RunningGear(), 0.05, 1e-4, 1e-3, False)
@@ -210,7 +211,7 @@ def test_batch_is_its_members(robot):
 
 @pytest.mark.slow
 def test_batch_compiles_once(robot, compilations):
-    commands = command(voltage=jnp.asarray([33.0, 15.0]), wheeled=jnp.asarray([0.0, 1.0]))
+    commands = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
     keywords = dict(duration=0.02, sample=1e-3)
     track_batch(robot, commands, **keywords)
     before = len(compilations)
@@ -223,7 +224,7 @@ def test_run_in_parts_is_the_run_in_one(robot):
     """What a progress bar asks for: the same numbers, also where the parts do not divide the run."""
     from mmrjax.fidelities.track import PARTS, _batch
 
-    two = command(voltage=jnp.asarray([33.0, 15.0]), wheeled=jnp.asarray([0.0, 1.0]))
+    two = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
     shares = []
     whole = _batch(robot, two, RunningGear(), 0.047, 1e-4, 1e-3, False)
     parts = track_batch(robot, two, duration=0.047, progress=shares.append)

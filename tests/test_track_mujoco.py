@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from mmrjax import balances, mjcf, params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import advance, generalized, instant, stand, system
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import State, command
+from mmrjax.signals import State
 
 RUNS = {
     "tracked": dict(voltage=33.0, slope=np.radians(5.0), payload=3.0),
@@ -29,7 +30,7 @@ def native(robot, gear, run):
 def test_member_has_the_constants_that_mujoco_compiles(robot, name):
     """Against stale derived constants (mujoco issue 1607): MJX's are replaced, MuJoCo's compiled afresh."""
     gear = params.replace(RunningGear(), {"lever_front": jnp.asarray(2.5), "centre_offset": jnp.asarray(0.01)})
-    run = command(**RUNS[name])
+    run = Conditions(**RUNS[name])
     ours, theirs = system(robot, run, gear, STEP).model, native(robot, gear, run)
     for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
         np.testing.assert_allclose(
@@ -42,7 +43,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
 
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_masses_make_up_the_robot(robot, name):
-    run = command(**RUNS[name])
+    run = Conditions(**RUNS[name])
     half = system(robot, run, RunningGear(), STEP).half
     chassis = robot.chassis(run.wheeled)
     assert float(half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
@@ -68,7 +69,7 @@ def step_both(robot):
 def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
     """10 000 steps, each engine on its own trajectory; to 1e-6 of every coordinate's and rate's size."""
     gear, forces = step_both
-    run = command(**RUNS[name])
+    run = Conditions(**RUNS[name])
     model = native(robot, gear, run)
     data = mujoco.MjData(model)
 
@@ -95,10 +96,10 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
 def test_wrong_mass_is_seen(robot, step_both):
     """The comparison can fail: one gram more, one step."""
     gear, forces = step_both
-    run = command(**RUNS["tracked"])
+    run = Conditions(**RUNS["tracked"])
     motion = stand(system(robot, run, gear, STEP))
     (force, armature), after = forces(run, motion)
-    heavier = command(**(RUNS["tracked"] | {"payload": 3.002}))
+    heavier = Conditions(**(RUNS["tracked"] | {"payload": 3.002}))
     model = native(robot, gear, heavier)
     data = mujoco.MjData(model)
     data.qpos[:], data.qfrc_applied[:], model.dof_armature[:] = motion.q, force, armature
@@ -110,7 +111,7 @@ def test_wrong_mass_is_seen(robot, step_both):
 def test_mjcf_shows_a_robot_that_stands_on_its_ground(robot, name):
     """What MuJoCo's viewer draws at the keyframe: wheels touch the ground, pulleys leave room for the grousers."""
     gear = RunningGear()
-    model = native(robot, gear, command(**RUNS[name]))
+    model = native(robot, gear, Conditions(**RUNS[name]))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
     mujoco.mj_forward(model, data)

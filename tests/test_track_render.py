@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.track import _batch
 from mmrjax.render import render, scene
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import command
 
-RUNS = command(voltage=jnp.asarray([33.0, 24.0, np.nan]), slope=0.1, wheeled=jnp.asarray([0.0, 1.0, 0.0]))
+RUNS = Conditions(
+    voltage=jnp.asarray([33.0, 24.0, np.nan]), slope_deg=np.degrees(0.1), configuration=jnp.asarray([0.0, 1.0, 0.0])
+)
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax import effects, nominal, params
 from mmrjax.balances import BALANCES, added, moving
+from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
-from mmrjax.signals import Reading, Signals, State, command
+from mmrjax.signals import Signals, State
 
 #: Effects by name, as robot files and the command line know them.
 Library = Mapping[str, type[Effect]]
@@ -121,7 +122,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
     robot = nominal.nominal()
-    run = command(voltage=24.0, slope=0.1, payload=2.0)
+    run = Conditions(voltage=24.0, slope_deg=np.degrees(0.1), payload=2.0)
     state = State(*map(jnp.asarray, (1.5, 800.0, 0.6, 0.0)))
     signals = moving(robot, run, state)
     memory = {} if effect.memory_size is None else {effect.name: jnp.asarray(0.3 * effect.memory_size)}

@@ -17,7 +17,7 @@ from calibration.data.errors import BadConfiguration, BadData, DoorError, choice
 from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
 
 if TYPE_CHECKING:
-    from mmrjax.signals import Command
+    from mmrjax.conditions import Conditions
 
 #: Condition columns with the least and greatest value allowed.
 CONDITIONS: dict[str, tuple[float, float]] = {
@@ -86,23 +86,22 @@ class Runs:
         """Measured current [A], motor speed [rad/s] and speed [m/s], shape (rows, 3)."""
         return np.stack([self["total_current_A"], self["motor_speed_rpm"] * RPM, self["speed_mm_s"] * MM], 1)
 
-    def command(self, **conditions: float) -> Command:
-        """The conditions as one batched `Command` of shape (rows,), SI units.
+    def command(self, **conditions: float) -> Conditions:
+        """The conditions as one batched `Conditions` of shape (rows,), SI units.
 
         The mass is the stated `total_mass_kg` where the table has that column, else the robot's own mass
         and the payload. `conditions` set what no column says (`battery`, `discharge`).
         """
-        from mmrjax import signals
 
         wheeled = np.asarray(self["configuration"] == CONFIGURATIONS[1], float)
         adhesion = np.ones(len(self))
         if self.has("surface"):
             adhesion = np.array([adhesion_ratio(s, w > 0.5) for s, w in zip(self["surface"], wheeled, strict=True)])
-        return signals.command(
+        return Conditions(
             voltage=self["supply_voltage_V"],
-            slope=np.radians(self["slope_deg"]),
+            slope_deg=self["slope_deg"],
             payload=self["payload_kg"],
-            wheeled=wheeled,
+            configuration=wheeled,
             adhesion=adhesion,
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
             **conditions,

@@ -14,10 +14,11 @@ from jaxtyping import Array, Bool, Float
 
 from calibration.data.runs import CHANNELS, RPM
 from mmrjax import balances, params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import operating_point
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, STALLED, Command, Reading, Signals, State, command
+from mmrjax.signals import CONVERGED, STALLED, Signals, State
 from mmrjax.tables import CONFIGURATIONS
 
 CURRENT, MOTOR_SPEED, SPEED = range(len(CHANNELS))
@@ -133,7 +134,7 @@ def _show(robot: Robot, **signals: float) -> Reading:
 def _weighed(robot: Robot) -> Array:
     """Mass beyond the stated one, so that it does not matter how that was come by."""
     still = State(*(jnp.zeros(()),) * 4)
-    loads = [command(payload=m, wheeled=w) for w in (0.0, 1.0) for m in (0.0, 8.0)]
+    loads = [Conditions(payload=m, configuration=w) for w in (0.0, 1.0) for m in (0.0, 8.0)]
     stated = without(robot, "mass")
     return jnp.stack([balances.begin(robot, c, still).mass - balances.begin(stated, c, still).mass for c in loads])
 
@@ -271,9 +272,9 @@ def sds(of_channels: Float[Array, " 3"] | np.ndarray) -> np.ndarray:
     return np.concatenate(found)
 
 
-def _command(run: Run) -> Command:
+def _command(run: Run) -> Conditions:
     weightless = run.setup in (lifted, bare, blocked, braked)
-    commanded = command(run.voltage, np.radians(run.slope), run.payload, run.wheeled)
+    commanded = Conditions(run.voltage, np.radians(run.slope), run.payload, run.wheeled)
     shape = commanded.voltage.shape
     # None would take the robot's own mass, which a batch with the others cannot.
     return dataclasses.replace(

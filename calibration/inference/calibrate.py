@@ -284,7 +284,7 @@ def _nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) 
     draws = z + rng.standard_normal((DRAWS, len(z))) @ spread.T
 
     def steepness(robot: Robot) -> jax.Array:
-        laws = [chassis.ground.friction for chassis in (robot.tracked, robot.wheeled)]
+        laws = [chassis.ground.friction for chassis in (robot.configurations["6T2A"], robot.configurations["4W2T"])]
         return jnp.stack([law.static / law.speed_static for law in laws])
 
     def seen(z: jax.Array) -> tuple[jax.Array, jax.Array]:

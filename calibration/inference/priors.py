@@ -39,7 +39,7 @@ FRICTION = {
 }
 #: Share of the weight that the guides of 6T2A carry in the track model, where it is an output (docs/track-model.md).
 GUIDED = 0.98
-GUIDE_SHARE, GUIDE_FRICTION = "tracked.track.guide_share", "tracked.track.guide_friction"
+GUIDE_SHARE, GUIDE_FRICTION = "6T2A.track.guide_share", "6T2A.track.guide_friction"
 #: Parameters whose source states a ratio to another one, which they keep while they are not freed themselves.
 TIED = {
     f"{chassis}.ground.friction.{follower}": f"{chassis}.ground.friction.{leader}"
@@ -195,7 +195,7 @@ def parse_prior(text: str) -> tuple[str, float, float]:
     Raises:
         BadConfiguration: another form, no number, or an sd that is not positive.
     """
-    form = "expected name=value±sd in SI units, e.g. tracked.ground.friction.static=0.45±0.05 or ...=0.45±10%"
+    form = "expected name=value±sd in SI units, e.g. 6T2A.ground.friction.static=0.45±0.05 or ...=0.45±10%"
     match = _PRIOR.match(text.strip())
     if match is None:
         raise BadConfiguration(f"--prior {text}: {form}")

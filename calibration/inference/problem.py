@@ -16,12 +16,13 @@ from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import Runs
 from calibration.inference.priors import Coordinates
 from mmrjax import balances, params
+from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.drive import drive, rates, state_of
 from mmrjax.fidelities.histories import grid, histories, respond, states
 from mmrjax.fidelities.steady import operating_point
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, FAILED, SLIDES, TIPS, Command, Reading, Result, Signals
+from mmrjax.signals import CONVERGED, FAILED, SLIDES, TIPS, Result, Signals
 
 #: Share of the adhesion limit that a measured steady row is taken to leave unused [-].
 MARGIN = 0.02
@@ -38,21 +39,21 @@ ROLLED = 0.6
 #: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
 KNOTS, KNOT_STEPS = 256, 1e7
 
-Simulate = Callable[[Robot, Command], Result]
+Simulate = Callable[[Robot, Conditions], Result]
 
 
-def _steady(robot: Robot, commands: Command) -> Result:
+def _steady(robot: Robot, commands: Conditions) -> Result:
     return jax.vmap(lambda c: operating_point(robot, c)[0])(commands)
 
 
-def _drive(robot: Robot, commands: Command) -> Result:
+def _drive(robot: Robot, commands: Conditions) -> Result:
     # A settled row does not say how its run was started. One from standstill starts by sliding at μ_d, and on
     # a slope between μ_d and μ_s it never grips, though it was measured there: so from a rolling start, as `track`.
     times = jnp.asarray([0.0, SETTLED])
     return jax.vmap(lambda c: drive(robot, c, times, rolling=True).result)(commands)
 
 
-def _track(robot: Robot, commands: Command) -> Result:
+def _track(robot: Robot, commands: Conditions) -> Result:
     from mmrjax.fidelities.track import track  # brings mujoco, which the other fidelities do without
 
     return jax.vmap(lambda c: track(robot, c, duration=ROLLED, rolling=True).result)(commands)
@@ -95,7 +96,7 @@ def _stack(reading: Reading) -> Float[Array, "... 3"]:
 class Settled(eqx.Module):
     """Observer of steady rows: one run a row, read when settled."""
 
-    commands: Command
+    commands: Conditions
     simulate: Simulate = eqx.field(static=True)
 
     def __call__(self, robot: Robot) -> Observation:
@@ -116,7 +117,7 @@ class Series(eqx.Module):
         knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
     """
 
-    commands: Command
+    commands: Conditions
     times: Float[Array, "runs instants"]
     run: Int[Array, " rows"]
     instant: Int[Array, " rows"]
@@ -128,7 +129,7 @@ class Series(eqx.Module):
         falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
         clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
 
-        def one(command: Command, times: Array, clock: Array, instants: Array) -> Array:
+        def one(command: Conditions, times: Array, clock: Array, instants: Array) -> Array:
             def probed(amplitude: Array) -> Robot:
                 put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
                 return dataclasses.replace(robot, effects=(*robot.effects, *put))

@@ -36,6 +36,6 @@ class CentrifugalTension(Effect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        loss = robot.chassis(signals.wheeled).track.loss_coulomb
-        belt_speed = signals.speed_wheel * robot.tracked.radius
+        loss = robot.chassis(signals.configuration).track.loss_coulomb
+        belt_speed = signals.speed_wheel * robot.radius_pulley
         return self.amplitude * loss * belt_speed**2 * signals.direction

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, ClassVar
 
+from jaxtyping import Array, Int
+
 from mmrjax import contact
+from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Scalar, parameter
-from mmrjax.signals import Command, Signals
+from mmrjax.signals import Signals
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -54,7 +57,7 @@ class Cogging(Periodic, Effect):
         source="a choice of the model, see above",
     )
 
-    def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
+    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
         return self.ripples
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
@@ -62,6 +65,6 @@ class Cogging(Periodic, Effect):
         fade = contact.step(share**2, 1.0, 1.0, 4.0, 0.0)
         return self.amplitude * self.wave(signals) * fade
 
-    def step_longest(self, robot: Robot, command: Command) -> float:
+    def step_longest(self, robot: Robot, conditions: Conditions) -> float:
         """No limit: where the ripple acts, the start's own steps are shorter than its period."""
         return math.inf

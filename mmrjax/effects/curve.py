@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mmrjax.effects.base import Effect
 from mmrjax.effects.periodic import Periodic, phase_parameter
@@ -173,7 +173,7 @@ def _wave(place: str) -> type[Effect]:
         y_sin: Scalar = _ordinate()
         y_cos: Scalar = _ordinate()
 
-        def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
+        def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
             return self.order_shaft / robot.gearbox.ratio
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:

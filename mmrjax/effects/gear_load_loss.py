@@ -36,5 +36,5 @@ class GearLoadLoss(Effect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        load = signals.torque_track_loss + robot.chassis(signals.wheeled).radius * signals.traction
+        load = signals.torque_track_loss + robot.chassis(signals.configuration).radius * signals.traction
         return self.amplitude * jnp.abs(load) * signals.direction

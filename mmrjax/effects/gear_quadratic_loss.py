@@ -35,5 +35,5 @@ class GearQuadraticLoss(Effect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        load = signals.torque_track_loss + robot.chassis(signals.wheeled).radius * signals.traction
+        load = signals.torque_track_loss + robot.chassis(signals.configuration).radius * signals.traction
         return self.amplitude * load**2 * signals.direction

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import jax.numpy as jnp
+from jaxtyping import Array, Int
 
 from mmrjax.effects.base import Effect
 from mmrjax.effects.periodic import Periodic, phase_parameter
@@ -25,6 +26,7 @@ class GrouserPolygon(Periodic, Effect):
 
     name: ClassVar[str] = "grouser_polygon"
     balance: ClassVar[str] = "ground"
+    movers: ClassVar[str] = "tracks"
 
     amplitude: Scalar = parameter(
         0.0,
@@ -45,9 +47,9 @@ class GrouserPolygon(Periodic, Effect):
         source="Section 3.2.4",
     )
 
-    def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
-        passages = robot.tracked.radius / (self.pitch * robot.gearbox.ratio)
-        return 2 * jnp.pi * passages * (1 - wheeled)
+    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
+        passages = robot.radius_pulley / (self.pitch * robot.gearbox.ratio)
+        return 2 * jnp.pi * passages * robot.chassis(configuration).on_tracks
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.amplitude * self.wave(signals) * (1 - signals.wheeled)
+        return self.amplitude * self.wave(signals)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+import jax.numpy as jnp
+
 from mmrjax.effects.base import Effect
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import Signals
@@ -22,6 +24,7 @@ class MassOffset(Effect):
     name: ClassVar[str] = "mass_offset"
     balance: ClassVar[str] = "mass"
     dissipative: ClassVar[bool] = False
+    movers: ClassVar[str] = "wheels"
 
     amplitude: Scalar = parameter(
         0.0,
@@ -34,4 +37,4 @@ class MassOffset(Effect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.amplitude * signals.wheeled
+        return self.amplitude * jnp.ones_like(signals.payload)

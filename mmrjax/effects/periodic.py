@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Int
 
 from mmrjax import power
+from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar, parameter
-from mmrjax.signals import Command, Signals
+from mmrjax.signals import Signals
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -45,11 +47,11 @@ class Periodic(eqx.Module):
     phase: eqx.AbstractVar[Scalar]
 
     @abc.abstractmethod
-    def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
+    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
         """Radians of the wave per radian of the motor's shaft k [-]."""
 
     def rate(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.order(robot, signals.wheeled) * signals.speed_motor
+        return self.order(robot, signals.configuration) * signals.speed_motor
 
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
         """0: a phase does not settle; `wave` is then its mean."""
@@ -61,8 +63,10 @@ class Periodic(eqx.Module):
             return jnp.zeros_like(signals.speed_motor)
         return jnp.sin(signals.memory[self.name] + self.phase)
 
-    def step_longest(self, robot: Robot, command: Command) -> Scalar:
+    def step_longest(self, robot: Robot, conditions: Conditions) -> Scalar:
         """A twelfth of the period at the no-load speed [s]."""
-        source = power.voltage_source(robot.battery, command.voltage, command.battery, 0.0, command.discharge)
-        rate = self.order(robot, command.wheeled) * source / robot.motor.torque_constant
+        source = power.voltage_source(
+            robot.battery, conditions.voltage, conditions.battery, 0.0, conditions.discharge
+        )
+        rate = self.order(robot, conditions.configuration) * source / robot.motor.torque_constant
         return 2 * jnp.pi / STEPS / jnp.maximum(jnp.abs(rate), 1.0)

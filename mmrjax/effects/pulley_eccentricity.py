@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from jaxtyping import Array, Int
+
 from mmrjax.effects.base import Effect
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Scalar, parameter
@@ -34,7 +36,7 @@ class PulleyEccentricity(Periodic, Effect):
     )
     phase: Scalar = phase_parameter()
 
-    def order(self, robot: Robot, wheeled: Scalar) -> Scalar:
+    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
         return 1.0 / robot.gearbox.ratio
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

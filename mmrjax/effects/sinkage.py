@@ -43,6 +43,6 @@ class Sinkage(Effect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        unladen = robot.chassis(signals.wheeled).mass
+        unladen = robot.chassis(signals.configuration).mass
         growth = (signals.mass / unladen) ** (1 / self.exponent)
         return self.amplitude * signals.normal * growth * signals.direction_travel

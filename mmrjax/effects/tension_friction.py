@@ -37,4 +37,5 @@ class TensionFriction(Effect):
     )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
-        return self.amplitude * robot.chassis(signals.wheeled).radius * jnp.abs(signals.traction) * signals.direction
+        radius = robot.chassis(signals.configuration).radius
+        return self.amplitude * radius * jnp.abs(signals.traction) * signals.direction

@@ -10,6 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
 from mmrjax.fidelities.steady import operating_signals
@@ -22,7 +23,6 @@ from mmrjax.signals import (
     NOT_SETTLED,
     SLIDES,
     STALLED,
-    Command,
     Result,
     Signals,
     State,
@@ -62,10 +62,10 @@ def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     return State(y[0], y[1], y[2], y[4], memory)
 
 
-def rates(robot: Robot, command: Command, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]."""
-    signals = balances.moving(robot, command, state_of(robot, y))
-    current_battery = robot.battery.current(signals.total_current) * (command.battery > 0.5)  # eq. (11)
+    signals = balances.moving(robot, conditions, state_of(robot, y))
+    current_battery = robot.battery.current(signals.total_current) * (conditions.battery > 0.5)  # eq. (11)
     rates = [
         signals.voltage_left / signals.inductance,
         signals.acceleration_wheel * robot.gearbox.ratio,
@@ -82,39 +82,39 @@ def _norm(error: Float[Array, " unknowns"]) -> Scalar:
     return optx.rms_norm(error) * (error.shape[0] / len(_UNITS)) ** 0.5
 
 
-def _step_longest(robot: Robot, command: Command) -> Scalar | None:
+def _step_longest(robot: Robot, conditions: Conditions) -> Scalar | None:
     """The longest step that still resolves every effect with a memory [s]; None where none has one."""
-    limits = [jnp.asarray(effect.step_longest(robot, command)) for effect in robot.remembering]
+    limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
     return jax.lax.stop_gradient(jnp.min(jnp.stack(limits))) if limits else None
 
 
-def start(robot: Robot, command: Command, rolling: bool = False) -> Float[Array, " unknowns"]:
+def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
     """At rest; or as the steady fidelity travels, what effects remember settled too, at rest where it has no root."""
-    units = jnp.asarray(_units(robot), jnp.result_type(command.voltage))
-    rest = jnp.zeros_like(units).at[4].set(command.discharge / units[4])
+    units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
+    rest = jnp.zeros_like(units).at[4].set(conditions.discharge / units[4])
     if not rolling:
         return rest
-    settled = operating_signals(robot, command)
+    settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
-    state = [settled.current, settled.speed_motor, settled.speed, 0.0, command.discharge, *memory]
+    state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
     state = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
     return jnp.where(jnp.all(jnp.isfinite(state)), state, rest)
 
 
 def drive(
     robot: Robot,
-    command: Command,
+    conditions: Conditions,
     times: Float[Array, " times"],
     tolerance: float = 1e-6,
     max_steps: int = 4096,
     *,
     rolling: bool = False,
 ) -> Trajectory:
-    """Run one robot from standstill (or rolling) under a constant command and keep the given times.
+    """Run one robot from standstill (or rolling) under a constant conditions and keep the given times.
 
     Args:
         robot: any robot; its parameters may be tracers.
-        command: one run, scalar fields.
+        conditions: one run, scalar fields.
         times: increasing, from 0 [s]; the last one ends the run.
         tolerance: relative and (in units of 10 A, 1000 rad/s, 1 m/s) absolute error of a step.
         max_steps: integration steps after which a run has `failed`.
@@ -128,7 +128,7 @@ def drive(
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
-    y0 = start(robot, command, rolling)
+    y0 = start(robot, conditions, rolling)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, conditions: rates(*conditions, y)),
         Rodas4(),
@@ -136,22 +136,22 @@ def drive(
         times[-1],
         dt0=jnp.asarray(1e-4, y0.dtype),
         y0=y0,
-        args=(robot, command),
+        args=(robot, conditions),
         saveat=diffrax.SaveAt(ts=times),
         max_steps=max_steps,
         throw=False,
         stepsize_controller=diffrax.PIDController(
-            rtol=tolerance, atol=tolerance, norm=_norm, dtmax=_step_longest(robot, command)
+            rtol=tolerance, atol=tolerance, norm=_norm, dtmax=_step_longest(robot, conditions)
         ),
         adjoint=diffrax.ForwardMode(),
     )
     assert solution.ys is not None
     ys = solution.ys
-    signals = jax.vmap(lambda y: balances.moving(robot, command, state_of(robot, y)))(ys)
+    signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
     end = jax.tree.map(lambda x: x[-1], signals)
-    status = _status(robot, command, end, solution.result == diffrax.RESULTS.successful)
+    status = _status(robot, conditions, end, solution.result == diffrax.RESULTS.successful)
     # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
-    going = (command.battery < 0.5) | ~robot.battery.empty(signals.discharge)
+    going = (conditions.battery < 0.5) | ~robot.battery.empty(signals.discharge)
     signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
     time_end = jnp.max(jnp.where(going, times, times[0]))
     there = (status != BATTERY_EMPTY) & (status != FAILED)
@@ -159,8 +159,8 @@ def drive(
     return Trajectory(times, distance, signals, time_end, answer)
 
 
-def _status(robot: Robot, command: Command, end: Signals, done: Array) -> Array:
-    friction = robot.chassis(command.wheeled).ground.friction
+def _status(robot: Robot, conditions: Conditions, end: Signals, done: Array) -> Array:
+    friction = robot.chassis(conditions.configuration).ground.friction
     settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, CONVERGED)
     stands = jnp.minimum(end.direction, end.direction_travel) < 1.0
@@ -168,14 +168,18 @@ def _status(robot: Robot, command: Command, end: Signals, done: Array) -> Array:
     spinning = jnp.abs(end.speed_sliding) > friction.speed_static
     gaining = end.acceleration * end.speed_sliding > 1e-3 * jnp.abs(end.speed_sliding)  # 1 mm/s²
     status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
-    empty = (command.battery > 0.5) & robot.battery.empty(end.discharge)
+    empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
 
 
 @eqx.filter_jit
 def drive_batch(
-    robot: Robot, commands: Command, times: Float[Array, " times"], tolerance: float = 1e-6, max_steps: int = 4096
+    robot: Robot,
+    conditions: Conditions,
+    times: Float[Array, " times"],
+    tolerance: float = 1e-6,
+    max_steps: int = 4096,
 ) -> Trajectory:
-    """`drive` over a batch of commands (leading axis of every field) for one robot, compiled."""
-    return jax.vmap(lambda c: drive(robot, c, times, tolerance, max_steps))(commands)
+    """`drive` over a batch of conditions (leading axis of every field) for one robot, compiled."""
+    return jax.vmap(lambda c: drive(robot, c, times, tolerance, max_steps))(conditions)

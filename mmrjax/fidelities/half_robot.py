@@ -17,12 +17,13 @@ from jaxtyping import Array, Float
 from mmrjax import balances, mjcf, undercarriage
 from mmrjax.belt import Path
 from mmrjax.chassis import Chassis, inertia_reduced
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
 from mmrjax.mjcf import Masses, mjx
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import CONVERGED, GRAVITY, Command, Signals, State
+from mmrjax.signals import CONVERGED, GRAVITY, Signals, State
 from mmrjax.undercarriage import Pull, Touch
 
 
@@ -52,22 +53,27 @@ class System(eqx.Module):
 
     robot: Robot
     gear: RunningGear
-    command: Command
+    conditions: Conditions
     path: Path
     half: Masses
     model: Any
     data: Any
     step: float = eqx.field(static=True)
 
+    @property
+    def chassis(self) -> Chassis:
+        """The chassis of the run's configuration."""
+        return self.robot.chassis(self.conditions.configuration)
 
-def system(robot: Robot, command: Command, gear: RunningGear, step: float) -> System:
+
+def system(robot: Robot, conditions: Conditions, gear: RunningGear, step: float) -> System:
     """Constants of one run (scalar fields); robot and gear may hold tracers."""
-    rest = State(*(jnp.zeros_like(command.voltage) for _ in range(4)))
-    mass = balances.begin(robot, command, rest).mass
-    half = mjcf.masses(robot, gear, command, mass)
+    rest = State(*(jnp.zeros_like(conditions.voltage) for _ in range(4)))
+    mass = balances.begin(robot, conditions, rest).mass
+    half = mjcf.masses(robot, gear, conditions, mass)
     model, data = mjcf.template()
-    model = mjcf.member(model, half, command.slope, gear.wheelbase, step)
-    return System(robot, gear, command, Path(robot.tracked.radius, gear), half, model, data, step)
+    model = mjcf.member(model, half, conditions.slope, gear.wheelbase, step)
+    return System(robot, gear, conditions, Path(robot.radius_pulley, gear), half, model, data, step)
 
 
 class _Mover(eqx.Module):
@@ -85,10 +91,10 @@ class _Mover(eqx.Module):
 
 def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
     """All signals, contacts and forces of an instant."""
-    at = undercarriage.touch(run.path, run.robot.wheeled.radius, run.command.wheeled, motion.q, motion.v)
+    at = undercarriage.touch(run.path, run.chassis, motion.q, motion.v)
     state = State(motion.current, run.robot.gearbox.ratio * motion.v[3], motion.v[0], motion.discharge, motion.memory)
     mover = _Mover(run.path, at, motion.q[1])
-    signals, pulled = balances.resolved(run.robot, run.command, state, mover, run.half.inertia_pulley)
+    signals, pulled = balances.resolved(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
     return signals, at, pulled
 
 
@@ -110,7 +116,7 @@ def current_after(run: System, signals: Signals) -> Scalar:
 
     def left(current: Scalar) -> Scalar:
         shifted = dataclasses.replace(signals, current=current, total_current=run.robot.sides * current)
-        return balances.electrical(run.robot, balances.supply(run.robot, run.command, shifted)).voltage_left
+        return balances.electrical(run.robot, balances.supply(run.robot, run.conditions, shifted)).voltage_left
 
     voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
     z = run.step * slope / signals.inductance
@@ -123,7 +129,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     force, armature = generalized(run, signals, pulled)
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
     data = mjx.step(run.model.replace(dof_armature=armature), data)
-    charge = run.robot.battery.current(signals.total_current) * (run.command.battery > 0.5)
+    charge = run.robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
@@ -136,7 +142,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
 def margin(run: System) -> Scalar:
     """How far the line of gravity meets the ground inside the outermost contacts [m]; negative: it tips."""
     forward, up, _ = centre(run)
-    meets = forward - jnp.tan(run.command.slope) * (up + axle_height(run))
+    meets = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
     return run.gear.wheelbase / 2 - jnp.abs(meets)
 
 
@@ -150,7 +156,7 @@ def centre(run: System) -> tuple[Scalar, Scalar, Scalar]:
 def axle_height(run: System) -> Scalar:
     """Height of the axles over the ground where the contacts just touch [m]."""
     tracked = run.path.radius + run.gear.grouser_height
-    return jnp.where(run.command.wheeled > 0.5, run.robot.wheeled.radius, tracked)
+    return jnp.where(run.chassis.on_tracks > 0.5, tracked, run.chassis.radius)
 
 
 def stand(run: System) -> Motion:
@@ -160,13 +166,13 @@ def stand(run: System) -> Motion:
     """
     forward, up, total = centre(run)
     weight = total * GRAVITY
-    cos, sin = jnp.cos(run.command.slope), jnp.sin(run.command.slope)
+    cos, sin = jnp.cos(run.conditions.slope), jnp.sin(run.conditions.slope)
     axle = axle_height(run)
     zeros = jnp.zeros(5, jnp.result_type(axle))
 
     def unbalanced(y: Float[Array, " 2"]) -> Float[Array, " 2"]:
         q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
-        at = undercarriage.touch(run.path, run.robot.wheeled.radius, run.command.wheeled, q, zeros)
+        at = undercarriage.touch(run.path, run.chassis, q, zeros)
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
         return jnp.stack([(at.normal - weight * cos) / weight, moment / weight])
 
@@ -184,7 +190,7 @@ def stand(run: System) -> Motion:
     y = jnp.where(margin(run) > 0, y, jnp.zeros_like(y))
     q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
-    return Motion(q, zeros, jnp.zeros_like(axle), run.command.discharge * jnp.ones_like(axle), memory)
+    return Motion(q, zeros, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
 
 
 def roll(run: System) -> Motion:
@@ -193,14 +199,14 @@ def roll(run: System) -> Motion:
     Derivatives pass through it, so that those of a short run are those of what was run.
     """
     start = stand(run)
-    guess = steady(run.robot, run.command)
+    guess = steady(run.robot, run.conditions)
     solved = guess.status == CONVERGED
-    ratio, radius = run.robot.gearbox.ratio, run.robot.chassis(run.command.wheeled).radius
-    no_load = run.command.voltage / run.robot.motor.torque_constant
-    shown, speed_wheel = guess.reading, guess.theoretical_speed / radius  # the reading may carry a sensor's error
+    ratio, radius = run.robot.gearbox.ratio, run.chassis.radius
+    no_load = run.conditions.voltage / run.robot.motor.torque_constant
+    speed_wheel = guess.theoretical_speed / radius  # the reading may carry a sensor's error
     motor = jnp.where(solved, ratio * speed_wheel, no_load)
     speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)
-    current = jnp.where(solved, shown.total_current / run.robot.sides, 0.0)
+    current = jnp.where(solved, guess.reading["total_current"] / run.robot.sides, 0.0)
     v = jnp.zeros(5, start.q.dtype).at[0].set(speed).at[3:5].set(motor / ratio)
     start = dataclasses.replace(start, v=v, current=current)
     signals, _, _ = instant(run, start)  # what effects remember is settled too

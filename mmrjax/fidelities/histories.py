@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import balances
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import rates, start, state_of
 from mmrjax.robot import Robot
-from mmrjax.signals import Command, Signals
+from mmrjax.signals import Signals
 
 _GAMMA = 1 - 0.5**0.5
 #: Most Newton steps of a stage, which starts where the last one ended, and what its equations may leave in the
@@ -53,26 +54,26 @@ def grid(times: Float[np.ndarray, " times"]) -> np.ndarray:
     return np.concatenate([*parts, times[-1:]])
 
 
-def _matrix(robot: Robot, command: Command, y: Array, h: Array) -> tuple[Array, Array]:
+def _matrix(robot: Robot, conditions: Conditions, y: Array, h: Array) -> tuple[Array, Array]:
     """I - γ h ∂f/∂y, and f."""
 
     def f(y: Array) -> tuple[Array, Array]:
-        value = rates(robot, command, y)
+        value = rates(robot, conditions, y)
         return value, value
 
     jacobian, value = jax.jacfwd(f, has_aux=True)(y)
     return jnp.eye(y.shape[0], dtype=y.dtype) - _GAMMA * h * jacobian, value
 
 
-def _stage(robot: Robot, command: Command, known: Array, guess: Array, h: Array) -> Array:
+def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array) -> Array:
     """Y = known + γ h f(Y)."""
 
     def left(y: Array) -> Array:
-        return y - known - _GAMMA * h * rates(robot, command, y)
+        return y - known - _GAMMA * h * rates(robot, conditions, y)
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
-        matrix, value = _matrix(robot, command, y, h)
+        matrix, value = _matrix(robot, conditions, y, h)
         step = jnp.linalg.solve(matrix, y - known - _GAMMA * h * value)
         # Over a kink of the friction law full steps can swing to and fro for ever.
         whole, part = y - step, y - 0.3 * step
@@ -88,13 +89,13 @@ def _stage(robot: Robot, command: Command, known: Array, guess: Array, h: Array)
 
 
 @eqx.filter_custom_jvp
-def states(robot: Robot, command: Command, times: Float[Array, " times"]) -> tuple[Array, Array]:
+def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> tuple[Array, Array]:
     """Unknowns of one run from standstill at both stages of every step, shape (steps, unknowns) each."""
-    y0 = start(robot, command)
+    y0 = start(robot, conditions)
 
     def step(y: Array, h: Array) -> tuple[Array, tuple[Array, Array]]:
-        one = _stage(robot, command, y, y, h)
-        two = _stage(robot, command, y + (1 - _GAMMA) / _GAMMA * (one - y), one, h)
+        one = _stage(robot, conditions, y, y, h)
+        two = _stage(robot, conditions, y + (1 - _GAMMA) / _GAMMA * (one - y), one, h)
         return two, (one, two)
 
     return jax.lax.scan(step, y0, jnp.diff(times))[1]
@@ -102,19 +103,19 @@ def states(robot: Robot, command: Command, times: Float[Array, " times"]) -> tup
 
 @states.def_jvp
 def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    robot, command, times = primals
+    robot, conditions, times = primals
     moved = tangents[0]
-    stages = states(robot, command, times)
+    stages = states(robot, conditions, times)
 
     def source(_: Array, y: Array) -> Array:
-        return eqx.filter_jvp(lambda r: rates(r, command, y), (robot,), (moved,))[1]
+        return eqx.filter_jvp(lambda r: rates(r, conditions, y), (robot,), (moved,))[1]
 
-    return stages, respond(robot, command, times, stages, source, lambda y, dy: dy)
+    return stages, respond(robot, conditions, times, stages, source, lambda y, dy: dy)
 
 
 def respond(
     robot: Robot,
-    command: Command,
+    conditions: Conditions,
     times: Float[Array, " times"],
     stages: tuple[Array, Array],
     source: Callable[[Array, Array], Array],
@@ -133,8 +134,8 @@ def respond(
 
     def step(dy: Array, inputs: tuple) -> tuple[Array, tuple[Array, Array]]:
         t, h, one, two = inputs
-        first = jnp.linalg.inv(_matrix(robot, command, one, h)[0])
-        second = jnp.linalg.inv(_matrix(robot, command, two, h)[0])
+        first = jnp.linalg.inv(_matrix(robot, conditions, one, h)[0])
+        second = jnp.linalg.inv(_matrix(robot, conditions, two, h)[0])
         d1 = jnp.tensordot(first, dy + _GAMMA * h * source(t + _GAMMA * h, one), 1)
         known = dy + (1 - _GAMMA) / _GAMMA * (d1 - dy)
         d2 = jnp.tensordot(second, known + _GAMMA * h * source(t + h, two), 1)
@@ -144,18 +145,18 @@ def respond(
     return jax.lax.scan(step, still, (times[:-1], jnp.diff(times), *stages))[1]
 
 
-def histories(robot: Robot, command: Command, times: Float[Array, " times"]) -> Signals:
+def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> Signals:
     """Signals of one run from standstill at every instant of a grid; fields have shape (times,).
 
     Args:
         robot: its parameters may be tracers; derivatives by them, and by nothing else, are forward and exact
             for these steps.
-        command: one run, scalar fields.
+        conditions: one run, scalar fields.
         times: from 0 on, as by `grid` [s]; repeated instants are steps of no length.
 
     A run that could not be followed is not finite from there on.
     """
-    y0 = start(robot, command)
-    _, nodes = states(robot, command, times)
+    y0 = start(robot, conditions)
+    _, nodes = states(robot, conditions, times)
     ys = jnp.concatenate([y0[None], nodes])
-    return jax.vmap(lambda y: balances.moving(robot, command, state_of(robot, y)))(ys)
+    return jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)

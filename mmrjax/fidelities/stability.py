@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import Motion, advance, roll, stand, system
 from mmrjax.robot import Robot
 from mmrjax.running_gear import RunningGear
-from mmrjax.signals import Command
 from mmrjax.undercarriage import lever_tip
 
 SAFETY = 0.75  # of the linear limit: contacts bear more than when standing, by their ripple
@@ -22,10 +22,10 @@ _PROBE = 1e-5  # [s], step at which the slopes of the dynamics are taken; their 
 
 
 @eqx.filter_jit
-def _slopes(robot: Robot, commands: Command, gear: RunningGear) -> Float[Array, "runs starts 11 11"]:
+def _slopes(robot: Robot, conditions: Conditions, gear: RunningGear) -> Float[Array, "runs starts 11 11"]:
     # Rates of (q, v, current) by (q, v, current), standing and rolling.
-    def one(command: Command) -> Float[Array, "starts 11 11"]:
-        run = system(robot, command, gear, _PROBE)
+    def one(conditions: Conditions) -> Float[Array, "starts 11 11"]:
+        run = system(robot, conditions, gear, _PROBE)
 
         def rate(y: Float[Array, " 11"], at: Motion) -> Float[Array, " 11"]:
             motion = Motion(y[:5], y[5:10], y[10], at.discharge, at.memory)
@@ -38,7 +38,7 @@ def _slopes(robot: Robot, commands: Command, gear: RunningGear) -> Float[Array, 
 
         return jax.vmap(slope)(jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run)))
 
-    return jax.vmap(one)(commands)
+    return jax.vmap(one)(conditions)
 
 
 def _grows(slopes: Float[np.ndarray, "n 11 11"], steps: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -52,14 +52,14 @@ def _grows(slopes: Float[np.ndarray, "n 11 11"], steps: Float[np.ndarray, " n"])
     return np.abs(np.linalg.eigvals(np.concatenate([place, velocity, current[:, None]], axis=1))).max(axis=1)
 
 
-def largest_step(robot: Robot, commands: Command, gear: RunningGear | None = None) -> Float[np.ndarray, " runs"]:
-    """Largest stable step [s] of each run of a batch of `commands`.
+def largest_step(robot: Robot, conditions: Conditions, gear: RunningGear | None = None) -> Float[np.ndarray, " runs"]:
+    """Largest stable step [s] of each run of a batch of `conditions`.
 
     Three quarters of the step at which semi-implicit Euler, linearised about the robot standing and
     rolling, would make a small disturbance grow; the quarter is for the ripple of the contacts.
     """
     gear = RunningGear() if gear is None else gear
-    slopes = np.asarray(_slopes(params.strong(robot), commands, gear))
+    slopes = np.asarray(_slopes(params.strong(robot), conditions, gear))
     runs, starts = slopes.shape[:2]
     flat = slopes.reshape(runs * starts, 11, 11)
     usable = np.isfinite(flat).all(axis=(1, 2))
@@ -75,19 +75,19 @@ def largest_step(robot: Robot, commands: Command, gear: RunningGear | None = Non
     return SAFETY * (10**low).reshape(runs, starts).min(axis=1)
 
 
-def refuse(robot: Robot, commands: Command, gear: RunningGear, step: float, sample: float) -> None:
+def refuse(robot: Robot, conditions: Conditions, gear: RunningGear, step: float, sample: float) -> None:
     """Raise for what no run can be made of.
 
     Args:
-        robot, commands, gear: a batch of runs.
+        robot, conditions, gear: a batch of runs.
         step, sample: intervals of integration and of the record [s].
 
     Raises:
         ValueError: a lever reaches below the ground, or the step is too large for the stiffness; the message
             then names a step that is neither too large nor at odds with `sample`.
     """
-    tracked = np.asarray(commands.wheeled) < 0.5
-    height = float(robot.tracked.radius + gear.grouser_height)  # levers are on tracks alone
+    tracked = np.asarray(jax.vmap(robot.chassis)(conditions.configuration).on_tracks) > 0.5
+    height = float(robot.radius_pulley + gear.grouser_height)  # levers are on tracks alone
     for name, angle, side in (("lever_front", gear.lever_front, 1.0), ("lever_rear", gear.lever_rear, -1.0)):
         tip = float(lever_tip(gear, angle, side)[1])
         if tracked.any() and tip < -height:
@@ -95,7 +95,7 @@ def refuse(robot: Robot, commands: Command, gear: RunningGear, step: float, samp
                 f"{name}: got {np.degrees(float(angle)):.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the "
                 "ground; expected a posture on the main tracks, with both tips above the ground"
             )
-    limits = largest_step(robot, commands, gear)
+    limits = largest_step(robot, conditions, gear)
     worst = int(np.argmin(limits))
     if step > limits[worst]:
         raise ValueError(

@@ -11,11 +11,12 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.linear import SmallDense
 from mmrjax.fidelities.newton import SmallNewton
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.robot import Robot
-from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Command, Result, Signals, State
+from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Result, Signals, State
 
 # Units of the unknowns and of the torque residual, so that all are of the order of one.
 _CURRENT, _SPEED_MOTOR, _SPEED, _VOLTAGE, _TORQUE = 10.0, 1000.0, 1.0, 10.0, 100.0
@@ -25,68 +26,71 @@ def _state(unknowns: Float[Array, " 3"], discharge: Float[Array, ""]) -> State:
     return State(_CURRENT * unknowns[0], _SPEED_MOTOR * unknowns[1], _SPEED * unknowns[2], discharge)
 
 
-def _residual(unknowns: Float[Array, " 3"], conditions: tuple[Robot, Command]) -> Float[Array, " 3"]:
-    robot, command = conditions
-    signals, creep = balances.settled(robot, command, _state(unknowns, command.discharge))
+def _residual(unknowns: Float[Array, " 3"], run: tuple[Robot, Conditions]) -> Float[Array, " 3"]:
+    robot, conditions = run
+    signals, creep = balances.settled(robot, conditions, _state(unknowns, conditions.discharge))
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
     torque = jnp.minimum(unknowns[1], -signals.torque_net / _TORQUE)
     return jnp.stack([signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep])
 
 
-def _sound(robot: Robot, command: Command) -> tuple[Array, Command]:
+def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     """Whether a run's conditions are finite and its mass positive; where not, all ones in their place.
 
     A NaN that entered the residual would reach the derivatives of the whole batch, as 0 * NaN.
     """
-    stated = command.total_mass
-    mass = robot.chassis(command.wheeled).mass + command.payload if stated is None else stated
-    sound = jnp.all(jnp.isfinite(jnp.stack(jax.tree.leaves(command)))) & (mass > 0)
-    command = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), command)
+    stated = conditions.total_mass
+    mass = robot.chassis(conditions.configuration).mass + conditions.payload if stated is None else stated
+    sound = jnp.all(jnp.isfinite(jnp.stack([jnp.asarray(x, float) for x in jax.tree.leaves(conditions)]))) & (
+        mass > 0
+    )
+    conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
     # No adhesion at all: the robot slides, but a share of nothing has no value.
-    return sound, dataclasses.replace(command, adhesion=jnp.maximum(command.adhesion, 1e-9))
+    return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
 
 
-def _start(robot: Robot, command: Command) -> Float[Array, " 3"]:
-    nominal = jnp.where(command.battery > 0.5, robot.battery.voltage(0.0, command.discharge), command.voltage)
+def _start(robot: Robot, conditions: Conditions) -> Float[Array, " 3"]:
+    battery = robot.battery.voltage(0.0, conditions.discharge)
+    nominal = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
     speed = 0.9 * nominal / robot.motor.torque_constant
     return jnp.stack(
         [
             0.1 * nominal / robot.motor.resistance / _CURRENT,
             speed / _SPEED_MOTOR,
-            robot.chassis(command.wheeled).radius * speed / robot.gearbox.ratio / _SPEED,
+            robot.chassis(conditions.configuration).radius * speed / robot.gearbox.ratio / _SPEED,
         ]
     )
 
 
-def _root(robot: Robot, command: Command) -> tuple[State, Array]:
+def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
     """The state at which the balances close, and whether the search got there; derivatives are implicit."""
-    dtype = jnp.result_type(command.voltage)
+    dtype = jnp.result_type(conditions.voltage)
     solution = optx.root_find(
         _residual,
         SmallNewton(atol=float(jnp.finfo(dtype).eps) ** 0.85),
-        jax.lax.stop_gradient(_start(robot, command)),
-        args=(robot, command),
+        jax.lax.stop_gradient(_start(robot, conditions)),
+        args=(robot, conditions),
         max_steps=40,
         throw=False,
         adjoint=optx.ImplicitAdjoint(linear_solver=SmallDense()),
     )
-    return _state(solution.value, command.discharge), solution.result == optx.RESULTS.successful
+    return _state(solution.value, conditions.discharge), solution.result == optx.RESULTS.successful
 
 
-def operating_signals(robot: Robot, command: Command) -> Signals:
+def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
-    _, command = _sound(robot, command)
-    return balances.settled(robot, command, _root(robot, command)[0])[0]
+    _, conditions = _sound(robot, conditions)
+    return balances.settled(robot, conditions, _root(robot, conditions)[0])[0]
 
 
-def steady(robot: Robot, command: Command) -> Result:
+def steady(robot: Robot, conditions: Conditions) -> Result:
     """Steady forward travel of one run: a root in motor current, motor speed and robot speed.
 
     Derivatives are implicit (forward and reverse). Vmapped by `steady_batch`.
 
     Args:
         robot: any robot; its parameters may be tracers.
-        command: one run, scalar fields.
+        conditions: one run, scalar fields.
 
     Returns:
         Scalars. `status` is `converged`; `stalled` (shafts or robot slower than a tenth of V_s, where
@@ -98,36 +102,36 @@ def steady(robot: Robot, command: Command) -> Result:
         the mass not positive). A member that has no numbers has zero derivatives and harms no
         other.
     """
-    point, sound = operating_point(robot, command)
+    point, sound = operating_point(robot, conditions)
     return withhold(point, (point.status == CONVERGED) | (point.status == STALLED), sound)
 
 
-def operating_point(robot: Robot, command: Command) -> tuple[Result, Array]:
+def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
     """`steady` with the numbers left in whatever the status, for a fit that has to find its way back.
 
     Where the robot `slides` they are those of the balances with the contact held at V_s: current and motor
     speed as if the ground held, the robot V_s slower than r_k ω_k, and no derivative of the speed in μ_s.
 
     Returns:
-        The result, and whether robot and command are sound (see `_sound`).
+        The result, and whether robot and conditions are sound (see `_sound`).
     """
-    sound, command = _sound(robot, command)
-    state, solved = _root(robot, command)
-    signals, _ = balances.settled(robot, command, state)
+    sound, conditions = _sound(robot, conditions)
+    state, solved = _root(robot, conditions)
+    signals, _ = balances.settled(robot, conditions, state)
     solved = solved & jnp.isfinite(signals.voltage_left + signals.torque_net)
-    rest = robot.chassis(command.wheeled).ground.friction.speed_rest
+    rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
     stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest
     # Ordered by what a person would say first.
     status = jnp.where(stands, STALLED, CONVERGED)
     status = jnp.where(jnp.abs(signals.demand) > signals.adhesion_limit, SLIDES, status)
     status = jnp.where(solved, status, FAILED)
-    empty = (command.battery > 0.5) & robot.battery.empty(command.discharge)
+    empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
     return result(robot, signals, status), sound
 
 
 @eqx.filter_jit
-def steady_batch(robot: Robot, commands: Command) -> Result:
-    """`steady` over a batch of commands (leading axis of every field) for one robot, compiled."""
-    return jax.vmap(steady, in_axes=(None, 0))(robot, commands)
+def steady_batch(robot: Robot, conditions: Conditions) -> Result:
+    """`steady` over a batch of conditions (leading axis of every field) for one robot, compiled."""
+    return jax.vmap(steady, in_axes=(None, 0))(robot, conditions)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from mmrjax import contact, undercarriage
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.fidelities.stability import refuse
@@ -26,7 +27,6 @@ from mmrjax.signals import (
     SLIDES,
     STALLED,
     TIPS,
-    Command,
     Result,
     Signals,
 )
@@ -116,14 +116,14 @@ def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Ar
 
 
 def _status(run: System, steady: Steady, end: Motion) -> Array:
-    robot, command, signals = run.robot, run.command, steady.signals
-    friction = robot.chassis(command.wheeled).ground.friction
+    robot, conditions, signals = run.robot, run.conditions, steady.signals
+    friction = robot.chassis(conditions.configuration).ground.friction
     status = jnp.where(steady.change > SETTLED, NOT_SETTLED, CONVERGED)
     status = jnp.where(signals.direction < 0.999, STALLED, status)
     spinning = jnp.abs(signals.speed_sliding) > friction.speed_static
     gaining = signals.acceleration > 1e-2  # m/s², on average over the window
     status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
-    empty = (command.battery > 0.5) & robot.battery.empty(end.discharge)
+    empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(margin(run) < 0, TIPS, status)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
@@ -135,7 +135,7 @@ def _status(run: System, steady: Steady, end: Motion) -> Array:
 
 def track(
     robot: Robot,
-    command: Command,
+    conditions: Conditions,
     gear: RunningGear | None = None,
     *,
     duration: float = 1.5,
@@ -143,13 +143,13 @@ def track(
     sample: float = SAMPLE,
     rolling: bool = False,
 ) -> Trajectory:
-    """Run one robot under a constant command, from standstill or rolling.
+    """Run one robot under a constant conditions, from standstill or rolling.
 
     Pure and traceable: differentiable forward and backward, vmappable over every argument's leaves.
 
     Args:
         robot: any robot; its parameters may be tracers. Its `guide_share` is not used: it is an output.
-        command: one run, scalar fields.
+        conditions: one run, scalar fields.
         gear: running gear; None takes the paper's.
         duration: of the run [s]; step, sample: intervals of integration and of the record [s].
         rolling: start at the steady fidelity's speed, which settles sooner; else from standstill.
@@ -162,7 +162,7 @@ def track(
         left the ground or turned over though gravity alone would not turn it. `failed` and `tips` withhold
         the result's numbers.
     """
-    run = system(robot, command, RunningGear() if gear is None else gear, step)
+    run = system(robot, conditions, RunningGear() if gear is None else gear, step)
     start = roll(run) if rolling else stand(run)
     end, record = _record(run, start, sample, round(duration / sample))
     return _trajectory(run, start, end, record, sample)
@@ -196,7 +196,7 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
 
 def track_batch(
     robot: Robot,
-    commands: Command,
+    conditions: Conditions,
     gear: RunningGear | None = None,
     *,
     duration: float = 1.5,
@@ -205,7 +205,7 @@ def track_batch(
     rolling: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """`track` over a batch of commands (leading axis of every field) for one robot, compiled once.
+    """`track` over a batch of conditions (leading axis of every field) for one robot, compiled once.
 
     Args:
         progress: told now and then the share of the runs' time that is done; between its calls the runs can be
@@ -220,31 +220,31 @@ def track_batch(
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
         raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
-    refuse(robot, commands, gear, step, sample)
+    refuse(robot, conditions, gear, step, sample)
     if progress is not None:
-        return _in_parts(robot, commands, gear, duration, step, sample, rolling, progress)
-    return _batch(robot, commands, gear, duration, step, sample, rolling)
+        return _in_parts(robot, conditions, gear, duration, step, sample, rolling, progress)
+    return _batch(robot, conditions, gear, duration, step, sample, rolling)
 
 
 @eqx.filter_jit
 def _batch(
     robot: Robot,
-    commands: Command,
+    conditions: Conditions,
     gear: RunningGear,
     duration: float,
     step: float,
     sample: float,
     rolling: bool,
 ) -> Trajectory:
-    def one(command: Command) -> Trajectory:
-        return track(robot, command, gear, duration=duration, step=step, sample=sample, rolling=rolling)
+    def one(conditions: Conditions) -> Trajectory:
+        return track(robot, conditions, gear, duration=duration, step=step, sample=sample, rolling=rolling)
 
-    return jax.vmap(one)(commands)
+    return jax.vmap(one)(conditions)
 
 
 def _in_parts(
     robot: Robot,
-    commands: Command,
+    conditions: Conditions,
     gear: RunningGear,
     duration: float,
     step: float,
@@ -255,34 +255,35 @@ def _in_parts(
     # All parts are of one length, for one compilation; what the last one has too many is cut off.
     samples = round(duration / sample)
     length = math.ceil(samples / PARTS)
-    start = motion = _begin(robot, commands, gear, step, rolling)
+    start = motion = _begin(robot, conditions, gear, step, rolling)
     records = []
     for done in range(0, samples, length):
-        motion, record = jax.block_until_ready(_part(robot, commands, gear, motion, step, sample, length))
+        motion, record = jax.block_until_ready(_part(robot, conditions, gear, motion, step, sample, length))
         records.append(record)
         progress(min((done + length) / samples, 1.0))
-    return _end(robot, commands, gear, start, records, step, sample, samples)
+    return _end(robot, conditions, gear, start, records, step, sample, samples)
 
 
 @eqx.filter_jit
-def _begin(robot: Robot, commands: Command, gear: RunningGear, step: float, rolling: bool) -> Motion:
-    return jax.vmap(lambda command: (roll if rolling else stand)(system(robot, command, gear, step)))(commands)
+def _begin(robot: Robot, conditions: Conditions, gear: RunningGear, step: float, rolling: bool) -> Motion:
+    begin = roll if rolling else stand
+    return jax.vmap(lambda one: begin(system(robot, one, gear, step)))(conditions)
 
 
 @eqx.filter_jit
 def _part(
-    robot: Robot, commands: Command, gear: RunningGear, motions: Motion, step: float, sample: float, samples: int
+    robot: Robot, conditions: Conditions, gear: RunningGear, motions: Motion, step: float, sample: float, samples: int
 ) -> tuple[Motion, Record]:
-    def one(command: Command, motion: Motion) -> tuple[Motion, Record]:
-        return _record(system(robot, command, gear, step), motion, sample, samples)
+    def one(conditions: Conditions, motion: Motion) -> tuple[Motion, Record]:
+        return _record(system(robot, conditions, gear, step), motion, sample, samples)
 
-    return jax.vmap(one)(commands, motions)
+    return jax.vmap(one)(conditions, motions)
 
 
 @eqx.filter_jit
 def _end(
     robot: Robot,
-    commands: Command,
+    conditions: Conditions,
     gear: RunningGear,
     starts: Motion,
     records: list[Record],
@@ -290,9 +291,9 @@ def _end(
     sample: float,
     samples: int,
 ) -> Trajectory:
-    def one(command: Command, start: Motion, parts: list[Record]) -> Trajectory:
+    def one(conditions: Conditions, start: Motion, parts: list[Record]) -> Trajectory:
         record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
         end = jax.tree.map(lambda x: x[-1], record.motions)
-        return _trajectory(system(robot, command, gear, step), start, end, record, sample)
+        return _trajectory(system(robot, conditions, gear, step), start, end, record, sample)
 
-    return jax.vmap(one)(commands, starts, records)
+    return jax.vmap(one)(conditions, starts, records)

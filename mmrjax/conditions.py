@@ -1,0 +1,95 @@
+"""The conditions of runs: what is set from outside before a robot starts."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+Number = float | Sequence[float] | np.ndarray | Array
+
+
+class Conditions(eqx.Module):
+    """The conditions of one run, or of a batch: every field broadcast to one shape.
+
+    Attributes:
+        configuration: which of the robot's configurations, its index; until `resolved` also a name, or an array
+            of names.
+        voltage: of the external supply [V]; not used with `battery`.
+        slope_deg: slope angle, positive uphill [deg].
+        payload: additional load mass m_c [kg].
+        battery: 0 external supply (Source Mode 2), 1 on-board battery (Source Mode 1), eq. (8).
+        discharge: charge C_b already taken from the battery [C].
+        adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
+        total_mass: mass of robot and payload as weighed [kg]; None takes the robot's own mass and the payload.
+    """
+
+    configuration: Int[Array, "..."] | np.ndarray
+    voltage: Float[Array, "..."]
+    slope_deg: Float[Array, "..."]
+    payload: Float[Array, "..."]
+    battery: Float[Array, "..."]
+    discharge: Float[Array, "..."]
+    adhesion: Float[Array, "..."]
+    total_mass: Float[Array, "..."] | None
+
+    def __init__(
+        self,
+        configuration: str | int | Sequence[str] | np.ndarray | Array = 0,
+        voltage: Number = 33.0,
+        slope_deg: Number = 0.0,
+        payload: Number = 0.0,
+        battery: Number | bool = 0.0,
+        discharge: Number = 0.0,
+        adhesion: Number = 1.0,
+        total_mass: Number | None = None,
+    ) -> None:
+        which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
+        if which.dtype.kind != "U":
+            which = jnp.asarray(which).astype(int)
+        numbers = [jnp.asarray(v, float) for v in (voltage, slope_deg, payload, battery, discharge, adhesion)]
+        mass = None if total_mass is None else jnp.asarray(total_mass, float)
+        shapes = [x.shape for x in (which, *numbers, *([] if mass is None else [mass]))]
+        try:
+            shape = jnp.broadcast_shapes(*shapes)
+        except ValueError:
+            of = dict(zip([f.name for f in dataclasses.fields(type(self))], shapes, strict=False))
+            said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
+            raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
+        self.configuration = (np if which.dtype.kind == "U" else jnp).broadcast_to(which, shape)
+        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = (
+            jnp.broadcast_to(x, shape) for x in numbers
+        )
+        self.total_mass = None if mass is None else jnp.broadcast_to(mass, shape)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the batch; () for one run."""
+        return self.voltage.shape
+
+    @property
+    def slope(self) -> Float[Array, "..."]:
+        """Slope angle α, positive uphill [rad]."""
+        return jnp.radians(self.slope_deg)
+
+    def resolved(self, robot: Robot) -> Conditions:
+        """The same with names of configurations replaced by their indices in `robot`.
+
+        Raises:
+            KeyError: a name that the robot does not have; the message lists those that it has.
+        """
+        if not isinstance(self.configuration, np.ndarray) or self.configuration.dtype.kind != "U":
+            return self
+        which = np.empty(self.configuration.shape, int)
+        for name in np.unique(self.configuration):
+            which[self.configuration == name] = robot.configurations.index(str(name))
+        return dataclasses.replace(self, configuration=jnp.asarray(which))
