@@ -20,7 +20,7 @@ import numpy as np  # noqa: E402
 import reference  # noqa: E402  (tests/reference.py, plain NumPy and SciPy)
 from scipy.optimize import least_squares, root  # noqa: E402
 
-from calibration.data import noise  # noqa: E402
+from calibration.inference import noise  # noqa: E402
 from calibration.data import runs as records  # noqa: E402
 from calibration.inference import identifiability, priors, problem  # noqa: E402
 from calibration.inference import optimizers as fit  # noqa: E402

@@ -103,7 +103,7 @@ def oracle(case: g.Case) -> list[dict]:
 
 def one(engine, kind: str, seed: int, replicates: int) -> dict:
     """A case made, looped over and scored against its label."""
-    from calibration.data import noise
+    from calibration.inference import noise
     from calibration.data import runs as records
     from calibration.discovery import loop
 

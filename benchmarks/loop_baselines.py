@@ -186,7 +186,7 @@ def sindy_refit(looped, linear, scores) -> list[str]:
 
 def one(engine, kind: str, seed: int) -> dict:
     """A case made, and what each method names."""
-    from calibration.data import noise
+    from calibration.inference import noise
     from calibration.data import runs as records
     from calibration.discovery import loop
 

@@ -62,7 +62,7 @@ def work(task: tuple) -> dict:
 
 def judged(engine, table: dict, label: dict, seed: int, replicates: int) -> dict:
     """The loop over a case, verdict and label side by side."""
-    from calibration.data import noise
+    from calibration.inference import noise
     from calibration.data import runs as records
     from calibration.discovery import loop
     from calibration.discovery import result as loop_outcome

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calibration.data.errors import DoorError
+from calibration.data.errors import InputError
 from mmrjax import __version__
 
 INTERRUPTED = 130
@@ -395,7 +395,7 @@ def main() -> None:
         code = app(standalone_mode=False)
         if code == INTERRUPTED:  # the option parser has caught the interrupt
             raise KeyboardInterrupt
-    except DoorError as error:
+    except InputError as error:
         code = _fail(str(error), error.exit_code)
     except (typer.Abort, KeyboardInterrupt):
         advice = "no run folder was left"

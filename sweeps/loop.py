@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import checks, effect_file, robot_file
-from calibration.data import noise as noise_room
+from calibration.data import effect_file, robot_file
+from calibration.inference import checks
+from calibration.inference import noise as noise_room
 from calibration.data.errors import BadData
 from calibration.data.runs import CHANNELS, Runs
 from calibration.discovery import result as loop_outcome

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data.errors import BadConfiguration, DoorError
+from calibration.data.errors import BadConfiguration, InputError
 from calibration.data.runs import Runs
 from mmrjax import __version__
 
@@ -80,7 +80,7 @@ class RunFolder:
         if kind is None:
             return
         vain = issubclass(kind, KeyboardInterrupt) and not any((self.partial / "chunks").glob("*.npz"))
-        if vain or issubclass(kind, DoorError):
+        if vain or issubclass(kind, InputError):
             shutil.rmtree(self.partial, ignore_errors=True)
 
     def chunk(self, name: str) -> dict[str, np.ndarray] | None:

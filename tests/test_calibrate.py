@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from calibration.data import noise, robot_file
+from calibration.data import robot_file
+from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import result as outcome

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import checks
+from calibration.inference import checks
 from calibration.data import runs as records
 from calibration.inference import optimizers as fit
 from calibration.inference import priors

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import noise, robot_file
+from calibration.data import robot_file
+from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.discovery import bases as curves
 from calibration.discovery import discrepancy as discover

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_generator import SHAPES
 
-from calibration.data import noise
+from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.discovery import experiments as experiment
 from calibration.discovery import loop, menu

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.data import noise
+from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, priors, problem

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibration.data import noise
+from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.discovery import active_set as slots
 from calibration.discovery import bases as curves

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calibration.data import checks, noise
+from calibration.inference import checks, noise
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from calibration.discovery import active_set as slots

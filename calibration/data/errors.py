@@ -1,4 +1,4 @@
-"""Errors raised at the doors, where files and arguments come in; each carries its exit code."""
+"""Errors of what comes in from outside, files and arguments; each carries its exit code."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import difflib
 from collections.abc import Iterable
 
 
-class DoorError(Exception):
+class InputError(Exception):
     """Something from outside is not as it should be; the message is one sentence for a person."""
 
     exit_code = 2
 
 
-class BadConfiguration(DoorError):
+class BadConfiguration(InputError):
     """A wrong option, key, name or folder (exit code 2)."""
 
     exit_code = 2
 
 
-class BadData(DoorError):
+class BadData(InputError):
     """A wrong table of runs (exit code 4)."""
 
     exit_code = 4

@@ -13,11 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data.errors import BadConfiguration, BadData, DoorError, choices, number
-from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
+from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number
+from mmrjax import channels
+from mmrjax.channels import MM, RPM
+from mmrjax.tables import SURFACES, adhesion_ratio
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
+    from mmrjax.robot import Robot
 
 #: Condition columns with the least and greatest value allowed.
 CONDITIONS: dict[str, tuple[float, float]] = {
@@ -26,27 +29,31 @@ CONDITIONS: dict[str, tuple[float, float]] = {
     "payload_kg": (0.0, 300.0),
     "slope_deg": (-45.0, 45.0),
 }
-#: Measured columns, in the order of `mmrjax.signals.Reading`.
-MEASURED: dict[str, tuple[float, float]] = {
-    "total_current_A": (-200.0, 200.0),
-    "motor_speed_rpm": (-30_000.0, 30_000.0),
-    "speed_mm_s": (-10_000.0, 10_000.0),
-}
-CHANNELS = ("total_current", "motor_speed", "speed")
-#: Standard deviations of the measured columns; positive.
-DEVIATIONS: dict[str, tuple[float, float]] = {
-    "total_current_sd_A": (0.0, 100.0),
-    "motor_speed_sd_rpm": (0.0, 10_000.0),
-    "speed_sd_mm_s": (0.0, 5_000.0),
-}
 TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
 WORDS = ("configuration", "surface", "run_id")
+#: Columns that every table has to have, and those that a table without measurements may lack.
+REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
 
-INPUT_COLUMNS = ("configuration", *CONDITIONS, *MEASURED)
-KNOWN_COLUMNS = (*INPUT_COLUMNS, *DEVIATIONS, "surface", "run_id", "time_s")
+__all__ = ["CONDITIONS", "MM", "RPM", "Runs", "known_columns", "measured_columns", "read", "single"]
 
-RPM = math.pi / 30  # rad/s
-MM = 1e-3  # m
+
+def measured_columns() -> tuple[str, ...]:
+    """Columns of the channels, in the order of arrays."""
+    return tuple(c.column for c in channels.CHANNELS)
+
+
+def known_columns() -> tuple[str, ...]:
+    """Every column that means something in a table of runs."""
+    deviations = tuple(c.sd_column for c in channels.CHANNELS)
+    return (*REQUIRED, *measured_columns(), *deviations, "surface", "run_id", "time_s")
+
+
+def _ranges() -> dict[str, tuple[float, float]]:
+    """Least and greatest value of every number column."""
+    readings = {c.column: c.range for c in channels.CHANNELS}
+    deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.CHANNELS}
+    return {**CONDITIONS, **readings, **deviations, **TIME}
+
 
 #: Tables that come with the package.
 PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_paper.csv"}
@@ -58,7 +65,8 @@ class Runs:
 
     Attributes:
         source: where it came from, for messages.
-        columns: name → array of shape (rows,); numbers in the unit of the name, words as str.
+        columns: name → array of shape (rows,); numbers in the unit of the name, words as str; NaN for a reading
+            that is missing.
         unknown: columns of the file that this program does not know, kept out.
         digest: SHA-256 of the file, empty for a table that came from none.
     """
@@ -83,28 +91,77 @@ class Runs:
         return dataclasses.replace(self, columns={k: v[rows] for k, v in self.columns.items()})
 
     def measured(self) -> np.ndarray:
-        """Measured current [A], motor speed [rad/s] and speed [m/s], shape (rows, 3)."""
-        return np.stack([self["total_current_A"], self["motor_speed_rpm"] * RPM, self["speed_mm_s"] * MM], 1)
+        """Measured readings [SI], NaN where one is missing, shape (rows, channels)."""
+        return self._stacked(tuple(c.column for c in channels.CHANNELS))
 
-    def command(self, **conditions: float) -> Conditions:
-        """The conditions as one batched `Conditions` of shape (rows,), SI units.
+    def deviations(self) -> np.ndarray:
+        """Stated sds of the readings [SI], NaN where none is stated, shape (rows, channels)."""
+        return self._stacked(tuple(c.sd_column for c in channels.CHANNELS))
+
+    def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
+        nothing = np.full(len(self), np.nan)
+        found = [self.columns.get(column, nothing) for column in columns]
+        return np.stack(found, 1) * np.asarray(channels.factors())
+
+    def missing(self) -> list[str]:
+        """A sentence for each channel of which readings are missing."""
+        said = []
+        for k, channel in enumerate(channels.CHANNELS):
+            lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
+            if not self.has(channel.column) or lost.size == len(self):
+                said.append(f"{channel.column}: no readings; what they would show is not fitted")
+            elif lost.size:
+                rows = ", ".join(str(r + 1) for r in lost[:8]) + (", ..." if lost.size > 8 else "")
+                said.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing (rows {rows})")
+        return said
+
+    def configurations(self, robot: Robot) -> np.ndarray:
+        """Index of each row's configuration in `robot`, shape (rows,).
+
+        Raises:
+            InputError: a configuration that the robot does not have; those that it has are listed.
+        """
+        which = np.empty(len(self), int)
+        for name in np.unique(self["configuration"]):
+            rows = self["configuration"] == name
+            if name not in robot.configurations:
+                first = int(np.flatnonzero(rows)[0]) + 1
+                raise BadData(
+                    f"{self.source} row {first}, configuration: got {name}; expected one of these; "
+                    f"{choices(str(name), robot.configurations)}"
+                )
+            which[rows] = robot.configurations.index(str(name))
+        return which
+
+    def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
+        """The conditions as one batch of shape (rows,).
 
         The mass is the stated `total_mass_kg` where the table has that column, else the robot's own mass
-        and the payload. `conditions` set what no column says (`battery`, `discharge`).
-        """
+        and the payload.
 
-        wheeled = np.asarray(self["configuration"] == CONFIGURATIONS[1], float)
+        Args:
+            robot: has the configurations of the table.
+            battery: 1 for the on-board battery; discharge: charge already taken from it [C].
+
+        Raises:
+            BadData: as `configurations`.
+        """
+        from mmrjax.conditions import Conditions
+
+        which = self.configurations(robot)
         adhesion = np.ones(len(self))
         if self.has("surface"):
-            adhesion = np.array([adhesion_ratio(s, w > 0.5) for s, w in zip(self["surface"], wheeled, strict=True)])
+            on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
+            adhesion = np.array([adhesion_ratio(s, t) for s, t in zip(self["surface"], on_tracks, strict=True)])
         return Conditions(
-            voltage=self["supply_voltage_V"],
-            slope_deg=self["slope_deg"],
-            payload=self["payload_kg"],
-            configuration=wheeled,
+            which,
+            self["supply_voltage_V"],
+            self["slope_deg"],
+            self["payload_kg"],
+            battery=battery,
+            discharge=discharge,
             adhesion=adhesion,
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
-            **conditions,
         )
 
 
@@ -113,10 +170,10 @@ def read(source: str | Path, *, measured: bool = True) -> Runs:
 
     Args:
         source: `measured`, `simulated_by_paper`, or a path.
-        measured: whether the measured columns are required; without them `total_mass_kg` may be missing too.
+        measured: whether at least one channel is required; without any `total_mass_kg` may be missing too.
 
     Raises:
-        BadData: no such file, nothing in it, a missing, misspelt or repeated column, a row of another
+        BadData: no such file, nothing in it, no channel, a missing, misspelt or repeated column, a row of another
             length, or a cell that is no number, not finite or out of range; said with file, row (counted
             from 1 below the header), column, value and what is allowed.
     """
@@ -137,14 +194,12 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
         raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
     rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     if not rows:
-        raise BadData(f"{name}: the file is empty; expected a header with {', '.join(INPUT_COLUMNS)}")
+        expected = ", ".join((*REQUIRED, *measured_columns()))
+        raise BadData(f"{name}: the file is empty; expected a header with {expected}")
     header = [cell.strip() for cell in rows[0]]
     if len(header) == 1 and ";" in header[0]:
         raise BadData(f"{name}: columns are separated by semicolons; expected commas, and points in numbers")
-    required = (
-        INPUT_COLUMNS if measured else tuple(c for c in INPUT_COLUMNS if c not in MEASURED and c != "total_mass_kg")
-    )
-    _check_header(name, header, required)
+    _check_header(name, header, measured)
     if len(rows) == 1:
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     for k, row in enumerate(rows[1:], 1):
@@ -152,41 +207,50 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
             raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
     columns: dict[str, np.ndarray] = {}
     for j, column in enumerate(header):
-        if column in KNOWN_COLUMNS:
+        if column in known_columns():
             cells = [row[j].strip() for row in rows[1:]]
             columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
     _check_mass(name, columns)
-    unknown = tuple(c for c in header if c not in KNOWN_COLUMNS)
+    _check_deviations(name, columns)
+    unknown = tuple(c for c in header if c not in known_columns())
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest())
 
 
-def _check_header(name: str, header: list[str], required: tuple[str, ...]) -> None:
+def _check_header(name: str, header: list[str], measured: bool) -> None:
     repeated = sorted({c for c in header if header.count(c) > 1})
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
-    missing = [c for c in required if c not in header]
-    for column in missing:
-        close = difflib.get_close_matches(column, [c for c in header if c not in KNOWN_COLUMNS], 1, 0.6)
-        got = f"; is {close[0]} meant?" if close else ""
-        raise BadData(f"{name}: column {column} is missing{got} (required: {', '.join(required)})")
-    for column in (c for c in header if c not in KNOWN_COLUMNS):
-        free = [c for c in KNOWN_COLUMNS if c not in header]
-        close = difflib.get_close_matches(column, free, 1, 0.85)
+    known = known_columns()
+    strange = [c for c in header if c not in known]
+    required = REQUIRED if measured else tuple(c for c in REQUIRED if c not in OWN)
+    for column in (c for c in (*required, *measured_columns()) if c not in header):
+        close = difflib.get_close_matches(column, strange, 1, 0.6)
+        if column in required or close:
+            got = f"; is {close[0]} meant?" if close else ""
+            raise BadData(f"{name}: column {column} is missing{got} (required: {', '.join(required)})")
+    if measured and not any(c in header for c in measured_columns()):
+        raise BadData(f"{name}: no column of a channel; expected at least one of {', '.join(measured_columns())}")
+    for column in strange:
+        close = difflib.get_close_matches(column, [c for c in known if c not in header], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
-def _cell(where: str, column: str, cell: str, kind: type[DoorError] = BadData) -> Any:
-    def refuse(allowed: str) -> DoorError:
+def _cell(where: str, column: str, cell: str, kind: type[InputError] = BadData) -> Any:
+    def refuse(allowed: str) -> InputError:
         return kind(f"{where}, {column}: got {cell or 'an empty cell'}; expected {allowed}")
 
     if column in WORDS:
-        known = {"configuration": CONFIGURATIONS, "surface": tuple(SURFACES)}.get(column)
-        if known is not None and cell not in known:
-            raise refuse(f"one of these; {choices(cell, known)}")
+        if column == "surface" and cell not in SURFACES:
+            raise refuse(f"one of these; {choices(cell, SURFACES)}")
+        if column == "configuration" and not cell:
+            raise refuse("the name of one of the robot's configurations")
         return cell
-    low, high = (CONDITIONS | MEASURED | DEVIATIONS | TIME)[column]
-    positive = column in DEVIATIONS or column == "supply_voltage_V"
+    deviations = [c.sd_column for c in channels.CHANNELS]
+    if not cell and column in (*measured_columns(), *deviations):
+        return math.nan
+    low, high = _ranges()[column]
+    positive = column in deviations or column == "supply_voltage_V"
     allowed = f"{'more than ' if positive else ''}{number(low)} to {number(high)}"
     try:
         value = float(cell)
@@ -203,6 +267,17 @@ def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
     for row, (total, payload) in enumerate(zip(columns["total_mass_kg"], columns["payload_kg"], strict=True), 1):
         if total <= payload:
             raise BadData(_too_light(f"{name} row {row}", total, payload))
+
+
+def _check_deviations(name: str, columns: dict[str, np.ndarray]) -> None:
+    for channel in channels.CHANNELS:
+        if channel.column in columns and channel.sd_column in columns:
+            lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
+            if lost.any():
+                raise BadData(
+                    f"{name} row {int(np.flatnonzero(lost)[0]) + 1}, {channel.sd_column}: got an empty cell beside a "
+                    f"reading; expected its sd, more than 0 {channel.unit}"
+                )
 
 
 def _too_light(where: str, total: float, payload: float) -> str:

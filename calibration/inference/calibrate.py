@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import checks
-from calibration.data import noise as noise_room
-from calibration.data.noise import Noise
+from calibration.inference import checks
+from calibration.inference import noise as noise_room
+from calibration.inference.noise import Noise
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, priors, problem

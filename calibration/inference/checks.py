@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.errors import BadConfiguration, BadData, number
-from calibration.data.noise import Noise
+from calibration.inference.noise import Noise
 from calibration.data.runs import CONDITIONS, MEASURED, Runs
 from calibration.inference.problem import SETTLED, is_series
 from mmrjax.fidelities.drive import drive_batch

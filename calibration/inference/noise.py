@@ -1,0 +1,116 @@
+"""Standard deviations of the measured channels: from the file's columns, as stated, or to be estimated."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+
+from calibration.data.errors import BadConfiguration, BadData, choices
+from calibration.data.runs import Runs
+from mmrjax import channels
+
+#: Shares of the reading that the estimate starts from and does not fall below [-].
+START, FLOOR = 0.02, 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """Where the sds come from, and what they are.
+
+    Attributes:
+        sd: [SI], shape (rows, channels); the first guess where estimated, 1 where there is no reading.
+        estimated: whether a channel's sd is to be estimated from the misfit, shape (channels,).
+        source: one word a channel: `columns`, `stated`, `estimated`, `assumed`, or `no readings`.
+    """
+
+    sd: np.ndarray
+    estimated: np.ndarray
+    source: tuple[str, ...]
+
+
+def parse(text: str) -> dict[int, tuple[float, bool]]:
+    """`current=2%,motor_speed=0.5%,speed=1%` (or `current=0.05A,motor_speed=30rpm,speed=5mm/s`).
+
+    Returns:
+        Position of the channel → (number, whether it is a share of the reading); absolute ones in SI.
+
+    Raises:
+        BadConfiguration: an unknown channel, no positive number, or another unit.
+    """
+    words = {c.word: k for k, c in enumerate(channels.CHANNELS)}
+    known = words | {c.name: k for k, c in enumerate(channels.CHANNELS)}
+    found: dict[int, tuple[float, bool]] = {}
+    for part in text.split(","):
+        name, _, value = part.strip().partition("=")
+        if name not in known:
+            raise BadConfiguration(f"--noise {part.strip()}: no such channel; {choices(name, words)}")
+        k = known[name]
+        channel = channels.CHANNELS[k]
+        match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
+        form = f"expected a positive number with % or {channel.unit}, e.g. {name}=2% or {name}=0.1{channel.unit}"
+        try:
+            size = float(match[1]) if match else math.nan
+        except ValueError:
+            size = math.nan
+        if match is None or not size > 0 or math.isinf(size) or match[2] not in ("%", channel.unit):
+            raise BadConfiguration(f"--noise {part.strip()}: {form}")
+        relative = match[2] == "%"
+        found[k] = (size / 100 if relative else size * channel.factor, relative)
+    return found
+
+
+def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
+    """Noise of a table: `stated` channels as stated, else the file's sd columns, else to be estimated.
+
+    Args:
+        sizes: of each reading [SI], that a share of the reading is of, see `Observer.sizes`; shape (rows, channels).
+        stated: as `parse`.
+
+    Raises:
+        BadConfiguration: as `parse`.
+        BadData: a channel that reads zero everywhere and has no stated sd.
+    """
+    shares = parse(stated) if stated else {}
+    measured, columns = runs.measured(), runs.deviations()
+    sd, source = np.ones_like(measured), []
+    for k, channel in enumerate(channels.CHANNELS):
+        there = np.isfinite(measured[:, k])
+        if not there.any():
+            source.append("no readings")
+            continue
+        if k not in shares and runs.has(channel.sd_column):
+            sd[:, k] = np.where(there, columns[:, k], 1.0)
+            source.append("columns")
+            continue
+        size, relative = shares.get(k, (START, True))
+        if relative and not np.any(measured[there, k] != 0):
+            raise BadData(
+                f"{runs.source}: {channel.name} reads 0 in every row; state its sd, e.g. --noise in {channel.unit}"
+            )
+        sd[:, k] = np.where(there, size * sizes[:, k] if relative else size, 1.0)
+        source.append("stated" if k in shares else "estimated")
+    return Noise(sd, np.array([s == "estimated" for s in source]), tuple(source))
+
+
+def default() -> str:
+    """What the loop takes sds to be where neither the file nor the user says: averages of at least three repeats,
+    printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2."""
+    return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in channels.CHANNELS)
+
+
+def assumed(runs: Runs, sizes: np.ndarray, stated: str | None = None, factor: float = 1.0) -> Noise:
+    """As `of`, with `default` times `factor` where a channel's sd would have to be estimated.
+
+    Raises:
+        BadConfiguration, BadData: as `of`.
+    """
+    known = of(runs, sizes, stated)
+    if not known.estimated.any():
+        return known
+    guess = of(runs, sizes, default())
+    sd = np.where(known.estimated, factor * guess.sd, known.sd)
+    words = tuple("assumed" if e else w for e, w in zip(known.estimated, known.source, strict=True))
+    return Noise(sd, np.zeros(len(words), bool), words)
