@@ -11,14 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference import checks
-from calibration.inference import noise as noise_room
-from calibration.inference.noise import Noise
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
-from calibration.inference import identifiability, priors, problem
+from calibration.inference import checks, identifiability, priors, problem
+from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.identifiability import Identifiability, Profile
+from calibration.inference.noise import Noise
 from calibration.inference.problem import Data, Problem
 from mmrjax.robot import Robot
 
