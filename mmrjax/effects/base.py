@@ -47,8 +47,8 @@ class Effect(eqx.Module):
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
             temperature, a phase); None has none. A run starts with memory 0.
         memory_unit: unit of its memory.
-        configurations: a field, of each instance: names of the configurations that it acts on; none: all, or
-            those with its `movers`. A robot file states it as `configurations = ["4W2T"]`.
+        configurations: names of the configurations that it acts on; none: all, or those with its `movers`. A
+            field: what a class states is the default, and a robot file may say `configurations = ["4W2T"]`.
 
     An effect with a memory defines `rate`, and `settled` for the fidelities that keep no memory.
     """
@@ -72,6 +72,10 @@ class Effect(eqx.Module):
         super().__init_subclass__(**keywords)
         if "name" not in vars(cls):
             cls.name = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+        # Stated beside the class attributes, it is the default of the field.
+        if isinstance(stated := vars(cls).get("configurations"), tuple):
+            cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": tuple[str, ...]}
+            cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
 
     @property
     def acts_everywhere(self) -> bool:
@@ -81,8 +85,8 @@ class Effect(eqx.Module):
     def acts(self, robot: Robot, signals: Signals) -> Scalar:
         """1 in configurations on which it acts, else 0 [-]: those that it names, else those with its `movers`."""
         if self.configurations:
-            named = [robot.configurations.index(n) for n in self.configurations if n in robot.configurations]
-            return sum((jnp.where(signals.configuration == k, 1.0, 0.0) for k in named), jnp.zeros(()))
+            named = {robot.configurations.index(n) for n in self.configurations if n in robot.configurations}
+            return sum((jnp.where(signals.configuration == k, 1.0, 0.0) for k in sorted(named)), jnp.zeros(()))
         return signals.on_tracks if self.movers == "tracks" else 1 - signals.on_tracks
 
     @abc.abstractmethod
