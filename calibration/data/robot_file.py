@@ -122,11 +122,11 @@ def change(robot: Robot, values: dict[str, Any], where: str) -> Robot:
         if not math.isfinite(value) or not low <= value <= high:
             raise BadConfiguration(f"{where}, {name}: got {number(value)}; expected {allowed_text}")
     robot = params.replace(robot, {k: jnp.asarray(v, float) for k, v in values.items()})  # type: ignore[assignment]
-    for gear in ("tracked", "wheeled"):
-        friction = getattr(robot, gear).ground.friction
+    for name, chassis in robot.configurations.items():
+        friction = chassis.ground.friction
         if friction.speed_dynamic <= friction.speed_static:
             raise BadConfiguration(
-                f"{where}, {gear}.ground.friction.speed_dynamic: got {float(friction.speed_dynamic):g}; "
+                f"{where}, {name}.ground.friction.speed_dynamic: got {float(friction.speed_dynamic):g}; "
                 f"expected more than speed_static, {float(friction.speed_static):g} m/s"
             )
     for effect in robot.effects:
