@@ -11,6 +11,7 @@ from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import CONDITIONS, Runs
 from calibration.inference import observers
 from calibration.inference.noise import Noise
+from mmrjax import channels
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED
