@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
 import tomllib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,7 @@ def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
 
     The file states `schema` (optional), `base` (a robot's name, `nominal` if left out), and tables of
     parameters by dotted name in SI units, e.g. `[motor] resistance = 0.9`; an effect is present when its
-    table `[effects.NAME]` is.
+    table `[effects.NAME]` is, which may name the `configurations` that it acts on.
 
     Raises:
         BadConfiguration: not TOML, an unknown key (with the choices), a value that is no number, not
@@ -63,14 +65,41 @@ def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
     for name in present:
         if name not in library and name not in effects.UNNAMED:
             raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
-    robot = with_effects(robot, tuple(present), library)
+    tables = {name: table for name, table in present.items() if isinstance(table, dict)}
+    acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
+    robot = with_effects(robot, tuple(present), library, acting, where=path.name)
     return change(robot, dict(_flatten(content)), where=path.name)
 
 
-def with_effects(robot: Robot, names: tuple[str, ...], library: Library = effects.BY_NAME) -> Robot:
-    """The robot with these effects of `library`, or curves, present, each with amplitude 0."""
+def with_effects(
+    robot: Robot,
+    names: Sequence[str],
+    library: Library = effects.BY_NAME,
+    configurations: Mapping[str, Any] | None = None,
+    where: str = "effects",
+) -> Robot:
+    """The robot with these effects of `library`, or curves, present, each with amplitude 0.
+
+    Args:
+        configurations: by an effect's name, a list of those that it acts on; others keep their class's default.
+        where: opens the message of an error.
+
+    Raises:
+        BadConfiguration: configurations of an effect that are no list of names, or that the robot does not have.
+    """
     known = {**effects.UNNAMED, **library}
-    return dataclasses.replace(robot, effects=tuple(known[name]() for name in names))
+    present = []
+    for name in names:
+        effect = known[name]()
+        acting = (configurations or {}).get(name, effect.configurations)
+        here = f"{where}, effects.{name}.configurations"
+        if not isinstance(acting, list | tuple) or not all(isinstance(c, str) for c in acting):
+            raise BadConfiguration(f"{here}: got {acting!r}; expected a list of {', '.join(robot.configurations)}")
+        for c in acting:
+            if c not in robot.configurations:
+                raise BadConfiguration(f"{here}: got {c}; {choices(c, robot.configurations)}")
+        present.append(dataclasses.replace(effect, configurations=tuple(acting)))
+    return dataclasses.replace(robot, effects=tuple(present))
 
 
 def change(robot: Robot, values: dict[str, Any], where: str) -> Robot:
@@ -115,10 +144,15 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
     lines += [f'schema = "{SCHEMA}"', 'base = "nominal"']
     table = ""
     start = {p.name: float(p.value) for p in params.walk(nominal.nominal())}
+    acting = {
+        f"effects.{e.name}": e.configurations for e in robot.effects if e.configurations or type(e)().configurations
+    }
     for parameter in params.walk(robot):
         head, _, key = parameter.name.rpartition(".")
         if head != table:
             lines += ["", f"[{head}]"]
+            if head in acting:
+                lines.append(f"configurations = {json.dumps(acting[head])}  # on which it acts")
             table = head
         spec, value = parameter.spec, float(parameter.value)
         was = start.get(parameter.name, 0.0)
