@@ -38,7 +38,10 @@ _Set = Annotated[
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
 ]
-_Configuration = Annotated[str, typer.Option(help="6T2A (tracked) or 4W2T (wheeled).")]
+_Configuration = Annotated[
+    str | None,
+    typer.Option(help="One of the robot's, such as 6T2A or 4W2T of the packaged one.  \\[default: its first]"),
+]
 _Voltage = Annotated[float, typer.Option(help="Supply voltage (V).")]
 _Slope = Annotated[float, typer.Option(help="Slope, positive uphill (deg).")]
 _Payload = Annotated[float, typer.Option(help="Additional load mass (kg).")]
@@ -73,7 +76,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command(epilog="Example: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive")
 def simulate(
-    configuration: _Configuration = "6T2A",
+    configuration: _Configuration = None,
     voltage: _Voltage = 33.0,
     slope: _Slope = 0.0,
     payload: _Payload = 0.0,
@@ -105,14 +108,11 @@ def simulate(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
         discharge_mAh=discharge, report=report,
     )  # fmt: skip
-    resolved = _prepared(config.resolve(config.History, None, options))
-    from sweeps import commands
+    resolved = _prepared(config.resolve(config.Simulate, None, options))
+    from sweeps import simulate as room
 
-    if runs is not None:
-        table = commands.read_runs(str(runs), measured=False)
-    else:
-        table = _one_run(configuration, voltage, slope, payload, mass, surface)
-    return commands.simulate(resolved, table, out, force)
+    cells = _cells(configuration, voltage, slope, payload, mass, surface)
+    return room.simulate(resolved, cells if runs is None else str(runs), out, force)
 
 
 @app.command(
@@ -120,7 +120,9 @@ def simulate(
     "--set 6T2A.ground.friction.static=0.6"
 )
 def sweep(
-    configurations: Annotated[str | None, typer.Option(help="Comma-separated.  \\[default: 6T2A,4W2T]")] = None,
+    configurations: Annotated[
+        str | None, typer.Option(help="Comma-separated, of the robot's.  \\[default: all that it has]")
+    ] = None,
     voltages: Annotated[str | None, typer.Option(help="Supply voltages (V).  \\[default: 15,24,33]")] = None,
     payloads: Annotated[
         str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8]")
@@ -171,9 +173,9 @@ def sweep(
         "surface": surface,
     }
     resolved = _prepared(config.resolve(config.Sweep, config_file, options))
-    from sweeps import commands
+    from sweeps import sweep as room
 
-    return commands.sweep(resolved, out, force)
+    return room.sweep(resolved, out, force)
 
 
 @app.command(epilog="Example: mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")
@@ -200,10 +202,10 @@ def compare(
     options = _options(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
     )
-    resolved = _prepared(config.resolve(config.Simulation, None, options))
-    from sweeps import commands
+    resolved = _prepared(config.resolve(config.Compare, None, options))
+    from sweeps import compare as room
 
-    return commands.compare(resolved, data, own_mass, out, force)
+    return room.compare(resolved, data, own_mass, out, force)
 
 
 @app.command(epilog="Example: mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20")
@@ -212,7 +214,7 @@ def render(
     begin: Annotated[float, typer.Option(help="Instant of a picture, first one of a film (s).")] = 0.8,
     end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  \\[default: begin + 0.1]")] = None,
     slow: Annotated[float, typer.Option(help="How many times slower than life a film runs.", min=0.01)] = 20.0,
-    configuration: _Configuration = "6T2A",
+    configuration: _Configuration = None,
     voltage: _Voltage = 33.0,
     slope: _Slope = 0.0,
     payload: _Payload = 0.0,
@@ -234,7 +236,6 @@ def render(
     from sweeps import config
 
     options = _options(
-        model="track",
         duration_s=duration,
         step_s=step,
         robot=robot,
@@ -243,12 +244,12 @@ def render(
         battery=battery,
         discharge_mAh=discharge,
     )
-    resolved = _prepared(config.resolve(config.History, None, options))
-    from sweeps import commands
+    resolved = _prepared(config.resolve(config.Render, None, options))
+    from sweeps import render as room
 
-    table = _one_run(configuration, voltage, slope, payload, mass, surface)
+    cells = _cells(configuration, voltage, slope, payload, mass, surface)
     end = begin + 0.1 if end is None else end
-    return commands.render(resolved, table, file, begin, end, slow, force)
+    return room.render(resolved, cells, file, begin, end, slow, force)
 
 
 @app.command(epilog="Example: mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted")
@@ -342,7 +343,7 @@ def loop(
     options = _options(robot=robot, set=set_, effects=effects, report=report) | {
         "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
     }  # fmt: skip
-    resolved = config.resolve(config.Loop, None, options)
+    resolved = _prepared(config.resolve(config.Loop, None, options))
     from sweeps import loop as room
 
     return room.loop(resolved, data, out, force)
@@ -370,22 +371,22 @@ def _prepared(resolved: Any) -> Any:
     XLA's CPU executor (jax 0.10.2); with this flag none of twelve did (docs/benchmarks.md). Whoever sets
     XLA_FLAGS, be it to nothing, is heeded.
     """
-    if resolved.model == "track":
+    if getattr(resolved, "model", None) == "track":
         os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
     return resolved
 
 
-def _one_run(configuration: str, voltage: float, slope: float, payload: float, mass: float | None,
-             surface: str) -> Any:  # fmt: skip
-    from calibration.data import runs as records
-
-    cells: dict[str, Any] = {
+def _cells(
+    configuration: str | None, voltage: float, slope: float, payload: float, mass: float | None, surface: str
+) -> dict[str, Any]:
+    """One run by the columns of a table of runs; None is left to the robot."""
+    return {
         "configuration": configuration, "supply_voltage_V": voltage, "payload_kg": payload, "slope_deg": slope,
-        "surface": surface,
+        "surface": surface, "total_mass_kg": mass,
     }  # fmt: skip
-    if mass is not None:
-        cells["total_mass_kg"] = mass
-    return records.single(cells)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""What a command is told: options and TOML files, checked into one frozen record."""
+"""What a command is told: options and TOML files, checked into one frozen record, composed of the parts that apply."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import CONDITIONS
-from mmrjax.tables import BENCH, CONFIGURATIONS, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 
 Model = Literal["steady", "drive", "track"]
 #: Length of a run [s] and runs in one vmapped call, by fidelity, where none is stated.
@@ -23,36 +23,45 @@ _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "paylo
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(gt=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
+Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 
-class Simulation(BaseModel):
-    """What every simulating command needs to know.
-
-    Attributes:
-        model: fidelity.
-        duration_s: length of a run of `drive` or `track` [s]; None takes `DURATION`.
-        step_s: integration step of `track` [s].
-        robot: name of a robot, or path of its TOML file.
-        set: parameters to change, by dotted name, in SI units.
-        effects: Python files with effects of the user's own, see `calibration.data.effect_file`.
-        battery: run on the on-board battery instead of the external supply.
-        discharge_mAh: charge already taken from the battery.
-        chunk: runs in one vmapped call; None takes `CHUNK`.
-        report: whether to write report.html.
-    """
+class Part(BaseModel):
+    """A part of a command's configuration; unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    model: Model = "steady"
-    duration_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = None
-    step_s: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = STEP
+
+class RobotPart(Part):
+    """Which robot.
+
+    Attributes:
+        robot: name of a robot, or path of its TOML file.
+        set: parameters to change, by dotted name, in SI units.
+        effects: Python files with effects of the user's own, see `calibration.data.effect_file`.
+    """
+
     robot: str = "nominal"
     set: dict[str, float] = {}
     effects: tuple[str, ...] = ()
-    battery: bool = False
-    discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
-    chunk: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
-    report: bool = True
+
+
+class ModelPart(Part):
+    """Which fidelity."""
+
+    model: Model = "steady"
+
+
+class FidelityPart(ModelPart):
+    """Which fidelity simulates, and how.
+
+    Attributes:
+        duration_s: length of a run of `drive` or `track` [s]; None takes `DURATION`.
+        step_s: integration step of `track` [s].
+    """
+
+    duration_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = None
+    step_s: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = STEP
 
     @model_validator(mode="after")
     def _acts(self) -> Self:
@@ -60,8 +69,6 @@ class Simulation(BaseModel):
             raise PydanticCustomError("idle", "duration_s acts with model drive or track only")
         if self.step_s != STEP and self.model != "track":
             raise PydanticCustomError("idle", "step_s acts with model track only")
-        if self.discharge_mAh and not self.battery:
-            raise PydanticCustomError("idle", "discharge_mAh acts with battery only")
         return self
 
     @property
@@ -72,64 +79,136 @@ class Simulation(BaseModel):
     @property
     def runs_at_once(self) -> int:
         """Runs in one vmapped call."""
-        return self.chunk or CHUNK[self.model]
+        return CHUNK[self.model]
 
 
-class History(Simulation):
-    """A few given runs, shown from standstill: short enough that the start is seen."""
+class BatchPart(FidelityPart):
+    """How many runs at once.
+
+    Attributes:
+        chunk: runs in one vmapped call; None takes the fidelity's.
+    """
+
+    chunk: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
 
     @property
-    def duration(self) -> float:
-        return min(super().duration, 5.0) if self.duration_s is None else self.duration_s
+    def runs_at_once(self) -> int:
+        """Runs in one vmapped call."""
+        return self.chunk or super().runs_at_once
 
 
-class Sweep(Simulation):
-    """A grid of runs: every combination of the axes; Table 8 in both configurations by default."""
+class SupplyPart(Part):
+    """What feeds the motors.
 
-    configurations: Annotated[tuple[Literal["6T2A", "4W2T"], ...], Field(min_length=1)] = CONFIGURATIONS
+    Attributes:
+        battery: run on the on-board battery instead of the external supply.
+        discharge_mAh: charge already taken from the battery.
+    """
+
+    battery: bool = False
+    discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
+
+    @model_validator(mode="after")
+    def _feeds(self) -> Self:
+        if self.discharge_mAh and not self.battery:
+            raise PydanticCustomError("idle", "discharge_mAh acts with battery only")
+        return self
+
+
+class GridPart(Part):
+    """The axes of a grid, Table 8 by default.
+
+    Attributes:
+        configurations: of the robot, by name; None takes all that it has.
+    """
+
+    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] = VOLTAGES_V
     payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
     slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] = SLOPES_DEG
     surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]
 
 
-class Calibrate(Simulation):
-    """What a calibration needs to know beside the data.
+class InferencePart(Part):
+    """What is known before the data speak.
+
+    Attributes:
+        prior: `name=value±sd` in SI units, in place of the fields' priors.
+        noise: `current=2%,motor_speed=0.5%,speed=1%`; empty takes the file's sd columns, else an assumption or an
+            estimate, which is said.
+        seed: of everything random.
+    """
+
+    prior: tuple[str, ...] = ()
+    noise: str = ""
+    seed: Seed = 0
+
+
+class OutputPart(Part):
+    """What is written beside the numbers.
+
+    Attributes:
+        report: whether to write report.html.
+    """
+
+    report: bool = True
+
+
+class Simulate(RobotPart, FidelityPart, SupplyPart, OutputPart):
+    """A few given runs, with `drive` and `track` from standstill: short enough that the start is seen."""
+
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return min(super().duration, 5.0) if self.duration_s is None else self.duration_s
+
+
+class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, OutputPart):
+    """A grid of runs: every combination of the axes."""
+
+
+class Compare(RobotPart, FidelityPart, OutputPart):
+    """The runs of a measured table."""
+
+
+class Render(RobotPart, FidelityPart, SupplyPart):
+    """One run of the fidelity that can be drawn."""
+
+    model: Literal["track"] = "track"
+
+
+class Reproduce(RobotPart, ModelPart):
+    """The paper's figures and tables."""
+
+
+class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
+    """A calibration beside its data.
 
     Attributes:
         free, fix: parameters to free (`default` stands for the default set) and to hold, by dotted name.
-        prior: `name=value±sd` in SI units, in place of the fields' priors.
-        noise: `current=2%,motor_speed=0.5%,speed=1%`; empty takes the file's sd columns, or estimates.
-        starts: searches; seed: of their draws.
+        starts: searches.
         profiles: whether to profile every parameter.
         hold_out: whether to fit again without each block. None leaves these three to the fidelity.
     """
 
     free: tuple[str, ...] = ()
     fix: tuple[str, ...] = ()
-    prior: tuple[str, ...] = ()
-    noise: str = ""
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
     profiles: bool | None = None
     hold_out: bool | None = None
 
 
-class Loop(Simulation):
-    """What the closed loop needs to know beside the data.
+class Loop(RobotPart, InferencePart, OutputPart):
+    """The closed loop beside its data.
 
     Attributes:
-        prior, noise: as for `Calibrate`; noise not stated and in no column is assumed, and said so.
-        replicates: of the bootstrap; seed: of everything random.
+        replicates: of the bootstrap.
     """
 
-    prior: tuple[str, ...] = ()
-    noise: str = ""
     replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
-    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
 
 
-C = TypeVar("C", bound=Simulation)
+C = TypeVar("C", bound=Part)
 
 
 def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
@@ -155,7 +234,7 @@ def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
         raise BadConfiguration(_sentence(kind, error, file, given)) from None
 
 
-def _sentence(kind: type[Simulation], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
+def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given: dict[str, Any]) -> str:
     first = error.errors()[0]
     if first["type"] == "idle":
         return f"{file.name if file is not None else 'options'}: {first['msg']}"
@@ -228,13 +307,13 @@ def axis(option: str, text: str | None) -> tuple[float, ...] | None:
     return tuple(values)
 
 
-def as_toml(config: Simulation) -> str:
+def as_toml(config: Part) -> str:
     """The resolved configuration; `--config` accepts it."""
     lines = []
     values = config.model_dump()
     table = values.pop("set")
     for key, value in values.items():
-        if value is None:  # left to the fidelity
+        if value is None:  # left to the fidelity or the robot
             continue
         lines.append(f"{key} = {_toml(value)}")
     lines += ["", "[set]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]

@@ -7,12 +7,19 @@ import itertools
 import numpy as np
 
 from calibration.data.runs import Runs
-from sweeps.config import Sweep
+from mmrjax.robot import Robot
+from sweeps.config import GridPart
+from sweeps.inputs import check_configurations
 
 
-def grid(config: Sweep) -> Runs:
-    """Every combination of the axes as a table of conditions, slope varying fastest."""
-    points = list(itertools.product(config.configurations, config.voltages_V, config.payloads_kg, config.slopes_deg))
+def grid(config: GridPart, robot: Robot) -> Runs:
+    """Every combination of the axes as a table of conditions, slope varying fastest.
+
+    Raises:
+        BadConfiguration: a configuration that the robot does not have.
+    """
+    names = configurations(config, robot)
+    points = list(itertools.product(names, config.voltages_V, config.payloads_kg, config.slopes_deg))
     configuration, voltage, payload, slope = (np.array(column) for column in zip(*points, strict=True))
     return Runs(
         source="the grid",
@@ -24,3 +31,15 @@ def grid(config: Sweep) -> Runs:
             "surface": np.full(len(points), config.surface),
         },
     )
+
+
+def configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:
+    """The configurations of a grid: those stated, each of which the robot has, or all of the robot's.
+
+    Raises:
+        BadConfiguration: one that the robot does not have.
+    """
+    if config.configurations is None:
+        return robot.configurations.names
+    check_configurations(robot, config.configurations, "configurations")
+    return config.configurations

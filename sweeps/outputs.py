@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data.runs import MM, RPM
+from mmrjax import channels
+from mmrjax.channels import MM
 from mmrjax.signals import FLAGS, STATUSES, Result
 
-#: Number columns: name → (number out of a result, unit as a factor).
+#: Number columns beside the channels': name → (number out of a result, unit as a factor).
 OUTPUTS: dict[str, tuple[Callable[[Result], Any], float]] = {
-    "total_current_A": (lambda r: r.reading.total_current, 1.0),
-    "motor_speed_rpm": (lambda r: r.reading.motor_speed, RPM),
-    "speed_mm_s": (lambda r: r.reading.speed, MM),
     "theoretical_speed_mm_s": (lambda r: r.theoretical_speed, MM),
     "slip": (lambda r: r.slip, 1.0),
     "voltage_V": (lambda r: r.voltage, 1.0),
@@ -34,11 +32,17 @@ OUTPUTS: dict[str, tuple[Callable[[Result], Any], float]] = {
 
 def columns(result: Result) -> dict[str, np.ndarray]:
     """A batch of results, shape (rows,), in the units and words of `runs.csv`."""
-    columns = {name: np.asarray(pick(result)) / unit for name, (pick, unit) in OUTPUTS.items()}
+    columns = readings(result.reading)
+    columns |= {name: np.asarray(pick(result)) / unit for name, (pick, unit) in OUTPUTS.items()}
     columns["status"] = np.array(STATUSES)[np.asarray(result.status)]
     bits = np.asarray(result.flags)
     columns["flags"] = np.array([";".join(f for k, f in enumerate(FLAGS) if b >> k & 1) for b in bits], dtype=str)
     return columns
+
+
+def readings(reading: dict[str, Any]) -> dict[str, np.ndarray]:
+    """What the instruments show, by column, in the columns' units."""
+    return {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.CHANNELS}
 
 
 def columns_track(trajectory: Any) -> dict[str, np.ndarray]:

@@ -1,48 +1,52 @@
-"""Runs many operating points in chunks of one vmapped call, and makes the table of what came out."""
+"""Runs many operating points in chunks of one vmapped call, and leaves the table of what came out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.power import COULOMB_PER_MAH
-from mmrjax.robot import CONFIGURATIONS, Robot
-from mmrjax.signals import STATUSES
+from mmrjax.robot import Robot
+from mmrjax.signals import FLAGS, STATUSES
+from sweeps import config as configuration
 from sweeps import outputs
-from sweeps.config import Simulation
-from sweeps.store import RunFolder
+from sweeps.config import FidelityPart, Part, SupplyPart
+from sweeps.console import progress as bar
+from sweeps.console import say
+from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder
 
 if TYPE_CHECKING:
     from mmrjax.fidelities.track import Trajectory
 
 
 def simulate(
-    robot: Robot, command: Conditions, config: Simulation, progress: Callable[[float], None]
+    robot: Robot, conditions: Conditions, config: FidelityPart, progress: Callable[[float], None]
 ) -> dict[str, np.ndarray]:
     """One batch in the fidelity that the configuration names: the columns that it adds to its runs.
 
     `progress` is told by the track model alone, which takes long, the share that is done.
     """
     if config.model == "steady":
-        return outputs.columns(jax.device_get(steady_batch(robot, command)))
+        return outputs.columns(jax.device_get(steady_batch(robot, conditions)))
     if config.model == "drive":
-        answer = drive_batch(robot, command, jnp.array([0.0, config.duration]))
+        answer = drive_batch(robot, conditions, jnp.array([0.0, config.duration]))
         return outputs.columns(jax.device_get(answer.result))
-    run = track_runs(robot, command, config, rolling=True, progress=progress)
+    run = track_runs(robot, conditions, config, rolling=True, progress=progress)
     return outputs.columns_track(jax.device_get(run))
 
 
 def track_runs(
-    robot: Robot, command: Conditions, config: Simulation, *, rolling: bool, progress: Callable[[float], None]
+    robot: Robot, conditions: Conditions, config: FidelityPart, *, rolling: bool, progress: Callable[[float], None]
 ) -> Trajectory:
     """Runs of the track model, from standstill or rolling at the steady fidelity's speed.
 
@@ -53,39 +57,45 @@ def track_runs(
 
     try:
         return track.track_batch(
-            robot, command, duration=config.duration, step=config.step_s, rolling=rolling, progress=progress
+            robot, conditions, duration=config.duration, step=config.step_s, rolling=rolling, progress=progress
         )
     except ValueError as error:
         raise BadConfiguration(f"--model track: {error}") from error
 
 
-def _bear(robot: Robot, runs: Runs, config: Simulation) -> None:
+def _bear(robot: Robot, runs: Runs, config: FidelityPart) -> None:
     """Refuse a step that some run of any chunk cannot bear, before the first is simulated."""
     from mmrjax.fidelities import stability, track
     from mmrjax.running_gear import RunningGear
 
     try:
-        stability.refuse(robot, runs.command(), RunningGear(), config.step_s, track.SAMPLE)
+        stability.refuse(robot, runs.conditions(robot), RunningGear(), config.step_s, track.SAMPLE)
     except ValueError as error:
         raise BadConfiguration(f"--model track: {error}") from error
 
 
-def charge(config: Simulation) -> float:
-    """Charge already taken from the battery [C]."""
-    return config.discharge_mAh * COULOMB_PER_MAH
+def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
+    """The conditions of the runs, fed as the configuration says; without a say by the external supply."""
+    if not isinstance(config, SupplyPart):
+        return runs.conditions(robot)
+    return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
 
 
-def evaluate(
-    robot: Robot, runs: Runs, config: Simulation, folder: RunFolder, advance: Callable[[float], None]
-) -> dict[str, np.ndarray]:
-    """Simulate every run and return the table of conditions and outcomes.
+def evaluate(robot: Robot, runs: Runs, config: FidelityPart, folder: RunFolder) -> dict[str, np.ndarray]:
+    """Simulate every run and return the table of conditions and outcomes, with a bar where it takes long.
 
     Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
     The last chunk is filled up with its last run, so that all chunks share one compilation.
-
-    Args:
-        advance: called with the number of runs done since its last call; of a chunk under way, its share.
     """
+    slow = config.model == "track" or len(runs) > config.runs_at_once
+    with bar(len(runs), quiet=not slow) as advance:
+        return {**conditions(robot, runs), **_outcomes(robot, runs, config, folder, advance)}
+
+
+def _outcomes(
+    robot: Robot, runs: Runs, config: FidelityPart, folder: RunFolder, advance: Callable[[float], None]
+) -> dict[str, np.ndarray]:
+    # `advance` is called with the number of runs done since its last call; of a chunk under way, its share.
     size = min(config.runs_at_once, len(runs))
     if config.model == "track" and len(runs) > size:
         _bear(robot, runs, config)
@@ -97,16 +107,14 @@ def evaluate(
         part = folder.chunk(name)
         if part is None:
             told = shares(advance, count)
-            command = runs.where(rows).command(battery=float(config.battery), discharge=charge(config))
-            part = simulate(robot, command, config, told)
+            part = simulate(robot, commanded(robot, runs.where(rows), config), config, told)
             part = {key: value[:count] for key, value in part.items()}
             folder.keep_chunk(name, part)
             told(1.0)
         else:
             advance(count)
         parts.append(part)
-    outcome = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    return {**conditions(robot, runs), **outcome}
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
 def shares(advance: Callable[[float], None], count: int) -> Callable[[float], None]:
@@ -127,9 +135,8 @@ def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
     if runs.has("total_mass_kg"):
         columns["total_mass_kg"] = runs["total_mass_kg"]
     else:
-        tracked = runs["configuration"] == CONFIGURATIONS[0]
-        own = np.where(tracked, float(robot.configurations["6T2A"].mass), float(robot.configurations["4W2T"].mass))
-        columns["total_mass_kg"] = own + runs["payload_kg"]
+        own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
+        columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
     columns |= {key: runs[key] for key in ("payload_kg", "slope_deg")}
     columns |= {key: runs[key] for key in ("surface", "run_id") if runs.has(key)}
     return columns
@@ -138,3 +145,29 @@ def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
 def counts(table: dict[str, np.ndarray]) -> dict[str, int]:
     """How many runs ended in each status; every status is named."""
     return {status: int(np.sum(table["status"] == status)) for status in STATUSES}
+
+
+def leave(
+    folder: RunFolder,
+    config: FidelityPart,
+    robot: Robot,
+    table: dict[str, np.ndarray],
+    result: dict[str, Any],
+    runs: Runs,
+) -> int:
+    """Write what every simulating command leaves, and move the folder into place; returns the exit code.
+
+    Args:
+        folder: of the command; config: its configuration, with the robot's name.
+        table: of `evaluate`; result: what `result.json` holds beside the counts; runs: what was simulated.
+    """
+    folder.write_table("runs.csv", table)
+    folder.write_text("config.resolved.toml", configuration.as_toml(config))
+    robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
+    ended = counts(table)
+    flags = {name: int(np.sum(np.char.find(table["flags"], name) >= 0)) for name in FLAGS}
+    content = {**result, "model": config.model, "runs": len(table["status"]), "statuses": ended, "flags": flags}
+    folder.write_json("result.json", content)
+    path = folder.finish({"seed": None, "statuses": ended}, runs)
+    say(str(path))
+    return DONE if ended["converged"] == len(table["status"]) else SOME_NOT_CONVERGED

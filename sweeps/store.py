@@ -13,14 +13,20 @@ import platform
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from calibration.data.errors import BadConfiguration, InputError
 from calibration.data.runs import Runs
-from mmrjax import __version__
+from mmrjax import __version__, params
 
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+    from sweeps.config import RobotPart
+
+#: Exit codes of a command that is done: all runs converged, or some did not.
+DONE, SOME_NOT_CONVERGED = 0, 3
 #: Packages whose versions are part of a result.
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "lineax", "diffrax", "numpy")
 
@@ -142,6 +148,28 @@ class RunFolder:
                 self.path.rmdir()
         os.replace(self.partial, self.path)
         return self.path
+
+
+def open_folder(
+    command: str, config: RobotPart, robot: Robot, out: Path | None, force: bool, runs: Runs | None = None
+) -> RunFolder:
+    """The run folder of a command, whose identity is what it was told.
+
+    Args:
+        command: its name; config: its configuration; robot: the one that the configuration names, changes and all.
+        out: where the folder is to appear; None: a new one below `runs/`; force: replace an existing run folder.
+        runs: the table that it was given, if any.
+    """
+    import jax
+
+    identity = {
+        "command": command,
+        "program": f"{__version__}, jax {jax.__version__}, {jax.default_backend()}",
+        "config": config.model_dump(exclude={"report"}),
+        "robot": {p.name: float(p.value) for p in params.walk(robot)},
+        "runs": None if runs is None else {key: value.tolist() for key, value in runs.columns.items()},
+    }
+    return RunFolder(out or default_path(command), identity, force=force)
 
 
 def provenance() -> dict[str, Any]:

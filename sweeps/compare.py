@@ -1,0 +1,124 @@
+"""The command `compare`: a simulation set against a table of measured runs, equation (35) and R² of (A1)."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from calibration.data import runs as records
+from calibration.inference import errors as residual
+from mmrjax import channels
+from mmrjax.signals import STATUSES
+from sweeps import config as configuration
+from sweeps import run
+from sweeps.console import say
+from sweeps.inputs import load_robot, read_runs
+from sweeps.store import open_folder
+
+#: Group → channel → rows, rms_percent, max_percent, r2, missing.
+Summary = dict[str, dict[str, dict[str, Any]]]
+
+
+def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
+    """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
+    robot = load_robot(config)
+    stated = runs = read_runs(source, robot, measured=True)
+    if own_mass:
+        runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
+    with open_folder("compare", config, robot, out, force, runs) as folder:
+        table = run.evaluate(robot, runs, config, folder)
+        comparison, summary = compared(stated, table)
+        folder.write_table("comparison.csv", comparison)
+        notes = missing(comparison)
+        print_comparison(comparison, summary, notes)
+        if config.report:
+            from sweeps import report_comparison
+
+            report_comparison.write(
+                folder.partial, robot=robot, robot_name=config.robot, model=config.model, data_name=runs.source,
+                table=comparison, summary=summary, notes=notes,
+            )  # fmt: skip
+        result = {"schema": "mmrjax.compare/1", "errors": summary, "notes": notes}
+        return run.leave(folder, config, robot, table, result, runs)
+
+
+def compared(measured: records.Runs, simulated: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Summary]:
+    """Rows side by side with their errors (35), and the errors' summary for all rows and by configuration.
+
+    A reading that is missing is NaN in its row; it weighs nothing and is counted as `missing`.
+    """
+    table = {key: simulated[key] for key in ("configuration", *records.CONDITIONS)}
+    nothing = np.full(len(measured), np.nan)
+    for channel in channels.CHANNELS:
+        table[channel.column] = measured.columns.get(channel.column, nothing)
+        table[f"simulated_{channel.column}"] = simulated[channel.column]
+        table[f"error_{channel.name}_percent"] = residual.relative_error(
+            simulated[channel.column], table[channel.column]
+        )
+    table["status"] = simulated["status"]
+    groups = {"all": np.ones(len(measured), bool)}
+    groups |= {str(c): measured["configuration"] == c for c in dict.fromkeys(measured["configuration"])}
+    summary = {
+        name: {c.name: _summary(c, {k: v[rows] for k, v in table.items()}) for c in channels.CHANNELS}
+        for name, rows in groups.items()
+    }
+    return table, summary
+
+
+def _summary(channel: channels.Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
+    measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
+    return {
+        **residual.summary(table[f"error_{channel.name}_percent"]),
+        "r2": residual.certainty(measured, simulated),
+        "missing": int(np.isnan(measured).sum()),
+    }
+
+
+def missing(table: dict[str, np.ndarray]) -> list[str]:
+    """A sentence for each channel of which the table lacks readings."""
+    lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels.CHANNELS}
+    rows = len(table["status"])
+    return [
+        f"{column}: {'all readings are missing' if count == rows else f'{count} of {rows} readings are missing'}; they weigh nothing"
+        for column, count in lost.items()
+        if count
+    ]
+
+
+def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list[str]) -> None:
+    """Every row's errors, their summary, and which readings are missing."""
+    rows = Table(title="(simulated - measured) / simulated, eq. (35) [%]", title_justify="left")
+    for heading in ("", "U [V]", "M [kg]", "slope [deg]", *(_words(c) for c in channels.CHANNELS), "status"):
+        rows.add_column(heading, justify="left" if heading in ("", "status") else "right")
+    for k in range(len(table["status"])):
+        errors = (table[f"error_{channel.name}_percent"][k] for channel in channels.CHANNELS)
+        stated = (f"{table[c][k]:g}" for c in ("supply_voltage_V", "total_mass_kg", "slope_deg"))
+        rows.add_row(
+            table["configuration"][k], *stated,
+            *("-" if e != e else f"{e:+.1f}" for e in errors), table["status"][k],
+        )  # fmt: skip
+    if len(table["status"]) <= 60:
+        say(rows)
+    shown = Table(title="Summary", title_justify="left")
+    for heading in ("rows of", "channel", "rows", "rms [%]", "worst [%]", "R²"):
+        shown.add_column(heading, justify="left" if heading in ("rows of", "channel") else "right")
+    for group, by_channel in summary.items():
+        for channel in channels.CHANNELS:
+            numbers = by_channel[channel.name]
+            figures = (numbers["rms_percent"], numbers["max_percent"], numbers["r2"])
+            cells = ("-" if v != v else format(v, f) for v, f in zip(figures, (".1f", ".1f", ".3f"), strict=True))
+            shown.add_row(group, channel.label, str(numbers["rows"]), *cells)
+    say(shown)
+    lost = int(np.sum(table["status"] != STATUSES[0]))
+    if lost:
+        say(f"{lost} of {len(table['status'])} rows did not converge; rows with no simulated value are left out.")
+    for note in notes:
+        say(note)
+
+
+def _words(channel: channels.Channel) -> str:
+    return channel.word.replace("_", " ")

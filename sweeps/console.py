@@ -1,0 +1,35 @@
+"""What a command says to the person who runs it: results on stdout, everything else on stderr."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+_WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
+_out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
+_err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
+
+
+def say(what: Any) -> None:
+    """Print text or a table to stdout."""
+    _out.print(what)
+
+
+def tell(text: str) -> None:
+    """Print a line to stderr, where what is not the result goes."""
+    _err.print(text)
+
+
+@contextmanager
+def progress(total: int, quiet: bool, doing: str = "simulating") -> Iterator[Callable[[float], None]]:
+    """A bar on stderr; gives a function that is called with how much more is done."""
+    columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_err, disable=quiet) as bar:
+        task = bar.add_task("", total=total)
+        # rounded, or the sum of a chunk's shares would end a hair below its runs
+        yield lambda count: bar.update(task, completed=round(bar.tasks[task].completed + count, 6))

@@ -1,0 +1,71 @@
+"""What comes in: the robot that a configuration names, tables of runs, and single runs from options."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from calibration.data import effect_file, robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData, choices
+from mmrjax.robot import Robot
+from sweeps.config import RobotPart
+from sweeps.console import tell
+
+
+def load_robot(config: RobotPart) -> Robot:
+    """The robot that a configuration names, with its changes; its effects may be the user's own.
+
+    Raises:
+        BadConfiguration: no such robot, a file or a change that is refused.
+    """
+    library = effect_file.library(config.effects)
+    return robot_file.change(robot_file.load(config.robot, library), config.set, where="--set")
+
+
+def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> None:
+    """Refuse a configuration that the robot does not have.
+
+    Raises:
+        BadConfiguration: says `where`, and which the robot has.
+    """
+    for name in names:
+        if name not in robot.configurations:
+            raise BadConfiguration(
+                f"{where}: got {name}; the robot has no such configuration; {choices(name, robot.configurations)}"
+            )
+
+
+def read_runs(source: str, robot: Robot, *, measured: bool, series: bool = False) -> records.Runs:
+    """Read a table, and say on stderr which of its columns are not used.
+
+    Args:
+        source: a file, or a packaged table.
+        robot: has the configurations of the table.
+        measured: whether readings are needed; series: whether time histories are taken.
+
+    Raises:
+        BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
+            robot does not have.
+    """
+    runs = records.read(source, measured=measured)
+    if runs.has("time_s") and not series:
+        raise BadData(
+            f"{runs.source}: column time_s: time histories are for calibrate and loop; expected one row a run"
+        )
+    runs.configurations(robot)
+    if runs.unknown:
+        tell(f"{runs.source}: not used: {', '.join(runs.unknown)}")
+    return runs
+
+
+def one_run(robot: Robot, cells: dict[str, Any]) -> records.Runs:
+    """One run from options by column name; without a configuration it is the robot's first.
+
+    Raises:
+        BadConfiguration: a value out of range, or a configuration that the robot does not have.
+    """
+    stated = cells.get("configuration")
+    name = robot.configurations.names[0] if stated is None else stated
+    check_configurations(robot, (name,), "--configuration")
+    given = {key: value for key, value in cells.items() if value is not None}
+    return records.single({**given, "configuration": name})

@@ -1,0 +1,54 @@
+"""The command `render`: a picture or a film of a run whose running gear is resolved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from calibration.data.errors import BadConfiguration
+from mmrjax import render as pictures
+from mmrjax.signals import STATUSES
+from sweeps import config as configuration
+from sweeps import run, words
+from sweeps.console import progress, say
+from sweeps.inputs import load_robot, one_run
+from sweeps.store import DONE, SOME_NOT_CONVERGED
+
+
+def render(
+    config: configuration.Render, given: dict[str, Any], file: Path, begin: float, end: float | None, slow: float,
+    force: bool,
+) -> int:  # fmt: skip
+    """Draw one run (of options, by column) from standstill, as a picture or a film; returns the exit code."""
+    try:
+        pictures.instants(file, begin, end, slow, config.duration)
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}") from error
+    if file.exists() and not force:
+        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
+    if not file.parent.is_dir():
+        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+    robot = load_robot(config)
+    conditions = run.commanded(robot, one_run(robot, given), config)
+    with progress(1, quiet=False) as advance:
+        told = run.shares(advance, 1)
+        trajectory = run.track_runs(robot, conditions, config, rolling=False, progress=told)
+        told(1.0)
+    trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
+    aside = file.with_name(f".{file.stem}.writing{file.suffix}")
+    try:
+        view = pictures.scene(robot, conditions, trajectory)
+        with progress(1, quiet=False, doing="drawing") as advance:
+            pictures.render(view, aside, begin, end, slow)
+            advance(1)
+        aside.replace(file)
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}") from error
+    finally:
+        aside.unlink(missing_ok=True)
+    status = STATUSES[int(trajectory.result.status)]
+    say(f"{status}: {words.STATUSES[status].why}")
+    say(str(file))
+    return DONE if status == STATUSES[0] else SOME_NOT_CONVERGED

@@ -1,0 +1,41 @@
+"""The command `sweep`: every combination of a grid, in vmapped batches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from sweeps import config as configuration
+from sweeps import run, words
+from sweeps.console import say
+from sweeps.grid import configurations, grid
+from sweeps.inputs import load_robot
+from sweeps.store import open_folder
+
+
+def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
+    """Simulate a grid and leave a run folder; returns the exit code."""
+    robot = load_robot(config)
+    config = config.model_copy(update={"configurations": configurations(config, robot)})
+    runs = grid(config, robot)
+    with open_folder("sweep", config, robot, out, force) as folder:
+        table = run.evaluate(robot, runs, config, folder)
+        print_counts(table)
+        if config.report:
+            from sweeps import report_sweep
+
+            report_sweep.write(folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table)
+        return run.leave(folder, config, robot, table, {"schema": "mmrjax.sweep/1"}, runs)
+
+
+def print_counts(table: dict[str, np.ndarray]) -> None:
+    """How the runs ended, in words."""
+    shown = Table(title=f"{len(table['status'])} runs", title_justify="left")
+    for heading in ("status", "runs", "meaning"):
+        shown.add_column(heading, justify="right" if heading == "runs" else "left")
+    for status, count in run.counts(table).items():
+        if count:
+            shown.add_row(status, str(count), words.STATUSES[status].why)
+    say(shown)

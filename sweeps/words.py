@@ -1,0 +1,57 @@
+"""Statuses and limits in words: one row each, for the console and the reports."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Status(NamedTuple):
+    """How a run ended: `short` in figures, `why` in one line, `meaning` for the reader of a report."""
+
+    short: str
+    why: str
+    meaning: str
+
+
+STATUSES: dict[str, Status] = {
+    "converged": Status("settled", "steady travel", "found a steady operating point"),
+    "stalled": Status(
+        "stalls",
+        "the motors cannot turn the load",
+        "the motors cannot turn against the load: shafts at rest at stall current",
+    ),
+    "slides": Status(
+        "slides",
+        "traction demand above the adhesion limit",
+        "slope and rolling resistance demand more traction than adhesion gives (demand above μ_s N), so the movers "
+        "spin and the robot does not climb; an operating point does not exist",
+    ),
+    "not_settled": Status(
+        "not settled",
+        "still accelerating at the end of the run; try a longer --duration",
+        "still gaining speed when the simulated time ended",
+    ),
+    "battery_empty": Status("battery empty", "the battery has no charge left", "the battery's capacity is used up"),
+    "failed": Status("failed", "the solver gave up", "the solver found no answer; please report the conditions"),
+    "tips": Status(
+        "tips over",
+        "the line of gravity passes outside the contacts: the robot turns over",
+        "the line of gravity passes outside the contacts: the robot turns over",
+    ),
+}
+
+FLAGS = {
+    "motor_overspeed": "motor faster than it is permitted to turn",
+    "gearbox_overspeed": "gearbox input faster than its catalogue permits",
+    "winding_hot": "winding hotter than permitted after long running at this current",
+}
+
+
+def short(status: str) -> str:
+    """A status as figures show it."""
+    return STATUSES[status].short if status in STATUSES else status
+
+
+def meaning(status: str) -> str:
+    """A status for the reader of a report."""
+    return STATUSES[status].meaning if status in STATUSES else ""
