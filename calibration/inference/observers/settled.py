@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadData, number
 from calibration.data.runs import CONDITIONS, Runs
 from calibration.inference import bases as bases_room
+from calibration.inference import treatments
 from calibration.inference.bases import Bases
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
@@ -58,6 +59,7 @@ class SettledRuns(Observer):
 
     word: ClassVar[str] = "runs"
     fewest: ClassVar[int] = 6
+    axes: ClassVar[tuple[str, ...]] = tuple(CONDITIONS)
     pad: ClassVar[int] = 16
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
     percent_of: ClassVar[str] = "simulated reading, eq. (35)"
@@ -140,6 +142,9 @@ class SettledRuns(Observer):
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.isin(status, (SLIDES, FAILED, TIPS))
+
+    def cautions(self, robot: Robot) -> list[str]:
+        return treatments.of(self.fidelity).cautions(robot, self.conditions)
 
     @property
     def runs(self) -> int:
