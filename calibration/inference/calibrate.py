@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
@@ -72,10 +73,15 @@ def calibrate(
     profiles = effort.profiles if profiles is None else profiles
     blocks = (observe.blocks if effort.blocks else ()) if blocks is None else blocks
 
+    former: list[str] = []
+    free, fix = (robot_file.current_names(names, robot, former) for names in (free, fix))
+    stated = dict(stated or {})
+    stated = dict(zip(robot_file.current_names(stated, robot, former), stated.values(), strict=True))
+    for sentence in former:
+        tell(sentence)
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     default = priors.default_names(present, robot, guides_are_output=treatment.guides_are_output)
     names = priors.choose(robot, default, free, fix)
-    stated = dict(stated or {})
     base, of_product = _guided(robot, present, names, stated) if treatment.guides_are_output else (robot, {})
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
     coordinates = dataclasses.replace(coordinates, stated=tuple(stated))

@@ -140,6 +140,6 @@ def infeasible(
     at = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
-        f"no start is feasible: {runs.source} rows {rows(slides)} were measured in steady travel, but the model slides "
-        f"there ({' and '.join(parameter.values())} = {at} cannot carry the demand); {cure}"
+        f"no start is feasible: {runs.source} rows {rows(slides)} were measured in steady travel, but the model "
+        f"slides there ({' and '.join(parameter.values())} = {at} cannot carry the demand); {cure}"
     )

@@ -87,8 +87,8 @@ def _limits(found: CalibrationResult) -> list[str]:
     limited = found.adhesion_used > 1 - MARGIN
     if limited.any():
         said.append(
-            f"rows {_rows(limited)} use all the adhesion but the margin of {MARGIN:.0%}: the limit holds their static "
-            "friction from below, and the slip that they show is not all explained"
+            f"rows {_rows(limited)} use all the adhesion but the margin of {MARGIN:.0%}: the limit holds their "
+            "static friction from below, and the slip that they show is not all explained"
         )
     for configuration in found.robot.configurations:
         friction = f"{configuration}.{priors.GUIDE_FRICTION}"
