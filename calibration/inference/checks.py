@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.errors import BadConfiguration, BadData, number
-from calibration.data.runs import CONDITIONS, Runs
+from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.noise import Noise
 from mmrjax import channels
-from mmrjax.fidelities.drive import drive_batch
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED
+from mmrjax.signals import SLIDES, STATUSES
 
 #: What would measure a parameter that the data do not, by the start or end of its name.
 WOULD_MEASURE = {
@@ -43,14 +41,14 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
     """Refuse data that cannot be fitted; return what should be said of data that can.
 
     Raises:
-        BadData: too few rows, a stuck channel, contradictory replicates, samples of one run under
-            different conditions.
+        BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
+            different conditions, a configuration that `robot` does not have.
         BadConfiguration: a free parameter of a configuration that has no rows.
     """
     _configurations(runs, robot, names)
     _enough(runs, names, noise)
     _stuck(runs)
-    return [*observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
+    return [*runs.missing(), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
 
 
 def _configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
@@ -66,19 +64,23 @@ def _configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:
 
 def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
     levels = int(noise.estimated.sum())
+    readings = int(np.isfinite(runs.measured()).sum())
     shown = sum(word != "no readings" for word in noise.source)
     needed = max(2, -(-(len(names) + levels) // max(shown, 1)) + (levels > 0))
-    if len(runs) < needed:
-        also = f" and estimate {levels} noise levels" if levels else ""
-        cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
-        raise BadData(
-            f"{runs.source}: {len(runs)} rows of {shown} channels cannot fit {len(names)} parameters{also}; "
-            f"at least {needed} rows are needed, or {cure}"
-        )
+    if readings >= needed * shown:
+        return
+    also = f" and estimate {levels} noise levels" if levels else ""
+    cure = "fix some with --fix, or state --noise" if levels else "fix some with --fix"
+    whole = readings == len(runs) * shown
+    have = f"{len(runs)} rows of {shown} channels" if whole else f"{readings} readings in {len(runs)} rows"
+    least = f"{needed} rows" if whole else f"{needed * shown} readings"
+    raise BadData(
+        f"{runs.source}: {have} cannot fit {len(names)} parameters{also}; at least {least} are needed, or {cure}"
+    )
 
 
 def _stuck(runs: Runs) -> None:
-    columns = [c for c in (*CONDITIONS, "time_s") if runs.has(c)]
+    columns = [c for c in observers.kind(runs).axes if runs.has(c)]
     if len(np.unique(np.stack([runs[c] for c in columns], 1), axis=0)) < 2:
         return
     for channel in channels.CHANNELS:
@@ -113,44 +115,31 @@ def unmeasured(names: Sequence[str], sensitivity: np.ndarray) -> dict[str, str]:
     }
 
 
-def too_stiff(runs: Runs, robot: Robot) -> list[str]:
-    """A sentence if the track model's step is too long for some row, so that its readings are not to be trusted."""
-    from mmrjax.fidelities.stability import largest_step
-    from mmrjax.fidelities.track import STEP
-
-    limits = largest_step(robot, runs.command())
-    rows = ", ".join(str(k + 1) for k in np.flatnonzero(limits < STEP))
-    if not rows:
-        return []
-    return [
-        f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
-        f"{limits.min():.2g} s, so its readings there are not to be trusted; V_s is too small for μ_s"
-    ]
-
-
-def from_standstill(runs: Runs, robot: Robot) -> list[str]:
-    """A sentence if `drive` settles on some row only because it was rolling."""
-    run = drive_batch(robot, runs.command(), jnp.asarray([0.0, SETTLED]))
-    rows = ", ".join(str(k + 1) for k in np.flatnonzero(np.asarray(run.result.status) != CONVERGED))
-    if not rows:
-        return []
-    return [
-        f"rows {rows}: read from a rolling start; from standstill the calibrated robot does not settle there within "
-        f"{SETTLED:g} s, since it starts by sliding at μ_d"
-    ]
-
-
 def infeasible(
-    runs: Runs, slides: np.ndarray, names: Sequence[str], spec_adhesion: dict[str, float]
+    runs: Runs, robot: Robot, status: np.ndarray, lost: np.ndarray, names: Sequence[str]
 ) -> BadConfiguration:
-    """The error for rows that slide at the best point found, from every start."""
-    rows = ", ".join(str(k + 1) for k in np.flatnonzero(slides))
-    chassis = sorted({"wheeled" if w == "4W2T" else "tracked" for w in runs["configuration"][slides]})
-    parameter = " and ".join(f"{c}.ground.friction.static" for c in chassis)
-    at = ", ".join(f"{spec_adhesion[c]:.3g}" for c in chassis)
-    fixed = [c for c in chassis if f"{c}.ground.friction.static" not in names]
-    cure = "free it, or raise it in --robot" if fixed else "widen its prior"
+    """The error for rows that the model does not reach at the best point found, from every start.
+
+    Args:
+        robot: of that point; status: of each row there, shape (rows,).
+        lost: whether a row is not reached, shape (rows,); names: of the free parameters.
+    """
+
+    def rows(which: np.ndarray) -> str:
+        return ", ".join(str(k + 1) for k in np.flatnonzero(which))
+
+    slides = lost & (status == SLIDES)
+    if not slides.any():
+        words = ", ".join(STATUSES[k] for k in np.unique(status[lost]))
+        return BadConfiguration(
+            f"no start is feasible: the model does not reach {runs.source} rows {rows(lost)} ({words} at the best "
+            "point found); check their conditions, or widen the priors"
+        )
+    sliding = sorted(set(runs["configuration"][slides]), key=robot.configurations.index)
+    parameter = {c: f"{c}.ground.friction.static" for c in sliding}
+    at = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
+    cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"
     return BadConfiguration(
-        f"no start is feasible: {runs.source} rows {rows} were measured in steady travel, but the model slides there "
-        f"({parameter} = {at} cannot carry the demand); {cure}"
+        f"no start is feasible: {runs.source} rows {rows(slides)} were measured in steady travel, but the model "
+        f"slides there ({' and '.join(parameter.values())} = {at} cannot carry the demand); {cure}"
     )

@@ -111,14 +111,16 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
     return tuple(f"{configuration}.{name}" for name in names)
 
 
-def default_names(configurations: Iterable[str], robot: Robot, model: str = "steady") -> tuple[str, ...]:
+def default_names(configurations: Iterable[str], robot: Robot, *, guides_are_output: bool = False) -> tuple[str, ...]:
     """The default set of free parameters for data of these configurations.
 
-    In the track model the guides' share is an output, so the guide friction μ_t stands in its place.
+    Args:
+        guides_are_output: whether the fidelity puts out the guides' share, as the track model does; the guide
+            friction μ_t then stands in its place.
     """
     present = set(configurations)
     names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
-    if model == "track":
+    if guides_are_output:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
     return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects))
 
@@ -217,7 +219,7 @@ def _near(word: str, everything: list[str]) -> list[str]:
     return near or [n for n in everything if n.split(".")[0] == word.split(".")[0]] or everything
 
 
-_PRIOR = re.compile(r"^(?P<name>[\w.]+)=(?P<value>[^±]+?)(?:±|\+-|\+/-)(?P<sd>.+)$")
+_PRIOR = re.compile(r"^(?P<name>[\w.-]+)=(?P<value>[^±]+?)(?:±|\+-|\+/-)(?P<sd>.+)$")
 
 
 def parse_prior(text: str) -> tuple[str, float, float]:

@@ -51,7 +51,7 @@ class Observer(eqx.Module):
     Attributes:
         conditions: of each run, shape (runs,).
         word: what a row is; fewest: rows in which a missing effect can be told from noise.
-        fidelities: that can simulate such data, the default first; None: any.
+        axes: columns of a table over which readings vary.
         pad: rows are padded to a multiple of this, so that tables of about one size share what is compiled.
         blocks: kinds of blocks to hold out, the most telling first.
         percent_of: what errors in percent are of.
@@ -67,6 +67,7 @@ class Observer(eqx.Module):
 
     word: ClassVar[str]
     fewest: ClassVar[int]
+    axes: ClassVar[tuple[str, ...]]
     pad: ClassVar[int]
     blocks: ClassVar[tuple[str, ...]]
     percent_of: ClassVar[str]
@@ -150,6 +151,10 @@ class Observer(eqx.Module):
     @abc.abstractmethod
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         """Whether the model has no such operating point, by row."""
+
+    def cautions(self, robot: Robot) -> list[str]:
+        """What to know before the readings of a calibrated robot are trusted, as sentences."""
+        return []
 
     @abc.abstractmethod
     def runs_counting(self, included: np.ndarray) -> int:

@@ -106,6 +106,7 @@ class Histories(Observer):
 
     word: ClassVar[str] = "samples"
     fewest: ClassVar[int] = 24
+    axes: ClassVar[tuple[str, ...]] = (*CONDITIONS, "time_s")
     pad: ClassVar[int] = 1
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
     percent_of: ClassVar[str] = "channel's root mean square"

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadData, number
 from calibration.data.runs import CONDITIONS, Runs
 from calibration.inference import bases as bases_room
+from calibration.inference import treatments
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
@@ -62,6 +63,7 @@ class SettledRuns(Observer):
 
     word: ClassVar[str] = "runs"
     fewest: ClassVar[int] = 6
+    axes: ClassVar[tuple[str, ...]] = tuple(CONDITIONS)
     pad: ClassVar[int] = 16
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
     percent_of: ClassVar[str] = "simulated reading, eq. (35)"
@@ -149,6 +151,9 @@ class SettledRuns(Observer):
 
     def runs_counting(self, included: np.ndarray) -> int:
         return int(included.sum())
+
+    def cautions(self, robot: Robot) -> list[str]:
+        return treatments.of(self.fidelity).cautions(robot, self.conditions)
 
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
