@@ -208,6 +208,30 @@ def compare(
     return room.compare(resolved, data, own_mass, out, force)
 
 
+@app.command(epilog="Example: mmrjax reproduce --robot found/robot.toml --model track")
+def reproduce(
+    model: Annotated[
+        str | None, typer.Option("--model", help="steady, or track for Figs. 23-27 too.  \\[default: steady]")
+    ] = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    out: _Out = None,
+    force: _Force = False,
+) -> int:
+    """Remake the paper's figures and tables with a robot: the bench's rows, Figs. 5a-29, row by row.
+
+    With --model track the running gear is resolved: Figs. 23-27, how the weight divides.
+    """
+    from sweeps import config
+
+    options = _options(model=model, robot=robot, set=set_, effects=effects)
+    resolved = _prepared(config.resolve(config.Reproduce, None, options))
+    from sweeps import reproduce as room
+
+    return room.reproduce(resolved, out, force)
+
+
 @app.command(epilog="Example: mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20")
 def render(
     file: Annotated[Path, typer.Argument(help="What to write: its suffix is .png, .gif or .mp4.")],

@@ -1,4 +1,4 @@
-"""What a command is told: options and TOML files, checked into one frozen record, composed of the parts that apply."""
+"""What a command is told: options and TOML files, checked into one frozen record of the parts that apply."""
 
 from __future__ import annotations
 

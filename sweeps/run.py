@@ -81,21 +81,26 @@ def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
 
 
-def evaluate(robot: Robot, runs: Runs, config: FidelityPart, folder: RunFolder) -> dict[str, np.ndarray]:
-    """Simulate every run and return the table of conditions and outcomes, with a bar where it takes long.
+def evaluate(
+    robot: Robot,
+    runs: Runs,
+    config: FidelityPart,
+    folder: RunFolder,
+    advance: Callable[[float], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Simulate every run and return the table of conditions and outcomes.
 
     Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
     The last chunk is filled up with its last run, so that all chunks share one compilation.
+
+    Args:
+        advance: called with the number of runs done since its last call; of a chunk under way, its share. None:
+            a bar on stderr where it takes long.
     """
-    slow = config.model == "track" or len(runs) > config.runs_at_once
-    with bar(len(runs), quiet=not slow) as advance:
-        return {**conditions(robot, runs), **_outcomes(robot, runs, config, folder, advance)}
-
-
-def _outcomes(
-    robot: Robot, runs: Runs, config: FidelityPart, folder: RunFolder, advance: Callable[[float], None]
-) -> dict[str, np.ndarray]:
-    # `advance` is called with the number of runs done since its last call; of a chunk under way, its share.
+    if advance is None:
+        slow = config.model == "track" or len(runs) > config.runs_at_once
+        with bar(len(runs), quiet=not slow) as advance:
+            return evaluate(robot, runs, config, folder, advance)
     size = min(config.runs_at_once, len(runs))
     if config.model == "track" and len(runs) > size:
         _bear(robot, runs, config)
@@ -114,7 +119,8 @@ def _outcomes(
         else:
             advance(count)
         parts.append(part)
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    outcome = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return {**conditions(robot, runs), **outcome}
 
 
 def shares(advance: Callable[[float], None], count: int) -> Callable[[float], None]:

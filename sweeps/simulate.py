@@ -23,7 +23,7 @@ from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run, read_runs
 from sweeps.store import RunFolder, open_folder
 
-_POINTS = 1001  # of a history
+_POINTS, _INRUSH, _EARLY = 1001, 0.04, 160  # of a history; of its first instants [s], in which the current peaks
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
 
@@ -70,14 +70,19 @@ def _histories(
     """Write the runs over time, of the track model with every reaction; the columns of their ends, and the runs."""
     conditions = run.commanded(robot, runs, config)
     if config.model == "drive":
-        times = jnp.linspace(0.0, config.duration, _POINTS)
-        trajectory = jax.device_get(drive_batch(robot, conditions, times))
+        trajectory = jax.device_get(drive_batch(robot, conditions, jnp.asarray(instants(config.duration))))
         folder.write_table("history.csv", history_table(robot, trajectory, trajectory.distance, runs))
         return outputs.columns(trajectory.result), trajectory
     trajectory = jax.device_get(run.track_runs(robot, conditions, config, rolling=False, progress=told))
     folder.write_table("history.csv", history_table(robot, trajectory, trajectory.q[..., 0], runs))
     folder.write_table("reactions.csv", reactions_table(trajectory, runs))
     return outputs.columns_track(trajectory), trajectory
+
+
+def instants(duration: float) -> np.ndarray:
+    """Times of a history [s] from 0 to `duration`, close together while the current rises to its peak."""
+    early = np.linspace(0.0, min(_INRUSH, duration), _EARLY, endpoint=False)
+    return np.union1d(early, np.linspace(0.0, duration, _POINTS))
 
 
 def _names(runs: records.Runs) -> np.ndarray:
