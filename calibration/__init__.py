@@ -1,1 +1,33 @@
-"""Measured data and what is done with it: tables of runs, errors, and calibration by gradients."""
+"""Measured data and what is done with them: read a robot and runs, calibrate, discover what the model lacks."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calibration.data.robot_file import load as read_robot
+    from calibration.data.runs import read as read_runs
+    from calibration.discovery.discover import discover
+    from calibration.inference.calibrate import calibrate
+
+__all__ = ["calibrate", "discover", "read_robot", "read_runs"]
+
+#: Module and attribute of each name; imported when it is asked for, since most of them load JAX.
+_HOMES = {
+    "calibrate": ("calibration.inference.calibrate", "calibrate"),
+    "discover": ("calibration.discovery.discover", "discover"),
+    "read_robot": ("calibration.data.robot_file", "load"),
+    "read_runs": ("calibration.data.runs", "read"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    module, attribute = _HOMES[name]
+    return getattr(importlib.import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -92,7 +92,10 @@ def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
                     yield from walk(member, f"{name}.{member.name}.")  # type: ignore[attr-defined]
 
 
-def replace(component: eqx.Module, values: dict[str, Any]) -> eqx.Module:
+M = TypeVar("M", bound=eqx.Module)
+
+
+def replace(component: M, values: dict[str, Any]) -> M:
     """Return `component` with the named parameters replaced; values may be tracers or batches.
 
     Raises:
@@ -123,6 +126,6 @@ def _replace(component: Any, values: dict[str, Any], prefix: str) -> Any:
     return dataclasses.replace(component, **changes) if changes else component
 
 
-def strong(robot: eqx.Module) -> eqx.Module:
+def strong(robot: M) -> M:
     """`robot` without weakly typed numbers: each of those is another program to compile of the same function."""
     return jax.tree.map(lambda x: jnp.asarray(x, x.dtype) if eqx.is_array(x) else x, robot)

@@ -15,11 +15,17 @@ from sweeps.console import tell
 def load_robot(config: RobotPart) -> Robot:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
 
+    Former names of parameters are taken, and said on stderr.
+
     Raises:
         BadConfiguration: no such robot, a file or a change that is refused.
     """
-    library = effect_file.library(config.effects)
-    return robot_file.change(robot_file.load(config.robot, library), config.set, where="--set")
+    notes: list[str] = []
+    robot = robot_file.load(config.robot, effect_file.library(config.effects), notes)
+    robot = robot_file.change(robot, config.set, where="--set", notes=notes)
+    for note in notes:
+        tell(note)
+    return robot
 
 
 def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> None:

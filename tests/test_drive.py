@@ -11,7 +11,7 @@ from scipy.integrate import cumulative_simpson
 
 from mmrjax import balances, params
 from mmrjax.conditions import Conditions
-from mmrjax.effects.thermal_drift import ThermalDrift
+from mmrjax.effects.electrical import ThermalDrift
 from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.signals import CONVERGED, STATUSES, State

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.util
 import inspect
 import math
@@ -10,32 +11,55 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from calibration.data.errors import BadConfiguration, choices
-from mmrjax import effects, nominal, params
+from mmrjax import channels, effects, nominal, params
 from mmrjax.balances import BALANCES, added, moving
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
+from mmrjax.effects.contract import readable
 from mmrjax.signals import Signals, State
 
 #: Effects by name, as robot files and the command line know them.
 Library = Mapping[str, type[Effect]]
+
+#: Kind of every class attribute that an effect states or inherits.
+_STATED = {
+    "name": str,
+    "balance": str,
+    "dissipative": bool,
+    "channel": str,
+    "transient": bool,
+    "settles_to": str,
+    "needs_battery": bool,
+    "odd_in_travel": bool,
+    "movers": str,
+    "memory_unit": str,
+}
+_MOVERS = ("tracks", "wheels")
 
 
 def library(paths: Sequence[Path | str] = ()) -> Library:
     """The packaged effects and those of the files, by name.
 
     Raises:
-        BadConfiguration: as `read`, or a name that stands twice.
+        BadConfiguration: as `read`, a name that stands twice, or one that settles to an effect that is not there.
     """
     known = dict(effects.BY_NAME)
-    for path in map(Path, paths):
-        for effect in read(path):
-            if effect.name in known or effect.name in effects.UNNAMED:
-                raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is taken; choose another")
-            known[effect.name] = effect
+    own = [(path, effect) for path in map(Path, paths) for effect in read(path)]
+    for path, effect in own:
+        if effect.name in known or effect.name in effects.UNNAMED:
+            raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is taken; choose another")
+        known[effect.name] = effect
+    for path, effect in own:
+        others = [name for name in known if name != effect.name]
+        if effect.settles_to and effect.settles_to not in others:
+            raise BadConfiguration(
+                f"{_where(path, effect)}, settles_to: got {effect.settles_to}; {choices(effect.settles_to, others)}"
+            )
     return known
 
 
@@ -59,14 +83,11 @@ def read(path: Path) -> tuple[type[Effect], ...]:
         spec.loader.exec_module(module)
     except Exception as error:
         raise BadConfiguration(f"{path.name}: its code fails ({type(error).__name__}: {error})") from error
-    found = tuple(
-        value
-        for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, Effect) and value.__module__ == name
-    )
-    concrete = tuple(effect for effect in found if not inspect.isabstract(effect))
+    concrete = effects.defined_in(module)
     if not concrete:
-        missing = f"; {found[0].__name__} defines no term" if found else ""
+        own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == name]
+        partial = [v.__name__ for v in own if issubclass(v, Effect)]
+        missing = f"; {partial[0]} defines no term" if partial else ""
         raise BadConfiguration(
             f"{path.name}: holds no effect; expected a class derived from mmrjax.effects.Effect{missing}"
         )
@@ -85,7 +106,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
     def refuse(what: str) -> BadConfiguration:
         return BadConfiguration(f"{where}{what}")
 
-    for attribute, kind in (("name", str), ("balance", str), ("dissipative", bool)):
+    for attribute, kind in _STATED.items():
         value = getattr(effect, attribute, None)
         if not isinstance(value, kind):
             raise refuse(f", {attribute}: got {value}; expected a {kind.__name__} as class attribute")
@@ -93,25 +114,32 @@ def _check(path: Path, effect: type[Effect]) -> None:
         raise refuse(f", name: got {effect.name!r}; expected lower-case words joined by underscores")
     if effect.balance not in BALANCES:
         raise refuse(f", balance: got {effect.balance}; {choices(effect.balance, BALANCES)}")
-    channels = tuple(Reading.__dataclass_fields__)
     if (effect.balance == "sensor") != bool(effect.channel):
         raise refuse(
-            f", channel: got {effect.channel!r}; expected one of {', '.join(channels)} for sensor, else none"
+            f", channel: got {effect.channel!r}; expected one of {', '.join(channels.names())} for sensor, else none"
         )
-    if effect.channel and effect.channel not in channels:
-        raise refuse(f", channel: got {effect.channel}; {choices(effect.channel, channels)}")
+    if effect.channel and effect.channel not in channels.names():
+        raise refuse(f", channel: got {effect.channel}; {choices(effect.channel, channels.names())}")
+    if effect.movers and effect.movers not in _MOVERS:
+        raise refuse(f", movers: got {effect.movers}; {choices(effect.movers, _MOVERS)}, or none for both")
+    size = effect.memory_size
+    if size is not None and (isinstance(size, bool) or not isinstance(size, int | float) or not size > 0):
+        raise refuse(f", memory_size: got {size}; expected a positive number, or None for no memory")
     if "Source:" not in (effect.__doc__ or ""):
         raise refuse(": its docstring states no equation with its «Source:»")
     try:
         default = effect()
     except Exception as error:
         raise refuse(f": cannot be made without arguments ({error}); give every field a default") from error
+    acting, stated = default.configurations, effect.configurations
+    if acting != stated or not isinstance(acting, tuple) or not all(isinstance(c, str) for c in acting):
+        raise refuse(f', configurations: got {stated!r}; expected a tuple of names such as ("4W2T",)')
     declared = {p.name: p for p in params.walk(default)}
     amplitudes = [name for name, p in declared.items() if p.spec.amplitude]
     if amplitudes != ["amplitude"]:
         raise refuse(
-            f": its amplitudes are {', '.join(amplitudes) or 'none'}; expected one field "
-            "amplitude = parameter(0.0, ..., amplitude=True)"
+            f": its amplitudes are {', '.join(amplitudes) or 'none'}; expected one field, "
+            "amplitude: Scalar = amplitude(unit=..., meaning=..., bounds=..., sd=..., source=...)"
         )
     if float(declared["amplitude"].value) != 0.0:
         raise refuse(f", amplitude: got default {float(declared['amplitude'].value):g}; expected 0, which is absent")
@@ -120,32 +148,56 @@ def _check(path: Path, effect: type[Effect]) -> None:
     _check_term(refuse, effect, declared["amplitude"].spec.prior_sd(0.0))
 
 
+@functools.cache
+def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
+    """Of the nominal robot on its battery: what a term may read while it climbs, all signals of that instant, and
+    what a term may read at rest."""
+    robot = nominal.nominal()
+    run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
+    climbing, rest = (State(*map(jnp.asarray, x)) for x in ((1.5, 800.0, 0.6, 100.0), (0.0, 0.0, 0.0, 0.0)))
+    climbs = readable(robot, run, climbing, balance, channel)
+    return climbs, moving(robot, run, climbing), readable(robot, run, rest, balance, channel)
+
+
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
     robot = nominal.nominal()
-    run = Conditions(voltage=24.0, slope_deg=np.degrees(0.1), payload=2.0)
-    state = State(*map(jnp.asarray, (1.5, 800.0, 0.6, 0.0)))
-    signals = moving(robot, run, state)
     memory = {} if effect.memory_size is None else {effect.name: jnp.asarray(0.3 * effect.memory_size)}
-    signals = Signals(**{**vars(signals), "memory": memory})
 
-    def term(amplitude: jax.Array) -> jax.Array:
-        made = params.replace(effect(), {"amplitude": amplitude})
+    def term(amplitude: jax.Array, signals: Signals) -> jax.Array:
+        # A configuration that the nominal robot does not have is the business of the robot file.
+        made = dataclasses.replace(params.replace(effect(), {"amplitude": amplitude}), configurations=())
         with_it = dataclasses.replace(robot, effects=(made,))
         return jnp.asarray(added(with_it, signals, effect.balance, effect.channel), float)
 
-    try:
-        none, once, twice = (term(jnp.asarray(k * size)) for k in (0.0, 1.0, 2.0))
-        slope = jax.grad(lambda a: jnp.sum(term(a)))(jnp.asarray(0.0))
-        if effect.memory_size is not None:
-            effect().rate(robot, signals)
-            effect().settled(robot, signals)
-    except Exception as error:
-        raise refuse(f": its term cannot be computed ({type(error).__name__}: {error})") from error
-    if once.shape != ():
-        raise refuse(f": its term has shape {once.shape}; expected a scalar for scalar signals")
-    if float(none) != 0.0:
-        raise refuse(f": its term is {float(none):g} at amplitude 0; expected 0, which is absent")
-    if not math.isfinite(float(slope)):
-        raise refuse(f": the derivative of its term at amplitude 0 is {float(slope)}; expected a finite one")
-    if abs(float(twice) - 2 * float(once)) > 1e-6 * abs(float(twice)) or (float(slope) == 0) != (float(once) == 0):
-        raise refuse(": its term is not linear in its amplitude; expected amplitude times something")
+    for configuration in range(len(robot.configurations)):
+        known, every, rest = (
+            dataclasses.replace(s, memory=memory) for s in _instants(effect.balance, effect.channel, configuration)
+        )
+        external = dataclasses.replace(known, battery=jnp.zeros(()))
+        try:
+            none, once, twice = (term(jnp.asarray(k * size), known) for k in (0.0, 1.0, 2.0))
+            late, fed = (term(jnp.asarray(size), s) for s in (every, external))
+            slope = jax.grad(lambda a, s=known: jnp.sum(term(a, s)))(jnp.asarray(0.0))
+            at_rest = eqx.filter_grad(lambda s: jnp.sum(term(jnp.asarray(size), s)))(rest)
+            kept = []
+            if effect.memory_size is not None:
+                kept = [effect().rate(robot, every), effect().settled(robot, known)]
+        except Exception as error:
+            raise refuse(f": its term cannot be computed ({type(error).__name__}: {error})") from error
+        if once.shape != ():
+            raise refuse(f": its term has shape {once.shape}; expected a scalar for scalar signals")
+        if not jnp.array_equal(once, late, equal_nan=True):
+            raise refuse(": its term reads a signal that is computed after its balance; see balances.moving")
+        if float(none) != 0.0:
+            raise refuse(f": its term is {float(none):g} at amplitude 0; expected 0, which is absent")
+        if not math.isfinite(float(slope)):
+            raise refuse(f": the derivative of its term at amplitude 0 is {float(slope)}; expected a finite one")
+        bent = abs(float(twice) - 2 * float(once)) > 1e-6 * abs(float(twice))
+        if bent or (float(slope) == 0) != (float(once) == 0):
+            raise refuse(": its term is not linear in its amplitude; expected amplitude times something")
+        if not all(math.isfinite(float(jnp.sum(x))) for x in kept):
+            raise refuse(": rate or settled value of its memory is no finite number")
+        if not all(jnp.isfinite(x).all() for x in jax.tree.leaves(at_rest)):
+            raise refuse(": derivatives of its term are not finite at rest, where drive and track start")
+        if effect.needs_battery and float(fed) != 0.0:
+            raise refuse(f", needs_battery: its term is {float(fed):g} on an external supply; expected 0")

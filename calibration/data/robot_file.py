@@ -1,26 +1,42 @@
-"""Robots as TOML files: a base robot by name and the parameters in which this one differs."""
+"""Robots as TOML files: a base robot by name, and what this one has besides or in its place."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
 import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 
+from calibration.data.configuration_tables import configured
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadConfiguration, choices, number
 from mmrjax import effects, nominal, params
 from mmrjax.robot import Robot
+from mmrjax.tables import TRACKED, WHEELED
 
-SCHEMA = "mmrjax.robot/1"
+SCHEMA = "mmrjax.robot/2"
+#: Schemas that are read; in the first, configurations had the names of OLD_NAMES.
+SCHEMAS = ("mmrjax.robot/1", SCHEMA)
+#: Former name of a configuration's parameters, and the configuration.
+OLD_NAMES = {"tracked": TRACKED, "wheeled": WHEELED}
+#: Whole numbers of a robot, which no fit can free: least, greatest, meaning.
+COUNTS = {
+    "sides": (1, 12, "(motors driven alike)"),
+    "battery.cells": (1, 100, "(cells of the battery in series)"),
+}
 
 
-def load(name_or_path: str, library: Library = effects.BY_NAME) -> Robot:
+def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
     """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
+
+    Args:
+        notes: is given a sentence for each former name that stands for a new one.
 
     Raises:
         BadConfiguration: no such name or file, or what `read` raises.
@@ -32,67 +48,167 @@ def load(name_or_path: str, library: Library = effects.BY_NAME) -> Robot:
         raise BadConfiguration(
             f"--robot: got {name_or_path}, no such file and no known robot; {choices(name_or_path, nominal.ROBOTS)}"
         )
-    return read(path, library)
+    return read(path, library, notes)
 
 
-def read(path: Path, library: Library = effects.BY_NAME) -> Robot:
+def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
     """Read a robot file; its effects are looked up in `library` (see `effect_file.library`) and among the curves.
 
-    The file states `schema` (optional), `base` (a robot's name, `nominal` if left out), and tables of
-    parameters by dotted name in SI units, e.g. `[motor] resistance = 0.9`; an effect is present when its
-    table `[effects.NAME]` is.
+    The file states, all optional:
+        schema: version of this form.
+        base: name of the robot that it starts from, `nominal` if left out.
+        sides: motors driven alike; `battery.cells`: cells in series.
+        configurations: names of those that the robot has, in order; else those of the base. One that the base does
+            not have states `like`, the base's configuration that it starts from, or `movers` (`tracks` or
+            `wheels`) and every parameter that has no default.
+        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`.
+        effects: one is present when its table `[effects.NAME]` is, which may name the `configurations` that it acts
+            on.
+
+    Args:
+        notes: as for `load`.
 
     Raises:
-        BadConfiguration: not TOML, an unknown key (with the choices), a value that is no number, not
-            finite, or outside the field's bounds.
+        BadConfiguration: not TOML, an unknown key (with the choices), a value that is no number, not finite, or
+            outside the field's bounds, or what `configured` and `with_effects` raise.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadConfiguration(f"{path.name}: not a readable TOML file ({error})") from error
     schema = content.pop("schema", SCHEMA)
-    if schema != SCHEMA:
+    if schema not in SCHEMAS:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
     if base not in nominal.ROBOTS:
         raise BadConfiguration(f"{path.name}, base: got {base}; {choices(str(base), nominal.ROBOTS)}")
-    robot = nominal.ROBOTS[base]()
+    robot = configured(nominal.ROBOTS[base](), content, path.name)
     present = content.get("effects", {})
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
     for name in present:
         if name not in library and name not in effects.UNNAMED:
             raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
-    robot = with_effects(robot, tuple(present), library)
-    return change(robot, dict(_flatten(content)), where=path.name)
+    tables = {name: table for name, table in present.items() if isinstance(table, dict)}
+    acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
+    robot = with_effects(robot, tuple(present), library, acting, where=path.name)
+    return change(robot, dict(_flatten(content)), where=path.name, notes=notes)
 
 
-def with_effects(robot: Robot, names: tuple[str, ...], library: Library = effects.BY_NAME) -> Robot:
-    """The robot with these effects of `library`, or curves, present, each with amplitude 0."""
-    known = {**effects.UNNAMED, **library}
-    return dataclasses.replace(robot, effects=tuple(known[name]() for name in names))
+def with_effects(
+    robot: Robot,
+    names: Sequence[str],
+    library: Library = effects.BY_NAME,
+    configurations: Mapping[str, Any] | None = None,
+    where: str = "effects",
+) -> Robot:
+    """The robot with these effects of `library`, or curves, present, each with amplitude 0.
 
-
-def change(robot: Robot, values: dict[str, Any], where: str) -> Robot:
-    """The robot with parameters replaced, each checked against its field.
+    Args:
+        configurations: by an effect's name, a list of those that it acts on; others keep their class's default.
+        where: opens the message of an error.
 
     Raises:
-        BadConfiguration: as `read`; `where` opens the message.
+        BadConfiguration: configurations of an effect that are no list of names, or that the robot does not have.
     """
+    known = {**effects.UNNAMED, **library}
+    present = []
+    for name in names:
+        effect = known[name]()
+        acting = (configurations or {}).get(name, effect.configurations)
+        here = f"{where}, effects.{name}.configurations"
+        if not isinstance(acting, list | tuple) or not all(isinstance(c, str) for c in acting):
+            raise BadConfiguration(f"{here}: got {acting!r}; expected a list of {', '.join(robot.configurations)}")
+        for c in acting:
+            if c not in robot.configurations:
+                raise BadConfiguration(f"{here}: got {c}; {choices(c, robot.configurations)}")
+        present.append(dataclasses.replace(effect, configurations=tuple(acting)))
+    return dataclasses.replace(robot, effects=tuple(present))
+
+
+def current_names(names: Iterable[str], robot: Robot, notes: list[str] | None = None) -> list[str]:
+    """Names of parameters, or of groups ending in `.*`, with former names of configurations brought up to date.
+
+    A former name stands for the configuration of OLD_NAMES where the robot has that one, and none of the former name.
+
+    Args:
+        notes: is given a sentence for each former name of a configuration.
+    """
+    found, changed = [], {}
+    for name in names:
+        head, dot, rest = name.partition(".")
+        new = OLD_NAMES.get(head, "")
+        if dot and new in robot.configurations and head not in robot.configurations:
+            changed.setdefault(head, []).append(f"{name} is now {new}.{rest}")
+            name = f"{new}.{rest}"
+        found.append(name)
+    for head, sentences in changed.items():
+        others = f", and so with {len(sentences) - 1} more of {head}" if len(sentences) > 1 else ""
+        if notes is not None:
+            notes.append(f"{sentences[0]}{others}")
+    return found
+
+
+def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
+    """The robot with parameters replaced, each checked against its field; `sides` and `battery.cells` too.
+
+    Args:
+        values: by dotted name [SI]; where: opens the message of an error; notes: as for `load`.
+
+    Raises:
+        BadConfiguration: as `read`.
+    """
+    names = current_names(values, robot, notes)
+    for old, name in zip(values, names, strict=True):
+        if names.count(name) > 1:
+            raise BadConfiguration(f"{where}, {old}: its new name {name} is stated too; state it once")
+    stated = dict(zip(names, values.values(), strict=True))
+    counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     known = {p.name: p for p in params.walk(robot)}
-    for name, value in values.items():
+    for name, value in stated.items():
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
-            allowed = [n for n in known if n.split(".")[0] == name.split(".")[0]] or list(known)
-            raise BadConfiguration(f"{where}, {name}: no such parameter; {choices(name, near or allowed)}")
+            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, list(known))}")
         spec = known[name].spec
         low, high = spec.bounds
-        allowed_text = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
+        allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed_text}")
+            raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed}")
         if not math.isfinite(value) or not low <= value <= high:
-            raise BadConfiguration(f"{where}, {name}: got {number(value)}; expected {allowed_text}")
-    robot = params.replace(robot, {k: jnp.asarray(v, float) for k, v in values.items()})  # type: ignore[assignment]
+            raise BadConfiguration(f"{where}, {name}: got {number(value)}; expected {allowed}")
+    robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
+    robot = dataclasses.replace(
+        robot,
+        sides=counts.get("sides", robot.sides),
+        battery=dataclasses.replace(robot.battery, cells=counts.get("battery.cells", robot.battery.cells)),
+    )
+    _check_pairs(robot, where)
+    return robot
+
+
+def _count(where: str, name: str, value: Any) -> int:
+    low, high, what = COUNTS[name]
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or value != value // 1
+        or not low <= value <= high
+    ):
+        raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a whole number, {low} to {high} {what}")
+    return int(value)
+
+
+def _parameters(name: str, known: list[str]) -> str:
+    """What to choose from in place of an unknown parameter."""
+    head = name.partition(".")[0]
+    heads = list(dict.fromkeys(n.partition(".")[0] for n in known))
+    near = difflib.get_close_matches(name, known, n=5, cutoff=0.4)
+    if head in heads:
+        return choices(name, near or [n for n in known if n.startswith(f"{head}.")])
+    hint = f"did you mean {near[0]}? " if near and difflib.get_close_matches(head, heads, 1, 0.6) else ""
+    return f"{hint}the robot has {', '.join(heads)}"
+
+
+def _check_pairs(robot: Robot, where: str) -> None:
     for name, chassis in robot.configurations.items():
         friction = chassis.ground.friction
         if friction.speed_dynamic <= friction.speed_static:
@@ -101,29 +217,39 @@ def change(robot: Robot, values: dict[str, Any], where: str) -> Robot:
                 f"expected more than speed_static, {float(friction.speed_static):g} m/s"
             )
     for effect in robot.effects:
-        if effect.name in effects.CURVES and not effect.low < effect.high:  # type: ignore[attr-defined]
+        ends = {p.name: float(p.value) for p in params.walk(effect)}
+        if effect.name in effects.CURVES and not ends["low"] < ends["high"]:
             raise BadConfiguration(
-                f"{where}, effects.{effect.name}.high: got {float(effect.high):g}; "  # type: ignore[attr-defined]
-                f"expected more than low, {float(effect.low):g}"  # type: ignore[attr-defined]
+                f"{where}, effects.{effect.name}.high: got {ends['high']:g}; expected more than low, {ends['low']:g}"
             )
-    return robot
 
 
 def write(robot: Robot, path: Path, *, note: str = "") -> None:
-    """Write every parameter of a robot, with unit, meaning and source beside each; `read` gives it back."""
-    lines = [f"# {line}" for line in note.splitlines()]
-    lines += [f'schema = "{SCHEMA}"', 'base = "nominal"']
-    table = ""
+    """Write a robot with everything that it states, unit, meaning and source beside each; `read` gives it back."""
+    tables: dict[str, list[str]] = {
+        "battery": [f"cells = {robot.battery.cells}  # in series"],
+        "motor": [],
+        "gearbox": [],
+    }
+    for name, chassis in robot.configurations.items():
+        tables[name] = ['movers = "tracks"' if float(chassis.on_tracks) > 0.5 else 'movers = "wheels"']
+    for effect in robot.effects:
+        named = effect.configurations or type(effect)().configurations
+        acting = f"configurations = {json.dumps(effect.configurations)}  # on which it acts"
+        tables[f"effects.{effect.name}"] = [acting] if named else []
     start = {p.name: float(p.value) for p in params.walk(nominal.nominal())}
     for parameter in params.walk(robot):
         head, _, key = parameter.name.rpartition(".")
-        if head != table:
-            lines += ["", f"[{head}]"]
-            table = head
         spec, value = parameter.spec, float(parameter.value)
-        was = start.get(parameter.name, 0.0)
-        origin = spec.source if value == was else f"nominal {was:g}: {spec.source}"
-        lines.append(f"{key} = {value!r}  # [{spec.unit}] {spec.meaning}; {origin}")
+        was = start.get(parameter.name, 0.0 if head.startswith("effects.") else None)
+        origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
+        origin = f"; {spec.source}" if value == was else origin
+        tables.setdefault(head, []).append(f"{key} = {value!r}  # [{spec.unit}] {spec.meaning}{origin}")
+    lines = [f"# {line}" for line in note.splitlines()]
+    lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {robot.sides}  # motors driven alike"]
+    lines.append(f"configurations = {json.dumps(list(robot.configurations))}")
+    for head, table in tables.items():
+        lines += ["", f"[{head}]", *table]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -42,7 +42,7 @@ class HeldOut:
     Attributes:
         labels: of the blocks.
         block: index of each row's block, shape (rows,).
-        reading: [A, rad/s, m/s], NaN where that fit's robot does not reach the row, shape (rows, 3).
+        reading: [SI], NaN where that fit's robot does not reach the row, shape (rows, channels).
         status: of each row, shape (rows,).
         z: of each block's fit, shape (blocks, parameters).
         converged: of each block's fit.
@@ -84,7 +84,7 @@ def held_out(problem: Problem, start: Array, masks: dict[str, dict[str, np.ndarr
         block, rows = left_out[part].argmax(0), np.arange(left_out.shape[1])
         status = np.asarray(seen.status)[part][block, rows]
         reading = np.asarray(seen.reading)[part][block, rows]
-        reading = np.where(problem.unreachable(status)[:, None], np.nan, reading)
+        reading = np.where(problem.observe.unreachable(status)[:, None], np.nan, reading)
         answers[kind] = HeldOut(
             tuple(kind_blocks), block, reading, status, np.asarray(found.z)[part], np.asarray(found.converged)[part]
         )

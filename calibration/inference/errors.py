@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.data.runs import CHANNELS
+from mmrjax import channels
 
 
 def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
@@ -37,17 +37,21 @@ def certainty(measured: np.ndarray, approximated: np.ndarray) -> float:
     return float(1 - np.sum((approximation - y) ** 2) / spread) if spread > 0 else float("nan")
 
 
-def channel_errors(simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> dict[str, dict[str, float | int]]:
-    """Errors (35) [%] and in sigmas of every channel over the rows that have a simulated value.
+def channel_errors(
+    simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray | None = None
+) -> dict[str, dict[str, float | int]]:
+    """Errors [%] and in sigmas of every channel over the rows that have a simulated and a measured value.
 
     Args:
-        simulated, measured, sd: current [A], motor speed [rad/s], speed [m/s], shape (rows, 3).
+        simulated, measured, sd: [SI], NaN where there is none, shape (rows, channels).
+        percent: errors of the same shape; None takes eq. (35).
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        percent = relative_error(simulated, measured)
+    if percent is None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            percent = relative_error(simulated, measured)
     sigma = (simulated - measured) / sd
     answer = {}
-    for k, channel in enumerate(CHANNELS):
+    for k, channel in enumerate(channels.names()):
         there = sigma[np.isfinite(sigma[:, k]), k]
         rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
         answer[channel] = {**summary(percent[:, k]), "rms_sigma": rms}

@@ -38,7 +38,7 @@ class Identifiability:
         rank: singular values above 1e-8 of the largest.
         sensitivity: norm of each column of that Jacobian: how many data sds one prior sd moves the
             readings; 0 for a parameter that nothing measures.
-        leverage: share of each reading's variance that the fit explains, shape (rows, 3).
+        leverage: share of each reading's variance that the fit explains, shape (rows, channels).
     """
 
     names: tuple[str, ...]
@@ -91,7 +91,7 @@ def analyse(problem: Problem, z: Array, data: Data | None = None) -> Identifiabi
     Where the adhesion limit holds z the limit is one-sided, which is for the profile to show: no sd does.
     """
     data = problem.data if data is None else data
-    if problem.long:
+    if problem.observe.long:
         jacobian = np.asarray(fit.linearised(problem, z, data)[1])
         whole, readings = jacobian[fit.informing(data)], jacobian[: data.measured.size]
     else:

@@ -14,7 +14,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import Normal, cholesky, forward
+from calibration.inference.normal_equations import Normal, backward, cholesky, forward
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.robot import Robot
 
@@ -142,7 +142,7 @@ def levenberg_marquardt(
     """One search by `optimistix.LevenbergMarquardt`. To be vmapped over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
     function = residuals(problem, data, pin)
-    tolerance = TOLERANCE_LONG if problem.long else TOLERANCE
+    tolerance = TOLERANCE_LONG if problem.observe.long else TOLERANCE
     solution = optx.least_squares(
         lambda z, _: function(z),
         Search(rtol=tolerance, atol=tolerance, linear_solver=Normal()),
@@ -254,7 +254,7 @@ def searches_long(
     Args:
         evaluate: residuals, their Jacobian and the observation of every member at its z, compiled; leading axis the
             batch.
-        starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, 3).
+        starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, channels).
         rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
             lower, and those that cannot come down to it (by `HOPELESS` times what their step predicts) before.
 
@@ -290,6 +290,20 @@ def searches_long(
 @jax.jit
 def _where(which: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+
+
+def gauss_newton(problem: Problem, z: Z, data: Data, steps: int) -> Z:
+    """A few Gauss-Newton steps: the refit of a bootstrap's replicate, whose truth is the start."""
+    function = residuals(problem, data, no_pin(z.shape[0]))
+
+    def step(_: Any, z: Z) -> Z:
+        jacobian, r = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
+        lower = cholesky(jacobian.T @ jacobian)
+        move = backward(lower, forward(lower, jacobian.T @ r))
+        move = jnp.where(jnp.all(jnp.isfinite(move)), move, 0.0)
+        return z - move * jnp.minimum(1.0, 3.0 / jnp.maximum(jnp.linalg.norm(move), 1e-9))
+
+    return jax.lax.fori_loop(0, steps, step, z)
 
 
 def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) -> Optimum:
@@ -345,4 +359,4 @@ def read(problem: Problem, robot: Robot) -> Observation:
 
 def observation(problem: Problem, z: Z) -> Observation:
     """What the model says of every row at z, by a program that the search has compiled already if it is long."""
-    return linearised(problem, z, problem.data)[2] if problem.long else read(problem, problem.robot(z))
+    return linearised(problem, z, problem.data)[2] if problem.observe.long else read(problem, problem.robot(z))

@@ -17,35 +17,26 @@ from mmrjax import params
 from mmrjax.params import Parameter
 from mmrjax.robot import Robot
 
-#: Freed by default, for each configuration that has rows: friction, with the makers' electrics, the
-#: gearbox and motor losses of Table 2, the ratio, radii and masses held where their tables put them.
-#: Guide friction μ_t stays at Table 4 because only its product with `guide_share` acts.
-FRICTION = {
-    "tracked": (
-        "track.loss_coulomb",
-        "track.loss_viscous",
-        "track.guide_share",
-        "ground.rolling_resistance",
-        "ground.friction.static",
-        "ground.friction.speed_static",
-    ),
-    "wheeled": (
-        "track.loss_coulomb",
-        "track.loss_viscous",
-        "ground.rolling_resistance",
-        "ground.friction.static",
-        "ground.friction.speed_static",
-    ),
-}
-#: Share of the weight that the guides of 6T2A carry in the track model, where it is an output (docs/track-model.md).
+#: Freed by default of each configuration that has rows: friction, with the makers' electrics, the gearbox and
+#: motor losses of Table 2, the ratio, radii and masses held where their tables put them.
+FRICTION = (
+    "track.loss_coulomb",
+    "track.loss_viscous",
+    "ground.rolling_resistance",
+    "ground.friction.static",
+    "ground.friction.speed_static",
+)
+#: And of configurations on tracks, after the losses; guide friction μ_t stays at Table 4 because only its product
+#: with the share of the guides acts.
+GUIDE_SHARE, GUIDE_FRICTION = "track.guide_share", "track.guide_friction"
+#: Share of the weight that the guides carry in the track model, where it is an output (docs/track-model.md).
 GUIDED = 0.98
-GUIDE_SHARE, GUIDE_FRICTION = "6T2A.track.guide_share", "6T2A.track.guide_friction"
-#: Parameters whose source states a ratio to another one, which they keep while they are not freed themselves.
-TIED = {
-    f"{chassis}.ground.friction.{follower}": f"{chassis}.ground.friction.{leader}"
-    for chassis in FRICTION
-    for follower, leader in (("dynamic", "static"), ("speed_dynamic", "speed_static"))
-}
+#: Parameters of a chassis whose source states a ratio to another one, which they keep while they are not freed
+#: themselves: follower, leader.
+TIED = (
+    ("ground.friction.dynamic", "ground.friction.static"),
+    ("ground.friction.speed_dynamic", "ground.friction.speed_static"),
+)
 
 _SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
 
@@ -99,7 +90,7 @@ class Coordinates(eqx.Module):
         theta = self.value(z)
         values = {name: theta[k] for k, name in enumerate(self.names)}
         values |= {follower: ratio * theta[k] for follower, k, ratio in self.tied}
-        return params.replace(base, values)  # type: ignore[return-value]
+        return params.replace(base, values)
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
         """-1 or 1 where z lies on or beyond its lower or upper bound, else 0; shape (parameters,)."""
@@ -112,33 +103,75 @@ def known(robot: Robot) -> dict[str, Parameter]:
     return {p.name: p for p in params.walk(robot)}
 
 
-def default_names(configurations: Iterable[str], robot: Robot, model: str = "steady") -> tuple[str, ...]:
-    """The default set of free parameters for data of these configurations (6T2A, 4W2T).
+def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
+    """The friction parameters of a configuration that are free by default."""
+    names = list(FRICTION)
+    if float(robot.configurations[configuration].on_tracks) > 0.5:
+        names.insert(2, GUIDE_SHARE)
+    return tuple(f"{configuration}.{name}" for name in names)
 
-    In the track model the guides' share is an output, so the guide friction μ_t stands in its place.
+
+def default_names(configurations: Iterable[str], robot: Robot, *, guides_are_output: bool = False) -> tuple[str, ...]:
+    """The default set of free parameters for data of these configurations.
+
+    Args:
+        guides_are_output: whether the fidelity puts out the guides' share, as the track model does; the guide
+            friction μ_t then stands in its place.
     """
     present = set(configurations)
-    chassis = [c for c, word in (("tracked", "6T2A"), ("wheeled", "4W2T")) if word in present]
-    names = [f"{c}.{name}" for c in chassis for name in FRICTION[c]]
-    if model == "track":
-        names = [GUIDE_FRICTION if name == GUIDE_SHARE else name for name in names]
+    names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
+    if guides_are_output:
+        names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
     return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects))
 
 
-def guided(robot: Robot) -> tuple[Robot, dict[str, tuple[float, float]]]:
+#: Freed by the loop beside friction: what benches and makers state, with their tolerances.
+BENCH = (
+    "motor.resistance",
+    "motor.torque_constant",
+    "motor.friction_coulomb",
+    "motor.friction_viscous",
+    "gearbox.efficiency_load",
+    "gearbox.friction_coulomb",
+    "gearbox.friction_viscous",
+)
+
+
+def free_names(
+    robot: Robot, configurations: Iterable[str], drive: Sequence[str] = (), chassis: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """What the loop frees for data of these configurations.
+
+    Args:
+        drive, chassis: what the data determine beside, see `Observer.free`.
+    """
+    present = set(configurations)
+    own = [
+        name
+        for c in robot.configurations
+        if c in present
+        for name in (*friction(robot, c), f"{c}.radius", *(f"{c}.{n}" for n in chassis))
+    ]
+    return (*BENCH, *drive, *own)
+
+
+def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
     """`robot` with the share that the track model's guides carry, and what is known of its guide friction.
 
     The prior is that of the product of friction and share, on which all fidelities agree: Table 4 measured
     the friction alone, and its 0.20 on all of the weight contradicts every measured current.
 
+    Args:
+        configuration: one on tracks.
+
     Returns:
         The robot, and (mean, sd) of the guide friction by its name.
     """
     field = known(robot)
-    friction, share = float(field[GUIDE_FRICTION].value), float(field[GUIDE_SHARE].value)
-    sd = friction * field[GUIDE_SHARE].spec.prior_sd(share) / GUIDED
-    turned = params.replace(robot, {GUIDE_SHARE: jnp.asarray(GUIDED)})
-    return turned, {GUIDE_FRICTION: (friction * share / GUIDED, sd)}  # type: ignore[return-value]
+    of_share, of_friction = f"{configuration}.{GUIDE_SHARE}", f"{configuration}.{GUIDE_FRICTION}"
+    size, share = float(field[of_friction].value), float(field[of_share].value)
+    sd = size * field[of_share].spec.prior_sd(share) / GUIDED
+    return params.replace(robot, {of_share: jnp.asarray(GUIDED)}), {of_friction: (size * share / GUIDED, sd)}
 
 
 def choose(
@@ -186,7 +219,7 @@ def _near(word: str, everything: list[str]) -> list[str]:
     return near or [n for n in everything if n.split(".")[0] == word.split(".")[0]] or everything
 
 
-_PRIOR = re.compile(r"^(?P<name>[\w.]+)=(?P<value>[^±]+?)(?:±|\+-|\+/-)(?P<sd>.+)$")
+_PRIOR = re.compile(r"^(?P<name>[\w.-]+)=(?P<value>[^±]+?)(?:±|\+-|\+/-)(?P<sd>.+)$")
 
 
 def parse_prior(text: str) -> tuple[str, float, float]:
@@ -250,7 +283,8 @@ def coordinates(
     location, spread, low, high, scale = zip(*rows, strict=True)
     tied = tuple(
         (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
-        for follower, leader in TIED.items()
+        for configuration in robot.configurations
+        for follower, leader in ((f"{configuration}.{a}", f"{configuration}.{b}") for a, b in TIED)
         if leader in names and follower not in names
     )
     return Coordinates(

@@ -1,268 +1,390 @@
-"""A calibration as plain data: parameters, errors before and after, what holds what, for `result.json`."""
+"""The result of a calibration: what was found, by name, and its plain-data forms for files."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.runs import CHANNELS, CONDITIONS, MEASURED, MM, RPM
-from calibration.inference import priors
-from calibration.inference.calibrate import Calibration
-from calibration.inference.errors import channel_errors, relative_error
-from calibration.inference.identifiability import Z95
-from calibration.inference.problem import MARGIN
+from calibration.data import files
+from calibration.inference.identifiability import Identifiability
+from calibration.inference.multistart import Starts
+from mmrjax import channels
+from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 
 SCHEMA = "mmrjax.calibrate/1"
-#: Kind of block whose errors `errors.*.held_out` gives, the first that the data have.
-MAIN_BLOCKS = ("slope", "voltage_configuration", "run")
+METHOD = "optimistix.LevenbergMarquardt"
+
+Interval = tuple[float, float]
 
 
-def document(c: Calibration) -> dict[str, Any]:
-    """Everything that a calibration found, as JSON-able data."""
-    about = c.identifiability
-    return {
-        "schema": SCHEMA,
-        "model": c.model,
-        "rows": len(c.runs),
-        "parameters": parameters(c),
-        "tied": {f: f"{ratio:.4g} x {about.names[k]}" for f, k, ratio in c.problem.coordinates.tied},
-        "noise": noise(c),
-        "errors": errors(c),
-        "held_out_by": {kind: held_out_errors(c, kind) for kind in c.held_out},
-        "optimizer": {
-            "method": "optimistix.LevenbergMarquardt",
-            "status": "converged" if c.converged else "not_converged",
-            "objective": c.cost,
-            "starts": len(c.starts.cost),
-            "starts_infeasible": c.starts.infeasible,
-            "starts_at_best": c.starts.agree,
-            "agreement": c.starts.statement(),
-            "seed": c.seed,
-        },
-        "chi2": chi2(c),
-        "identifiability": {
-            "singular_values": about.singular_values.tolist(),
-            "rank": about.rank,
-            "directions_better_known_from_data": int(np.sum(about.singular_values > 1)),
-            "weak_directions": [{"singular_value": s, "components": v} for s, v in about.weak_directions()],
-            "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
-        },
-        "statuses_before": _counts(c.status_before),
-        "statuses": _counts(c.status_after),
-        "notes": [*c.notes, *remarks(c)],
-    }
+@dataclasses.dataclass(frozen=True)
+class Prior:
+    """What was known of a parameter beforehand.
+
+    Attributes:
+        family: `normal` or `log-normal`.
+        median: [SI]; interval: that holds 95 % [SI].
+        source: where it comes from.
+    """
+
+    family: str
+    median: float
+    interval: Interval
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ProfileCurve:
+    """Profile likelihood of one parameter: the objective minimised over all others.
+
+    Attributes:
+        value: of the parameter, increasing [SI], shape (points,).
+        rise: twice the objective's rise above the optimum [σ²], shape (points,).
+    """
+
+    value: np.ndarray
+    rise: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Beside:
+    """The same parameter at the optimum of the same problem with `steady`.
+
+    Attributes:
+        value: there [SI]; apart_in_sd: how far this one lies from it [posterior sd].
+    """
+
+    value: float
+    apart_in_sd: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """One free parameter.
+
+    Attributes:
+        value: at the optimum; sd: posterior, linear; both [unit].
+        interval: of 95 %, that of the profile where there is one; interval_linear: from the sd alone [unit].
+        interval_open: whether an end lies beyond the last point of the profile.
+        interval_shift: the ends of `interval` in prior sds from the prior's median.
+        unit, meaning: of its field.
+        prior: what was known beforehand; shift: of the value from it [prior sd].
+        variance_ratio: posterior over prior variance [-].
+        held_by: `data` or `prior`, whichever says more of it.
+        at_bound: `lower`, `upper` or None.
+        measured_by_data: whether any reading depends on it.
+        profile: None where none was made.
+        with_steady: None where the search did not begin at the optimum of `steady`.
+    """
+
+    value: float
+    sd: float
+    interval: Interval
+    interval_linear: Interval
+    interval_open: tuple[bool, bool]
+    interval_shift: Interval
+    unit: str
+    meaning: str
+    prior: Prior
+    shift: float
+    variance_ratio: float
+    held_by: str
+    at_bound: str | None
+    measured_by_data: bool
+    profile: ProfileCurve | None = None
+    with_steady: Beside | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `parameters` of result.json."""
+        found = {
+            "value": self.value,
+            "sd": self.sd,
+            "interval": self.interval,
+            "interval_linear": self.interval_linear,
+            "interval_open": self.interval_open,
+            "unit": self.unit,
+            "meaning": self.meaning,
+            "prior": dataclasses.asdict(self.prior),
+            "shift_in_prior_sd": self.shift,
+            "variance_ratio": self.variance_ratio,
+            "held_by_prior": self.held_by == "prior",
+            "at_bound": self.at_bound,
+            "measured_by_data": self.measured_by_data,
+        }
+        return found if self.with_steady is None else {**found, "with_steady": dataclasses.asdict(self.with_steady)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Tie:
+    """A parameter that keeps its ratio to a free one: value = ratio · leader."""
+
+    leader: str
+    ratio: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelNoise:
+    """The sd of a channel.
+
+    Attributes:
+        source: `stated`, `columns`, `estimated` (from the misfit), or `no readings`.
+        median_percent: median over the readings of sd over reading.
+        estimated_percent: where estimated, of the channel's size, see `Observer.sizes`; else None.
+    """
+
+    source: str
+    median_percent: float
+    estimated_percent: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelErrors:
+    """Errors of one channel over the rows that have both a simulated and a measured value.
+
+    Attributes:
+        rows: how many they are.
+        rms_percent, max_percent: of what `CalibrationResult.percent_of` says; rms_sigma: in sds of the noise.
+    """
+
+    rows: int
+    rms_percent: float
+    max_percent: float
+    rms_sigma: float
+
+
+#: Errors by the name of the channel.
+Errors = dict[str, ChannelErrors]
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """One block that was held out.
+
+    Attributes:
+        errors: of its rows; unreachable_rows: that the fit without it does not reach, counted from 1.
+        converged: whether that fit did.
+    """
+
+    errors: Errors
+    unreachable_rows: tuple[int, ...]
+    converged: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `held_out_by` of result.json."""
+        return {
+            **_by_name(self.errors),
+            "unreachable_rows": self.unreachable_rows,
+            "converged": self.converged,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut:
+    """Every row predicted by a fit that has not seen its block, for one kind of blocks.
+
+    Attributes:
+        errors: of all rows; unreachable_rows: without a prediction, counted from 1.
+        blocks: by label.
+        reading: by channel [SI], NaN where the fit's robot does not reach the row, shape (rows,).
+    """
+
+    errors: Errors
+    unreachable_rows: tuple[int, ...]
+    blocks: dict[str, Block]
+    reading: dict[str, np.ndarray]
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `held_out_by` of result.json."""
+        return {
+            "all": _by_name(self.errors),
+            "unreachable_rows": self.unreachable_rows,
+            "blocks": {label: block.to_json() for label, block in self.blocks.items()},
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class ChannelReadings:
+    """Readings of one channel, every array of shape (rows,).
+
+    Attributes:
+        measured: [SI], NaN where missing; sd: of each.
+        before, after: of the robot as given and as calibrated [SI], NaN where it does not reach the row.
+        percent, sigma: errors after.
+    """
+
+    measured: np.ndarray
+    sd: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    percent: np.ndarray
+    sigma: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class ChiSquare:
+    """Misfit of the readings [σ²], and the degrees of freedom that the fit leaves them.
+
+    Attributes:
+        tests_adequacy: false where noise was estimated from the misfit.
+    """
+
+    value: float
+    degrees_of_freedom: float
+    tests_adequacy: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationResult:
+    """All that a calibration found, computed once by `calibrate`; what is written and drawn is read from it.
+
+    Attributes:
+        robot: calibrated.
+        source: of the runs; model: the fidelity; seed: of the starts.
+        parameters: the free ones, by name; tied: those that follow them, by name.
+        noise: by channel.
+        percent_of: what errors in percent are of.
+        errors_before, errors_after: of the robot as given and as calibrated, by channel.
+        held_out: by kind of block, in the order in which they tell most.
+        conditions: columns of the runs, as in their table; readings: by channel.
+        status_before, status: word of each row, shape (rows,).
+        adhesion_used: by the calibrated robot [-], shape (rows,).
+        objective: at the optimum [½σ²]; converged: whether the search did.
+        starts: how all searches ended.
+        chi_square: of the readings that are there.
+        identifiability: the linear analysis.
+        notes: sentences worth reading before it is used.
+    """
+
+    robot: Robot
+    source: str
+    model: str
+    seed: int
+    parameters: dict[str, Estimate]
+    tied: dict[str, Tie]
+    noise: dict[str, ChannelNoise]
+    percent_of: str
+    errors_before: Errors
+    errors_after: Errors
+    held_out: dict[str, HeldOut]
+    conditions: dict[str, np.ndarray]
+    readings: dict[str, ChannelReadings]
+    status_before: np.ndarray
+    status: np.ndarray
+    adhesion_used: np.ndarray
+    objective: float
+    converged: bool
+    starts: Starts
+    chi_square: ChiSquare
+    identifiability: Identifiability
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Rows of the table."""
+        return len(self.status)
+
+    @property
+    def profiled(self) -> bool:
+        """Whether profiles were made."""
+        return any(p.profile is not None for p in self.parameters.values())
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many rows have each status with the calibrated robot."""
+        return _counts(self.status)
+
+    @property
+    def main_blocks(self) -> HeldOut | None:
+        """The most telling kind of blocks that was held out."""
+        return next(iter(self.held_out.values()), None)
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json, docs/schemas/calibrate.schema.json."""
+        about, before, main = self.identifiability, _by_name(self.errors_before), self.main_blocks
+        return files.finite(
+            {
+                "schema": SCHEMA,
+                "model": self.model,
+                "rows": len(self),
+                "parameters": {name: p.to_json() for name, p in self.parameters.items()},
+                "tied": {name: f"{tie.ratio:.4g} x {tie.leader}" for name, tie in self.tied.items()},
+                "noise": _by_name(self.noise),
+                "percent_of": self.percent_of,
+                "errors": {
+                    # nothing is fitted before, so both are the same
+                    "before": {"fitted": before, "held_out": before},
+                    "after": {
+                        "fitted": _by_name(self.errors_after),
+                        "held_out": None if main is None else _by_name(main.errors),
+                    },
+                },
+                "held_out_by": {kind: held.to_json() for kind, held in self.held_out.items()},
+                "optimizer": {
+                    "method": METHOD,
+                    "status": "converged" if self.converged else "not_converged",
+                    "objective": self.objective,
+                    "starts": len(self.starts.cost),
+                    "starts_infeasible": self.starts.infeasible,
+                    "starts_at_best": self.starts.agree,
+                    "agreement": self.starts.statement(),
+                    "seed": self.seed,
+                },
+                "chi2": dataclasses.asdict(self.chi_square),
+                "identifiability": {
+                    "singular_values": about.singular_values,
+                    "rank": about.rank,
+                    "directions_better_known_from_data": int(np.sum(about.singular_values > 1)),
+                    "weak_directions": [
+                        {"singular_value": s, "components": main} for s, main in about.weak_directions()
+                    ],
+                    "correlated": [{"a": a, "b": b, "correlation": r} for a, b, r in about.correlated()],
+                },
+                "statuses_before": _counts(self.status_before),
+                "statuses": self.counts,
+                "notes": self.notes,
+            }
+        )
+
+    def rows(self) -> dict[str, np.ndarray]:
+        """Conditions, readings before and after and held out, errors in percent and in σ: a table, row by row."""
+        return {**self.conditions, **dict(self._readings()), "status": self.status}
+
+    def _readings(self) -> Iterator[tuple[str, np.ndarray]]:
+        main = self.main_blocks
+        for channel in channels.CHANNELS:
+            r, column = self.readings[channel.name], channel.column
+            yield column, r.measured / channel.factor
+            yield f"sd_{column}", r.sd / channel.factor
+            yield f"before_{column}", r.before / channel.factor
+            yield f"after_{column}", r.after / channel.factor
+            if main is not None:
+                yield f"held_out_{column}", main.reading[channel.name] / channel.factor
+            yield f"error_{channel.name}_percent", r.percent
+            yield f"error_{channel.name}_sigma", r.sigma
+
+    def save(self, folder: Path | str, robot_name: str = "a robot") -> None:
+        """Write robot.toml, result.json and rows.csv into a folder, which is made if it is not there.
+
+        Args:
+            robot_name: of the robot that was calibrated, for the head of robot.toml.
+        """
+        from calibration.data import robot_file
+
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        note = f"calibrated from {robot_name} with {self.source}; the free parameters: {', '.join(self.parameters)}"
+        robot_file.write(self.robot, folder / "robot.toml", note=note)
+        files.write_json(folder / "result.json", self.to_json())
+        files.write_table(folder / "rows.csv", self.rows())
+
+
+def _by_name(values: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {name: dataclasses.asdict(value) for name, value in values.items()}
 
 
 def _counts(status: np.ndarray) -> dict[str, int]:
-    return {name: int(np.sum(status == k)) for k, name in enumerate(STATUSES)}
-
-
-def parameters(c: Calibration) -> dict[str, dict[str, Any]]:
-    """Every free parameter: value, sd and 95 % interval [SI], prior, and what holds it.
-
-    The sd is the linear one; the interval is that of the profile where there is one.
-    """
-    coordinates, about, z = c.problem.coordinates, c.identifiability, jnp.asarray(c.z)
-    value, slope = np.asarray(coordinates.value(z)), np.asarray(coordinates.slope(z))
-    linear = [np.asarray(coordinates.value(z + sign * Z95 * jnp.asarray(about.sd))) for sign in (-1, 1)]
-    median = np.asarray(coordinates.value(jnp.zeros_like(z)))
-    wide = [np.asarray(coordinates.value(jnp.full_like(z, sign * Z95))) for sign in (-1, 1)]
-    beyond = coordinates.beyond(c.z)
-    fields = priors.known(c.base)
-    found: dict[str, dict[str, Any]] = {}
-    for k, name in enumerate(about.names):
-        profile = c.profile
-        found[name] = {
-            "value": value[k],
-            "sd": about.sd[k] * slope[k],
-            "interval": [linear[0][k], linear[1][k]] if profile is None else [profile.low[k], profile.high[k]],
-            "interval_linear": [linear[0][k], linear[1][k]],
-            "interval_open": [False, False] if profile is None else profile.open[k].tolist(),
-            "unit": coordinates.units[k],
-            "meaning": fields[name].spec.meaning,
-            "prior": {
-                "family": "log-normal" if coordinates.scale[k] else "normal",
-                "median": median[k],
-                "interval": [wide[0][k], wide[1][k]],
-                "source": _source(c, name, fields[name].spec.source),
-            },
-            "shift_in_prior_sd": c.z[k],
-            "variance_ratio": about.sd[k] ** 2,
-            "held_by_prior": bool(about.held_by_prior[k]),
-            "at_bound": {-1: "lower", 0: None, 1: "upper"}[int(beyond[k])],
-            "measured_by_data": bool(about.sensitivity[k] > 1e-6),
-        }
-        if c.beside is not None:
-            found[name]["with_steady"] = {
-                "value": float(coordinates.value(jnp.asarray(c.beside))[k]),
-                "apart_in_sd": float((c.z[k] - c.beside[k]) / about.sd[k]),
-            }
-    return found
-
-
-def _source(c: Calibration, name: str, field: str) -> str:
-    if name in c.problem.coordinates.stated:
-        return "stated"
-    if c.model == "track" and name == priors.GUIDE_FRICTION:
-        return "its product with the share of the guides, as in the other fidelities"
-    return field
-
-
-def noise(c: Calibration) -> dict[str, Any]:
-    """Where each channel's sd comes from, and its size."""
-    share = c.sd / np.maximum(np.abs(c.runs.measured()), 1e-12)
-    return {
-        channel: {
-            "source": c.noise.source[k],
-            "median_percent": 100 * float(np.median(share[:, k])),
-            "estimated_percent": 100 * c.shares[k] if c.noise.estimated[k] else None,
-        }
-        for k, channel in enumerate(CHANNELS)
-    }
-
-
-def _errors(simulated: np.ndarray, c: Calibration) -> dict[str, dict[str, Any]]:
-    return channel_errors(simulated, c.runs.measured(), c.sd)
-
-
-def main_kind(c: Calibration) -> str | None:
-    """The kind of blocks that stands for `held_out`."""
-    return next((kind for kind in MAIN_BLOCKS if kind in c.held_out), None)
-
-
-def errors(c: Calibration) -> dict[str, dict[str, Any]]:
-    """Errors (35) and in σ, before and after, fitted and held out, by channel.
-
-    Before, nothing is fitted, so both are the same. `rows` counts the rows that the model reaches: a robot
-    that slides where the real one climbed has no reading there, which `held_out_by` and the statuses say.
-    """
-    kind = main_kind(c)
-    before = _errors(c.before, c)
-    return {
-        "before": {"fitted": before, "held_out": before},
-        "after": {
-            "fitted": _errors(c.after, c),
-            "held_out": None if kind is None else _errors(c.held_out[kind].reading, c),
-        },
-    }
-
-
-def held_out_errors(c: Calibration, kind: str) -> dict[str, Any]:
-    """Errors on blocks that the fit had not seen, in all and block by block."""
-    held = c.held_out[kind]
-    lost = c.problem.unreachable(held.status)
-    each = {}
-    for k, label in enumerate(held.labels):
-        inside = held.block == k
-        each[label] = {
-            **_errors(np.where(inside[:, None], held.reading, np.nan), c),
-            "unreachable_rows": (np.flatnonzero(inside & lost) + 1).tolist(),
-            "converged": bool(held.converged[k]),
-        }
-    return {"all": _errors(held.reading, c), "unreachable_rows": (np.flatnonzero(lost) + 1).tolist(), "blocks": each}
-
-
-def chi2(c: Calibration) -> dict[str, Any]:
-    """Misfit of the readings, and the degrees of freedom that the fit leaves them."""
-    value = float(np.sum(((c.after - c.runs.measured()) / c.sd) ** 2))
-    freedom = float(c.sd.size - c.identifiability.leverage.sum())
-    return {
-        "value": value,
-        "degrees_of_freedom": freedom,
-        "tests_adequacy": not bool(c.noise.estimated.any()),
-    }
-
-
-def remarks(c: Calibration) -> list[str]:
-    """What a careful engineer would say of this calibration, one sentence each."""
-    about, said = c.identifiability, []
-    names = np.asarray(about.names)
-    estimated = [
-        f"{ch.replace('_', ' ')} {100 * s:.1f} %" for ch, s in zip(CHANNELS, c.shares, strict=True) if s == s
-    ]
-    if estimated:
-        said.append(
-            f"no noise was stated for {', '.join(estimated)}: estimated from the misfit, so it holds model error too "
-            "and cannot test whether the model is adequate"
-        )
-    if not c.converged:
-        said.append("the search did not converge; values and intervals are not to be trusted")
-    said += _beside(c)
-    if c.profile is None:
-        said.append("no profiles were made: the intervals are linear, and too symmetric where the model is curved")
-    if c.starts.agree < len(c.starts.cost):
-        said.append(c.starts.statement())
-    for status in np.unique(c.status_after[c.status_after != 0]):
-        rows = ", ".join(str(k + 1) for k in np.flatnonzero(c.status_after == status))
-        said.append(f"rows {rows}: {STATUSES[status]} with the calibrated robot")
-    held = names[about.held_by_prior]
-    if held.size:
-        said.append(f"the prior says more than the data of: {', '.join(held)}")
-    for name, z in zip(names, c.z, strict=True):
-        if abs(z) > 3:
-            said.append(f"{name} lies {abs(z):.1f} prior sds from its prior: the prior or the model is wrong")
-    for name, side in zip(names, c.problem.coordinates.beyond(c.z), strict=True):
-        if side:
-            said.append(f"{name} is at its {'lower' if side < 0 else 'upper'} bound")
-    limited = np.flatnonzero(c.adhesion_used > 1 - MARGIN)
-    if limited.size:
-        said.append(
-            f"rows {', '.join(str(k + 1) for k in limited)} use all the adhesion but the margin of {MARGIN:.0%}: the "
-            "limit holds their static friction from below, and the slip that they show is not all explained"
-        )
-    for chassis in ("tracked", "wheeled"):
-        pair = [f"{chassis}.track.guide_friction", f"{chassis}.track.guide_share"]
-        if all(p in names for p in pair):
-            said.append(f"only the product {pair[0]} x {pair[1]} acts; the priors alone divide it")
-        elif pair[1] in names:
-            said.append(f"{pair[1]} is found with {pair[0]} held: only their product acts")
-    lost = {kind: int(c.problem.unreachable(h.status).sum()) for kind, h in c.held_out.items()}
-    said += [
-        f"held out by {kind.replace('_', ' and ')}: {n} of {len(c.runs)} rows have no prediction, because the robot "
-        "fitted without them slides there; the errors leave them out"
-        for kind, n in lost.items()
-        if n
-    ]
-    said += [
-        f"a search without a block of {kind} did not converge"
-        for kind, h in c.held_out.items()
-        if not h.converged.all()
-    ]
-    return said
-
-
-def _beside(c: Calibration) -> list[str]:
-    """How a calibration with rollouts compares with that of `steady`."""
-    if c.beside is None:
-        return []
-    about, said = c.identifiability, []
-    apart = np.abs(c.z - c.beside) / about.sd
-    worst = int(apart.argmax())
-    inside = int(np.sum(apart < Z95))
-    said.append(
-        f"{inside} of {len(apart)} parameters lie within their 95 % intervals of the same problem's optimum with "
-        f"steady; furthest apart is {about.names[worst]}, {apart[worst]:.2f} sd"
-    )
-    return said
-
-
-def rows_table(c: Calibration) -> dict[str, np.ndarray]:
-    """Conditions, measured, simulated before and after and held out, errors (35) and in σ, row by row."""
-    unit = np.array([1.0, RPM, MM])
-    table = {k: c.runs[k] for k in ("run_id", "time_s", "configuration", *CONDITIONS) if c.runs.has(k)}
-    kind = main_kind(c)
-    for k, (channel, column) in enumerate(zip(CHANNELS, MEASURED, strict=True)):
-        table[column] = c.runs[column]
-        table[f"sd_{column}"] = c.sd[:, k] / unit[k]
-        table[f"before_{column}"] = c.before[:, k] / unit[k]
-        table[f"after_{column}"] = c.after[:, k] / unit[k]
-        if kind is not None:
-            table[f"held_out_{column}"] = c.held_out[kind].reading[:, k] / unit[k]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            table[f"error_{channel}_percent"] = relative_error(c.after[:, k], c.runs.measured()[:, k])
-        table[f"error_{channel}_sigma"] = (c.after[:, k] - c.runs.measured()[:, k]) / c.sd[:, k]
-    table["status"] = np.array(STATUSES)[c.status_after]
-    return table
+    return {name: int(np.sum(status == name)) for name in STATUSES}

@@ -3,54 +3,79 @@
 from __future__ import annotations
 
 import abc
+import inspect
 import math
-from typing import TYPE_CHECKING, ClassVar
+import re
+from types import ModuleType
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax.conditions import Conditions
-from mmrjax.params import Scalar
+from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+
+def amplitude(*, unit: str, meaning: str, bounds: tuple[float, float], sd: float, source: str) -> Any:
+    """Declare the amplitude of an effect, 0 (absent) by default; see `params.Spec` for the arguments."""
+    return parameter(0.0, unit=unit, meaning=meaning, bounds=bounds, sd=sd, source=source, amplitude=True)
 
 
 class Effect(eqx.Module):
     """A term that the paper's model lacks.
 
-    A subclass states its equation and source in its docstring, declares `amplitude` as a parameter with
-    default 0 (absent) and `amplitude=True`, any shape parameters beside it, and the class attributes:
+    A subclass states its equation and source in its docstring, declares its `amplitude` (see the function of
+    that name), any shape parameters beside it, and defines `term`. The class attributes that differ from their
+    defaults are stated as `dissipative = True`:
 
     Attributes:
-        name: its name in files and reports.
-        balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has. A positive
-            term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
+        name: its name in files and reports; by default that of the class, `MassError` as `mass_error`.
+        balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has; has no default. A
+            positive term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
             `inertia` and `inductance` it adds, and in `sensor` it adds to the reading of `channel`.
         dissipative: whether a positive amplitude may only take power out.
-        channel: for `sensor` alone: the field of `Reading` that it changes.
-        transient: whether settled travel shows nothing of it, so that only time series can.
+        channel: for `sensor` alone: the channel that it changes, one of `channels.names()`.
+        transient: whether settled travel shows nothing of it, so that only histories can.
+        settles_to: name of the effect from which settled travel cannot tell it, so that only histories can.
+        needs_battery: whether it acts with the on-board battery alone, so that no run on an external supply
+            shows it.
+        odd_in_travel: whether it keeps its sign in space and not in the frame of travel, as a wrong slope does:
+            a robot that is turned about, so that its travel is forward again, meets minus its amplitude.
+        movers: `tracks` or `wheels` where it acts on configurations of that kind alone.
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
             temperature, a phase); None has none. A run starts with memory 0.
         memory_unit: unit of its memory.
-        movers: `tracks` or `wheels` where it acts on configurations of that kind alone.
-        configurations: names of the configurations that it acts on; none: all, or those with its `movers`.
+        configurations: names of the configurations that it acts on; none: all, or those with its `movers`. A
+            field: what a class states is the default, and a robot file may say `configurations = ["4W2T"]`.
 
     An effect with a memory defines `rate`, and `settled` for the fidelities that keep no memory.
     """
 
     name: ClassVar[str]
     balance: ClassVar[str]
-    dissipative: ClassVar[bool]
+    dissipative: ClassVar[bool] = False
     channel: ClassVar[str] = ""
     transient: ClassVar[bool] = False
+    settles_to: ClassVar[str] = ""
+    needs_battery: ClassVar[bool] = False
+    odd_in_travel: ClassVar[bool] = False
+    movers: ClassVar[str] = ""
     memory_size: ClassVar[float | None] = None
     memory_unit: ClassVar[str] = "-"
-    movers: ClassVar[str] = ""
 
     amplitude: eqx.AbstractVar[Scalar]
     configurations: tuple[str, ...] = eqx.field(default=(), static=True, kw_only=True)
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if "name" not in vars(cls):
+            cls.name = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+        # Stated beside the class attributes, it is the default of the field.
+        if isinstance(stated := vars(cls).get("configurations"), tuple):
+            cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": tuple[str, ...]}
+            cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
 
     @property
     def acts_everywhere(self) -> bool:
@@ -60,8 +85,8 @@ class Effect(eqx.Module):
     def acts(self, robot: Robot, signals: Signals) -> Scalar:
         """1 in configurations on which it acts, else 0 [-]: those that it names, else those with its `movers`."""
         if self.configurations:
-            named = [robot.configurations.index(n) for n in self.configurations if n in robot.configurations]
-            return sum((jnp.where(signals.configuration == k, 1.0, 0.0) for k in named), jnp.zeros(()))
+            named = {robot.configurations.index(n) for n in self.configurations if n in robot.configurations}
+            return sum((jnp.where(signals.configuration == k, 1.0, 0.0) for k in sorted(named)), jnp.zeros(()))
         return signals.on_tracks if self.movers == "tracks" else 1 - signals.on_tracks
 
     @abc.abstractmethod
@@ -87,3 +112,9 @@ class Effect(eqx.Module):
         right it has to see also what would happen.
         """
         return math.inf
+
+
+def defined_in(module: ModuleType) -> tuple[type[Effect], ...]:
+    """The effects that a module defines, in its order; classes that lack a `term` are none."""
+    own = [v for v in vars(module).values() if inspect.isclass(v) and v.__module__ == module.__name__]
+    return tuple(v for v in own if issubclass(v, Effect) and not inspect.isabstract(v))

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax.effects.base import Effect
+from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Robot
 from mmrjax.signals import Signals
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
 
 #: Balances that a curve may enter: unit, amplitude that is plausible, and which direction it acts along.
 BALANCES = {
@@ -74,14 +72,12 @@ def _ordinate() -> Scalar:
 
 
 def _size(unit: str, size: float) -> Scalar:
-    return parameter(
-        0.0,
+    return amplitude(
         unit=unit,
         meaning="size of the discrepancy",
         bounds=(-100 * size, 100 * size),
         sd=size,
         source="what the fit leaves; no cause is known",
-        amplitude=True,
     )
 
 
@@ -91,12 +87,11 @@ def _curve(place: str, over: str) -> type[Effect]:
     unit_x, first, last = VARIABLES[over]
 
     class Curve(Effect):
-        name: ClassVar[str] = f"curve_{place}_{over}"
-        balance: ClassVar[str] = place
-        dissipative: ClassVar[bool] = False
+        name = f"curve_{place}_{over}"
+        balance = place
         variable: ClassVar[str] = over
-        memory_size: ClassVar[float | None] = 1.0 if over == "time" else None
-        memory_unit: ClassVar[str] = unit_x
+        memory_size = 1.0 if over == "time" else None
+        memory_unit = unit_x
 
         amplitude: Scalar = _size(unit, size)
         low: Scalar = parameter(
@@ -156,9 +151,9 @@ def _wave(place: str) -> type[Effect]:
     """The wave of one balance."""
     unit, size, _ = BALANCES[place]
 
-    class Wave(Periodic, Effect):
-        name: ClassVar[str] = f"wave_{place}"
-        balance: ClassVar[str] = place
+    class Wave(Periodic):
+        name = f"wave_{place}"
+        balance = place
 
         amplitude: Scalar = _size(unit, size)
         phase: Scalar = phase_parameter()

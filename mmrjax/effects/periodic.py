@@ -1,9 +1,8 @@
-"""What repeats with the angle of a shaft: shared by the effects that a series shows as orders."""
+"""What repeats with the angle of a shaft: shared by the effects that a history shows as orders."""
 
 from __future__ import annotations
 
 import abc
-from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,11 +10,10 @@ from jaxtyping import Array, Int
 
 from mmrjax import power
 from mmrjax.conditions import Conditions
+from mmrjax.effects.base import Effect
 from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Robot
 from mmrjax.signals import Signals
-
-if TYPE_CHECKING:
-    from mmrjax.robot import Robot
 
 STEPS = 12  # integration steps in a period: derivatives at amplitude 0 are then right to 1e-5
 
@@ -32,18 +30,16 @@ def phase_parameter() -> Scalar:
     )
 
 
-class Periodic(eqx.Module):
+class Periodic(Effect):
     """term = a w(signals) sin(ψ + φ), with ψ' = k ω_m and k the order per radian of the motor's shaft.
 
     The memory is the phase ψ [rad]. Where none is kept (`steady`) the wave is its mean, zero.
     """
 
-    dissipative: ClassVar[bool] = False
-    transient: ClassVar[bool] = True
-    memory_size: ClassVar[float | None] = 100.0
-    memory_unit: ClassVar[str] = "rad"
+    transient = True
+    memory_size = 100.0
+    memory_unit = "rad"
 
-    name: eqx.AbstractClassVar[str]
     phase: eqx.AbstractVar[Scalar]
 
     @abc.abstractmethod

@@ -1,0 +1,177 @@
+"""What a finished search says of parameters, noise and errors: the parts of a calibration's result."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.runs import CONDITIONS, Runs
+from calibration.inference import blocks as holdout
+from calibration.inference import priors
+from calibration.inference.errors import channel_errors
+from calibration.inference.identifiability import Z95, Identifiability, Profile
+from calibration.inference.noise import Noise
+from calibration.inference.observers import Observer
+from calibration.inference.problem import Problem
+from calibration.inference.result import (
+    Beside,
+    Block,
+    ChannelErrors,
+    ChannelNoise,
+    ChannelReadings,
+    ChiSquare,
+    Errors,
+    Estimate,
+    HeldOut,
+    Prior,
+    ProfileCurve,
+    Tie,
+)
+from mmrjax import channels
+from mmrjax.robot import Robot
+
+#: How many data sds one prior sd has to move the readings to be measured by them at all.
+SENSITIVE = 1e-6
+
+_SIDE = {-1: "lower", 0: None, 1: "upper"}
+
+
+def parameters(
+    posed: Problem,
+    base: Robot,
+    z: np.ndarray,
+    about: Identifiability,
+    profile: Profile | None,
+    beside: np.ndarray | None,
+    sources: dict[str, str],
+) -> dict[str, Estimate]:
+    """Every free parameter by its name.
+
+    Args:
+        posed, base: the problem, and the robot whose values are the prior means.
+        z: the optimum; beside: that of the same problem with `steady`, or None.
+        about, profile: the linear analysis there, and the profiles, if any.
+        sources: of the priors that are not the fields'.
+    """
+    coordinates = posed.coordinates
+    at, sd = jnp.asarray(z), jnp.asarray(about.sd)
+    value, slope = np.asarray(coordinates.value(at)), np.asarray(coordinates.slope(at))
+    linear = np.stack([coordinates.value(at + side * Z95 * sd) for side in (-1, 1)], 1)
+    median = np.asarray(coordinates.value(jnp.zeros_like(at)))
+    wide = np.stack([coordinates.value(jnp.full_like(at, side * Z95)) for side in (-1, 1)], 1)
+    other = None if beside is None else np.asarray(coordinates.value(jnp.asarray(beside)))
+    bound, fields = coordinates.beyond(z), priors.known(base)
+    found = {}
+    for k, name in enumerate(coordinates.names):
+        interval, shift, is_open = linear[k], z[k] + Z95 * about.sd[k] * np.array([-1.0, 1.0]), (False, False)
+        if profile is not None:
+            interval = np.array([profile.low[k], profile.high[k]])
+            shift = np.interp(interval, profile.value[k], profile.z[k])
+            is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
+        found[name] = Estimate(
+            value=float(value[k]),
+            sd=float(about.sd[k] * slope[k]),
+            interval=_pair(interval),
+            interval_linear=_pair(linear[k]),
+            interval_open=is_open,
+            interval_shift=_pair(shift),
+            unit=coordinates.units[k],
+            meaning=fields[name].spec.meaning,
+            prior=Prior(
+                "log-normal" if coordinates.scale[k] else "normal",
+                float(median[k]),
+                _pair(wide[k]),
+                sources.get(name, fields[name].spec.source),
+            ),
+            shift=float(z[k]),
+            variance_ratio=float(about.sd[k] ** 2),
+            held_by="prior" if about.held_by_prior[k] else "data",
+            at_bound=_SIDE[int(bound[k])],
+            measured_by_data=bool(about.sensitivity[k] > SENSITIVE),
+            profile=None if profile is None else ProfileCurve(profile.value[k], profile.rise[k]),
+            with_steady=None if other is None else Beside(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
+        )
+    return found
+
+
+def _pair(ends: np.ndarray) -> tuple[float, float]:
+    return float(ends[0]), float(ends[1])
+
+
+def tied(posed: Problem) -> dict[str, Tie]:
+    """Parameters that follow a free one, by name."""
+    names = posed.coordinates.names
+    return {follower: Tie(names[k], ratio) for follower, k, ratio in posed.coordinates.tied}
+
+
+def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray) -> dict[str, ChannelNoise]:
+    """Where each channel's sd comes from, and its size."""
+    share = np.where(np.isfinite(measured), np.asarray(posed.data.sd) / np.maximum(np.abs(measured), 1e-12), np.nan)
+    return {
+        name: ChannelNoise(
+            known.source[k],
+            100 * float(np.nanmedian(share[:, k])) if np.isfinite(share[:, k]).any() else np.nan,
+            100 * float(shares[k]) if known.estimated[k] else None,
+        )
+        for k, name in enumerate(channels.names())
+    }
+
+
+def errors(observe: type[Observer], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> Errors:
+    """Errors by channel, in percent of what the observer says and in σ; arrays of shape (rows, channels)."""
+    return _errors(simulated, measured, sd, observe.percent(simulated, measured))
+
+
+def _errors(simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray) -> Errors:
+    found = channel_errors(simulated, measured, sd, percent)
+    return {
+        name: ChannelErrors(int(e["rows"]), float(e["rms_percent"]), float(e["max_percent"]), float(e["rms_sigma"]))
+        for name, e in found.items()
+    }
+
+
+def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np.ndarray) -> HeldOut:
+    """Errors on blocks that the fit had not seen, in all and block by block."""
+    percent, lost = posed.observe.percent(held.reading, measured), posed.observe.unreachable(held.status)
+    blocks = {}
+    for k, label in enumerate(held.labels):
+        inside = held.block == k
+        alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
+        blocks[label] = Block(
+            _errors(alone[0], measured, sd, alone[1]), _counted(inside & lost), bool(held.converged[k])
+        )
+    reading = dict(zip(channels.names(), held.reading.T, strict=True))
+    return HeldOut(_errors(held.reading, measured, sd, percent), _counted(lost), blocks, reading)
+
+
+def _counted(rows: np.ndarray) -> tuple[int, ...]:
+    """Rows of a mask, counted from 1."""
+    return tuple((np.flatnonzero(rows) + 1).tolist())
+
+
+def readings(
+    observe: type[Observer], measured: np.ndarray, sd: np.ndarray, before: np.ndarray, after: np.ndarray
+) -> dict[str, ChannelReadings]:
+    """Readings by channel; arrays of shape (rows, channels), NaN where there is none."""
+    percent, sigma = observe.percent(after, measured), (after - measured) / sd
+    return {
+        name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
+        for k, name in enumerate(channels.names())
+    }
+
+
+def chi_square(
+    after: np.ndarray, measured: np.ndarray, sd: np.ndarray, about: Identifiability, known: Noise
+) -> ChiSquare:
+    """Misfit of the readings that are there, and the degrees of freedom that the fit leaves them."""
+    there = np.isfinite(measured)
+    misfit = np.where(there, (after - measured) / sd, 0.0)
+    freedom = float(there.sum() - about.leverage.sum())
+    return ChiSquare(float(np.sum(misfit**2)), freedom, not bool(known.estimated.any()))
+
+
+def conditions(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
+    """Columns of the runs that say which row is which."""
+    others = (axis for axis in observe.axes if axis not in CONDITIONS)
+    columns = ("run_id", *others, "configuration", *CONDITIONS, "surface")
+    return {column: runs[column] for column in columns if runs.has(column)}

@@ -1,0 +1,192 @@
+"""A fit, linearised: residuals, Jacobian, what effects and defects of balances would change of the readings."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax import channels, params
+from mmrjax.effects import Effect
+from mmrjax.params import Parameter, Scalar, parameter
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals
+
+#: Balances whose defect moves the readings of settled travel. Those of a line act alike on the readings, but
+#: for what they depend on: three channels close three equations.
+PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground", "slip")
+
+
+def probe(of: str) -> Effect:
+    """An effect that adds its amplitude to a balance."""
+
+    class Probe(Effect):
+        name: ClassVar[str] = f"probe_{of}"
+        balance: ClassVar[str] = of
+        dissipative: ClassVar[bool] = False
+        amplitude: Scalar = parameter(
+            0.0, unit="", meaning="defect", bounds=(-1e9, 1e9), sd=1.0, source="", amplitude=True
+        )
+
+        def term(self, robot: Robot, signals: Signals) -> Scalar:
+            return self.amplitude
+
+    return Probe()
+
+
+# --- effects as they are scored -------------------------------------------------------------------------
+
+
+def amplitude_of(effect: Effect) -> Parameter:
+    """The amplitude of an effect."""
+    return next(p for p in params.walk(effect) if p.spec.amplitude)
+
+
+def shape_of(effect: Effect) -> Parameter | None:
+    """The shape parameter that a fit frees: the first phase or scale beside the amplitude, if the effect has one."""
+    for p in params.walk(effect):
+        if not p.spec.amplitude and (_phase(p) or (p.spec.relative_sd and float(p.value) > 0)):
+            return p
+    return None
+
+
+def _phase(p: Parameter) -> bool:
+    return p.name == "phase"
+
+
+Scales = tuple[Scalar | float, Scalar | float, Scalar | float]
+
+
+def shape_scales(shape: Parameter | None) -> tuple[float, float, float]:
+    """(value, spread, sd) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z: a phase is
+    shifted, a scale multiplied."""
+    if shape is None:
+        return 1.0, 0.0, 0.0
+    if _phase(shape):
+        return float(shape.value), 0.0, shape.spec.prior_sd(0.0)
+    return float(shape.value), math.sqrt(math.log1p((shape.spec.relative_sd or 0.0) ** 2)), 0.0
+
+
+def shaped(scales: Scales, z: Array) -> Array:
+    """A shape parameter at coordinate z, `scales` as by `shape_scales`."""
+    value, spread, sd = scales
+    return value * jnp.exp(spread * z) + sd * z
+
+
+#: Where on the prior of a shape parameter the library is scored, in its sds.
+GRID = (-1.5, -0.75, 0.0, 0.75, 1.5)
+#: The same for a phase, whose sd is 2 rad: 36 degrees apart through half a turn; an amplitude has either sign.
+TURN = tuple(float(x) for x in np.arange(-2, 3) * math.pi / 10)
+
+
+class ScoredEffect(eqx.Module):
+    """One effect at every point of its shape's grid, with an amplitude of one prior sd.
+
+    Attributes:
+        effect: of amplitude one sd.
+        shape: name of its shape parameter, "" for none.
+        at: coordinates of the shape on the grid, in its sds; values: of the shape there.
+    """
+
+    effect: Effect
+    shape: str = eqx.field(static=True)
+    at: tuple[float, ...] = eqx.field(static=True)
+    values: tuple[float, ...] = eqx.field(static=True)
+
+    @property
+    def absent(self) -> Effect:
+        """The effect with amplitude 0."""
+        return eqx.tree_at(lambda e: e.amplitude, self.effect, jnp.zeros_like(jnp.asarray(self.effect.amplitude)))
+
+    def each(self, function: Callable[[Effect], Array]) -> Array:
+        """`function` of the effect at every point of the grid, along a new leading axis."""
+        if not self.shape:
+            return function(self.effect)[None]
+        return jax.vmap(lambda v: function(params.replace(self.effect, {self.shape: v})))(jnp.asarray(self.values))
+
+
+def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
+    """An effect with the grid of its shape parameter, cut at the bounds."""
+    shape, amplitude = shape_of(effect), amplitude_of(effect)
+    unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
+    if shape is None:
+        return ScoredEffect(unit, "", (0.0,), ())
+    grid = TURN if _phase(shape) else grid
+    values = np.clip(np.asarray(shaped(shape_scales(shape), jnp.asarray(grid))), *shape.spec.bounds)
+    return ScoredEffect(unit, shape.name, tuple(grid), tuple(map(float, values)))
+
+
+# --- the fit ------------------------------------------------------------------------------------------------
+
+
+class Linearization(eqx.Module):
+    """A fit, linearised.
+
+    Attributes:
+        residual: whitened residuals, shape (residuals,): readings (a channel after the other, row by row),
+            adhesion (1 a row), priors.
+        jacobian: by the free coordinates, shape (residuals, coordinates).
+        signatures: by each instance's amplitude in prior sds, shape (readings, instances).
+        defects: by a defect of each balance of PROBED [its unit]; what further axes are is the observer's.
+        signals: of every row, at the fit.
+    """
+
+    residual: Float[Array, " residuals"]
+    jacobian: Float[Array, "residuals coordinates"]
+    signatures: Float[Array, "readings instances"]
+    defects: Float[Array, "balances ..."]
+    signals: Signals
+
+    @property
+    def rows(self) -> int:
+        """How many rows there are."""
+        return self.signatures.shape[0] // len(channels.CHANNELS)
+
+    @property
+    def readings(self) -> int:
+        """How many readings there are, missing ones among them."""
+        return self.signatures.shape[0]
+
+    def by_row(self) -> Float[Array, "rows channels"]:
+        """Whitened residuals of the readings."""
+        return self.residual[: self.readings].reshape(self.rows, -1)
+
+    def with_residual(self, residual: Array) -> Linearization:
+        """The same at other residuals."""
+        return dataclasses.replace(self, residual=residual)
+
+    def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+        """Change of the whitened readings by defects of a balance, each a column over the rows.
+
+        Args:
+            balance: index into PROBED.
+        """
+        raise NotImplementedError
+
+    def places(self) -> np.ndarray:
+        """Rows at which a defect of a single row is told, indices."""
+        raise NotImplementedError
+
+    def variable(self, name: str) -> np.ndarray:
+        """What a curve may be over, by row [SI]: a signal, or what else the observer knows."""
+        return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
+
+    def series(self) -> Float[Array, "runs samples channels"]:
+        """Whitened residuals of the readings of each run in the order of time; of settled rows each its own."""
+        return self.by_row()[:, None]
+
+    def memory(self) -> Array:
+        """Whether residuals remember, as a normal deviate; -inf where their order means nothing."""
+        return jnp.asarray(-jnp.inf)
+
+
+def finite(x: Array) -> Array:
+    """x with 0 in the place of what is not finite."""
+    return jnp.where(jnp.isfinite(x), x, 0.0)

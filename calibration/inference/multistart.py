@@ -1,0 +1,240 @@
+"""Searches from many starts, with the noise estimated on the way where nobody states it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.inference import identifiability
+from calibration.inference import noise as noise_room
+from calibration.inference import optimizers as fit
+from calibration.inference.noise import Noise
+from calibration.inference.problem import Data, Problem
+from mmrjax.robot import Robot
+
+#: Costs closer than this to the best [½σ²] are the same optimum.
+AGREE = 1e-3
+#: Rounds of fitting and estimating the noise, and the change of a share at which they end.
+ROUNDS, SETTLED_SHARE = 30, 1e-3
+#: Draws among which the starts of a rollout's searches are chosen.
+DRAWS = 2000
+#: Tightenings of the penalty on adhesion, tenfold each.
+TIGHTENINGS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Starts:
+    """How searches from many starts ended.
+
+    Attributes:
+        cost: objective of each [½σ²], shape (starts,).
+        converged: of each.
+        infeasible: starts at which some row slides or fails.
+    """
+
+    cost: np.ndarray
+    converged: np.ndarray
+    infeasible: int
+
+    @property
+    def _at_best(self) -> np.ndarray:
+        return self.cost < self.cost.min() + AGREE * (1 + self.cost.min())
+
+    @property
+    def agree(self) -> int:
+        """How many converged searches ended at the best optimum."""
+        return int(np.sum(self.converged & self._at_best))
+
+    def statement(self) -> str:
+        """Whether the starts agree, as a sentence."""
+        n = len(self.cost)
+        if n == 1:
+            return "one search" if self.converged[0] else "one search, which did not converge"
+        if self.agree == n:
+            return f"all {n} starts end at the same optimum"
+        other = self.converged & ~self._at_best
+        parts = [f"{self.agree} of {n} starts end at the best optimum"]
+        if other.any():
+            best = self.cost[other].min()
+            parts.append(f"{other.sum()} at others (the next costs {best - self.cost.min():.3g} more)")
+        if not self.converged.all():
+            parts.append(f"{np.sum(~self.converged)} did not converge")
+        return ", ".join(parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What searches found.
+
+    Attributes:
+        problem: with the noise (and stiffness) it ended with; best: its optimum.
+        starts: how the searches ended.
+        shares: estimated sd of each channel as a share of its size, NaN where the sd was known.
+    """
+
+    problem: Problem
+    best: fit.Optimum
+    starts: Starts
+    shares: np.ndarray
+
+
+def unreachable(posed: Problem, status: np.ndarray) -> np.ndarray:
+    """Whether the model has no operating point for a row that has a reading; shape of `status`, (..., rows)."""
+    return posed.observe.unreachable(np.asarray(status)) & (np.asarray(posed.data.weight).max(1) > 0)
+
+
+def search(posed: Problem, noise: Noise, points: np.ndarray) -> Found:
+    """Search from all points in one batch; where the noise is not known, estimate it and search again until it
+    settles.
+
+    The best optimum so far starts beside the points, so that every round is the same compiled batch.
+    """
+    z = points[0]
+    shares = first_shares(noise)
+    for _ in range(ROUNDS):
+        posed, found, feasible = _tighten(posed, np.concatenate([points, z[None]]))
+        best = _member(found, int(np.nanargmin(found.cost)))
+        z = np.asarray(best.z)
+        new = _settling(posed, noise, z, shares)
+        if new is None:
+            break
+        shares = new
+        posed = _noisier(posed, noise, shares)
+    return Found(posed, best, _ended(jax.tree.map(lambda x: x[:-1], found), feasible[:-1]), shares)
+
+
+def search_one_by_one(
+    posed: Problem, noise: Noise, points: np.ndarray, shares: np.ndarray, tell: Callable[[str], None]
+) -> Found:
+    """As `search`, one search at a time: the noise settles on the first point's optimum, then the others start once
+    each. One that ends lower takes its place, and the noise settles again.
+
+    Args:
+        posed: with the noise to begin from; shares: of the reading, that it has.
+        tell: is given a sentence after every step.
+    """
+    begun = time.perf_counter()
+
+    def clock() -> str:
+        return f"{(time.perf_counter() - begun) / 60:.1f} min"
+
+    def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[fit.Optimum, np.ndarray, np.ndarray]:
+        whole = fit.search_long(posed, jnp.asarray(points[0]), data, tell=lambda said: tell(f"  {said}, {clock()}"))
+        found, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], whole)
+        return found, start.status, end.status
+
+    first = points[0]
+    for _ in range(len(points)):
+        z = first
+        for round_ in range(1, ROUNDS + 1):
+            posed, found, feasible = _tighten(posed, z[None], step)
+            z = np.asarray(found.z[0])
+            tell(f"round {round_}: objective {found.cost[0]:.4f} after {found.steps[0]} steps, {clock()}")
+            new = _settling(posed, noise, z, shares)
+            if new is None:
+                break
+            shares = new
+            posed = _noisier(posed, noise, shares)
+        ends, feasibles = [found], [feasible]
+        for k, point in enumerate(points[1:], 2):
+            end, status, _ = step(posed, point[None], posed.data)
+            ends.append(end)
+            feasibles.append(~unreachable(posed, status).any(1))
+            tell(f"start {k} of {len(points)}: objective {end.cost[0]:.4f} after {end.steps[0]} steps, {clock()}")
+        found = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
+        k = int(np.nanargmin(found.cost))
+        if not found.cost[k] < found.cost[0] - AGREE * (1 + found.cost[0]):
+            k = 0
+            break
+        first = np.asarray(found.z[k])
+    return Found(posed, _member(found, k), _ended(found, np.concatenate(feasibles)), shares)
+
+
+def nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
+    """Draws from the posterior of `steady` at its optimum z, for a rollout's searches to begin at: such at which
+    no row slides and no friction law is steeper at rest than the base's, or the nearest to that.
+
+    Draws from the prior would take hundreds of rollouts along the limit of adhesion to come back from; whether
+    the problem has several optima is what the many starts of `steady` say.
+    """
+    spread = np.linalg.cholesky(identifiability.analyse(easy, jnp.asarray(z)).covariance)
+    draws = z + rng.standard_normal((DRAWS, len(z))) @ spread.T
+
+    def steepness(robot: Robot) -> jax.Array:
+        laws = [chassis.ground.friction for chassis in robot.configurations.members]
+        return jnp.stack([law.static / law.speed_static for law in laws])
+
+    def seen(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return easy.observation(z).status, steepness(easy.robot(z)) > 1.001 * steepness(easy.base)
+
+    status, steep = jax.jit(jax.vmap(seen))(jnp.asarray(draws))
+    lost = unreachable(easy, status).sum(1) + np.asarray(steep).sum(1)
+    return draws[np.argsort(lost, kind="stable")[:count]]
+
+
+def first_shares(noise: Noise) -> np.ndarray:
+    """What the estimated shares begin at, NaN where the sd is known; shape (channels,)."""
+    return np.where(noise.estimated, noise_room.START, np.nan)
+
+
+def _member(found: fit.Optimum, k: int) -> fit.Optimum:
+    return jax.tree.map(lambda x: x[k], found)
+
+
+def _ended(found: fit.Optimum, feasible: np.ndarray) -> Starts:
+    cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
+    return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)))
+
+
+def _settling(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:
+    """The shares estimated anew at z, or None where there is nothing to estimate or they have settled."""
+    if not noise.estimated.any():
+        return None
+    new = _shares(posed, noise, z)
+    return None if np.nanmax(np.abs(new / shares - 1)) < SETTLED_SHARE else new
+
+
+def _noisier(posed: Problem, noise: Noise, shares: np.ndarray) -> Problem:
+    sd = np.where(noise.estimated, noise.sd / noise_room.START * shares, noise.sd)
+    return dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=jnp.asarray(sd)))
+
+
+def _tighten(
+    posed: Problem, points: np.ndarray, search: Callable[..., Any] = fit.searches
+) -> tuple[Problem, fit.Optimum, np.ndarray]:
+    """Search from all points, with the penalty on adhesion stiffer until no row slides at the best.
+
+    Returns:
+        The problem, the searches, and whether each start was feasible.
+    """
+    for _ in range(TIGHTENINGS + 1):
+        found, status_start, status_end = search(posed, jnp.asarray(points), posed.data)
+        k = int(np.nanargmin(found.cost))
+        if not unreachable(posed, status_end)[k].any():
+            break
+        data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
+        posed = dataclasses.replace(posed, data=data)
+    return posed, found, ~unreachable(posed, status_start).any(1)
+
+
+def _shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
+    """Sd over size of each channel from the misfit, degrees of freedom taken off; NaN where known.
+
+    s² = Σ (error / size)² / (readings - Σ leverage). It holds model error as well as noise, so a fit with it can't
+    be tested for adequacy.
+    """
+    data = posed.data
+    size = noise.sd / noise_room.START  # what an estimated share is of
+    weight = np.asarray(data.weight)
+    error = np.asarray(fit.observation(posed, jnp.asarray(z)).reading - data.measured) / size
+    error = np.where(weight > 0, error, 0.0)
+    leverage = identifiability.analyse(posed, jnp.asarray(z)).leverage
+    left = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
+    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / left), noise_room.FLOOR)
+    return np.where(noise.estimated, shares, np.nan)

@@ -1,0 +1,54 @@
+"""Observers: what runs show, settled or over time, and how inference treats each kind. One file a kind.
+
+No other room asks which kind a table holds (tests/test_structure.py reads the code for it).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.data.errors import BadConfiguration, choices
+from calibration.data.runs import Runs
+from calibration.inference.observers.base import Observer
+from calibration.inference.observers.histories import Histories
+from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.priors import Coordinates
+from calibration.inference.problem import Problem, data_of
+from mmrjax import fidelities, params
+from mmrjax.robot import Robot
+
+__all__ = ["Histories", "Observer", "SettledRuns", "fidelity", "kind", "pose"]
+
+#: In the order in which they are asked whether a table is theirs.
+KINDS: tuple[type[Observer], ...] = (Histories, SettledRuns)
+
+
+def kind(runs: Runs) -> type[Observer]:
+    """The observer of a table: time histories where it has `time_s`, else settled runs."""
+    return next(k for k in KINDS if k.observes(runs))
+
+
+def fidelity(name: str) -> str:
+    """The name of a fidelity.
+
+    Raises:
+        BadConfiguration: no such fidelity.
+    """
+    if name not in fidelities.NAMES:
+        raise BadConfiguration(f"--model {name}: no such fidelity; {choices(name, fidelities.NAMES)}")
+    return name
+
+
+def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str | None = None) -> Problem:
+    """The problem of these runs.
+
+    Args:
+        sd: of the readings [SI], shape (rows, channels).
+        model: name of the fidelity that simulates them; None takes the first that the kind of data allows.
+
+    Raises:
+        BadConfiguration: no such fidelity, or one that cannot simulate data of this kind.
+        BadData: a configuration that `base` does not have.
+    """
+    observe = kind(runs).of(runs, base, None if model is None else fidelity(model))
+    return Problem(params.strong(base), coordinates, observe, data_of(runs.measured(), sd, len(coordinates)))

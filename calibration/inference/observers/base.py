@@ -1,0 +1,214 @@
+"""The protocol of observers."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool
+
+from calibration.data.runs import Runs
+from calibration.inference.bases import Bases
+from calibration.inference.details import Detail
+from calibration.inference.linearization import Linearization, ScoredEffect
+from calibration.inference.noise import Noise
+from calibration.inference.optimizers import Optimum
+from calibration.inference.problem import Data, Observation, Problem
+from mmrjax.conditions import Conditions
+from mmrjax.effects import Effect
+from mmrjax.robot import Robot
+
+if TYPE_CHECKING:
+    from calibration.discovery.adequacy import Diagnosis
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchPolicy:
+    """How fits of one kind of data are searched for in batches.
+
+    Attributes:
+        batch: fits in one batch.
+        steps: most steps of one.
+        draws: of the prior, of which the best begin a search of the base.
+        searches: of the base.
+        one_by_one: whether outliers are set aside one at a time, with a fit after each.
+    """
+
+    batch: int = 16
+    steps: int = 60
+    draws: int = 0
+    searches: int = 16
+    one_by_one: bool = True
+
+
+class Observer(eqx.Module):
+    """What runs show, and what inference has to know of their kind.
+
+    Attributes:
+        conditions: of each run, shape (runs,).
+        word: what a row is; fewest: rows in which a missing effect can be told from noise.
+        axes: columns of a table over which readings vary.
+        pad: rows are padded to a multiple of this, so that tables of about one size share what is compiled.
+        blocks: kinds of blocks to hold out, the most telling first.
+        percent_of: what errors in percent are of.
+        policy: how fits are searched for.
+        compares: field of the score table by which curves are compared: what they `explained`, or where they have
+            different numbers of terms (waves have two a run) how improbable that is, `curve`.
+        rows_tell: whether a single row shows a defect by itself.
+        evidence: kinds of evidence that something is missing.
+        starts: searches of a calibration; None takes the fidelity's.
+    """
+
+    conditions: eqx.AbstractVar[Conditions]
+
+    word: ClassVar[str]
+    fewest: ClassVar[int]
+    axes: ClassVar[tuple[str, ...]]
+    pad: ClassVar[int]
+    blocks: ClassVar[tuple[str, ...]]
+    percent_of: ClassVar[str]
+    policy: ClassVar[SearchPolicy]
+    compares: ClassVar[str]
+    rows_tell: ClassVar[bool]
+    evidence: ClassVar[tuple[str, ...]]
+    starts: ClassVar[int | None] = None
+
+    # --- of a table, before anything is simulated
+
+    @classmethod
+    @abc.abstractmethod
+    def observes(cls, runs: Runs) -> bool:
+        """Whether a table is of this kind."""
+
+    @classmethod
+    @abc.abstractmethod
+    def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Observer:
+        """The observer of a table; see `observers.pose`."""
+
+    @classmethod
+    @abc.abstractmethod
+    def sizes(cls, runs: Runs) -> np.ndarray:
+        """What a share of noise is of [SI], shape (rows, channels)."""
+
+    @classmethod
+    @abc.abstractmethod
+    def check(cls, runs: Runs, noise: Noise) -> list[str]:
+        """Refuse runs that contradict themselves; return what should be said of them.
+
+        Raises:
+            BadData: readings that cannot all be true.
+        """
+
+    @classmethod
+    @abc.abstractmethod
+    def check_start(cls, runs: Runs, noise: Noise) -> list[str]:
+        """Refuse runs whose beginning the model cannot follow; return what should be said of their length.
+
+        Raises:
+            BadData: a run that does not begin as the model does.
+        """
+
+    @classmethod
+    @abc.abstractmethod
+    def identity(cls, runs: Runs) -> tuple[str, ...]:
+        """Columns in which exact copies of a row agree."""
+
+    @classmethod
+    @abc.abstractmethod
+    def shows(cls, effect: type[Effect]) -> bool:
+        """Whether data of this kind on an external supply can show an effect."""
+
+    @classmethod
+    @abc.abstractmethod
+    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Parameters that such data determine beside those that all do: of the drive, and of each chassis."""
+
+    @classmethod
+    @abc.abstractmethod
+    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        """Errors [%] of what `percent_of` says, shape (rows, channels)."""
+
+    # --- of robots
+
+    @abc.abstractmethod
+    def __call__(self, robot: Robot) -> Observation:
+        """What a robot shows in every row."""
+
+    @property
+    @abc.abstractmethod
+    def long(self) -> bool:
+        """Whether the model is a rollout: searches then run one by one, and end sooner."""
+
+    @property
+    @abc.abstractmethod
+    def eased(self) -> bool:
+        """Whether a search may begin at the optimum of the same problem with `steady`."""
+
+    @abc.abstractmethod
+    def unreachable(self, status: np.ndarray) -> np.ndarray:
+        """Whether the model has no such operating point, by row."""
+
+    def cautions(self, robot: Robot) -> list[str]:
+        """What to know before the readings of a calibrated robot are trusted, as sentences."""
+        return []
+
+    @abc.abstractmethod
+    def runs_counting(self, included: np.ndarray) -> int:
+        """How many runs count, of rows that do."""
+
+    # --- of fits
+
+    @abc.abstractmethod
+    def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
+        """Residuals, Jacobian and signatures at z."""
+
+    @abc.abstractmethod
+    def replicate(
+        self,
+        problem: Problem,
+        z: Array,
+        data: Data,
+        effects: tuple[ScoredEffect, ...],
+        linear: Linearization,
+        key: Array,
+    ) -> Linearization:
+        """A table drawn from the fit `z` of the base, fitted again and linearised: one replicate of the bootstrap.
+
+        Args:
+            problem: of the base alone, at its fit z; data: of the table.
+            linear: the same fit, linearised.
+            key: random.
+        """
+
+    @abc.abstractmethod
+    def search(
+        self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
+    ) -> tuple[Optimum, Observation]:
+        """A batch of fits, each to its own weights, and what each says of every row.
+
+        Args:
+            starts: shape (members, coordinates); weights: of each member's readings, (members, rows, channels).
+            active: set of effects of each member, see `ActiveSet`; None leaves the problem's.
+            rivals: whether all search the same optimum, so that some may be given up.
+        """
+
+    @abc.abstractmethod
+    def bases(self, columns: Mapping[str, np.ndarray], included: Bool[np.ndarray, " rows"], robot: Robot) -> Bases:
+        """Bases of the curves that a discrepancy is looked for with.
+
+        Args:
+            columns: of the padded table, with fitted readings; robot: fitted.
+        """
+
+    @abc.abstractmethod
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> Detail:
+        """What data of this kind tell beside the fit.
+
+        Args:
+            bases: of curves; included: whether a row of the table counts.
+            before, after: what base and proposed robot leave.
+        """

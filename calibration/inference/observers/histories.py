@@ -1,0 +1,446 @@
+"""Time histories: one run from standstill for each `run_id`, one row a sample."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from calibration.data.errors import BadConfiguration, BadData, number
+from calibration.data.runs import CONDITIONS, Runs
+from calibration.inference import bases as bases_room
+from calibration.inference.bases import Bases
+from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
+from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
+from calibration.inference.noise import Noise
+from calibration.inference.normal_equations import backward, cholesky, forward
+from calibration.inference.observers.base import Observer, SearchPolicy
+from calibration.inference.optimizers import Optimum, linearised, searches_long
+from calibration.inference.problem import Data, Observation, Problem
+from mmrjax import balances, channels, fidelities, params
+from mmrjax.conditions import Conditions
+from mmrjax.effects import Effect
+from mmrjax.fidelities.drive import rates, state_of
+from mmrjax.fidelities.histories import LONGEST, STEPS, grid, histories, respond, states
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED, FAILED, Signals
+
+if TYPE_CHECKING:
+    from calibration.discovery.adequacy import Diagnosis
+
+#: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
+KNOTS, KNOT_STEPS = 256, 1e7
+#: Lags of a run's residual that are looked at, at most a quarter of its samples.
+LAGS = 12
+#: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
+EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
+
+
+class HistoriesLinearization(Linearization):
+    """Of histories: `defects` has shape (balances, runs, knots, samples, channels), a defect at each knot of a run.
+
+    Attributes:
+        rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
+        knots: rows between which a defect is linear, shape (runs, knots).
+        time: of every row since the start of its run [s]; angle: of the driving shaft since then [rad].
+    """
+
+    rows_of: Int[Array, "runs samples"]
+    knots: Int[Array, "runs knots"]
+    time: Float[Array, " rows"]
+    angle: Float[Array, " rows"]
+
+    def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+        moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
+        there = jnp.where(self.rows_of < 0, self.rows, self.rows_of)  # beyond the last row: dropped
+        out = jnp.zeros((self.rows, len(channels.CHANNELS), shapes.shape[1])).at[there].set(moved, mode="drop")
+        return out.reshape(-1, shapes.shape[1])
+
+    def places(self) -> np.ndarray:
+        return np.unique(np.asarray(self.knots))
+
+    def variable(self, name: str) -> np.ndarray:
+        if name in bases_room.ORDERS:
+            return bases_room.ORDERS[name][0] * np.asarray(self.angle)
+        return np.asarray(self.time) if name == "time" else super().variable(name)
+
+    def series(self) -> Float[Array, "runs samples channels"]:
+        """Whitened residuals of the readings of each run in the order of time, 0 beyond its last."""
+        return jnp.where(self.rows_of[:, :, None] < 0, 0.0, self.by_row()[self.rows_of])
+
+    def memory(self) -> Array:
+        """Ljung and Box's (1978) statistic over all runs, as a normal deviate, the largest of the channels."""
+        x, rows = self.series(), self.rows_of
+        count = jnp.sum(rows >= 0, 1)[:, None]
+        power = jnp.sum(x**2, 1)
+        lags = min(LAGS, rows.shape[1] // 4)
+        statistic = jnp.zeros(x.shape[-1])
+        for k in range(1, lags + 1):
+            r = jnp.sum(x[:, k:] * x[:, :-k], 1) / jnp.maximum(power, 1e-9)
+            weight = jnp.where(count > k, count * (count + 2) / jnp.maximum(count - k, 1), 0.0)
+            statistic = statistic + jnp.sum(weight * r**2, 0)
+        freedom = jnp.maximum(jnp.sum(jnp.minimum(lags, count - 1)), 1)
+        return jnp.max((statistic - freedom) / (2 * freedom) ** 0.5)
+
+
+class Histories(Observer):
+    """Observer of time histories: one run of `drive` from standstill for each `run_id`, one row a sample.
+
+    Sliding during a start is part of the run, so adhesion is not penalised. Histories have hundreds of readings a
+    parameter, and refits of a bootstrap stay where the model is linear: there the refit is the linear one.
+
+    Attributes:
+        conditions: of each run, shape (runs,).
+        times: the grid of each run from 0 on, its last instant repeated to one length, shape (runs, instants) [s].
+        run: index of each row's run; instant: of its sample in `times`; shape (rows,).
+        rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
+        knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
+    """
+
+    word: ClassVar[str] = "samples"
+    fewest: ClassVar[int] = 24
+    axes: ClassVar[tuple[str, ...]] = (*CONDITIONS, "time_s")
+    pad: ClassVar[int] = 1
+    blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
+    percent_of: ClassVar[str] = "channel's root mean square"
+    #: Draws of the prior among which the starts are chosen: far off, a start slides where the measured one grips,
+    #: and a search from there stays.
+    policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, draws=128, searches=16, one_by_one=False)
+    compares: ClassVar[str] = "curve"
+    rows_tell: ClassVar[bool] = False
+    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
+    starts: ClassVar[int | None] = 8
+
+    conditions: Conditions
+    times: Float[Array, "runs instants"]
+    run: Int[Array, " rows"]
+    instant: Int[Array, " rows"]
+    rows_of: Int[Array, "runs samples"]
+    knots: Int[Array, "runs knots"]
+
+    @classmethod
+    def observes(cls, runs: Runs) -> bool:
+        return runs.has("time_s")
+
+    @classmethod
+    def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Histories:
+        """Rows may come in any order; conditions are those of a run's first row."""
+        if fidelity is not None and fidelities.get(fidelity).name != "drive":
+            raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
+        names, first, run = np.unique(_names(runs), return_index=True, return_inverse=True)
+        mine = [np.flatnonzero(run == k) for k in range(len(names))]
+        mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
+        grids = [grid(runs["time_s"][m]) for m in mine]
+        longest, samples = max(map(len, grids)), max(map(len, mine))
+        times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
+        instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
+        rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
+        most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
+        knots = np.stack([_knots(m, most) for m in mine])
+        return cls(runs.where(first).conditions(robot), *map(jnp.asarray, (times, run, instant, rows, knots)))
+
+    @classmethod
+    def sizes(cls, runs: Runs) -> np.ndarray:
+        """The channel's root mean square: histories pass through zero while their instruments stay as they are."""
+        measured = runs.measured()
+        there = np.isfinite(measured)
+        power = np.sum(np.where(there, measured, 0.0) ** 2, 0) / np.maximum(there.sum(0), 1)
+        return np.broadcast_to(np.sqrt(power), measured.shape)
+
+    @classmethod
+    def check(cls, runs: Runs, noise: Noise) -> list[str]:
+        names = _names(runs)
+        for name in np.unique(names):
+            for column in ("configuration", *CONDITIONS):
+                if runs.has(column) and len(np.unique(runs[column][names == name])) > 1:
+                    raise BadData(
+                        f"{runs.source}, {column}: run {name or '(no run_id)'} has several values; "
+                        "a run has one condition, so give each its own run_id"
+                    )
+        return []
+
+    @classmethod
+    def check_start(cls, runs: Runs, noise: Noise) -> list[str]:
+        """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
+        names, measured = _names(runs), runs.measured()
+        # Current rises within a millisecond; what moves does not.
+        moving = [k for k, c in enumerate(channels.CHANNELS) if c.word in ("motor_speed", "speed")]
+        for name in np.unique(names):
+            mine = np.flatnonzero(names == name)
+            first = mine[np.argmin(runs["time_s"][mine])]
+            times, count = np.unique(runs["time_s"][mine], return_counts=True)
+            if (count > 1).any():
+                raise BadData(
+                    f"{runs.source}, time_s: run {name or '(no run_id)'} has {count.max()} samples at "
+                    f"{number(times[count.argmax()])} s; give each run its own run_id"
+                )
+            for k in moving:
+                size = np.max(np.nan_to_num(np.abs(measured[mine, k])))
+                limit = max(RESTING * size, RESTING_SD * noise.sd[first, k])
+                if runs["time_s"][first] < EARLY and abs(measured[first, k]) > limit:
+                    column, unit = channels.CHANNELS[k].column, channels.CHANNELS[k].unit
+                    raise BadData(
+                        f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
+                        f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
+                        "starts from rest when the supply is switched on, at 0 s. Settled travel is one row a run, "
+                        "without time_s"
+                    )
+        step = runs["time_s"].max() / STEPS
+        if step <= 2 * LONGEST:
+            return []
+        return [
+            f"runs of {runs['time_s'].max():.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft "
+            "faster than some ten steps are not resolved; cut the runs to look for them"
+        ]
+
+    @classmethod
+    def identity(cls, runs: Runs) -> tuple[str, ...]:
+        """Of histories the run too: repeats begin alike, at rest."""
+        return tuple(runs.columns)
+
+    @classmethod
+    def shows(cls, effect: type[Effect]) -> bool:
+        return not effect.needs_battery
+
+    @classmethod
+    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        return ("motor.inductance", "motor.inertia"), ("inertia", "ground.friction.dynamic")
+
+    @classmethod
+    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        """Of the channel's size: eq. (35) divides by readings, which begin at rest."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100.0 * (simulated - measured) / np.sqrt(np.nanmean(simulated**2, 0))
+
+    def defective(
+        self, robot: Robot, probes: tuple[Effect, ...]
+    ) -> Float[Array, "probes runs knots samples channels"]:
+        """Change of the readings by a defect of each probe's balance [its unit] that is 1 at a knot of a run and
+        falls linearly to 0 at the next ones; an effect `probe` is its amplitude in its balance."""
+        clock = self.times[jnp.arange(len(self.times))[:, None], self.instant[self.knots]]
+
+        def one(conditions: Conditions, times: Array, clock: Array, instants: Array) -> Array:
+            def probed(amplitude: Array) -> Robot:
+                put = tuple(eqx.tree_at(lambda e: e.amplitude, p, a) for p, a in zip(probes, amplitude, strict=True))
+                return dataclasses.replace(robot, effects=(*robot.effects, *put))
+
+            none = jnp.zeros(len(probes))
+            # A run that ended early repeats its last knot; only the first of them is one.
+            real = jnp.concatenate([jnp.ones(1), (jnp.diff(clock) > 0).astype(clock.dtype)])
+            before = jnp.concatenate([clock[:1], clock[:-1]])
+            after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
+
+            def source(t: Array, y: Array) -> Array:
+                slope = jax.jacfwd(lambda a: rates(probed(a), conditions, y))(none)
+                rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
+                falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
+                hat = real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
+                return slope[:, :, None] * hat
+
+            def seen(y: Array, dy: Array) -> Array:
+                def reading(y: Array) -> Array:
+                    return _readings(robot, balances.moving(robot, conditions, state_of(robot, y)))
+
+                return jnp.tensordot(jax.jacfwd(reading)(y), dy, 1)
+
+            changed = respond(robot, conditions, times, states(robot, conditions, times), source, seen)[1]
+            whole = jnp.concatenate([jnp.zeros_like(changed[:1]), changed])
+            return jnp.moveaxis(whole[instants], (0, 1), (2, 3))  # probes, knots, samples, channels
+
+        instants = self.instant[jnp.where(self.rows_of < 0, 0, self.rows_of)]
+        return jnp.moveaxis(jax.vmap(one)(self.conditions, self.times, clock, instants), 0, 1)
+
+    def whole(self, robot: Robot) -> Signals:
+        """Every signal of every run at every instant, shape (runs, instants)."""
+        found = jax.vmap(lambda c, t: histories(robot, c, t))(self.conditions, self.times)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, self.times.shape), found)
+
+    def at_rows(self, whole: Signals) -> Signals:
+        """Every signal at every row."""
+        return jax.tree.map(lambda x: x[self.run, self.instant], whole)
+
+    @property
+    def time(self) -> Float[Array, " rows"]:
+        """Time of every row since the start of its run [s]."""
+        return self.times[self.run, self.instant]
+
+    def angle(self, whole: Signals) -> Float[Array, " rows"]:
+        """Angle of the driving shaft at every row, since the start of its run [rad]."""
+        speed = whole.speed_wheel
+        turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
+        angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
+        return angle[self.run, self.instant]
+
+    def __call__(self, robot: Robot) -> Observation:
+        reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(self.whole(robot)))
+        followed = jnp.all(jnp.isfinite(reading), 1)
+        return Observation(reading, jnp.zeros(self.run.shape), jnp.where(followed, CONVERGED, FAILED))
+
+    @property
+    def long(self) -> bool:
+        return True
+
+    @property
+    def eased(self) -> bool:
+        return False
+
+    def unreachable(self, status: np.ndarray) -> np.ndarray:
+        return status == FAILED
+
+    def runs_counting(self, included: np.ndarray) -> int:
+        return self.rows_of.shape[0]
+
+    def linearise(
+        self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
+    ) -> HistoriesLinearization:
+        """As the protocol says. Effects that keep a memory act by the whole past of a run, so a signature is the
+        derivative of the run by the amplitude. All effects are in one run, once for each point of the shapes'
+        grids; those that are there already keep their shape."""
+        residual, jacobian, _ = linearised(problem, z, data)
+        robot = problem.robot(z)
+        have = {e.name for e in robot.effects}
+        added = tuple(e.absent for e in effects if e.effect.name not in have)
+        whole = dataclasses.replace(robot, effects=(*robot.effects, *added))
+        value = {p.name: p.value for p in params.walk(whole)}
+        sds = jnp.stack([jnp.asarray(e.effect.amplitude) for e in effects])
+
+        def moved(point: Array) -> Array:
+            def readings(a: Array) -> Array:
+                put = {}
+                for k, e in enumerate(effects):
+                    amplitude = f"effects.{e.effect.name}.amplitude"
+                    put[amplitude] = value[amplitude] + a[k] * sds[k]
+                    if e.shape:
+                        shape = f"effects.{e.effect.name}.{e.shape}"
+                        wanted = jnp.asarray(e.values)[jnp.minimum(point, len(e.values) - 1)]
+                        put[shape] = jnp.where(value[amplitude] == 0, wanted, value[shape])
+                there = params.replace(whole, put)
+                return problem.whitened(self(there), data)[: data.measured.size]
+
+            return jax.jacfwd(readings)(jnp.zeros(len(effects)))
+
+        by_point = jax.lax.map(moved, jnp.arange(max(len(e.at) for e in effects)))
+        parts = [by_point[j, :, k] for k, e in enumerate(effects) for j in range(len(e.at))]
+        defects = self.defective(robot, tuple(probe(b) for b in PROBED))
+        scale = (data.weight / data.sd)[self.rows_of]
+        defects = jnp.where(self.rows_of[:, None, :, None] < 0, 0.0, defects * scale[:, None])
+        runs = self.whole(robot)
+        return HistoriesLinearization(
+            residual,
+            jacobian,
+            finite(jnp.stack(parts, 1)),
+            finite(defects),
+            self.at_rows(runs),
+            self.rows_of,
+            self.knots,
+            self.time,
+            self.angle(runs),
+        )
+
+    def replicate(
+        self,
+        problem: Problem,
+        z: Array,
+        data: Data,
+        effects: tuple[ScoredEffect, ...],
+        linear: Linearization,
+        key: Array,
+    ) -> Linearization:
+        jacobian = linear.jacobian
+        lower = cholesky(jacobian.T @ jacobian)
+        counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
+        noise = counts * jax.random.normal(key, counts.shape)
+        return linear.with_residual(noise - jacobian @ backward(lower, forward(lower, jacobian.T @ noise)))
+
+    def search(
+        self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
+    ) -> tuple[Optimum, Observation]:
+        """As the protocol says; the runs are compiled once for all steps."""
+        return searches_long(
+            lambda z: _evaluate(problem, z, weights, active),
+            starts,
+            problem.data,
+            weights,
+            self.policy.steps,
+            rivals=rivals,
+        )
+
+    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+        """Curves as of settled runs, over time too, and waves in the angle of a shaft."""
+        angle = np.nan_to_num(np.asarray(_angle(self, robot)))
+        on_tracks = np.asarray(jax.vmap(robot.chassis)(self.conditions.configuration).on_tracks > 0.5)
+        waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots))
+        return (*bases_room.families(columns, included.astype(float)), *waves)
+
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
+        names = bases_room.names(bases)
+        orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
+
+        def strongest(of: Diagnosis, variable: str) -> Strongest:
+            mine = [k for k, n in enumerate(names) if n[1] == variable]
+            k = max(mine, key=lambda j: np.asarray(of.scores.curve)[j])
+            return Strongest(names[k][0], float(of.scores.curve[k]), float(of.scores.explained[k]))
+
+        def side(of: Diagnosis) -> TimeSide:
+            lags = min(LAGS, self.rows_of.shape[1] // 4)
+            test = of.test
+            memory = Memory(
+                float(test.found.white),
+                test.threshold("white"),
+                test.p("white"),
+                lags,
+                _autocorrelation(of.linear, lags),
+            )
+            waves = {(w, bases_room.ORDERS[w][0]): strongest(of, w) for w in orders}
+            return TimeSide(memory, waves, strongest(of, "time"))
+
+        samples = int((np.asarray(self.rows_of) >= 0).sum())
+        unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
+        return TimeStatistics(self.rows_of.shape[0], samples, unresolved, side(before), side(after))
+
+
+def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]:
+    """Of each channel's residual over all runs, at lags 1 to `lags` samples."""
+    x = np.asarray(linear.series())
+    power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
+    of = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
+    return {name: [float(lag[k]) for lag in of] for k, name in enumerate(channels.names())}
+
+
+def _names(runs: Runs) -> np.ndarray:
+    """Which run each row belongs to."""
+    return runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+
+
+def _knots(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of a run's rows, evenly chosen, its first and last among them; the last again for the rest."""
+    chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
+    return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
+
+
+def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
+    shown = balances.sensor(robot, signals)
+    return jnp.stack([shown[name] for name in channels.names()], -1)
+
+
+@eqx.filter_jit
+def _angle(observe: Histories, robot: Robot) -> Array:
+    return observe.angle(observe.whole(robot))
+
+
+@eqx.filter_jit
+def _evaluate(problem: Problem, z: Array, weights: Array, active: Array | None) -> tuple[Array, Array, Observation]:
+    def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation]:
+        here = problem
+        if which is not None:
+            here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
+        return linearised(here, z, dataclasses.replace(problem.data, weight=weight))
+
+    return jax.vmap(one)(z, weights, active)

@@ -1,0 +1,251 @@
+"""Settled runs: one row a run, read when steady."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from calibration.data.errors import BadData, number
+from calibration.data.runs import CONDITIONS, Runs
+from calibration.inference import bases as bases_room
+from calibration.inference import treatments
+from calibration.inference.bases import Bases
+from calibration.inference.details import EquationDefects
+from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
+from calibration.inference.noise import Noise
+from calibration.inference.observers.base import Observer, SearchPolicy
+from calibration.inference.optimizers import Optimum, gauss_newton, levenberg_marquardt
+from calibration.inference.problem import Data, Observation, Problem
+from mmrjax import balances, channels, fidelities
+from mmrjax.conditions import Conditions
+from mmrjax.effects import Effect
+from mmrjax.fidelities.steady import operating_signals
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import FAILED, SLIDES, TIPS
+
+if TYPE_CHECKING:
+    from calibration.discovery.adequacy import Diagnosis
+
+#: Replicates further apart than this many sds of their difference contradict each other.
+CONTRADICTION = 6.0
+#: The same for replicates whose sd is not known, as a share of their mean.
+CONTRADICTION_SHARE = 0.25
+#: Gauss-Newton steps of a replicate's refit.
+STEPS = 4
+#: Balances to which the defect of a row is attributed, one for each equation that the channels close.
+EQUATIONS = ("electrical", "track", "slip")
+
+
+class SettledLinearization(Linearization):
+    """Of settled rows: `defects` has shape (balances, rows, channels), a defect of each row of its own."""
+
+    def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+        return (self.defects[balance][:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
+
+    def places(self) -> np.ndarray:
+        return np.arange(self.rows)
+
+
+class SettledRuns(Observer):
+    """Observer of settled rows: one run a row.
+
+    Attributes:
+        fidelity: that simulates them.
+    """
+
+    word: ClassVar[str] = "runs"
+    fewest: ClassVar[int] = 6
+    axes: ClassVar[tuple[str, ...]] = tuple(CONDITIONS)
+    pad: ClassVar[int] = 16
+    blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
+    percent_of: ClassVar[str] = "simulated reading, eq. (35)"
+    policy: ClassVar[SearchPolicy] = SearchPolicy()
+    compares: ClassVar[str] = "explained"
+    rows_tell: ClassVar[bool] = True
+    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
+
+    conditions: Conditions
+    fidelity: str = eqx.field(static=True)
+
+    @classmethod
+    def observes(cls, runs: Runs) -> bool:
+        return not runs.has("time_s")
+
+    @classmethod
+    def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
+        return cls(runs.conditions(robot), fidelities.get(fidelity or "steady").name)
+
+    @classmethod
+    def sizes(cls, runs: Runs) -> np.ndarray:
+        """The readings, and a hundredth of the channel's largest where one is smaller."""
+        measured = np.abs(runs.measured())
+        return np.maximum(measured, 0.01 * np.max(np.nan_to_num(measured), 0))
+
+    @classmethod
+    def check(cls, runs: Runs, noise: Noise) -> list[str]:
+        columns = [c for c in ("configuration", *CONDITIONS, "surface") if runs.has(c)]
+        keys = ["|".join(str(runs[c][k]) for c in columns) for k in range(len(runs))]
+        measured = runs.measured()
+        for first, key in enumerate(keys):
+            for second in range(first + 1, len(keys)):
+                if keys[second] != key:
+                    continue
+                apart = np.abs(measured[first] - measured[second])
+                mean = np.abs(measured[first] + measured[second]) / 2
+                sd = np.hypot(noise.sd[first], noise.sd[second])
+                allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
+                for k in np.flatnonzero(apart > allowed):
+                    column = channels.CHANNELS[k].column
+                    known = f"{apart[k] / sd[k]:.0f} sd" if not noise.estimated[k] else f"{apart[k] / mean[k]:.0%}"
+                    raise BadData(
+                        f"{runs.source} rows {first + 1} and {second + 1}, {column}: the same conditions gave "
+                        f"{number(runs[column][first])} and {number(runs[column][second])}, {known} apart; "
+                        "remove the wrong one or state a larger --noise"
+                    )
+        return []
+
+    @classmethod
+    def check_start(cls, runs: Runs, noise: Noise) -> list[str]:
+        return []
+
+    @classmethod
+    def identity(cls, runs: Runs) -> tuple[str, ...]:
+        return tuple(c for c in runs.columns if c != "run_id")
+
+    @classmethod
+    def shows(cls, effect: type[Effect]) -> bool:
+        return not (effect.needs_battery or effect.transient or effect.settles_to)
+
+    @classmethod
+    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        return (), ()
+
+    @classmethod
+    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return 100.0 * (simulated - measured) / simulated
+
+    def __call__(self, robot: Robot) -> Observation:
+        result = fidelities.get(self.fidelity).settled(robot, self.conditions)
+        reading = jnp.stack([result.reading[name] for name in channels.names()], -1)
+        return Observation(reading, result.adhesion_used, result.status)
+
+    @property
+    def long(self) -> bool:
+        return fidelities.get(self.fidelity).rollout
+
+    @property
+    def eased(self) -> bool:
+        return self.long
+
+    def unreachable(self, status: np.ndarray) -> np.ndarray:
+        return np.isin(status, (SLIDES, FAILED, TIPS))
+
+    def runs_counting(self, included: np.ndarray) -> int:
+        return int(included.sum())
+
+    def cautions(self, robot: Robot) -> list[str]:
+        return treatments.of(self.fidelity).cautions(robot, self.conditions)
+
+    def linearise(
+        self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
+    ) -> SettledLinearization:
+        """As the protocol says. A signature is the sensitivity of the readings to a defect of the effect's balance,
+        times its term: exact, as an effect enters one balance and is linear in its amplitude."""
+        probes = tuple(probe(b) for b in PROBED)
+        robot, size = problem.robot(z), z.size
+
+        def whitened(x: Array) -> Array:
+            z, delta = x[:size], x[size:]
+            there = problem.robot(z)
+            put = tuple(eqx.tree_at(lambda e: e.amplitude, p, d) for p, d in zip(probes, delta, strict=True))
+            there = dataclasses.replace(there, effects=(*there.effects, *put))
+            return jnp.concatenate([problem.whitened(self(there), data), z - data.centre])
+
+        jacobian, residual = jax.jacfwd(lambda x: (whitened(x),) * 2, has_aux=True)(
+            jnp.concatenate([z, jnp.zeros(len(probes))])
+        )
+        rows, count = data.measured.shape
+        defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes)).transpose(2, 0, 1)
+        signals = jax.vmap(lambda c: operating_signals(robot, c))(self.conditions)
+        scale = data.weight / data.sd
+
+        def signature(effect: Effect) -> Array:
+            alone = dataclasses.replace(robot, effects=(effect,))
+            term = jax.vmap(lambda s: balances.added(alone, s, effect.balance, effect.channel))(signals)
+            term = jnp.broadcast_to(term, (rows,))
+            if effect.balance == "sensor":
+                moved = term[:, None] * (jnp.arange(count) == channels.index(effect.channel)) * scale
+            elif effect.balance in PROBED:
+                moved = term[:, None] * defects[PROBED.index(effect.balance)]
+            else:
+                moved = jnp.zeros((rows, count))
+            return moved.ravel()
+
+        signatures = jnp.concatenate([e.each(signature) for e in effects]).T
+        return SettledLinearization(residual, jacobian[:, :size], finite(signatures), defects, signals)
+
+    def replicate(
+        self,
+        problem: Problem,
+        z: Array,
+        data: Data,
+        effects: tuple[ScoredEffect, ...],
+        linear: Linearization,
+        key: Array,
+    ) -> Linearization:
+        """As the protocol says. Readings are drawn with their sds, and the bench values too: a prior is a
+        measurement made beforehand."""
+        one, two = jax.random.split(key)
+        clean = problem.observation(z).reading
+        noisy = dataclasses.replace(
+            data,
+            measured=clean + data.sd * jax.random.normal(one, clean.shape),
+            centre=z + jax.random.normal(two, z.shape),
+        )
+        return self.linearise(problem, gauss_newton(problem, z, noisy, STEPS), noisy, effects)
+
+    def search(
+        self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
+    ) -> tuple[Optimum, Observation]:
+        return _fits(problem, starts, weights, active, self.policy.steps)
+
+    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+        return bases_room.families(columns, included.astype(float))
+
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
+        """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
+        balances `electrical`, `track` and `slip` that together make it."""
+        return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
+
+
+def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
+    rows = len(included)
+    sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][:rows] for b in EQUATIONS], 2)
+    residual = np.asarray(linear.by_row())[:rows]
+    found = np.full((rows, len(EQUATIONS)), np.nan)
+    for k in np.flatnonzero(included):
+        found[k] = -np.linalg.lstsq(sensitivity[k], residual[k], rcond=None)[0]
+    return dict(zip(EQUATIONS, found.T, strict=True))
+
+
+@eqx.filter_jit
+def _fits(
+    problem: Problem, starts: Array, weights: Array, active: Array | None, steps: int
+) -> tuple[Optimum, Observation]:
+    def one(z: Array, weight: Array, which: Array | None) -> tuple[Optimum, Observation]:
+        here = problem
+        if which is not None:
+            here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
+        found = levenberg_marquardt(here, z, dataclasses.replace(problem.data, weight=weight), max_steps=steps)
+        return found, here.observation(found.z)
+
+    return jax.vmap(one)(starts, weights, active)

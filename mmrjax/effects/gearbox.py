@@ -1,0 +1,101 @@
+"""Effects on the gearbox [N·m] at its output shaft, eqs. (19)-(23)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals
+
+
+class GearboxEffect(Effect):
+    """Torque lost in the gearbox, at its output shaft [N·m]."""
+
+    balance = "gearbox"
+
+
+def torque_output(robot: Robot, signals: Signals) -> Scalar:
+    """Torque of traction and track losses at the output shaft [N·m]."""
+    return signals.torque_track_loss + robot.chassis(signals.configuration).radius * signals.traction
+
+
+class GearLoadLoss(GearboxEffect):
+    """ΔM_r = a |M_load|: a share of the torque at the output shaft.
+
+    Teeth lose more, or less, of the load than the catalogue says.
+
+    Source: Niemann and Winter, Maschinenelemente II (2003): load-dependent mesh loss P_Z = P μ_z H_v. It is
+    eq. (19)'s η_rm in another form: look-alike of a change of η_rm by -a η_rm.
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the output torque lost beyond eq. (19)",
+        bounds=(-0.2, 0.5),
+        sd=0.05,
+        source="η_rm of two or three planet stages: 0.70 to 0.80",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load = torque_output(robot, signals)
+        return self.amplitude * jnp.abs(load) * signals.direction
+
+
+class GearQuadraticLoss(GearboxEffect):
+    """ΔM_r = a M_load²: the square of the torque at the output shaft.
+
+    Gear loss that grows faster than the load.
+
+    Source: second-order term of the load-dependent mesh loss, whose friction grows with tooth load
+    (Ohlendorf, Verlustleistung und Erwärmung von Stirnrädern, 1958: μ as the power 0.2 of the load) and
+    whose planets tilt.
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="1/N/m",
+        meaning="loss torque over squared output torque",
+        bounds=(-0.05, 0.3),
+        sd=0.03,
+        source="at 2 N·m 6 % of the load",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        load = torque_output(robot, signals)
+        return self.amplitude * load**2 * signals.direction
+
+
+class StribeckGear(GearboxEffect):
+    """ΔM_r = a exp(-|ω_m| / ω_s) sign ω_m at the output shaft.
+
+    Gear friction that falls as the input gains speed.
+
+    Source: Tustin (1947), the exponential law; mixed lubrication of grease-packed planets (Niemann and
+    Winter, 2003). With the same ω_s it is `stribeck_motor` times i η_rm.
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="friction torque at rest, at the output",
+        bounds=(-0.1, 1.0),
+        sd=0.05,
+        source="some 1.5 mN·m at the input, times 48 and η_rm",
+    )
+    speed_fade: Scalar = parameter(
+        300.0,
+        unit="rad/s",
+        meaning="input speed ω_s over which the excess fades",
+        bounds=(20.0, 3000.0),
+        relative_sd=0.5,
+        source="grease leaves mixed lubrication at 1000 to 5000 rpm of the input",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.exp(-jnp.abs(signals.speed_motor) / self.speed_fade) * signals.direction

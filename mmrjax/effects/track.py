@@ -1,0 +1,210 @@
+"""Effects on the loss of tracks and bearings [N·m] at the driving pulley, eqs. (24), (26)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals
+
+
+class TrackEffect(Effect):
+    """Torque lost between the driving shaft and the ground, of one side [N·m]."""
+
+    balance = "track"
+
+
+class Churning(TrackEffect):
+    """ΔM_t = a ω_k |ω_k| at the pulley, for a side's tracks.
+
+    Track loss that grows with the square of speed.
+
+    Source: the next term after eq. (24); impact of teeth and grousers takes a momentum that grows as the
+    speed, at a rate that grows as the speed (Merritt, The Evolution of a Tank Transmission, 1946).
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m·s^2",
+        meaning="torque over squared pulley speed",
+        bounds=(-1e-3, 1e-2),
+        sd=5e-4,
+        source="at 25 rad/s a tenth to the whole of eq. (24)",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        # ω² with the shaft's smooth sign: |ω| alone has no derivative at rest.
+        return self.amplitude * signals.speed_wheel**2 * signals.direction
+
+
+class StribeckTrack(TrackEffect):
+    """ΔM_t = a exp(-|ω_k| / ω_s) sign ω_k at the pulley, for a side's tracks.
+
+    Belt and pulley-bearing friction that falls as the belt gains speed.
+
+    Source: Tustin (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="loss torque at rest beyond M_t0",
+        bounds=(-0.1, 1.0),
+        sd=0.1,
+        source="a third of M_t0 of Table 3",
+    )
+    speed_fade: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="pulley speed ω_s over which the excess fades",
+        bounds=(0.5, 80.0),
+        relative_sd=0.5,
+        source="belt speeds of 0.1 to 0.5 m/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.exp(-jnp.abs(signals.speed_wheel) / self.speed_fade) * signals.direction
+
+
+class TensionFriction(TrackEffect):
+    """ΔM_t = a r_k |P_t|: tension presses the tight side on pulleys and guides.
+
+    Belt friction that grows with the traction the belt carries.
+
+    Source: Euler (1769) and Eytelwein (1808): normal force of a belt round a pulley in proportion to its
+    tension; Merritt, The Evolution of a Tank Transmission (1946), track efficiency as a share of the
+    tractive effort.
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="loss torque over torque of the traction",
+        bounds=(-0.2, 1.0),
+        sd=0.1,
+        source="1 - efficiency of a rubber track's final drive: 5 to 15 %",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        radius = robot.chassis(signals.configuration).radius
+        return self.amplitude * radius * jnp.abs(signals.traction) * signals.direction
+
+
+class CentrifugalTension(TrackEffect):
+    """ΔM_t = a M_t0 v², v = ω_k r_p the belt's speed: dry loss M_t0 in proportion to the tension T_0 + ρ v².
+
+    The belt's own centrifugal tension adds to its loss.
+
+    Source: centrifugal tension ρ v² of a running belt (Eytelwein 1808; Budynas and Nisbett, Shigley's
+    Mechanical Engineering Design, 2011, ch. 17); so a = ρ / T_0. With the belts of Table 7, ρ = 0.05 kg/m,
+    and T_0 of 1 to 10 N. Unlike `churning` it scales with the configuration's own M_t0. r_p is the radius of
+    the pulley, which drives the belt in both.
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="s^2/m^2",
+        meaning="mass of the belt per length over its rest tension",
+        bounds=(-0.1, 0.5),
+        sd=0.05,
+        source="0.005 for a taut belt, 0.05 for a slack one",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        loss = robot.chassis(signals.configuration).track.loss_coulomb
+        belt_speed = signals.speed_wheel * robot.radius_pulley
+        return self.amplitude * loss * belt_speed**2 * signals.direction
+
+
+class BendingLoss(TrackEffect):
+    """ΔM_t = a 2x / (1 + x²), x = ω_k / ω_r: loss modulus of a standard linear solid.
+
+    Rubber that is bent round the pulleys relaxes while it passes.
+
+    Source: Ferry, Viscoelastic Properties of Polymers (1980), ch. 3, the loss modulus G'' of a Maxwell
+    element; Gerbert, Traction Belt Mechanics (1999), bending loss of a belt at each run on and off a pulley.
+    Far from ω_r it is like eq. (24)'s terms.
+    """
+
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="largest loss torque, reached at ω_r",
+        bounds=(-0.1, 1.0),
+        sd=0.05,
+        source="a seventh of M_t0 of Table 3",
+    )
+    speed_relaxation: Scalar = parameter(
+        8.0,
+        unit="rad/s",
+        meaning="pulley speed ω_r of the largest loss",
+        bounds=(0.5, 200.0),
+        relative_sd=0.5,
+        source="relaxation over a tenth of a second, about the bend's duration",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        share = signals.speed_wheel / self.speed_relaxation
+        return self.amplitude * 2 * share / (1 + share**2)
+
+
+class StickSlip(TrackEffect):
+    """ΔM_t = a z, θ_s z' = ω_k exp(-(ω_k/ω_s)²) - |ω_k| z, z(0) = 0: bristles bend over θ_s, then let go.
+
+    Break-away: dry contacts of the track hold more before they slip.
+
+    Source: Dahl (1968) with the Stribeck curve of Canudas de Wit, Olsson, Åström and Lischinsky, A new model
+    for control of systems with friction, IEEE Trans. Automatic Control 40 (1995); the curve stands with the
+    drive of z so that its rate stays finite. Settled: z = exp(-(ω_k/ω_s)²) sign ω_k, nothing at travelling
+    speed. Torque that falls with speed is what lets a crawling drive stick and slip. The memory is z [-].
+    Bent bristles give energy back, so it is not a pure loss.
+    """
+
+    transient = True
+    memory_size = 1.0
+    memory_unit = "-"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="break-away torque of a side beyond M_t0",
+        bounds=(-0.2, 2.0),
+        sd=0.1,
+        source="a third of M_t0 of Table 3",
+    )
+    angle_breakaway: Scalar = parameter(
+        0.01,
+        unit="rad",
+        meaning="turn of the pulley over which the contacts let go θ_s",
+        bounds=(1e-4, 1.0),
+        relative_sd=0.5,
+        source="0.4 mm of belt: shear of teeth and seals",
+    )
+    speed_fade: Scalar = parameter(
+        3.0,
+        unit="rad/s",
+        meaning="pulley speed ω_s above which the excess is gone",
+        bounds=(0.05, 8.0),
+        relative_sd=0.5,
+        source="belt speed of 0.1 m/s",
+    )
+
+    def _excess(self, signals: Signals) -> Scalar:
+        return jnp.exp(-((signals.speed_wheel / self.speed_fade) ** 2))
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return self._excess(signals) * signals.direction
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        speed = signals.speed_wheel
+        turn = speed * self._excess(signals) - speed * signals.direction * signals.memory[self.name]
+        return turn / self.angle_breakaway
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * self.recall(robot, signals)
