@@ -61,6 +61,9 @@ _Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from th
 _Discharge = Annotated[
     float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  \\[default: 0]")
 ]
+_NoCache = Annotated[
+    bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
+]
 _Chunk = Annotated[
     int | None,
     typer.Option("--chunk", help="Runs in one vmapped call.  \\[default: steady 16384, drive 4096, track 512]"),
@@ -96,6 +99,7 @@ def simulate(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Simulate one run, or the runs of a CSV file, and write a run folder.
 
@@ -108,7 +112,7 @@ def simulate(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
         discharge_mAh=discharge, report=report,
     )  # fmt: skip
-    resolved = _prepared(config.resolve(config.Simulate, None, options))
+    resolved = _prepared(config.resolve(config.Simulate, None, options), no_cache)
     from sweeps import simulate as room
 
     cells = _cells(configuration, voltage, slope, payload, mass, surface)
@@ -146,6 +150,7 @@ def sweep(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Simulate every combination of a grid in vmapped batches: Table 8 in both configurations by default.
 
@@ -172,7 +177,7 @@ def sweep(
         "slopes_deg": config.axis("--slopes", slopes),
         "surface": surface,
     }
-    resolved = _prepared(config.resolve(config.Sweep, config_file, options))
+    resolved = _prepared(config.resolve(config.Sweep, config_file, options), no_cache)
     from sweeps import sweep as room
 
     return room.sweep(resolved, out, force)
@@ -195,6 +200,7 @@ def compare(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
     from sweeps import config
@@ -202,7 +208,7 @@ def compare(
     options = _options(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
     )
-    resolved = _prepared(config.resolve(config.Compare, None, options))
+    resolved = _prepared(config.resolve(config.Compare, None, options), no_cache)
     from sweeps import compare as room
 
     return room.compare(resolved, data, own_mass, out, force)
@@ -218,6 +224,7 @@ def reproduce(
     effects: _Effects = None,
     out: _Out = None,
     force: _Force = False,
+    no_cache: _NoCache = False,
 ) -> int:
     """Remake the paper's figures and tables with a robot: the bench's rows, Figs. 5a-29, row by row.
 
@@ -226,7 +233,7 @@ def reproduce(
     from sweeps import config
 
     options = _options(model=model, robot=robot, set=set_, effects=effects)
-    resolved = _prepared(config.resolve(config.Reproduce, None, options))
+    resolved = _prepared(config.resolve(config.Reproduce, None, options), no_cache)
     from sweeps import reproduce as room
 
     return room.reproduce(resolved, out, force)
@@ -252,6 +259,7 @@ def render(
     battery: _Battery = None,
     discharge: _Discharge = None,
     force: _Force = False,
+    no_cache: _NoCache = False,
 ) -> int:
     """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
 
@@ -268,7 +276,7 @@ def render(
         battery=battery,
         discharge_mAh=discharge,
     )
-    resolved = _prepared(config.resolve(config.Render, None, options))
+    resolved = _prepared(config.resolve(config.Render, None, options), no_cache)
     from sweeps import render as room
 
     cells = _cells(configuration, voltage, slope, payload, mass, surface)
@@ -313,6 +321,7 @@ def calibrate(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
 
@@ -325,7 +334,7 @@ def calibrate(
         "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
         "noise": noise, "starts": starts, "seed": seed, "profiles": profiles, "hold_out": hold_out,
     }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Calibrate, None, options))
+    resolved = _prepared(config.resolve(config.Calibrate, None, options), no_cache)
     from sweeps import calibrate as room
 
     return room.calibrate(resolved, data, out, force)
@@ -356,6 +365,7 @@ def loop(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Find what the model lacks: fit it, trace what is left to an effect, add that, report errors before and after.
 
@@ -367,15 +377,16 @@ def loop(
     options = _options(robot=robot, set=set_, effects=effects, report=report) | {
         "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
     }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Loop, None, options))
+    resolved = _prepared(config.resolve(config.Loop, None, options), no_cache)
     from sweeps import loop as room
 
     return room.loop(resolved, data, out, force)
 
 
 @app.command()
-def doctor() -> int:
-    """Check this installation: versions, devices, a solved run against its known answer, a writable folder."""
+def doctor(no_cache: _NoCache = False) -> int:
+    """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""
+    _start_jax(no_cache)
     from sweeps import doctor as room
 
     return room.doctor()
@@ -388,7 +399,7 @@ def _options(**given: Any) -> dict[str, Any]:
     return {**given, "set": config.settings(given["set"]), "effects": tuple(effects) if effects else None}
 
 
-def _prepared(resolved: Any) -> Any:
+def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     """A command's configuration, once the environment is ready for the jax that the command will import.
 
     Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
@@ -397,10 +408,21 @@ def _prepared(resolved: Any) -> Any:
     """
     if getattr(resolved, "model", None) == "track":
         os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    _start_jax(no_cache)
+    return resolved
+
+
+def _start_jax(no_cache: bool) -> None:
+    """Import jax with double precision, and with the compilation cache unless it is not wanted."""
+    from sweeps import compilation_cache
+
+    if not no_cache:
+        compilation_cache.enable()
     import jax
 
+    if no_cache:
+        jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_enable_x64", True)
-    return resolved
 
 
 def _cells(
