@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from calibration.data.errors import InputError
-from mmrjax import __version__
+from mmrjax import __version__, fidelities
 
 INTERRUPTED = 130
 
@@ -23,10 +24,21 @@ app = typer.Typer(
     "converge (their status says why); 4 bad data; 130 interrupted (the same command takes it up again).",
 )  # fmt: skip
 
-_Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady, drive or track.  \\[default: steady]")]
+
+def _defaults(option: str, shown: float = math.inf) -> str:
+    """Default of a fidelity's option by fidelity, as a help text has it; of `simulate` at most `shown`."""
+    found = {name: o.default for name, facts in fidelities.TABLE.items() for o in facts.options if o.name == option}
+    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in found.items()}
+    texts = [f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else list(capped.values())
+    return f"\\[default: {'; '.join(texts)}]"
+
+
+_Model = Annotated[
+    str | None,
+    typer.Option("--model", help=f"Fidelity: {', '.join(fidelities.NAMES)}.  \\[default: {fidelities.NAMES[0]}]"),
+]
 _Duration = Annotated[
-    float | None,
-    typer.Option("--duration", help="Length of a run (s).  \\[default: drive 30, simulate 5; track 1.5]"),
+    float | None, typer.Option("--duration", help=f"Length of a run (s).  {_defaults('duration', shown=5.0)}")
 ]
 _Robot = Annotated[
     str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  \\[default: nominal]")
@@ -51,9 +63,7 @@ _Mass = Annotated[
 _Surface = Annotated[
     str, typer.Option(help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood.")
 ]
-_Step = Annotated[
-    float | None, typer.Option("--step", help="Integration step of the track model (s).  \\[default: 1e-4]")
-]
+_Step = Annotated[float | None, typer.Option("--step", help=f"Integration step (s).  {_defaults('step')}")]
 _Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
 _Report = Annotated[bool | None, typer.Option("--report/--no-report", help="Write report.html.  \\[default: report]")]
@@ -66,7 +76,12 @@ _NoCache = Annotated[
 ]
 _Chunk = Annotated[
     int | None,
-    typer.Option("--chunk", help="Runs in one vmapped call.  \\[default: steady 16384, drive 4096, track 512]"),
+    typer.Option(
+        "--chunk",
+        help="Runs in one vmapped call.  \\[default: "
+        + ", ".join(f"{name} {facts.chunk}" for name, facts in fidelities.TABLE.items())
+        + "]",
+    ),
 ]
 
 
@@ -152,7 +167,7 @@ def sweep(
     report: _Report = None,
     no_cache: _NoCache = False,
 ) -> int:
-    """Simulate every combination of a grid in vmapped batches: Table 8 in both configurations by default.
+    """Simulate every combination of a grid in vmapped batches: Table 8 in every configuration by default.
 
     An axis is 0,5,10 or first:last:step as 0:20:0.5. An interrupted sweep goes on with the same command
     and the same --out.
@@ -406,7 +421,7 @@ def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     XLA's CPU executor (jax 0.10.2); with this flag none of twelve did (docs/benchmarks.md). Whoever sets
     XLA_FLAGS, be it to nothing, is heeded.
     """
-    if getattr(resolved, "model", None) == "track":
+    if hasattr(resolved, "model") and fidelities.facts(resolved.model).one_thread:
         os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     _start_jax(no_cache)
     return resolved

@@ -55,30 +55,29 @@ class Gear:
         return ripple.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
 
 
-def gears(robot: Robot, run: Any, which: Sequence[int], names: Sequence[str]) -> list[Gear]:
-    """Members of a batch of runs of the track model.
+def gears(
+    robot: Robot,
+    history: Any,
+    status: np.ndarray,
+    guide_share: np.ndarray,
+    which: Sequence[int],
+    names: Sequence[str],
+) -> list[Gear]:
+    """Members of a batch of runs whose running gear is resolved.
 
     Args:
-        run: the batch; which: index of each member's configuration in `robot`; names: headings of the members.
+        history: time, signals and reactions of the batch; status: codes of how its members ended.
+        guide_share: of each member [-].
+        which: index of each member's configuration in `robot`; names: headings of the members.
     """
     import jax
 
     answer = []
     for k, name in enumerate(names):
-        one = jax.tree.map(lambda x, k=k: np.asarray(x[k]), run)
         on_tracks = float(robot.configurations.members[int(which[k])].on_tracks) > 0.5
-        answer.append(
-            Gear(
-                name,
-                on_tracks,
-                STATUSES[int(one.result.status)],
-                float(robot.radius_pulley),
-                one.time,
-                one.signals,
-                one.reactions,
-                float(one.steady.guide_share),
-            )
-        )
+        over_time = jax.tree.map(lambda x, k=k: np.asarray(x[k]), (history.time, history.signals, history.reactions))
+        ended, share = STATUSES[int(status[k])], float(guide_share[k])
+        answer.append(Gear(name, on_tracks, ended, float(robot.radius_pulley), *over_time, share))
     return answer
 
 

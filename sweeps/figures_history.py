@@ -51,21 +51,22 @@ class Start:
         return float(self.current[last].mean()), float(self.speed[last].mean())
 
 
-def starts(robot: Robot, run: Any, which: Sequence[int], names: Sequence[str]) -> list[Start]:
+def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int], names: Sequence[str]) -> list[Start]:
     """Members of a batch of runs from standstill, of any fidelity that has histories.
 
     Args:
-        run: the batch; which: index of each member's configuration in `robot`; names: headings of the members.
+        history: time and signals of the batch; status: codes of how its members ended.
+        which: index of each member's configuration in `robot`; names: headings of the members.
     """
     from mmrjax.signals import STATUSES
 
     answer = []
     for k, name in enumerate(names):
-        current = np.asarray(run.signals.total_current[k])
+        current = np.asarray(history.signals.total_current[k])
         finite = np.flatnonzero(np.isfinite(current))
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
-        times, sliding = np.asarray(run.time[k])[upto], np.asarray(run.signals.speed_sliding[k])[upto]
-        speed = np.asarray(run.signals.speed[k])[upto] / MM
+        times, sliding = np.asarray(history.time[k])[upto], np.asarray(history.signals.speed_sliding[k])[upto]
+        speed = np.asarray(history.signals.speed[k])[upto] / MM
         kind = robot.configurations.names[int(which[k])]
         starting = slipping = settled = 0.0
         if finite.size:
@@ -76,10 +77,10 @@ def starts(robot: Robot, run: Any, which: Sequence[int], names: Sequence[str]) -
             last = speed[_end(times)].mean()
             late = np.nonzero(np.abs(speed - last) > 0.01 * np.abs(last))[0]
             settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
-        theoretical = np.asarray(run.signals.speed_theoretical[k])[upto] / MM
-        status = STATUSES[int(run.result.status[k])]
+        theoretical = np.asarray(history.signals.speed_theoretical[k])[upto] / MM
+        ended = STATUSES[int(status[k])]
         stages = (starting, max(slipping, starting), settled)
-        answer.append(Start(name, kind, status, times, current[upto], speed, theoretical, *stages))
+        answer.append(Start(name, kind, ended, times, current[upto], speed, theoretical, *stages))
     return answer
 
 

@@ -13,13 +13,20 @@ from sweeps import figures_power
 from sweeps.report import Album, columns, first_rows, named, render, statuses
 
 if TYPE_CHECKING:
+    from mmrjax.fidelities.base import Run
     from mmrjax.robot import Robot
 
 HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
 
 
 def write(
-    folder: Path, *, robot: Robot, robot_name: str, model: str, runs: dict[str, np.ndarray], histories: Any = None
+    folder: Path,
+    *,
+    robot: Robot,
+    robot_name: str,
+    model: str,
+    runs: dict[str, np.ndarray],
+    histories: Run | None = None,
 ) -> Path:
     """Write `report.html` and `figures/` for a few finished runs.
 
@@ -28,7 +35,7 @@ def write(
         robot: the robot that was simulated; robot_name: its name or file.
         model: fidelity.
         runs: the finished table of runs.
-        histories: the batch of runs over time, of a fidelity that has it.
+        histories: the same as a batch with its history, of a fidelity that keeps it.
 
     Returns:
         The path of the page.
@@ -74,19 +81,22 @@ def labels(runs: dict[str, np.ndarray]) -> list[str]:
 
 
 def _histories(
-    album: Album, robot: Robot, runs: dict[str, np.ndarray], names: list[str], histories: Any
+    album: Album, robot: Robot, runs: dict[str, np.ndarray], names: list[str], histories: Run
 ) -> dict[str, Any]:
     from sweeps import figures_history
 
     which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
-    starts = figures_history.starts(robot, histories, which, names[:HISTORIES])
+    history, status = histories.history, histories.result.status
+    starts = figures_history.starts(robot, history, status, which, names[:HISTORIES])
     album.add("history", lambda: figures_history.from_standstill(starts))
     known: dict[str, Any] = {"shown": len(starts), "starts": starts}
-    if hasattr(histories, "reactions"):
+    if history.reactions is not None:
         from sweeps import figures_gear
 
-        known["averaged"] = 1e3 * float(histories.time[0, 1] - histories.time[0, 0])
-        gears = [g for g in figures_gear.gears(robot, histories, which, names[:GEARS]) if g.rolls]
+        known["averaged"] = 1e3 * float(history.time[0, 1] - history.time[0, 0])
+        share = histories.columns["guide_share"]
+        gears = figures_gear.gears(robot, history, status, share, which, names[:GEARS])
+        gears = [g for g in gears if g.rolls]
         if gears and all(g.time[-1] > 2 * figures_gear.TAIL for g in gears):
             known["ripple"] = album.add("ripple", lambda: figures_gear.current_ripple(gears))
             album.add("reactions", lambda: figures_gear.reactions(gears))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from calibration.data import robot_file
 from calibration.data import runs as records
+from mmrjax import fidelities
 from mmrjax.tables import CONFIGURATIONS
 from sweeps import config as configuration
 from sweeps.console import say, tell
@@ -18,10 +19,9 @@ def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) ->
     """Write the paper's figures and tables for a robot into a run folder; returns the exit code."""
     robot = load_robot(config)
     runs = records.read("measured")
+    gear = "track.guide_share" in fidelities.facts(config.model).computes
     with open_folder("reproduce", config, robot, out, force) as folder:
-        _, rows = report.write(
-            folder.partial, robot=robot, robot_name=config.robot, model=config.model, gear=config.model == "track"
-        )
+        _, rows = report.write(folder.partial, robot=robot, robot_name=config.robot, model=config.model, gear=gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
             tell(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")

@@ -59,6 +59,8 @@ class Facts:
         rollout: whether it integrates over time; searches through it then run one by one, and end sooner.
         histories: whether it can keep a run over time.
         computes: parameters of a configuration that are results here and not read, such as `track.guide_share`.
+        slow: whether a batch takes long enough for a bar that shows its progress.
+        one_thread: whether XLA has to run on one thread: on two, runs have hung for good (docs/benchmarks.md).
     """
 
     module: str
@@ -69,6 +71,8 @@ class Facts:
     rollout: bool = False
     histories: bool = False
     computes: tuple[str, ...] = ()
+    slow: bool = False
+    one_thread: bool = False
 
     def resolved(self, **given: float | None) -> dict[str, float]:
         """Every option by name: as given, else (absent or None) its default.
@@ -125,6 +129,8 @@ TABLE: dict[str, Facts] = {
         rollout=True,
         histories=True,
         computes=("track.guide_share",),
+        slow=True,
+        one_thread=True,
     ),
 }
 

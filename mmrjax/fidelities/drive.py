@@ -40,6 +40,7 @@ _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
 TIME_SETTLED = 4.0
 #: Instants of a history.
 SAMPLES = 1001
+TIME_INRUSH, SAMPLES_INRUSH = 0.04, 160  # its first instants [s], and how many of them are kept besides
 
 
 class Trajectory(eqx.Module):
@@ -205,10 +206,16 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
     return Run(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
 
 
+def _instants(duration: float) -> np.ndarray:
+    """Times of a history [s] from 0 to `duration`, close together while the current rises to its peak."""
+    early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
+    return np.union1d(early, np.linspace(0.0, duration, SAMPLES))
+
+
 def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
-    kept = drive_batch(robot, conditions, jnp.linspace(0.0, options["duration"], SAMPLES))
+    kept = drive_batch(robot, conditions, jnp.asarray(_instants(options["duration"])))
     return Run(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
 
 

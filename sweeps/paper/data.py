@@ -230,7 +230,9 @@ def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[St
 def starts_of(robot: Robot, run: Any) -> list[Start]:
     """Runs of the paper's configurations from standstill, of any fidelity that has histories."""
     names = kinds(robot)
-    return figures_history.starts(robot, run, [robot.configurations.index(c) for c in names], names)
+    return figures_history.starts(
+        robot, run, run.result.status, [robot.configurations.index(c) for c in names], names
+    )
 
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:

@@ -43,7 +43,8 @@ def draw(album: Album, robot: Robot) -> dict[str, Any]:
         where the robot has none); or `left_out`, the statuses of all, and no figures drawn.
     """
     run, names = runs(robot), data.kinds(robot)
-    gears = figures_gear.gears(robot, run, [robot.configurations.index(c) for c in names], names)
+    which = [robot.configurations.index(c) for c in names]
+    gears = figures_gear.gears(robot, run, run.result.status, run.steady.guide_share, which, names)
     if not all(gear.rolls for gear in gears):
         return {"left_out": ", ".join(f"{g.name}: {words.short(g.status)}" for g in gears)}
     starts = data.starts_of(robot, run)
