@@ -40,7 +40,7 @@ def calibrate(
     starts: int | None = None,
     seed: int = 0,
     profiles: bool | None = None,
-    blocks: Sequence[str] | None = None,
+    blocks: Sequence[str] | bool | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Calibrate `robot` to measured runs.
@@ -54,7 +54,8 @@ def calibrate(
         starts: the prior mean and `starts - 1` draws from the prior; for settled rows with a rollout the optimum of
             `steady` and draws from its posterior.
         profiles: whether to profile every parameter.
-        blocks: kinds of blocks to hold out. These three by default as the kind of data and the fidelity say.
+        blocks: kinds of blocks to hold out; True: all that tell something of such data.
+            These three by default as the kind of data and the fidelity say.
         tell: is given a sentence now and then while a long calibration goes on.
 
     Raises:
@@ -71,7 +72,8 @@ def calibrate(
     effort = treatment.effort
     starts = (observe.starts or effort.starts) if starts is None else starts
     profiles = effort.profiles if profiles is None else profiles
-    blocks = (observe.blocks if effort.blocks else ()) if blocks is None else blocks
+    blocks = effort.blocks if blocks is None else blocks
+    kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
 
     former: list[str] = []
     free, fix = (robot_file.current_names(names, robot, former) for names in (free, fix))
@@ -99,12 +101,12 @@ def calibrate(
         raise checks.infeasible(runs, fitted, status, lost, names)
 
     if posed.observe.long:
-        doing = ["the linear analysis", *["profiles"] * profiles, *["blocks held out"] * bool(blocks)]
+        doing = ["the linear analysis", *["profiles"] * profiles, *["blocks held out"] * bool(kinds)]
         tell(f"optimum found; now {', '.join(doing)}")
     notes += posed.observe.cautions(fitted)
     about = identifiability.analyse(posed, jnp.asarray(z))
     profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about) if profiles else None
-    masks = {kind: holdout.blocks(runs, kind) for kind in blocks}
+    masks = {kind: holdout.blocks(runs, kind) for kind in kinds}
     held = holdout.held_out(posed, jnp.asarray(z), masks)
 
     measured, sd = runs.measured(), np.asarray(posed.data.sd)
