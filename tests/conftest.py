@@ -1,11 +1,15 @@
-# ruff: noqa: E402 (double precision is set before anything is imported)
-"""What the tests share: double precision, the runs of Table 8, and compiled functions."""
+# ruff: noqa: E402 (the cache and double precision are set before anything is imported)
+"""What the tests share: the compilation cache, double precision, the runs of Table 8, and compiled functions."""
 
 from __future__ import annotations
 
 import dataclasses
 import gc
 from pathlib import Path
+
+from sweeps import compilation_cache
+
+compilation_cache.enable()  # one for all workers, and for the next time
 
 import jax
 

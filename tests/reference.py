@@ -43,31 +43,31 @@ NOMINAL: dict[str, float] = {
     "gearbox.friction_coulomb": 0.0003,
     "gearbox.friction_viscous": 1.4e-6,
     # 6T2A: Tables 3, 4, 5 (lacquered wood), 7; guide share, μ_d, V_s, V_d are assumptions
-    "tracked.track.loss_coulomb": 0.350,
-    "tracked.track.loss_viscous": 0.016,
-    "tracked.track.guide_friction": 0.20,
-    "tracked.track.guide_share": 0.3,
-    "tracked.ground.friction.static": 0.32,
-    "tracked.ground.friction.dynamic": 0.8 * 0.32,
-    "tracked.ground.friction.speed_static": 0.02,
-    "tracked.ground.friction.speed_dynamic": 0.2,
-    "tracked.ground.rolling_resistance": 0.06,
-    "tracked.mass": 13.1,
-    "tracked.radius": PULLEY,
-    "tracked.inertia": 75e-6 + 140e-6 + (0.040 + 2 * 0.025) * PULLEY**2,
+    "6T2A.track.loss_coulomb": 0.350,
+    "6T2A.track.loss_viscous": 0.016,
+    "6T2A.track.guide_friction": 0.20,
+    "6T2A.track.guide_share": 0.3,
+    "6T2A.ground.friction.static": 0.32,
+    "6T2A.ground.friction.dynamic": 0.8 * 0.32,
+    "6T2A.ground.friction.speed_static": 0.02,
+    "6T2A.ground.friction.speed_dynamic": 0.2,
+    "6T2A.ground.rolling_resistance": 0.06,
+    "6T2A.mass": 13.1,
+    "6T2A.radius": PULLEY,
+    "6T2A.inertia": 75e-6 + 140e-6 + (0.040 + 2 * 0.025) * PULLEY**2,
     # 4W2T
-    "wheeled.track.loss_coulomb": 0.070,
-    "wheeled.track.loss_viscous": 0.003,
-    "wheeled.track.guide_friction": 0.20,
-    "wheeled.track.guide_share": 0.0,
-    "wheeled.ground.friction.static": 0.38,
-    "wheeled.ground.friction.dynamic": 0.8 * 0.38,
-    "wheeled.ground.friction.speed_static": 0.02,
-    "wheeled.ground.friction.speed_dynamic": 0.2,
-    "wheeled.ground.rolling_resistance": 0.03,
-    "wheeled.mass": 11.5,
-    "wheeled.radius": WHEEL,
-    "wheeled.inertia": 75e-6 + 140e-6 + 0.040 * PULLEY**2 + 2 * 152e-6,
+    "4W2T.track.loss_coulomb": 0.070,
+    "4W2T.track.loss_viscous": 0.003,
+    "4W2T.track.guide_friction": 0.20,
+    "4W2T.track.guide_share": 0.0,
+    "4W2T.ground.friction.static": 0.38,
+    "4W2T.ground.friction.dynamic": 0.8 * 0.38,
+    "4W2T.ground.friction.speed_static": 0.02,
+    "4W2T.ground.friction.speed_dynamic": 0.2,
+    "4W2T.ground.rolling_resistance": 0.03,
+    "4W2T.mass": 11.5,
+    "4W2T.radius": WHEEL,
+    "4W2T.inertia": 75e-6 + 140e-6 + 0.040 * PULLEY**2 + 2 * 152e-6,
 }
 
 
@@ -241,7 +241,7 @@ class Side:
     """One run: nominal numbers (or `p`) of one configuration, the slope, the load, the source."""
 
     def __init__(self, voltage, slope=0.0, payload=0.0, wheeled=False, battery=False, discharge=0.0, p=NOMINAL):
-        c = "wheeled." if wheeled else "tracked."
+        c = "4W2T." if wheeled else "6T2A."
         self.A, self.B, self.U0 = p["battery.curvature"], p["battery.slope"], p["battery.voltage_full"]
         self.R_b, self.I_p, self.full = p["battery.resistance"], p["battery.current_other"], p["battery.capacity"]
         self.R, self.L, self.C = p["motor.resistance"], p["motor.inductance"], p["motor.torque_constant"]

@@ -7,19 +7,39 @@ import pytest
 
 from calibration.data import effect_file, robot_file
 from calibration.data.errors import BadConfiguration
-from mmrjax import params
+from mmrjax import nominal, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 
 GOOD = '''
-from typing import ClassVar
-from mmrjax.effects import Effect
-from mmrjax.params import Scalar, parameter
+from mmrjax.effects import Effect, amplitude
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
 
 class SealDrag(Effect):
+    """ΔM_t = a: a seal that drags. Source: none, an example."""
+
+    balance = "track"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m", meaning="drag of the seal", bounds=(-1.0, 1.0), sd=0.1, source="example"
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.direction
+'''
+#: The same, everything stated and nothing derived.
+EXPLICIT = '''
+from typing import ClassVar
+from mmrjax.effects import Effect
+from mmrjax.params import Scalar, parameter
+
+
+class Drag(Effect):
     """ΔM_t = a: a seal that drags. Source: none, an example."""
 
     name: ClassVar[str] = "seal_drag"
@@ -30,7 +50,7 @@ class SealDrag(Effect):
         0.0, unit="N·m", meaning="drag of the seal", bounds=(-1.0, 1.0), sd=0.1, source="example", amplitude=True
     )
 
-    def term(self, robot, signals: Signals) -> Scalar:
+    def term(self, robot, signals):
         return self.amplitude * signals.direction
 '''
 
@@ -41,19 +61,49 @@ def written(tmp_path, text, name="mine.py"):
     return path
 
 
-def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path):
-    library = effect_file.library([written(tmp_path, GOOD)])
+def stating(*lines):
+    """The good effect with these class attributes too."""
+    return GOOD.replace("    dissipative = True\n", "    dissipative = True\n" + "".join(f"    {x}\n" for x in lines))
+
+
+@pytest.mark.parametrize("text", [GOOD, EXPLICIT], ids=["derived", "explicit"])
+def test_user_effect_is_usable_by_name_in_a_robot_file(tmp_path, text):
+    library = effect_file.library([written(tmp_path, text)])
     assert list(library) == [*BY_NAME, "seal_drag"] and "seal_drag" not in BY_NAME
     path = tmp_path / "robot.toml"
     path.write_text("[effects.seal_drag]\namplitude = 0.05\n")
     robot = robot_file.load(str(path), library)
     more = params.replace(robot_file.load("nominal"), {"6T2A.track.loss_coulomb": 0.4})
     run = Conditions(voltage=[15.0])
-    got, expected = (steady_batch(r, run).reading.total_current for r in (robot, more))
+    got, expected = (steady_batch(r, run).total_current for r in (robot, more))
     np.testing.assert_allclose(got, expected, rtol=1e-10)
     robot_file.write(robot, tmp_path / "again.toml")
     again = robot_file.load(str(tmp_path / "again.toml"), library)
     assert float(again.effects[0].amplitude) == 0.05
+
+
+def test_user_effect_states_what_the_library_states(tmp_path):
+    text = stating(
+        "transient = True", 'settles_to = "churning"', "odd_in_travel = True", 'configurations = ("4W2T",)'
+    )
+    drag = effect_file.library([written(tmp_path, text)])["seal_drag"]
+    assert (drag.transient, drag.settles_to, drag.odd_in_travel, drag.needs_battery) == (
+        True,
+        "churning",
+        True,
+        False,
+    )
+    assert drag().configurations == ("4W2T",)
+    power = GOOD.replace("signals.direction", "signals.direction * signals.battery")
+    text = power.replace("    dissipative = True\n", "    needs_battery = True\n")
+    assert effect_file.library([written(tmp_path, text, "on_battery.py")])["seal_drag"].needs_battery
+
+
+def test_user_effect_may_settle_to_another_of_the_users(tmp_path):
+    one = stating('settles_to = "seal_wear"')
+    two = GOOD.replace("SealDrag", "SealWear")
+    library = effect_file.library([written(tmp_path, one), written(tmp_path, two, "other.py")])
+    assert library["seal_drag"].settles_to == "seal_wear"
 
 
 def test_robot_file_without_the_users_library_says_so(tmp_path):
@@ -68,18 +118,61 @@ REFUSED = {
     "syntax": ("def (", r"mine\.py: its code fails \(SyntaxError"),
     "no effect": ("x = 1", r"mine\.py: holds no effect; expected a class derived from mmrjax\.effects\.Effect$"),
     "no term": (GOOD.replace("def term", "def other"), r"holds no effect; .*; SealDrag defines no term"),
-    "no name": (GOOD.replace('    name: ClassVar[str] = "seal_drag"\n', ""), r"mine\.py, SealDrag, name: got None"),
-    "name": (GOOD.replace('"seal_drag"', '"seal drag"'), r"name: got 'seal drag'; expected lower-case words"),
-    "name taken": (GOOD.replace('"seal_drag"', '"churning"'), r"name: churning is taken; choose another"),
+    "name": (stating('name = "seal drag"'), r"name: got 'seal drag'; expected lower-case words"),
+    "no name": (stating("name = None"), r"mine\.py, SealDrag, name: got None"),
+    "name taken": (GOOD.replace("SealDrag", "Churning"), r"name: churning is taken; choose another"),
+    "no balance": (GOOD.replace('    balance = "track"\n', ""), r"SealDrag, balance: got None; expected a str"),
     "balance": (GOOD.replace('"track"', '"trak"'), r"balance: got trak; did you mean track\? allowed: mass,"),
-    "channel": (GOOD.replace('"track"', '"sensor"'), r"channel: got ''; expected one of total_current, motor_speed"),
+    "no channel": (
+        GOOD.replace('"track"', '"sensor"'),
+        r"channel: got ''; expected one of total_current, motor_speed",
+    ),
+    "channel": (
+        GOOD.replace('"track"', '"sensor"\n    channel = "sped"'),
+        r"channel: got sped; did you mean speed\? allowed: total_current, motor_speed",
+    ),
+    "channel of no sensor": (
+        stating('channel = "speed"'),
+        r"channel: got 'speed'; expected .* for sensor, else none",
+    ),
     "dissipative": (GOOD.replace("= True\n", "= 1\n"), r"dissipative: got 1; expected a bool"),
+    "transient": (stating('transient = "yes"'), r"transient: got yes; expected a bool as class attribute"),
+    "settles": (
+        stating('settles_to = "churnin"'),
+        r"settles_to: got churnin; did you mean churning\? allowed: mass_",
+    ),
+    "settles to itself": (stating('settles_to = "seal_drag"'), r"settles_to: got seal_drag; .*allowed: mass_"),
+    "battery": (
+        stating("needs_battery = True"),
+        r"needs_battery: its term is 0\.1 on an external supply; expected 0",
+    ),
+    "odd": (stating("odd_in_travel = None"), r"odd_in_travel: got None; expected a bool"),
+    "movers": (
+        stating('movers = "track"'),
+        r"movers: got track; did you mean tracks\? allowed: tracks, wheels, or none",
+    ),
+    "configurations": (stating('configurations = "4W2T"'), r"configurations: got '4W2T'; expected a tuple of names"),
+    "configuration": (stating("configurations = (4,)"), r"configurations: got \(4,\); expected a tuple of names"),
+    "memory": (stating("memory_size = True"), r"memory_size: got True; expected a positive number, or None"),
+    "no rate": (stating("memory_size = 1.0"), r"cannot be computed \(NotImplementedError: seal_drag has a memory"),
     "source": (GOOD.replace("Source: none, an example.", ""), r"its docstring states no equation with its «Source:»"),
-    "no default": (GOOD.replace("        0.0, unit", "        unit"), r"cannot be made without arguments"),
-    "present at rest": (GOOD.replace("        0.0, unit", "        0.1, unit"), r"amplitude: got default 0\.1"),
-    "no amplitude": (GOOD.replace(", amplitude=True", ""), r"its amplitudes are none; expected one field"),
-    "no sd": (GOOD.replace(" sd=0.1", " relative_sd=0.1"), r"amplitude: expected a prior with sd > 0"),
+    "no default": (EXPLICIT.replace("        0.0, unit", "        unit"), r"cannot be made without arguments"),
+    "present at rest": (EXPLICIT.replace("        0.0, unit", "        0.1, unit"), r"amplitude: got default 0\.1"),
+    "no amplitude": (EXPLICIT.replace(", amplitude=True", ""), r"its amplitudes are none; expected one field"),
+    "no sd": (EXPLICIT.replace(" sd=0.1", " relative_sd=0.1"), r"amplitude: expected a prior with sd > 0"),
     "fails": (GOOD.replace("signals.direction", "signals.dirction"), r"its term cannot be computed \(AttributeError"),
+    "reads ahead": (
+        GOOD.replace("signals.direction", "signals.torque_net"),
+        r"its term reads a signal that is computed after its balance; see balances\.moving$",
+    ),
+    "reads ahead unseen": (
+        GOOD.replace("signals.direction", "(1.0 if signals.torque_net > 0 else 2.0)"),
+        r"its term reads a signal that is computed after its balance",
+    ),
+    "corner at rest": (
+        GOOD.replace("signals.direction", "abs(signals.speed_wheel) ** 0.5"),
+        r"derivatives of its term are not finite at rest, where drive and track start",
+    ),
     "there at zero": (GOOD.replace("self.amplitude *", "0.1 +"), r"its term is 1\.1 at amplitude 0"),
     "not linear": (GOOD.replace("self.amplitude *", "self.amplitude**2 *"), r"its term is not linear"),
     "no gradient": (
@@ -109,3 +202,44 @@ def test_missing_effect_file_is_refused(tmp_path):
 def test_packaged_effects_pass_the_users_checks():
     for effect in BY_NAME.values():
         effect_file._check(Path("library"), effect)
+
+
+# --- configurations in robot files ----------------------------------------------------------------------
+
+
+def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text('[effects.churning]\nconfigurations = ["4W2T"]\namplitude = 1e-4\n[effects.mass_offset]\n')
+    robot = robot_file.read(path)
+    assert [e.configurations for e in robot.effects] == [("4W2T",), ()]
+    assert float(robot.effects[0].amplitude) == 1e-4
+    robot_file.write(robot, tmp_path / "again.toml")
+    assert "configurations" in (tmp_path / "again.toml").read_text()
+    again = robot_file.read(tmp_path / "again.toml")
+    assert [e.configurations for e in again.effects] == [("4W2T",), ()]
+
+
+def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
+    library = effect_file.library([written(tmp_path, stating('configurations = ("4W2T",)'))])
+    robot = robot_file.with_effects(nominal.nominal(), ("seal_drag",), library)
+    assert robot.effects[0].configurations == ("4W2T",)
+    robot = robot_file.with_effects(nominal.nominal(), ("seal_drag",), library, {"seal_drag": []})
+    assert robot.effects[0].configurations == ()
+    robot_file.write(robot, tmp_path / "robot.toml")
+    assert robot_file.read(tmp_path / "robot.toml", library).effects[0].configurations == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "sentence"),
+    [
+        ('["4W2"]', r"got 4W2; did you mean 4W2T\? allowed: 6T2A, 4W2T$"),
+        ('["6T2A", "8W"]', r"got 8W; allowed: 6T2A, 4W2T$"),
+        ('"4W2T"', r"got '4W2T'; expected a list of 6T2A, 4W2T$"),
+        ("[1]", r"got \[1\]; expected a list of 6T2A, 4W2T$"),
+    ],
+)
+def test_wrong_configurations_of_an_effect_are_refused(tmp_path, value, sentence):
+    path = tmp_path / "mine.toml"
+    path.write_text(f"[effects.mass_offset]\nconfigurations = {value}\n")
+    with pytest.raises(BadConfiguration, match=r"mine\.toml, effects\.mass_offset\.configurations: " + sentence):
+        robot_file.read(path)

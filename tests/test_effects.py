@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
 import importlib
-import inspect
 import pkgutil
 import re
+import subprocess
+import sys
 from collections import Counter
+from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import balances, effects, nominal, params
+import mmrjax
+from mmrjax import balances, channels, effects, nominal, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME, Effect
-from mmrjax.fidelities.drive import drive
+from mmrjax.effects.contract import readable
+from mmrjax.effects.periodic import Periodic
+from mmrjax.fidelities import half_robot
+from mmrjax.fidelities.drive import drive, rates
 from mmrjax.fidelities.steady import steady, steady_batch
+from mmrjax.fidelities.track import track
 from mmrjax.params import Scalar, parameter
-from mmrjax.signals import Signals, State
+from mmrjax.running_gear import RunningGear
+from mmrjax.signals import CONVERGED, STALLED, Signals, State
 
 # --- units --------------------------------------------------------------------------------------------
 
@@ -53,7 +63,7 @@ SIGNAL_UNITS = {
     "torque_input torque_gear torque_net",
     "H": "inductance",
     "kg·m^2": "inertia_added",
-    "-": "wheeled battery slope adhesion direction direction_travel efficiency_load",
+    "-": "on_tracks battery slope adhesion direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}
@@ -100,10 +110,10 @@ CONDITIONS = Conditions(
     voltage=[33.0, 15.0, 24.0, 24.0, 24.0],
     slope_deg=np.degrees([0.09, 0.0, 0.05, -0.1, 0.12]),
     payload=[8.0, 0.0, 3.0, 0.0, 5.0],
-    configuration=[0.0, 1.0, 0.0, 1.0, 1.0],
+    configuration=["6T2A", "4W2T", "6T2A", "4W2T", "4W2T"],
     battery=[0.0, 0.0, 1.0, 0.0, 1.0],
     discharge=[0.0, 0.0, 3000.0, 0.0, 100.0],
-)
+).resolved(nominal.nominal())
 
 
 def random_states(n=400):
@@ -113,7 +123,8 @@ def random_states(n=400):
     current, motor, speed, charge, voltage, slope, payload, adhesion = rng.uniform(low, high, (n, 8)).T
     memory = {e.name: jnp.asarray(e.memory_size * rng.uniform(0, 1, n)) for e in ALL if e.memory_size is not None}
     motor[:40] *= 1e-4  # through rest
-    run = Conditions(voltage, slope, payload, rng.integers(0, 2, n), rng.integers(0, 2, n), charge, adhesion)
+    configuration, battery = rng.integers(0, 2, (2, n))
+    run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
     return moving(nominal.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge)), memory))
 
@@ -130,10 +141,21 @@ def fitted(effect: type[Effect], amplitude: float) -> Effect:
     return params.replace(effect(), {"amplitude": jnp.asarray(amplitude)})
 
 
+def with_effects(*present: Effect, robot=None):
+    return dataclasses.replace(robot or nominal.nominal(), effects=present)
+
+
 def terms(effect: Effect, robot=None, signals: Signals = STATES) -> np.ndarray:
-    robot = robot or nominal.nominal()
-    shape = np.shape(signals.current)
-    return np.broadcast_to(jax.vmap(lambda s: effect.term(robot, s) + 0.0 * s.current)(signals), shape)
+    """What it adds to its balance in each of the states."""
+    robot = with_effects(effect, robot=robot)
+    added = jax.vmap(lambda s: balances.added(robot, s, effect.balance, effect.channel) + 0.0 * s.current)
+    return np.asarray(added(signals))
+
+
+def readings(robot, signals: Signals) -> jax.Array:
+    """What the instruments show, channels last, in their order."""
+    shown = balances.sensor(robot, signals)
+    return jnp.stack([shown[name] for name in channels.names()], -1)
 
 
 def floats(tree) -> jax.Array:
@@ -149,8 +171,7 @@ def outputs_start(robot):
     """Readings through a start: for what settled travel does not show."""
     times = jnp.asarray([0.0, 0.002, 0.01, 0.1, 0.4])
     signals = jax.vmap(lambda c: drive(robot, c, times).signals)(CONDITIONS)
-    readings = jnp.stack(jax.tree.leaves(balances.sensor(robot, signals)), -1)[:, 1:]
-    return readings.reshape(-1, 3)
+    return readings(robot, signals)[:, 1:].reshape(-1, len(channels.CHANNELS))
 
 
 @functools.cache
@@ -159,7 +180,7 @@ def compiled(outputs, those: tuple[type[Effect], ...]):
 
     def numbers(amplitudes):
         there = tuple(fitted(e, a) for e, a in zip(those, amplitudes, strict=True))
-        return outputs(dataclasses.replace(nominal.nominal(), effects=there))
+        return outputs(with_effects(*there))
 
     return jax.jit(numbers), jax.jit(jax.jacfwd(numbers))
 
@@ -175,15 +196,21 @@ def company(effect: type[Effect]) -> tuple[type[Effect], ...]:
     return ALL if effect in ALL else (effect,)
 
 
+TRANSIENT = tuple(effect for effect in ALL if effect.transient)
+
+
 # --- the laws: each takes an effect class and raises AssertionError ------------------------------------
 
 
 def law_declared(effect: type[Effect]) -> None:
     """It states its equation's source, its balance, its amplitude, and for a sensor its channel."""
     assert "Source:" in (effect.__doc__ or ""), "docstring states no source"
+    assert effect.name.isidentifier() and effect.name == effect.name.lower()
+    assert effect.movers in ("", "tracks", "wheels")
+    assert not effect.settles_to or (effect.settles_to in BY_NAME and effect.settles_to != effect.name)
     assert effect.balance in balances.BALANCES
     assert bool(effect.channel) == (effect.balance == "sensor")
-    assert not effect.channel or effect.channel in {f.name for f in dataclasses.fields(Reading)}
+    assert not effect.channel or effect.channel in channels.names()
     declared = {p.name: p for p in params.walk(effect())}
     assert [n for n, p in declared.items() if p.spec.amplitude] == ["amplitude"]
     amplitude = declared["amplitude"]
@@ -202,7 +229,7 @@ def law_absent_at_zero(effect: type[Effect]) -> None:
 
 def law_alive_at_zero(effect: type[Effect]) -> None:
     """The derivative at zero is finite everywhere and not zero where the effect acts."""
-    there = company(effect)
+    there = TRANSIENT if effect.transient else company(effect)
     values, slopes = at_zero(outputs_start if effect.transient else outputs_steady, there)
     slopes = slopes[..., there.index(effect)]
     assert np.isfinite(values).all() and np.isfinite(slopes).all()
@@ -251,7 +278,60 @@ def law_dissipative(effect: type[Effect]) -> None:
         assert power.min() >= 0, f"adds power in {(power < 0).mean():.0%} of states"
 
 
-LAWS = (law_declared, law_absent_at_zero, law_alive_at_zero, law_linear, law_unit, law_dissipative)
+#: Instants at which a term may read: settled travel (None where it has none), motion, and standstill.
+INSTANTS = {
+    "settled": (State(*map(jnp.asarray, (2.0, 700.0, 0.5, 100.0))), True),
+    "climbing": (State(*map(jnp.asarray, (2.0, 700.0, 0.5, 100.0))), False),
+    "backwards": (State(*map(jnp.asarray, (-3.0, -500.0, -0.45, 100.0))), False),
+    "standstill": (State(*map(jnp.asarray, (0.0, 0.0, 0.0, 0.0))), False),
+}
+
+
+@functools.cache
+def known(balance: str, channel: str, instant: str) -> Signals:
+    """What a term in this balance may read."""
+    state, settled = INSTANTS[instant]
+    run = jax.tree.map(lambda x: x[2], CONDITIONS)
+    return readable(nominal.nominal(), run, state, balance, channel, settled=settled)
+
+
+def law_readable(effect: type[Effect]) -> None:
+    """Term and derivatives are finite on the signals that are computed before its balance, at rest too."""
+    robot = with_effects(fitted(effect, size(effect)))
+    for instant in INSTANTS:
+        signals = known(effect.balance, effect.channel, instant)
+        if effect.memory_size is not None and instant != "settled":
+            signals = dataclasses.replace(signals, memory={effect.name: jnp.asarray(0.3 * effect.memory_size)})
+        term, slopes = eqx.filter_value_and_grad(
+            lambda both, effect=effect: jnp.sum(balances.added(*both, effect.balance, effect.channel))
+        )((robot, signals))
+        assert np.isfinite(term), f"no number: {instant}"
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes)), f"no derivative: {instant}"
+
+
+#: Signals that are the same in a run in mirror image (the robot turned about on the same slope).
+EVEN = (
+    *("configuration", "on_tracks", "payload", "adhesion", "battery", "discharge", "memory", "mass", "normal"),
+    *("inductance", "inertia_added", "adhesion_limit", "efficiency_load"),
+)
+
+
+def law_travel(effect: type[Effect]) -> None:
+    """In a run in mirror image a term is the mirror image, and in that of one `odd_in_travel` what it was."""
+    if effect.balance not in CONJUGATE or issubclass(effect, Periodic):
+        return  # masses and readings have no direction; a phase has its own
+    start = fitted(effect, size(effect))
+    there = dataclasses.replace(STATES, memory={})
+    turned = {f.name: -getattr(there, f.name) for f in dataclasses.fields(Signals) if f.name not in EVEN}
+    sign = 1 if effect.odd_in_travel else -1
+    mirrored = terms(start, signals=dataclasses.replace(there, **turned))
+    np.testing.assert_allclose(mirrored, sign * terms(start, signals=there), rtol=1e-12, atol=1e-15)
+
+
+LAWS = (
+    *(law_declared, law_absent_at_zero, law_alive_at_zero, law_linear, law_unit, law_dissipative),
+    *(law_readable, law_travel),
+)
 
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__[4:])
@@ -271,7 +351,8 @@ def amplitude(unit="ohm", sd=0.5, **keywords):
 class Good(Effect):
     """ΔU = a I. Source: none, the control of the mutants."""
 
-    name, balance, dissipative = "good", "electrical", True
+    balance = "electrical"
+    dissipative = True
     amplitude: Scalar = amplitude()
 
     def term(self, robot, signals):
@@ -349,7 +430,38 @@ class DissipativeMass(Good):
     amplitude: Scalar = amplitude(unit="kg")
 
     def term(self, robot, signals):
-        return self.amplitude * signals.wheeled
+        return self.amplitude * signals.on_tracks
+
+
+class TooEarly(Good):
+    """ΔU = a P / 1 N·V: the traction is computed later. Source: mutant."""
+
+    def term(self, robot, signals):
+        return self.amplitude * signals.traction
+
+
+class CornerAtRest(Good):
+    """ΔU = a √ω: no derivative at rest. Source: mutant."""
+
+    def term(self, robot, signals):
+        return self.amplitude * jnp.sqrt(jnp.abs(signals.speed_motor))
+
+
+class Downhill(Good):
+    """ΔF = a N, undeclared: pulls one way in space. Source: mutant."""
+
+    balance = "ground"
+    dissipative = False
+    amplitude: Scalar = amplitude(unit="-")
+
+    def term(self, robot, signals):
+        return self.amplitude * signals.normal
+
+
+class NotOdd(Good):
+    """ΔU = a I follows the travel. Source: mutant."""
+
+    odd_in_travel = True
 
 
 class NoSource(Good):
@@ -374,6 +486,18 @@ class NotAnAmplitude(Good):
     amplitude: Scalar = amplitude(**{"amplitude": False})
 
 
+class UnknownMovers(Good):
+    """Source: mutant."""
+
+    movers = "legs"
+
+
+class SettlesToNothing(Good):
+    """Source: mutant."""
+
+    settles_to = "nothing"
+
+
 class UnknownUnit(Good):
     """Source: mutant."""
 
@@ -386,7 +510,12 @@ MUTANTS = {
     law_linear: (Squared, Softplus, Present, Dead),
     law_unit: (WrongUnit, HiddenConstant, WrongBalance),
     law_dissipative: (AddsPower, DissipativeMass),
-    law_declared: (NoSource, UnknownBalance, SensorWithoutChannel, NotAnAmplitude, UnknownUnit),
+    law_readable: (TooEarly, CornerAtRest),
+    law_travel: (Downhill, NotOdd, AddsPower),
+    law_declared: (
+        *(NoSource, UnknownBalance, SensorWithoutChannel, NotAnAmplitude, UnknownUnit, UnknownMovers),
+        SettlesToNothing,
+    ),
 }
 
 
@@ -407,33 +536,103 @@ def test_law_rejects_mutant(law, mutant):
 
 # --- the library is complete ----------------------------------------------------------------------------
 
+#: Positions in tables of scores and in the random numbers of a bootstrap.
+ORDER = """
+mass_error mass_offset rotating_inertia supply_sag battery_sag series_resistance brush_drop winding_heating
+thermal_drift armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
+gear_quadratic_loss stribeck_gear churning stribeck_track tension_friction centrifugal_tension bending_loss stick_slip
+speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip
+speed_slip load_slip pulley_eccentricity ammeter_gain ammeter_offset encoder_scale speed_gain
+""".split()  # noqa: SIM905
+MODULES = [m.name for m in pkgutil.iter_modules(effects.__path__, "mmrjax.effects.")]
 
-def found_effects() -> dict[str, type[Effect]]:
-    """Every subclass that a file of the package defines, by file."""
-    found = {}
-    for module in pkgutil.iter_modules(effects.__path__, "mmrjax.effects."):
-        content = importlib.import_module(module.name)
-        for _, cls in inspect.getmembers(content, inspect.isclass):
-            if issubclass(cls, Effect) and cls is not Effect and cls.__module__ == module.name:
-                found[f"{module.name.rpartition('.')[2]}:{cls.__name__}"] = cls
+
+def test_library_keeps_its_order():
+    assert [effect.name for effect in ALL] == ORDER == list(BY_NAME)
+
+
+def test_every_effect_stands_in_the_file_of_its_balance():
+    for effect in ALL:
+        assert effect.__module__ == f"mmrjax.effects.{effect.balance}"
+    found = {e for name in MODULES for e in effects.defined_in(importlib.import_module(name))}
+    assert found == set(ALL)
+
+
+def test_name_follows_from_the_class_unless_stated():
+    assert Good.name == "good" and SensorWithoutChannel.name == "sensor_without_channel"
+
+    class Renamed(Good):
+        name = "another"
+
+    assert Renamed.name == "another" and Renamed().amplitude == 0
+
+
+# --- imports --------------------------------------------------------------------------------------------
+
+FIRST = """
+import importlib, sys
+import diffrax, equinox, jax, optimistix
+for name in sys.argv[1:]:
+    for known in [n for n in sys.modules if n.partition(".")[0] == "mmrjax"]:
+        del sys.modules[known]
+    importlib.import_module(name)
+    from mmrjax.effects import ALL
+    assert len(ALL) == 40
+"""
+
+
+def test_every_file_of_effects_can_be_imported_first():
+    first = ["mmrjax.robot", "mmrjax.balances", "mmrjax.effects", *MODULES]
+    done = subprocess.run([sys.executable, "-c", FIRST, *first], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def imported(source: str, modules: set[str]) -> set[str]:
+    """Those of `modules` that a module imports when it is loaded: not for types alone, not within functions."""
+    found, rest = set(), list(ast.parse(source).body)
+    while rest:
+        node = rest.pop()
+        if isinstance(node, ast.ImportFrom):
+            below = {f"{node.module}.{a.name}" for a in node.names}
+            found |= below & modules or {str(node.module)} & modules
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names} & modules
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            rest += node.orelse
+        elif not isinstance(node, ast.FunctionDef | ast.Lambda):
+            rest += [n for n in ast.iter_child_nodes(node) if isinstance(n, ast.stmt)]
     return found
 
 
-def test_all_lists_every_effect_file_once():
-    found = found_effects()
-    assert set(found.values()) == set(ALL) and len(ALL) == len(set(ALL))
-    files = [key.partition(":")[0] for key in found]
-    assert len(files) == len(set(files)), "one effect a file"
+def circle(imports: dict[str, set[str]]) -> list[str]:
+    """Modules that import one another in a circle; none: empty."""
+    left = dict(imports)
+    while free := [m for m, needs in left.items() if not needs & set(left)]:
+        for module in free:
+            del left[module]
+    return sorted(left)
 
 
-def test_effect_names_are_unique_and_those_of_their_files():
-    assert len(BY_NAME) == len(ALL)
-    for key, effect in found_effects().items():
-        assert effect.name == key.partition(":")[0] and BY_NAME[effect.name] is effect
+def test_simulator_has_no_import_circle():
+    root = Path(mmrjax.__file__).parent
+    files = {".".join(("mmrjax", *f.relative_to(root).with_suffix("").parts)): f for f in root.rglob("*.py")}
+    sources = {name.removesuffix(".__init__"): f.read_text(encoding="utf-8") for name, f in files.items()}
+    imports = {name: imported(source, set(sources)) for name, source in sources.items()}
+    assert circle(imports) == []
+    assert "mmrjax.robot" in imports["mmrjax.effects.base"] and "mmrjax.effects" not in imports["mmrjax.robot"]
+
+
+def test_import_circles_are_found():
+    modules = {"a", "a.b", "c"}
+    assert circle({"a": {"c"}, "a.b": {"a"}, "c": {"a.b"}, "d": {"a"}}) == ["a", "a.b", "c", "d"]
+    assert circle({"a": {"c"}, "a.b": {"a", "c"}, "c": set()}) == []
+    assert imported("from a import b\nif TYPE_CHECKING:\n    import c", modules) == {"a.b"}
+    assert imported("def f():\n    import c\ntry:\n    from a import x\nexcept E:\n    pass", modules) == {"a"}
 
 
 def test_units_of_signals_are_all_known():
-    assert {*UNIT_OF, "memory"} == {f.name for f in dataclasses.fields(Signals)}  # each memory states its own
+    fields = {f.name for f in dataclasses.fields(Signals)}
+    assert {*UNIT_OF, "memory", "configuration"} == fields  # each memory states its own; an index has none
 
 
 def test_units_of_parameters_and_balances_are_all_known(free):
@@ -465,14 +664,11 @@ def drive_readings():
 
     @jax.jit
     def run(amplitudes):
-        robot = dataclasses.replace(
-            nominal.nominal(), effects=tuple(fitted(e, a) for e, a in zip(ALL, amplitudes, strict=True))
-        )
+        robot = with_effects(*(fitted(e, a) for e, a in zip(ALL, amplitudes, strict=True)))
 
         def one(c):
             answer = drive(robot, c, times, tolerance=1e-11, max_steps=65_536)
-            s = jax.vmap(lambda s: jnp.stack(jax.tree.leaves(balances.sensor(robot, s))))(answer.signals)
-            return s[1:]
+            return readings(robot, answer.signals)[1:]
 
         return jax.vmap(one)(CONDITIONS)
 
@@ -482,8 +678,7 @@ def drive_readings():
 def test_drive_without_amplitudes_is_drive_without_effects(drive_readings):
     bare = nominal.nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, jnp.asarray(DRIVEN), tolerance=1e-11)))(CONDITIONS)
-    s = plain.signals
-    expected = jnp.stack([s.total_current, s.speed_motor, s.speed], -1)[:, 1:]
+    expected = readings(bare, plain.signals)[:, 1:]
     np.testing.assert_allclose(drive_readings(jnp.zeros(len(ALL))), expected, rtol=1e-9, atol=1e-9)
 
 
@@ -509,13 +704,13 @@ def test_drive_and_steady_both_feel(k, drive_readings):
 
 def _steady_with(changes=None, **amplitudes):
     robot = params.replace(nominal.nominal(), changes or {})
-    added = tuple(fitted(BY_NAME[name], value) for name, value in amplitudes.items())
-    return steady_batch(dataclasses.replace(robot, effects=added), CONDITIONS)
+    present = (fitted(BY_NAME[name], value) for name, value in amplitudes.items())
+    return steady_batch(with_effects(*present, robot=robot), CONDITIONS)
 
 
 def _same(a, b, channels=("total_current", "motor_speed", "speed")):
     for channel in channels:
-        np.testing.assert_allclose(getattr(a.reading, channel), getattr(b.reading, channel), rtol=1e-9)
+        np.testing.assert_allclose(getattr(a, channel), getattr(b, channel), rtol=1e-9)
 
 
 def test_series_resistance_is_winding_resistance():
@@ -529,23 +724,152 @@ def test_mass_offset_is_mass_of_the_wheeled_robot():
 def test_winding_heating_is_resistance_at_the_settled_temperature():
     with_it = _steady_with(winding_heating=1.0)
     for k in range(CONDITIONS.voltage.size):
-        current = float(with_it.reading.total_current[k]) / 2
+        current = float(with_it.total_current[k]) / 2
         rise = 7.7 * 0.611 * current**2
         hot = _steady_with({"motor.resistance": 0.611 * (1 + 0.00393 * rise)})
-        np.testing.assert_allclose(with_it.reading.motor_speed[k], hot.reading.motor_speed[k], rtol=1e-9)
+        np.testing.assert_allclose(with_it.motor_speed[k], hot.motor_speed[k], rtol=1e-9)
 
 
 def test_churning_is_viscous_loss_that_grows_with_speed():
     with_it = _steady_with(churning=3e-4)
     for k in range(CONDITIONS.voltage.size):
-        turn = 3e-4 * float(with_it.reading.motor_speed[k]) / 48.0
+        turn = 3e-4 * float(with_it.motor_speed[k]) / 48.0
         viscous = {"6T2A.track.loss_viscous": 0.016 + turn, "4W2T.track.loss_viscous": 0.003 + turn}
         more = _steady_with(viscous)
-        np.testing.assert_allclose(with_it.reading.total_current[k], more.reading.total_current[k], rtol=1e-9)
+        np.testing.assert_allclose(with_it.total_current[k], more.total_current[k], rtol=1e-9)
 
 
 def test_rolling_radius_changes_the_distance_and_no_torque():
     with_it, without = _steady_with(rolling_radius=0.03), _steady_with()
     _same(with_it, without, ("total_current", "motor_speed"))
-    gained = np.asarray(with_it.reading.speed) - np.asarray(without.reading.speed)
+    gained = np.asarray(with_it.speed) - np.asarray(without.speed)
     np.testing.assert_allclose(gained, 0.03 * np.asarray(without.theoretical_speed), rtol=1e-9)
+
+
+# --- what effects declare, so that nobody needs their names ---------------------------------------------
+
+
+def test_library_declares_what_the_loop_asks_for():
+    assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
+    assert {e.name: e.settles_to for e in ALL if e.settles_to} == {"thermal_drift": "winding_heating"}
+    assert [e.name for e in ALL if e.odd_in_travel] == ["slope_bias"]
+    assert {e.name: e.movers for e in ALL if e.movers} == {"mass_offset": "wheels", "grouser_polygon": "tracks"}
+
+
+def test_effect_that_needs_the_battery_shows_on_it_alone():
+    _, slopes = at_zero(outputs_steady, ALL)
+    moved = np.abs(slopes[..., [e.needs_battery for e in ALL]]).max((1, 2))
+    on_battery = np.asarray(CONDITIONS.battery) > 0.5
+    assert (moved[~on_battery] == 0).all() and (moved[on_battery] > 0).all()
+
+
+def test_settled_travel_cannot_tell_an_effect_from_the_one_it_settles_to():
+    _, slopes = at_zero(outputs_steady, ALL)
+    for k, effect in enumerate(ALL):
+        if effect.settles_to:
+            one, other = (slopes[..., i].ravel() for i in (k, ORDER.index(effect.settles_to)))
+            assert abs(one @ other) / np.linalg.norm(one) / np.linalg.norm(other) > 1 - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "configurations", "acts"),
+    [
+        ("churning", (), (1, 1)),
+        ("churning", ("4W2T",), (0, 1)),
+        ("churning", ("4W2T", "6T2A", "4W2T"), (1, 1)),
+        ("mass_offset", (), (0, 1)),
+        ("mass_offset", ("6T2A",), (1, 0)),
+        ("mass_offset", ("6T2A", "4W2T"), (1, 1)),
+        ("grouser_polygon", (), (1, 0)),
+        ("bending_loss", (), (1, 1)),  # a loss of the belt, which the pulley drives in both
+        ("centrifugal_tension", (), (1, 1)),
+        ("churning", ("8W",), (0, 0)),  # of another robot
+    ],
+)
+def test_effect_acts_on_the_configurations_that_it_names(name, configurations, acts):
+    effect = dataclasses.replace(fitted(BY_NAME[name], size(BY_NAME[name])), configurations=configurations)
+    moved = np.abs(terms(effect)) > 0
+    assert [moved[np.asarray(STATES.configuration) == k].any() for k in (0, 1)] == [bool(a) for a in acts]
+
+
+def test_mass_offset_of_named_configurations_is_mass_of_those():
+    offset = dataclasses.replace(fitted(BY_NAME["mass_offset"], 1.6), configurations=("6T2A",))
+    heavier = params.replace(nominal.nominal(), {"6T2A.mass": 13.1 + 1.6})
+    _same(steady_batch(with_effects(offset), CONDITIONS), steady_batch(heavier, CONDITIONS))
+
+
+def test_class_states_the_configurations_of_its_instances():
+    class Here(Good):
+        configurations = ("4W2T",)
+
+    assert Here().configurations == ("4W2T",) and Here(configurations=()).configurations == ()
+    assert jax.tree.structure(Here()) != jax.tree.structure(Here(configurations=()))
+
+
+# --- derivatives by everything, with all effects at once ------------------------------------------------
+
+#: A run that travels, one whose motors cannot turn the shafts, and one that is at rest.
+RUNS = Conditions(
+    configuration=["6T2A", "4W2T", "6T2A"],
+    voltage=[24.0, 0.3, 0.0],
+    slope_deg=[3.0, 5.0, 0.0],
+    payload=[2.0, 0.0, 0.0],
+    battery=[1.0, 0.0, 0.0],
+).resolved(nominal.nominal())
+EVERY = {p.name: p.value for p in params.walk(with_effects(*(fitted(e, 0.02 * size(e)) for e in ALL)))}
+THETA = jnp.stack([jnp.asarray(x) for x in EVERY.values()])
+
+
+def _robot(theta):
+    return params.replace(with_effects(*(e() for e in ALL)), dict(zip(EVERY, theta, strict=True)))
+
+
+def test_steady_with_all_effects_has_finite_derivatives_by_every_parameter():
+    def numbers(theta, run):
+        result = steady(_robot(theta), run)
+        return floats(result), result.status
+
+    slopes, status = jax.jit(jax.vmap(jax.jacrev(numbers, has_aux=True), in_axes=(None, 0)))(THETA, RUNS)
+    assert list(status) == [CONVERGED, STALLED, STALLED]
+    assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
+
+
+def _slopes(outputs):
+    """Derivatives of outputs(robot, run) by every parameter, forward, in each of the runs."""
+    jacobian = jax.jacfwd(lambda theta, run: outputs(_robot(theta), run))
+    return jax.jit(jax.vmap(jacobian, in_axes=(None, 0)))(THETA, RUNS)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0], ids=["standstill", "moving"])
+def test_rates_with_all_effects_have_finite_derivatives_by_every_parameter(share):
+    """What `drive` integrates, at standstill and on the way."""
+    # Current, motor speed, speed, distance and discharge in the units of `drive`, then memories in theirs.
+    unknowns = share * jnp.asarray([0.2, 0.7, 0.5, 1.0, 10.0, *[0.3 for e in ALL if e.memory_size is not None]])
+    slopes = _slopes(lambda robot, run: rates(robot, run, unknowns))
+    assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
+
+
+def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_parameter():
+    """What `track` integrates, at standstill."""
+
+    def outputs(robot, run):
+        system = half_robot.system(robot, run, RunningGear(), 1e-4)
+        signals, _, pulled = half_robot.instant(system, half_robot.stand(system))
+        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves((signals, pulled)) if x.dtype == THETA.dtype])
+
+    slopes = _slopes(outputs)
+    assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0
+
+
+@pytest.mark.slow
+def test_drive_with_all_effects_has_finite_derivatives_by_every_parameter():
+    times = jnp.asarray([0.0, 1e-3, 5e-3])
+    slopes = _slopes(lambda robot, run: readings(robot, drive(robot, run, times).signals))
+    assert np.isfinite(slopes).all() and np.abs(slopes[0, 1:]).max() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rolling", [False, True], ids=["standstill", "rolling"])
+def test_track_with_all_effects_has_finite_derivatives_by_every_parameter(rolling):
+    slopes = _slopes(lambda robot, run: readings(robot, track(robot, run, duration=2e-3, rolling=rolling).signals))
+    assert np.isfinite(slopes).all() and np.abs(slopes[0]).max() > 0

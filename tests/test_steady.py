@@ -18,7 +18,7 @@ CHANNELS = ("total_current", "motor_speed", "speed")
 
 
 def readings(answer):
-    return np.stack([np.asarray(getattr(answer.reading, c)) for c in CHANNELS], -1)
+    return np.stack([np.asarray(answer.reading[c]) for c in CHANNELS], -1)
 
 
 def expected_readings(side):
@@ -48,7 +48,9 @@ def test_steady_matches_reference_root_on_battery(robot, grid):
     rows = grid[::3]  # voltage plays no part
     for charge in (0.0, 3000.0, 7000.0):
         wheeled, slope, payload, _ = rows.T
-        runs = Conditions(slope_deg=slope, payload=payload, configuration=wheeled, battery=1.0, discharge=charge)
+        runs = Conditions(
+            slope_deg=slope, payload=payload, configuration=wheeled.astype(int), battery=1.0, discharge=charge
+        )
         answer = steady_batch(robot, runs)
         got = readings(answer)
         for k, (w, s, p, _) in enumerate(rows):
@@ -67,7 +69,7 @@ def test_steady_matches_reference_root_for_random_robots(robot):
         slope, payload, wheeled = rng.uniform(-0.25, 0.12), rng.uniform(0, 8), rng.integers(2)
         side = reference.Side(24.0, slope, payload, bool(wheeled), p=values)
         other = params.replace(robot, values)
-        runs = Conditions(voltage=[24.0], slope_deg=np.degrees(slope), payload=payload, configuration=float(wheeled))
+        runs = Conditions(voltage=[24.0], slope_deg=np.degrees(slope), payload=payload, configuration=int(wheeled))
         answer = steady_batch(other, runs)
         if side.steady() is not None:
             np.testing.assert_allclose(readings(answer)[0], expected_readings(side), rtol=1e-9)
@@ -88,17 +90,17 @@ FRICTIONLESS = {
     "gearbox.friction_coulomb": 0.0,
     "gearbox.friction_viscous": 0.0,
     "gearbox.efficiency_load": 1.0,
-    **{f"{c}.track.loss_{k}": 0.0 for c in ("tracked", "wheeled") for k in ("coulomb", "viscous")},
-    **{f"{c}.track.guide_friction": 0.0 for c in ("tracked", "wheeled")},
-    **{f"{c}.ground.rolling_resistance": 0.0 for c in ("tracked", "wheeled")},
+    **{f"{c}.track.loss_{k}": 0.0 for c in ("6T2A", "4W2T") for k in ("coulomb", "viscous")},
+    **{f"{c}.track.guide_friction": 0.0 for c in ("6T2A", "4W2T")},
+    **{f"{c}.ground.rolling_resistance": 0.0 for c in ("6T2A", "4W2T")},
 }
-BOTH = dict(wheeled=[0.0, 1.0])
+BOTH = dict(configuration=[0, 1])
 
 
 def test_steady_without_friction_runs_at_no_load_speed(robot):
     answer = steady_batch(params.replace(robot, FRICTIONLESS), Conditions(voltage=24.0, **BOTH))
-    np.testing.assert_allclose(answer.reading.total_current, 0.0, atol=1e-10)
-    np.testing.assert_allclose(answer.reading.motor_speed, 24.0 / 0.0259, rtol=1e-12)
+    np.testing.assert_allclose(answer.total_current, 0.0, atol=1e-10)
+    np.testing.assert_allclose(answer.motor_speed, 24.0 / 0.0259, rtol=1e-12)
     np.testing.assert_allclose(answer.slip, 0.0, atol=1e-12)
 
 
@@ -106,7 +108,7 @@ def test_steady_without_friction_lifts_with_all_but_heat_and_creep(robot):
     answer = steady_batch(
         params.replace(robot, FRICTIONLESS), Conditions(voltage=24.0, slope_deg=np.degrees(0.1), **BOTH)
     )
-    heat = 0.611 * np.asarray(answer.reading.total_current) ** 2 / 2
+    heat = 0.611 * np.asarray(answer.total_current) ** 2 / 2
     np.testing.assert_allclose(answer.power_supply, answer.power_motor + heat, rtol=1e-12)
     np.testing.assert_allclose(answer.power_gear, answer.power_motor, rtol=1e-9)
     np.testing.assert_allclose(answer.power_ground, answer.power_lift, rtol=1e-9)
@@ -126,11 +128,11 @@ def test_steady_power_chain_only_loses(steady_table8):
 
 def test_steady_downhill_gearbox_never_gives_power(robot):
     slopes = np.linspace(-0.25, 0.0, 26)
-    answer = steady_batch(robot, Conditions(voltage=24.0, slope_deg=np.degrees(slopes), configuration=1.0))
+    answer = steady_batch(robot, Conditions(voltage=24.0, slope_deg=np.degrees(slopes), configuration=1))
     assert set(names(answer)) == {"converged"}
     assert (np.asarray(answer.power_motor) >= np.asarray(answer.power_gear)).all()
     assert (np.asarray(answer.power_gear) < 0).any()  # the robot does overhaul its drive
-    assert (np.diff(answer.reading.total_current) > 0).all()
+    assert (np.diff(answer.total_current) > 0).all()
 
 
 # --- statuses and flags -----------------------------------------------------------------------------
@@ -144,10 +146,10 @@ def one(robot, **conditions):
     ("conditions", "status"),
     [
         (dict(), "converged"),
-        (dict(voltage=[0.5], slope=0.1), "stalled"),
+        (dict(voltage=[0.5], slope_deg=np.degrees(0.1)), "stalled"),
         (dict(voltage=[0.0]), "stalled"),
-        (dict(slope=np.radians(20.0)), "slides"),
-        (dict(slope=np.radians(-25.0)), "slides"),
+        (dict(slope_deg=20.0), "slides"),
+        (dict(slope_deg=-25.0), "slides"),
         (dict(battery=1.0, discharge=7920.0), "battery_empty"),
         (dict(voltage=[np.nan]), "failed"),
         (dict(payload=np.nan), "failed"),
@@ -165,14 +167,14 @@ def test_steady_status(robot, conditions, status):
 
 
 def test_steady_nominal_adhesion_does_not_hold_20_degrees(robot):
-    answer = one(robot, slope=np.radians(20.0))
+    answer = one(robot, slope_deg=20.0)
     np.testing.assert_allclose(answer.adhesion_used, (np.tan(np.radians(20)) + 0.06) / 0.32, rtol=1e-12)
 
 
 def test_steady_stall_current_is_voltage_over_resistance(robot):
-    answer = one(robot, voltage=[0.5], slope=0.1)
-    np.testing.assert_allclose(answer.reading.total_current, 2 * 0.5 / 0.611, rtol=1e-12)
-    assert float(answer.reading.motor_speed) == 0.0
+    answer = one(robot, voltage=[0.5], slope_deg=np.degrees(0.1))
+    np.testing.assert_allclose(answer.total_current, 2 * 0.5 / 0.611, rtol=1e-12)
+    assert float(answer.motor_speed) == 0.0
     assert float(answer.efficiency_motor) == 0.0
 
 
@@ -181,8 +183,8 @@ def test_steady_stalls_exactly_below_the_voltage_that_breaks_away(robot):
     m, alpha, r = 13.1 / 2, np.radians(5.0), reference.PULLEY
     load = 0.350 + r * m * reference.G * (0.2 * 0.3 * np.cos(alpha) + 0.06 * np.cos(alpha) + np.sin(alpha))
     voltage = 0.611 * (load / (48 * 0.74) + 0.0027 + 0.0003) / 0.0259
-    below, above = (one(robot, voltage=[voltage * k], slope=alpha) for k in (0.9999, 1.0001))
-    assert float(below.reading.motor_speed) == 0.0 < float(above.reading.motor_speed)
+    below, above = (one(robot, voltage=[voltage * k], slope_deg=5.0) for k in (0.9999, 1.0001))
+    assert float(below.motor_speed) == 0.0 < float(above.motor_speed)
     assert STATUSES[int(below.status)] == "stalled"
 
 
@@ -191,24 +193,24 @@ def test_steady_stands_until_shafts_and_robot_are_faster_than_rest(robot):
     voltages = np.linspace(0.64, 1.2, 113)
     runs = Conditions(voltage=voltages, slope_deg=5.0)
     answer = steady_batch(robot, runs)
-    slow = np.minimum(np.asarray(answer.reading.speed), np.asarray(answer.theoretical_speed)) < 2e-3
+    slow = np.minimum(np.asarray(answer.speed), np.asarray(answer.theoretical_speed)) < 2e-3
     assert slow.any() and not slow.all()
     assert (np.asarray(answer.status) == np.where(slow, STATUSES.index("stalled"), 0)).all()
     ends = drive_batch(robot, runs, jnp.asarray([0.0, 30.0])).result
     agree = np.asarray(answer.status) == np.asarray(ends.status)
     assert agree.sum() >= len(voltages) - 2  # but for the edge itself
     moving = ~slow & agree
-    np.testing.assert_allclose(ends.reading.speed[moving], answer.reading.speed[moving], rtol=1e-3)
-    np.testing.assert_allclose(ends.reading.total_current[moving], answer.reading.total_current[moving], rtol=1e-3)
+    np.testing.assert_allclose(ends.speed[moving], answer.speed[moving], rtol=1e-3)
+    np.testing.assert_allclose(ends.total_current[moving], answer.total_current[moving], rtol=1e-3)
 
 
 @pytest.mark.parametrize(
     ("conditions", "flags"),
     [
-        (dict(voltage=[15.0], wheeled=1.0), set()),
-        (dict(voltage=[24.0], wheeled=1.0), {"gearbox_overspeed"}),
-        (dict(voltage=[36.0], wheeled=1.0), {"motor_overspeed", "gearbox_overspeed"}),
-        (dict(voltage=[15.0], slope=0.17, payload=70.0), {"winding_hot"}),
+        (dict(voltage=[15.0], configuration=1), set()),
+        (dict(voltage=[24.0], configuration=1), {"gearbox_overspeed"}),
+        (dict(voltage=[36.0], configuration=1), {"motor_overspeed", "gearbox_overspeed"}),
+        (dict(voltage=[15.0], slope_deg=np.degrees(0.17), payload=70.0), {"winding_hot"}),
     ],
 )
 def test_steady_flags(robot, conditions, flags):
@@ -233,9 +235,9 @@ def test_steady_compiles_once_for_other_numbers(robot, table8, compilations):
     other = params.replace(robot, {"motor.resistance": 0.9, "6T2A.mass": 14})
     runs = Conditions(
         voltage=table8.voltage * 0.9,
-        slope_deg=np.degrees(table8.slope),
+        slope_deg=table8.slope_deg,
         payload=table8.payload,
-        configuration=table8.wheeled,
+        configuration=table8.configuration,
     )
     compilations.clear()
     jax.block_until_ready(steady_batch(other, runs))
@@ -243,7 +245,7 @@ def test_steady_compiles_once_for_other_numbers(robot, table8, compilations):
 
 
 BAD = dict(
-    slides=dict(slope=0.5),
+    slides=dict(slope_deg=np.degrees(0.5)),
     stalled=dict(voltage=0.3),
     nan_voltage=dict(voltage=np.nan),
     zero_voltage=dict(voltage=0.0),
@@ -252,7 +254,7 @@ BAD = dict(
     weightless=dict(payload=-13.1),
     empty=dict(battery=1.0, discharge=1e5),
     huge=dict(voltage=1e30),
-    vertical=dict(slope=np.pi / 2),
+    vertical=dict(slope_deg=90.0),
     no_adhesion=dict(adhesion=0.0),
 )
 
@@ -280,10 +282,12 @@ def speed_and_gradients(robot, rebuild):
 
 
 def test_steady_bad_members_leave_neighbours_values_and_gradients(theta, speed_and_gradients):
-    fields = ("voltage", "slope", "payload", "wheeled", "battery", "discharge", "adhesion")
-    plain = dict(voltage=24.0, slope=0.05, payload=2.0, wheeled=0.0, battery=0.0, discharge=0.0, adhesion=1.0)
+    fields = ("voltage", "slope_deg", "payload", "configuration", "battery", "discharge", "adhesion")
+    plain = dict(voltage=24.0, slope_deg=np.degrees(0.05), payload=2.0, configuration=0, battery=0.0, discharge=0.0)
+    plain["adhesion"] = 1.0
     bad = [{**plain, **b} for b in BAD.values()]
-    good = [{**plain, "slope": s, "wheeled": w} for s, w in zip(np.linspace(0, 0.15, len(bad)), [0.0, 1.0] * 6)]  # noqa: B905
+    steep = np.degrees(np.linspace(0, 0.15, len(bad)))
+    good = [{**plain, "slope_deg": s, "configuration": w} for s, w in zip(steep, [0, 1] * 6)]  # noqa: B905
     mixed = Conditions(**{f: [row[f] for pair in zip(good, bad, strict=True) for row in pair] for f in fields})
     clean = Conditions(**{f: [row[f] for row in good for _ in range(2)] for f in fields})
     keep = jnp.asarray([True, False] * len(bad))

@@ -9,15 +9,15 @@ from mmrjax.conditions import Conditions
 
 #: Conditions at which the numbers are smooth: driving, on battery, overhauling, stalled.
 POINTS = {
-    "tracked_33V_5deg_8kg": dict(voltage=33.0, slope=np.radians(5.0), payload=8.0),
-    "wheeled_15V_level": dict(voltage=15.0, wheeled=1.0),
-    "tracked_battery": dict(battery=1.0, discharge=3600.0, slope=0.05, payload=3.0),
-    "wheeled_battery_10deg": dict(battery=1.0, discharge=100.0, slope=np.radians(10.0), wheeled=1.0),
-    "wheeled_overhauling": dict(voltage=24.0, slope=-0.2, wheeled=1.0),
-    "tracked_near_adhesion": dict(voltage=24.0, slope=np.radians(14.0), payload=1.5),
-    "tracked_stalled": dict(voltage=0.5, slope=0.1),
-    "wheeled_stalled_battery": dict(battery=1.0, slope=0.2, wheeled=1.0, payload=900.0),
-    "other_surface": dict(voltage=24.0, slope=np.radians(20.0), adhesion=2.1),
+    "tracked_33V_5deg_8kg": dict(voltage=33.0, slope_deg=5.0, payload=8.0),
+    "wheeled_15V_level": dict(voltage=15.0, configuration=1),
+    "tracked_battery": dict(battery=1.0, discharge=3600.0, slope_deg=np.degrees(0.05), payload=3.0),
+    "wheeled_battery_10deg": dict(battery=1.0, discharge=100.0, slope_deg=10.0, configuration=1),
+    "wheeled_overhauling": dict(voltage=24.0, slope_deg=np.degrees(-0.2), configuration=1),
+    "tracked_near_adhesion": dict(voltage=24.0, slope_deg=14.0, payload=1.5),
+    "tracked_stalled": dict(voltage=0.5, slope_deg=np.degrees(0.1)),
+    "wheeled_stalled_battery": dict(battery=1.0, slope_deg=np.degrees(0.2), configuration=1, payload=900.0),
+    "other_surface": dict(voltage=24.0, slope_deg=20.0, adhesion=2.1),
 }
 
 
@@ -55,7 +55,7 @@ def test_steady_derivatives_are_central_differences(point, theta, derivatives):
 
 @pytest.mark.parametrize(
     "conditions",
-    [dict(slope=np.radians(20.0)), dict(voltage=np.nan), dict(battery=1.0, discharge=9e3), dict(voltage=0.0)],
+    [dict(slope_deg=20.0), dict(voltage=np.nan), dict(battery=1.0, discharge=9e3), dict(voltage=0.0)],
     ids=["slides", "nan_voltage", "battery_empty", "zero_voltage"],
 )
 def test_steady_derivatives_without_an_answer_are_finite(conditions, theta, derivatives):
@@ -83,7 +83,7 @@ def test_steady_second_derivatives_are_central_differences(rebuild, theta, free,
     size = jnp.asarray(scales)[jnp.asarray(chosen)]
 
     def speed(x):
-        return steady(rebuild(theta.at[jnp.asarray(chosen)].add(x * size)), run).reading.speed
+        return steady(rebuild(theta.at[jnp.asarray(chosen)].add(x * size)), run).speed
 
     hessian = jax.jit(jax.hessian(speed))(jnp.zeros(3))
     slope = jax.jit(jax.grad(speed))

@@ -2,11 +2,10 @@
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 import pytest
 
-from mmrjax.fidelities.linear import SmallDense, factorise, substitute
+from mmrjax.fidelities.linear import factorise, inverse, substitute
 
 RNG = np.random.default_rng(1)
 EXCHANGE = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # no pivot on the diagonal at all
@@ -53,22 +52,18 @@ def test_singular_matrix_spoils_no_neighbour():
 
 
 @pytest.mark.parametrize("matrix", [EXCHANGE, ZERO_LATER, RNG.normal(size=(3, 3))])
-def test_small_dense_solves_operators_and_their_transposes(matrix):
-    operator, vector = lx.MatrixLinearOperator(jnp.asarray(matrix)), jnp.asarray([1.0, -2.0, 0.5])
-    got = lx.linear_solve(operator, vector, SmallDense()).value
-    np.testing.assert_allclose(got, np.linalg.solve(matrix, vector), rtol=1e-12)
-    got = lx.linear_solve(operator.T, vector, SmallDense()).value
-    np.testing.assert_allclose(got, np.linalg.solve(matrix.T, vector), rtol=1e-12)
-    solver = SmallDense()
-    state, _ = solver.transpose(solver.init(operator, {}), {})
-    np.testing.assert_allclose(solver.compute(state, vector, {})[0], np.linalg.solve(matrix.T, vector), rtol=1e-12)
+def test_inverse_matches_numpy(matrix):
+    np.testing.assert_allclose(inverse(jnp.asarray(matrix)), np.linalg.inv(matrix), rtol=1e-12, atol=1e-15)
 
 
-def test_small_dense_reverse_derivative_matches_numpy():
+def test_inverse_of_singular_matrix_is_zero_and_spoils_no_neighbour():
+    batch = np.stack([np.eye(3), np.ones((3, 3)), np.full((3, 3), np.nan), 2 * np.eye(3)])
+    answers = jax.vmap(inverse)(batch)
+    np.testing.assert_array_equal(answers, [np.eye(3), np.zeros((3, 3)), np.zeros((3, 3)), np.eye(3) / 2])
+
+
+def test_inverse_reverse_derivative_matches_numpy():
     matrix, vector = RNG.normal(size=(3, 3)), RNG.normal(size=3)
-
-    def first(a):
-        return lx.linear_solve(lx.MatrixLinearOperator(a), jnp.asarray(vector), SmallDense()).value[0]
-
-    x, inverse = np.linalg.solve(matrix, vector), np.linalg.inv(matrix)
-    np.testing.assert_allclose(jax.grad(first)(jnp.asarray(matrix)), -np.outer(inverse[0], x), rtol=1e-9)
+    got = jax.grad(lambda a: (inverse(a) @ vector)[0])(jnp.asarray(matrix))
+    x, inverted = np.linalg.solve(matrix, vector), np.linalg.inv(matrix)
+    np.testing.assert_allclose(got, -np.outer(inverted[0], x), rtol=1e-9)

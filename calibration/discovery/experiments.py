@@ -6,7 +6,7 @@ C = (JᵀJ)⁻¹ over readings and priors of the table (Chaloner and Verdinelli,
 Statistical Science 10 (1995)). Two alternatives A, B are √(dᵀ S⁻¹ d) apart, d = y_A - y_B, with the S of the
 two that leaves less (Hunter and Reiner, Designs for discriminating between two rival models, Technometrics 7
 (1965)). If one of them is true, the χ² of the other is larger by σ² ± 2σ, σ being that distance, so that the
-chance that the false one is refuted is Φ((σ² - REFUTED) / 2σ). What is proposed is what is expected to tell the
+chance that the false one is refuted is Φ((σ² - refuted) / 2σ). What is proposed is what is expected to tell the
 most of all pairs apart; where one experiment does not do, two.
 """
 
@@ -25,20 +25,16 @@ from jaxtyping import Array, Bool, Float
 from scipy import stats
 
 from calibration.discovery import menu
-from calibration.discovery.loop import Finding, Hypothesis, Loop, free_names
-from calibration.inference import optimizers as fit
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.candidates import Candidate
+from calibration.discovery.classes import Classes
+from calibration.discovery.discrepancy import Location
+from calibration.discovery.settings import Settings
 from calibration.inference import priors
 from calibration.inference.normal_equations import cholesky, forward
+from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
-from mmrjax.tables import CONFIGURATIONS
 
-#: Separation from which an experiment is worth while, and from which it is said to tell two apart [σ].
-WORTH, APART = 2.0, 3.0
-#: Chance that a pair is told apart beyond which more is no gain, so that the effort decides; how much a second
-#: experiment has to add to the number of pairs that are expected to be told apart.
-ENOUGH, GAIN = 0.95, 0.2
-#: Rise of χ² by which an alternative is refuted, two sigmas.
-REFUTED = 4.0
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
 PAD = 4
 NONE = "none on this menu"
@@ -50,21 +46,26 @@ class Prospect:
 
     Attributes:
         names: of the alternatives, the best fit first.
+        experiments: the menu.
         value: readings [SI], shape (alternatives, readings); sd: of the instruments [SI], shape (readings,).
         half: J C^½, so that the covariance that the fit leaves is half halfᵀ; shape
             (alternatives, readings, coordinates).
         there: readings that exist for every alternative, shape (readings,).
+        settings: from which separation an experiment counts.
     """
 
     names: tuple[str, ...]
+    experiments: tuple[menu.Experiment, ...]
     value: np.ndarray
     half: np.ndarray
     sd: np.ndarray
     there: np.ndarray
+    settings: Settings
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives by experiments, all carried out [σ]."""
-        spans = [menu.spans()[e] for e in experiments]
+        where = menu.spans(self.experiments)
+        spans = [where[e] for e in experiments]
         at = np.concatenate([np.flatnonzero(self.there[k]) + k.start for k in spans])
         d = self.value[a, at] - self.value[b, at]
         squares = [d @ np.linalg.solve(_covariance(self.half[x, at], self.sd[at]), d) for x in (a, b)]
@@ -89,12 +90,14 @@ class Ranked:
     Attributes:
         experiments: their names; sigma: between every two alternatives, the pairs of the best fit first, as
             `itertools.combinations` has them [σ].
-        separates: alternatives that they tell from the best fit, at `APART`.
+        separates: alternatives that they tell from the best fit, at `Settings.apart`.
+        settings: from which separation an experiment counts.
     """
 
     experiments: tuple[str, ...]
     sigma: tuple[float, ...]
     separates: tuple[str, ...]
+    settings: Settings
 
     @property
     def smallest(self) -> float:
@@ -104,13 +107,13 @@ class Ranked:
     @property
     def told(self) -> tuple[float, ...]:
         """Separations that are worth while."""
-        return tuple(s for s in self.sigma if s >= WORTH)
+        return tuple(s for s in self.sigma if s >= self.settings.worth)
 
     @property
     def chances(self) -> np.ndarray:
         """For each pair, that the false one is refuted if either is true."""
         sigma = np.maximum(self.sigma, 1e-9)
-        return stats.norm.cdf((sigma**2 - REFUTED) / (2 * sigma))
+        return stats.norm.cdf((sigma**2 - self.settings.refuted) / (2 * sigma))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +125,7 @@ class Proposal:
         description: what to do and what to read.
         separates: alternatives that it tells from the best fit.
         expected_sigma: the smallest separation of a pair that it is worth doing for; 0 for none.
-        settles: whether it tells every two alternatives apart, at `APART`.
+        settles: whether it tells every two alternatives apart, at `Settings.apart`.
         table: the whole menu, the most useful experiment first.
     """
 
@@ -145,7 +148,7 @@ class Verdict:
 
     Attributes:
         chi2: of each alternative, by name; best: whose is the smallest.
-        refuted: alternatives whose χ² is larger by `REFUTED` or more.
+        refuted: alternatives whose χ² is larger by `Settings.refuted` or more.
         resolved: whether the best alone is left.
     """
 
@@ -167,16 +170,15 @@ class Verdict:
 # --- alternatives -----------------------------------------------------------------------------------
 
 
-def alternatives(looped: Loop, found: Finding) -> dict[str, Hypothesis]:
-    """The hypotheses that a table leaves, by the names of their effects; the best fit first."""
-    best = found.after.hypothesis
-    fitted = {tuple(sorted(h.which)): h for h in sorted(found.ladder, key=lambda h: -h.cost)}
-    kept = {best.which: best}
-    for slot, members in enumerate(found.classes):
-        for k in members[1:]:
-            which = tuple(k if s == slot else w for s, w in enumerate(best.which))
-            kept[which] = fitted[tuple(sorted(which))]
-    return {" + ".join(looped.engine.names[k] for k in h.effects): h for h in kept.values()}
+def alternatives(best: Candidate, found: Classes) -> dict[str, Candidate]:
+    """The candidates that a table leaves, by the names of their effects; the best fit first."""
+    fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
+    kept = {best.active: best}
+    for slot, members in enumerate(found.members):
+        for name in members[1:]:
+            active = tuple(name if s == slot else n for s, n in enumerate(best.active))
+            kept[active] = fitted[frozenset(n for n in active if n)]
+    return {" + ".join(c.effects): c for c in kept.values()}
 
 
 # --- what they foresee ------------------------------------------------------------------------------
@@ -190,7 +192,7 @@ def _foreseen(
 
     `other` are coordinates of what the table does not show at all, known by their priors alone.
     """
-    rows = fit.informing(problem.data)
+    rows = informing(problem.data)
 
     def one(w: Array, z: Float[Array, " coordinates"]) -> tuple[Array, Array, Array]:
         here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(w))
@@ -213,18 +215,22 @@ def _foreseen(
     return jax.vmap(one)(which, z)
 
 
-def prospect(looped: Loop, hypotheses: Mapping[str, Hypothesis]) -> Prospect:
+def prospect(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> Prospect:
     """What these alternatives foresee of the menu, with instruments as good as those of the table."""
-    names, those = list(hypotheses), list(hypotheses.values())
+    names, those = list(candidates), list(candidates.values())
     those += [those[0]] * (-len(those) % PAD)
-    problem = looped.slotted
-    more = [n for n in free_names(CONFIGURATIONS) if n not in looped.coordinates.base.names]
-    other = priors.coordinates(looped.engine.base, more) if more else None
-    which, z = (jnp.asarray(np.stack(x)) for x in ([h.which for h in those], [h.z for h in those]))
-    found = jax.device_get(_foreseen(problem, other, which, z))
+    robot = space.bare.base
+    everything = priors.free_names(robot, robot.configurations.names)
+    more = [n for n in everything if n not in space.coordinates.base.names]
+    other = priors.coordinates(robot, more) if more else None
+    active = jnp.asarray([space.library.indices(c.active) for c in those])
+    z = jnp.asarray(np.stack([c.z for c in those]))
+    found = jax.device_get(_foreseen(space.equipped, other, active, z))
     value, half, there = (np.asarray(x)[: len(names)] for x in found)
-    sd = np.median(np.asarray(problem.data.sd), 0)
-    return Prospect(tuple(names), np.nan_to_num(value), np.nan_to_num(half), menu.sds(sd), there.all(0))
+    experiments = menu.menu(robot.configurations.names)
+    sd = menu.sds(experiments, np.median(np.asarray(space.equipped.data.sd), 0))
+    value, half = np.nan_to_num(value), np.nan_to_num(half)
+    return Prospect(tuple(names), experiments, value, half, sd, there.all(0), settings)
 
 
 # --- the choice -------------------------------------------------------------------------------------
@@ -234,18 +240,18 @@ def _ranked(seen: Prospect, *experiments: str) -> Ranked:
     pairs = itertools.combinations(range(len(seen.names)), 2)
     sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
     others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
-    return Ranked(experiments, sigma, tuple(n for n, s in others if s >= APART))
+    return Ranked(experiments, sigma, tuple(n for n, s in others if s >= seen.settings.apart), seen.settings)
 
 
 def _use(r: Ranked) -> tuple[bool, float]:
     """Whether it is worth while for any pair, and how many pairs it is expected to tell apart."""
-    return bool(r.told), float(np.sum(np.minimum(r.chances, ENOUGH)))
+    return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 
 def ranked(seen: Prospect) -> tuple[Ranked, ...]:
     """The whole menu by the number of pairs that an experiment is expected to tell apart; of those that tell as many
-    by `ENOUGH`, in the menu's order, the least effort first."""
-    return tuple(sorted((_ranked(seen, e.name) for e in menu.MENU), key=_use, reverse=True))
+    by `Settings.enough`, in the menu's order, the least effort first."""
+    return tuple(sorted((_ranked(seen, e.name) for e in seen.experiments), key=_use, reverse=True))
 
 
 def choose(seen: Prospect) -> Proposal:
@@ -253,16 +259,18 @@ def choose(seen: Prospect) -> Proposal:
     table = ranked(seen)
     plan = table[0]
     (first,) = plan.experiments
-    both = (_ranked(seen, first, e.name) for e in menu.MENU if e.name != first)
+    both = (_ranked(seen, first, e.name) for e in seen.experiments if e.name != first)
     more = max(both, key=_use)
-    if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + GAIN):
+    if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
-        text = f"No experiment of the menu tells {' and '.join(seen.names)} apart by {WORTH:g} sigma"
+        text = f"No experiment of the menu tells {' and '.join(seen.names)} apart by {seen.settings.worth:g} sigma"
         return Proposal((NONE,), text, (), 0.0, False, table)
-    said = {e.name: e.description for e in menu.MENU}
+    said = {e.name: e.description for e in seen.experiments}
     text = ". And: ".join(said[name] for name in plan.experiments)
-    return Proposal(plan.experiments, text, plan.separates, min(plan.told), plan.smallest >= APART, table)
+    return Proposal(
+        plan.experiments, text, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
+    )
 
 
 #: How the variable of a curve is covered more densely and further out.
@@ -285,33 +293,28 @@ STEADY_SPEEDS = (
 SERIES, REPEATS = 15, 3
 
 
-def denser(looped: Loop, found: Finding) -> Proposal:
+def denser(space: CandidateSpace, where: Location, settings: Settings) -> Proposal:
     """More runs along the variable of a discrepancy without a name.
 
     Its expected separation from nothing is that of the table [σ], whose curve explains so much a run, over the
     runs of the series.
     """
-    balance, variable, _ = found.unnamed  # type: ignore[misc]
-    scores = found.base.scores
-    explained = float(np.asarray(scores.explained)[int(np.argmax(np.asarray(scores.curve)))])
-    runs = len(looped.problem.observe.rows) if looped.engine.series else looped.counts.sum()
-    sigma = float(np.sqrt(max(explained, 0.0) * SERIES * REPEATS / max(runs, 1)))
+    balance, variable = where.balance, where.variable
+    runs = space.bare.observe.runs_counting(space.included)
+    sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     how = DENSER.get(variable) or STEADY_SPEEDS.format(variable=variable)
-    text = f"{how}; read all three channels. What the {balance} balance lacks then shows its shape"
+    text = f"{how}; read every channel. What the {balance} balance lacks then shows its shape"
     name = f"finer steps in {variable}" if variable in DENSER else f"steady speeds for {variable}"
-    if sigma < WORTH:
-        return Proposal(
-            (NONE,), f"A series in {variable} would show what is missing by {sigma:.1f} sigma", (), 0.0, False, ()
-        )
+    if sigma < settings.worth:
+        text = f"A series in {variable} would show what is missing by {sigma:.1f} sigma"
+        return Proposal((NONE,), text, (), 0.0, False, ())
     return Proposal((name,), text, (f"{balance} curve in {variable}",), sigma, False, ())
 
 
-def propose(looped: Loop, found: Finding) -> Proposal | None:
-    """The next experiment after a finished loop; None where nothing is missing or it has one name."""
-    if found.verdict == "unnamed":
-        return denser(looped, found)
-    left = alternatives(looped, found)
-    return choose(prospect(looped, left)) if found.classes and len(left) > 1 else None
+def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
+    """What tells the alternatives of a class apart; None where each effect has one name."""
+    left = alternatives(best, found)
+    return choose(prospect(space, left, settings)) if len(left) > 1 else None
 
 
 # --- what came of it --------------------------------------------------------------------------------
@@ -325,7 +328,7 @@ def supported(seen: Prospect, carried_out: Mapping[str, Mapping[str, Any]]) -> V
         carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
             NaN for what was not read.
     """
-    spans = menu.spans()
+    spans = menu.spans(seen.experiments)
     at = np.concatenate([np.arange(len(seen.sd))[spans[name]] for name in carried_out])
     value, sd = (
         np.concatenate([np.asarray(r[what], float) for r in carried_out.values()]) for what in ("value", "sd")
@@ -337,4 +340,4 @@ def supported(seen: Prospect, carried_out: Mapping[str, Mapping[str, Any]]) -> V
         d = value - seen.value[k, at]
         chi2[name] = float(d @ np.linalg.solve(_covariance(seen.half[k, at], sd), d))
     best = min(chi2, key=chi2.__getitem__)
-    return Verdict(chi2, best, tuple(n for n, c in chi2.items() if c - chi2[best] >= REFUTED))
+    return Verdict(chi2, best, tuple(n for n, c in chi2.items() if c - chi2[best] >= seen.settings.refuted))

@@ -125,6 +125,36 @@ def default_names(configurations: Iterable[str], robot: Robot, *, guides_are_out
     return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects))
 
 
+#: Freed by the loop beside friction: what benches and makers state, with their tolerances.
+BENCH = (
+    "motor.resistance",
+    "motor.torque_constant",
+    "motor.friction_coulomb",
+    "motor.friction_viscous",
+    "gearbox.efficiency_load",
+    "gearbox.friction_coulomb",
+    "gearbox.friction_viscous",
+)
+
+
+def free_names(
+    robot: Robot, configurations: Iterable[str], drive: Sequence[str] = (), chassis: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """What the loop frees for data of these configurations.
+
+    Args:
+        drive, chassis: what the data determine beside, see `Observer.free`.
+    """
+    present = set(configurations)
+    own = [
+        name
+        for c in robot.configurations
+        if c in present
+        for name in (*friction(robot, c), f"{c}.radius", *(f"{c}.{n}" for n in chassis))
+    ]
+    return (*BENCH, *drive, *own)
+
+
 def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
     """`robot` with the share that the track model's guides carry, and what is known of its guide friction.
 

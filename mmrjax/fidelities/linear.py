@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
-import lineax as lx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 #: Rows of the factors, and for each column the row exchanges that pivoting made.
@@ -56,30 +52,11 @@ def substitute(factors: Factors, vector: Float[Array, " n"]) -> Float[Array, " n
     return jnp.stack(x)
 
 
-class SmallDense(lx.AbstractLinearSolver):
-    """`factorise` and `substitute` as a lineax solver, for square operators of a handful of unknowns.
+def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse; zeros where it is not finite (a singular matrix), so that one member of a batch harms no other.
 
-    Where the answer is not finite (a singular matrix) it is zero: lineax would otherwise stop the whole
-    batch for one member's sake. Whoever uses it has to look at its residual.
+    Whoever uses it has to look at its residual.
     """
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        return operator.as_matrix(), operator.in_structure()
-
-    def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> Any:
-        matrix, structure = state
-        flat, _ = ravel_pytree(vector)
-        _, unravel = ravel_pytree(jnp.zeros(structure.shape, structure.dtype))
-        answer = substitute(factorise(matrix), flat)
-        answer = jnp.where(jnp.all(jnp.isfinite(answer)), answer, 0.0)
-        return unravel(answer), lx.RESULTS.successful, {}
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
-        matrix, structure = state
-        return (matrix.T, structure), {}
-
-    def conj(self, state: Any, options: dict[str, Any]) -> Any:
-        return state, {}
-
-    def assume_full_rank(self) -> bool:
-        return True
+    factors = factorise(matrix)
+    columns = jnp.stack([substitute(factors, column) for column in jnp.eye(len(matrix), dtype=matrix.dtype)], axis=1)
+    return jnp.where(jnp.all(jnp.isfinite(columns)), columns, 0.0)

@@ -7,13 +7,11 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.linear import SmallDense
-from mmrjax.fidelities.newton import SmallNewton
+from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Result, Signals, State
@@ -26,9 +24,13 @@ def _state(unknowns: Float[Array, " 3"], discharge: Float[Array, ""]) -> State:
     return State(_CURRENT * unknowns[0], _SPEED_MOTOR * unknowns[1], _SPEED * unknowns[2], discharge)
 
 
+_settled = eqx.filter_jit(balances.settled)
+
+
+@eqx.filter_jit
 def _residual(unknowns: Float[Array, " 3"], run: tuple[Robot, Conditions]) -> Float[Array, " 3"]:
     robot, conditions = run
-    signals, creep = balances.settled(robot, conditions, _state(unknowns, conditions.discharge))
+    signals, creep = _settled(robot, conditions, _state(unknowns, conditions.discharge))
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
     torque = jnp.minimum(unknowns[1], -signals.torque_net / _TORQUE)
     return jnp.stack([signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep])
@@ -64,23 +66,16 @@ def _start(robot: Robot, conditions: Conditions) -> Float[Array, " 3"]:
 
 def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
     """The state at which the balances close, and whether the search got there; derivatives are implicit."""
-    dtype = jnp.result_type(conditions.voltage)
-    solution = optx.root_find(
-        _residual,
-        SmallNewton(atol=float(jnp.finfo(dtype).eps) ** 0.85),
-        jax.lax.stop_gradient(_start(robot, conditions)),
-        args=(robot, conditions),
-        max_steps=40,
-        throw=False,
-        adjoint=optx.ImplicitAdjoint(linear_solver=SmallDense()),
-    )
-    return _state(solution.value, conditions.discharge), solution.result == optx.RESULTS.successful
+    tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
+    run = (robot, conditions)
+    unknowns, solved = root(_residual, jax.lax.stop_gradient(_start(robot, conditions)), run, tolerance)
+    return _state(unknowns, conditions.discharge), solved
 
 
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
     _, conditions = _sound(robot, conditions)
-    return balances.settled(robot, conditions, _root(robot, conditions)[0])[0]
+    return _settled(robot, conditions, _root(robot, conditions)[0])[0]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -106,6 +101,7 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     return withhold(point, (point.status == CONVERGED) | (point.status == STALLED), sound)
 
 
+@eqx.filter_jit
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
     """`steady` with the numbers left in whatever the status, for a fit that has to find its way back.
 
@@ -117,7 +113,7 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     """
     sound, conditions = _sound(robot, conditions)
     state, solved = _root(robot, conditions)
-    signals, _ = balances.settled(robot, conditions, state)
+    signals, _ = _settled(robot, conditions, state)
     solved = solved & jnp.isfinite(signals.voltage_left + signals.torque_net)
     rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
     stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest

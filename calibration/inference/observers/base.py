@@ -5,14 +5,15 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from calibration.data.runs import Runs
 from calibration.inference.bases import Bases
+from calibration.inference.details import Detail
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
 from calibration.inference.optimizers import Optimum
@@ -20,6 +21,9 @@ from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
+
+if TYPE_CHECKING:
+    from calibration.discovery.adequacy import Diagnosis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +56,10 @@ class Observer(eqx.Module):
         blocks: kinds of blocks to hold out, the most telling first.
         percent_of: what errors in percent are of.
         policy: how fits are searched for.
-        remembers: whether the order of the residuals means something, so that their memory is tested.
+        compares: field of the score table by which curves are compared: what they `explained`, or where they have
+            different numbers of terms (waves have two a run) how improbable that is, `curve`.
+        rows_tell: whether a single row shows a defect by itself.
+        evidence: kinds of evidence that something is missing.
         starts: searches of a calibration; None takes the fidelity's.
     """
 
@@ -65,7 +72,9 @@ class Observer(eqx.Module):
     blocks: ClassVar[tuple[str, ...]]
     percent_of: ClassVar[str]
     policy: ClassVar[SearchPolicy]
-    remembers: ClassVar[bool]
+    compares: ClassVar[str]
+    rows_tell: ClassVar[bool]
+    evidence: ClassVar[tuple[str, ...]]
     starts: ClassVar[int | None] = None
 
     # --- of a table, before anything is simulated
@@ -147,10 +156,9 @@ class Observer(eqx.Module):
         """What to know before the readings of a calibrated robot are trusted, as sentences."""
         return []
 
-    @property
     @abc.abstractmethod
-    def runs(self) -> int:
-        """How many runs there are that can be repeated in a series of experiments."""
+    def runs_counting(self, included: np.ndarray) -> int:
+        """How many runs count, of rows that do."""
 
     # --- of fits
 
@@ -197,9 +205,10 @@ class Observer(eqx.Module):
         """
 
     @abc.abstractmethod
-    def defects_by_row(self, linear: Linearization, included: np.ndarray) -> dict[str, Float[np.ndarray, " rows"]]:
-        """Defect of each equation in every row [its balance's unit]; empty where single rows do not show it."""
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> Detail:
+        """What data of this kind tell beside the fit.
 
-    def statistics(self) -> dict[str, Any]:
-        """What is said of data of this kind beside the fit; empty for nothing."""
-        return {}
+        Args:
+            bases: of curves; included: whether a row of the table counts.
+            before, after: what base and proposed robot leave.
+        """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -16,6 +16,7 @@ from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import CONDITIONS, Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
+from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import backward, cholesky, forward
@@ -30,6 +31,9 @@ from mmrjax.fidelities.histories import LONGEST, STEPS, grid, histories, respond
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals
+
+if TYPE_CHECKING:
+    from calibration.discovery.adequacy import Diagnosis
 
 #: Most knots of a run's defect in time, and most of knots times steps of all runs: 2 GB while they are computed.
 KNOTS, KNOT_STEPS = 256, 1e7
@@ -109,7 +113,9 @@ class Histories(Observer):
     #: Draws of the prior among which the starts are chosen: far off, a start slides where the measured one grips,
     #: and a search from there stays.
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, draws=128, searches=16, one_by_one=False)
-    remembers: ClassVar[bool] = True
+    compares: ClassVar[str] = "curve"
+    rows_tell: ClassVar[bool] = False
+    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
     starts: ClassVar[int | None] = 8
 
     conditions: Conditions
@@ -288,8 +294,7 @@ class Histories(Observer):
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return status == FAILED
 
-    @property
-    def runs(self) -> int:
+    def runs_counting(self, included: np.ndarray) -> int:
         return self.rows_of.shape[0]
 
     def linearise(
@@ -374,9 +379,39 @@ class Histories(Observer):
         waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots))
         return (*bases_room.families(columns, included.astype(float)), *waves)
 
-    def defects_by_row(self, linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
-        """None: a reading of a history answers to defects of all the time before it."""
-        return {}
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
+        names = bases_room.names(bases)
+        orders = [w for w in bases_room.ORDERS if any(n[1] == w for n in names)]
+
+        def strongest(of: Diagnosis, variable: str) -> Strongest:
+            mine = [k for k, n in enumerate(names) if n[1] == variable]
+            k = max(mine, key=lambda j: np.asarray(of.scores.curve)[j])
+            return Strongest(names[k][0], float(of.scores.curve[k]), float(of.scores.explained[k]))
+
+        def side(of: Diagnosis) -> TimeSide:
+            lags = min(LAGS, self.rows_of.shape[1] // 4)
+            test = of.test
+            memory = Memory(
+                float(test.found.white),
+                test.threshold("white"),
+                test.p("white"),
+                lags,
+                _autocorrelation(of.linear, lags),
+            )
+            waves = {(w, bases_room.ORDERS[w][0]): strongest(of, w) for w in orders}
+            return TimeSide(memory, waves, strongest(of, "time"))
+
+        samples = int((np.asarray(self.rows_of) >= 0).sum())
+        unresolved = tuple(w for w in bases_room.ORDERS if w not in orders)
+        return TimeStatistics(self.rows_of.shape[0], samples, unresolved, side(before), side(after))
+
+
+def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]:
+    """Of each channel's residual over all runs, at lags 1 to `lags` samples."""
+    x = np.asarray(linear.series())
+    power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
+    of = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
+    return {name: [float(lag[k]) for lag in of] for k, name in enumerate(channels.names())}
 
 
 def _names(runs: Runs) -> np.ndarray:

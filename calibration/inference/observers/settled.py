@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ from calibration.data.runs import CONDITIONS, Runs
 from calibration.inference import bases as bases_room
 from calibration.inference import treatments
 from calibration.inference.bases import Bases
+from calibration.inference.details import EquationDefects
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -29,6 +30,9 @@ from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import FAILED, SLIDES, TIPS
+
+if TYPE_CHECKING:
+    from calibration.discovery.adequacy import Diagnosis
 
 #: Replicates further apart than this many sds of their difference contradict each other.
 CONTRADICTION = 6.0
@@ -64,7 +68,9 @@ class SettledRuns(Observer):
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
     percent_of: ClassVar[str] = "simulated reading, eq. (35)"
     policy: ClassVar[SearchPolicy] = SearchPolicy()
-    remembers: ClassVar[bool] = False
+    compares: ClassVar[str] = "explained"
+    rows_tell: ClassVar[bool] = True
+    evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
 
     conditions: Conditions
     fidelity: str = eqx.field(static=True)
@@ -143,12 +149,11 @@ class SettledRuns(Observer):
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return np.isin(status, (SLIDES, FAILED, TIPS))
 
+    def runs_counting(self, included: np.ndarray) -> int:
+        return int(included.sum())
+
     def cautions(self, robot: Robot) -> list[str]:
         return treatments.of(self.fidelity).cautions(robot, self.conditions)
-
-    @property
-    def runs(self) -> int:
-        return self.conditions.shape[0]
 
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]
@@ -216,16 +221,20 @@ class SettledRuns(Observer):
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         return bases_room.families(columns, included.astype(float))
 
-    def defects_by_row(self, linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
-        """A row's residual (simulated less measured) is split among the defects of the balances `electrical`,
-        `track` and `slip` that together make it."""
-        rows = len(included)
-        sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][:rows] for b in EQUATIONS], 2)
-        residual = np.asarray(linear.by_row())[:rows]
-        found = np.full((rows, len(EQUATIONS)), np.nan)
-        for k in np.flatnonzero(included):
-            found[k] = -np.linalg.lstsq(sensitivity[k], residual[k], rcond=None)[0]
-        return dict(zip(EQUATIONS, found.T, strict=True))
+    def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
+        """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
+        balances `electrical`, `track` and `slip` that together make it."""
+        return EquationDefects(_defects(before.linear, included), _defects(after.linear, included))
+
+
+def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
+    rows = len(included)
+    sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][:rows] for b in EQUATIONS], 2)
+    residual = np.asarray(linear.by_row())[:rows]
+    found = np.full((rows, len(EQUATIONS)), np.nan)
+    for k in np.flatnonzero(included):
+        found[k] = -np.linalg.lstsq(sensitivity[k], residual[k], rcond=None)[0]
+    return dict(zip(EQUATIONS, found.T, strict=True))
 
 
 @eqx.filter_jit

@@ -1,0 +1,47 @@
+"""Tables and documents as files: CSV with empty cells, JSON with null, where a number is not finite."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file; what is not finite becomes null."""
+    path.write_text(json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write a table as CSV; what is not finite becomes an empty cell."""
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*(map(cell, column) for column in columns.values()), strict=True))
+
+
+def cell(value: Any) -> str:
+    """A cell of a table."""
+    if isinstance(value, float | np.floating):
+        return f"{value:.9g}" if math.isfinite(value) else ""
+    return str(value)
+
+
+def finite(value: Any) -> Any:
+    """JSON-able data with null in the place of what is not finite."""
+    if isinstance(value, Mapping):
+        return {key: finite(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return finite(value.tolist())
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,64 @@
+"""The adequacy test: whether the residuals of a fit exceed the noise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from calibration.discovery.score_tests import ScoreTable, Statistics
+from calibration.discovery.settings import Settings
+from calibration.inference.linearization import Linearization
+
+
+@dataclasses.dataclass(frozen=True)
+class AdequacyTest:
+    """Whether a fit leaves something to explain.
+
+    Attributes:
+        found: the strongest statistics of the data; null: of the bootstrap, shape (replicates,) each.
+        settings: shares of the family-wise error, and margins.
+    """
+
+    found: Statistics
+    null: Statistics
+    settings: Settings
+
+    def p(self, kind: str) -> float:
+        """Share of bootstrap tables with a statistic as strong, never below 1 / (replicates + 1)."""
+        null = getattr(self.null, kind)
+        return (1 + int(np.sum(null >= float(getattr(self.found, kind))))) / (1 + len(null))
+
+    def threshold(self, kind: str) -> float:
+        """What the strongest statistic of its kind has to exceed."""
+        return float(np.quantile(getattr(self.null, kind), 1 - self.settings.shares[kind], method="higher"))
+
+    @property
+    def rejected(self) -> bool:
+        """Whether something is missing, at the family-wise error of the settings."""
+        return any(self.p(kind) <= level for kind, level in self.settings.shares.items())
+
+    @property
+    def rejected_with_margin(self) -> bool:
+        """Whether what is left is beyond doubt, so that a fit which leaves it is not the whole story."""
+        margins = self.settings.margins
+        return any(float(getattr(self.found, k)) > self.threshold(k) + margins[k] for k in self.settings.shares)
+
+    @property
+    def p_value(self) -> float:
+        """Family-wise p-value: the smallest of its kinds, each over its share of the error."""
+        total = self.settings.family_wise_error
+        return min(1.0, min(self.p(kind) * total / level for kind, level in self.settings.shares.items()))
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """One look at what a fit leaves.
+
+    Attributes:
+        linear: the fit, linearised; scores: what effects and curves could explain; test: whether anything is left.
+    """
+
+    linear: Linearization
+    scores: ScoreTable
+    test: AdequacyTest

@@ -1,0 +1,195 @@
+"""Candidates: sets of effects, fitted together with the base."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from calibration.data.errors import BadData
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.settings import Settings
+from calibration.inference.held_out import search_in_batches
+from calibration.inference.linearization import amplitude_of
+from calibration.inference.optimizers import Optimum
+from calibration.inference.problem import Problem
+
+#: Fewest rows that a base can be fitted to.
+FEWEST = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A set of effects, fitted with the base.
+
+    Attributes:
+        active: name of the effect in each slot, "" where empty.
+        z: coordinates, see `ActiveSet`; sd: their posterior sds; cost: the objective [½σ²].
+        amplitude: in prior sds of each slot's effect (0 where empty).
+        plausible: whether every amplitude is within its bounds, four prior sds, and the sign of a loss.
+        converged: whether the fit is an optimum.
+    """
+
+    active: tuple[str, ...]
+    z: np.ndarray
+    sd: np.ndarray
+    cost: float
+    amplitude: np.ndarray
+    plausible: bool
+    converged: bool
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that are present."""
+        return tuple(name for name in self.active if name)
+
+    @property
+    def key(self) -> frozenset[str]:
+        """What makes it the same candidate as another one."""
+        return frozenset(self.effects)
+
+
+def empty(settings: Settings) -> tuple[str, ...]:
+    """No effect in any slot."""
+    return ("",) * settings.slots
+
+
+def filled(effects: Sequence[str], settings: Settings) -> tuple[str, ...]:
+    """These effects in the first slots."""
+    return (*effects, *("",) * (settings.slots - len(effects)))
+
+
+def candidate(space: CandidateSpace, active: tuple[str, ...], best: Optimum, settings: Settings) -> Candidate:
+    """What a fit says of the effects in its slots."""
+    amplitude = settings.width * np.asarray(space.coordinates.parts(best.z)[1])
+    spread = settings.width * np.asarray(space.coordinates.parts(best.sd)[1])
+    amplitude = np.where([bool(name) for name in active], amplitude, 0.0)
+    sizes = zip(active, amplitude, spread, strict=True)
+    ok = all(_plausible(space, name, a, s, settings) for name, a, s in sizes if name)
+    cost = float(best.cost) if np.isfinite(best.cost) else np.inf
+    return Candidate(active, np.asarray(best.z), np.asarray(best.sd), cost, amplitude, ok, bool(best.converged))
+
+
+def _plausible(space: CandidateSpace, name: str, amplitude: float, sd: float, settings: Settings) -> bool:
+    effect = space.library[name]
+    spec = amplitude_of(effect).spec
+    value = amplitude * spec.prior_sd(0.0)
+    if not (spec.bounds[0] < value < spec.bounds[1] and abs(amplitude) < settings.plausible):
+        return False
+    return not (effect.dissipative and amplitude < -2 * sd)
+
+
+@dataclasses.dataclass(frozen=True)
+class BaseFit:
+    """The base fitted alone.
+
+    Attributes:
+        candidate: without effects; reading: what it says of every row [SI], shape (rows, channels).
+        space: with the rows kept out that it cannot reach; unusable: indices of those.
+    """
+
+    candidate: Candidate
+    reading: np.ndarray
+    space: CandidateSpace
+    unusable: tuple[int, ...]
+
+
+def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
+    """The base fitted alone, from the prior mean and from draws of the prior; the best that was found.
+
+    Rows that it cannot reach at all are kept out, and it is fitted again.
+
+    Args:
+        where: opens the message.
+
+    Raises:
+        BadData: too few rows are left.
+    """
+    unusable: tuple[int, ...] = ()
+    while True:
+        found, seen = _base_searches(space, settings)
+        k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
+        lost = space.bare.observe.unreachable(seen.status[k]) & space.included
+        if not lost.any():
+            slots = np.zeros(2 * settings.slots)
+            best = jax.tree.map(lambda x: x[k], found)  # noqa: B023
+            z, sd = np.concatenate([best.z[: space.free], slots]), np.concatenate([best.sd[: space.free], slots + 1])
+            best = dataclasses.replace(best, z=z, sd=sd)
+            return BaseFit(candidate(space, empty(settings), best, settings), seen.reading[k], space, unusable)
+        unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(lost))}))
+        space = space.without(lost)
+        if space.included.sum() < FEWEST:
+            rows = ", ".join(str(r + 1) for r in unusable[:12])
+            raise BadData(f"{where}: the model reaches too few rows to trace anything (not rows {rows})")
+
+
+def _base_searches(space: CandidateSpace, settings: Settings):
+    """Where searches of the base end, from the prior mean and from draws of the prior, and what it says there.
+
+    Where rollouts are dear they run without slots, from the best of many draws.
+    """
+    policy, p = space.bare.observe.policy, space.free
+    random = np.random.default_rng(settings.seed)
+    if policy.draws:
+        draws = random.standard_normal((policy.draws, p))
+        order = np.argsort(np.asarray(_costs(space.bare, jnp.asarray(draws))))
+        starts = np.concatenate([np.zeros((1, p)), draws[order[: policy.searches - 1]]])
+        weights = jnp.repeat(space.bare.data.weight[None], policy.searches, 0)
+        return jax.device_get(space.bare.observe.search(space.bare, jnp.asarray(starts), weights, rivals=True))
+    starts = np.zeros((policy.searches, len(space.coordinates)))
+    starts[1:, :p] = random.standard_normal((policy.searches - 1, p))
+    none = [space.library.indices(empty(settings))] * policy.searches
+    return search_in_batches(space.equipped, list(starts), [space.weight] * policy.searches, none)
+
+
+@eqx.filter_jit
+def _costs(problem: Problem, zs: Array) -> Array:
+    def one(z: Array) -> Array:
+        cost = jnp.sum(problem.misfit(z, problem.data) ** 2) + jnp.sum(z**2)
+        return jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+
+    return jax.lax.map(one, zs, batch_size=16)
+
+
+Proposal = tuple[tuple[str, ...], np.ndarray]
+
+
+def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], settings: Settings) -> list[Candidate]:
+    """Fit every (active effects, start)."""
+    if not proposals:
+        return []
+    active = [space.library.indices(names) for names, _ in proposals]
+    starts = [z for _, z in proposals]
+    found, _ = search_in_batches(space.equipped, starts, [space.weight] * len(proposals), active)
+    return [
+        candidate(space, names, jax.tree.map(lambda x: x[k], found), settings)  # noqa: B023
+        for k, (names, _) in enumerate(proposals)
+    ]
+
+
+def start(
+    space: CandidateSpace,
+    at: Candidate,
+    active: tuple[str, ...],
+    settings: Settings,
+    scores: ScoreTable | None = None,
+) -> np.ndarray:
+    """Where to start a fit of `active`: at another fit, new effects at what their score says."""
+    p, s = space.free, settings.slots
+    z = np.zeros(p + 2 * s)
+    z[:p] = at.z[:p]
+    for slot, name in enumerate(active):
+        if name and name in at.active:
+            old = at.active.index(name)
+            z[p + slot], z[p + s + slot] = at.z[p + old], at.z[p + s + old]
+        elif name and scores is not None:
+            m = space.library.best_instance(name, np.asarray(scores.single))
+            z[p + slot] = np.clip(float(scores.amplitude[m]) / settings.width, -1.5, 1.5)
+            z[p + s + slot] = space.library.at[m]
+    return z

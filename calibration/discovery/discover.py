@@ -1,0 +1,393 @@
+"""The closed loop: fit, outliers, score tests, adequacy, search, classes, discrepancy, next experiment, in turn.
+
+Each stage is a function of what the stages before it found; none changes anything.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.effect_file import Library
+from calibration.data.errors import BadData
+from calibration.data.runs import Runs
+from calibration.discovery import findings
+from calibration.discovery.active_set import CandidateSpace, candidate_space
+from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
+from calibration.discovery.classes import Classes, classes, cosines
+from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate, one_curve_suffices
+from calibration.discovery.experiments import Proposal, denser, separating
+from calibration.discovery.outliers import Screening, screen
+from calibration.discovery.result import DiscoveryResult, Remainder, Sensitivity
+from calibration.discovery.score_tests import bootstrap, diagnosed
+from calibration.discovery.search import Search, search
+from calibration.discovery.settings import Settings, settings_for
+from calibration.inference import checks, observers, priors
+from calibration.inference import noise as noise_room
+from calibration.inference.bases import Bases
+from calibration.inference.noise import Noise
+from mmrjax import channels, effects
+from mmrjax.effects import Effect
+from mmrjax.robot import Robot
+
+#: Factors on an assumed noise at which the verdict is looked at too.
+FACTORS = (0.5, 2.0)
+
+
+def discover(
+    runs: Runs,
+    robot: Robot,
+    *,
+    noise: str | None = None,
+    stated: Mapping[str, tuple[float, float]] | None = None,
+    library: Library = effects.BY_NAME,
+    replicates: int = 500,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda text: None,
+) -> DiscoveryResult:
+    """Find what a robot's model lacks against measured runs.
+
+    Args:
+        runs: settled runs, or time histories from rest.
+        robot: its values are the prior means.
+        noise: sds as `noise.parse`; None takes the file's columns, else a usual one is assumed, halved and doubled.
+        stated: parameter → (mean, sd) [SI], priors in place of the fields'.
+        library: effects to look for.
+        replicates: of the bootstrap; seed: random seed.
+        progress: called with a sentence as the work goes on.
+
+    Raises:
+        BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be.
+    """
+    distinct, numbers, notes = without_copies(runs)
+    kind = observers.kind(distinct)
+    if len(distinct) < kind.fewest:
+        raise BadData(
+            f"{runs.source}: {len(distinct)} {kind.word} cannot show what a model lacks; at least {kind.fewest} are "
+            "needed"
+        )
+    known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
+    notes += [*distinct.missing(), *checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
+    settings = settings_for(kind, replicates, seed)
+
+    def at(sds: Noise, tell: Callable[[str], None]) -> DiscoveryResult:
+        return discover_at(distinct, robot, sds, settings, stated, library, numbers, tell)
+
+    found = at(known, progress)
+    sensitivity = []
+    if "assumed" in known.source:
+        for factor in FACTORS:
+            progress(f"the verdict with {factor:g} times the assumed noise")
+            sds = noise_room.assumed(distinct, kind.sizes(distinct), noise, factor)
+            sensitivity.append(in_short(factor, at(sds, lambda text: None)))
+        silent = ", ".join(c for c, w in zip(channels.names(), known.source, strict=True) if w == "assumed")
+        notes.append(f"no sd is stated for {silent}: {noise_room.default()} is assumed; state yours with --noise")
+    return dataclasses.replace(found, notes=(*notes, *found.notes), sensitivity=tuple(sensitivity))
+
+
+def discover_at(
+    runs: Runs,
+    robot: Robot,
+    noise: Noise,
+    settings: Settings,
+    stated: Mapping[str, tuple[float, float]] | None = None,
+    library: Library = effects.BY_NAME,
+    numbers: np.ndarray | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> DiscoveryResult:
+    """One pass of the loop over a table whose noise is known; the arguments as of `discover`.
+
+    Args:
+        numbers: of the rows, as messages call them; None counts from 1.
+    """
+    progress("fitting the base model")
+    space = pose(runs, robot, noise.sd, settings, stated, library)
+    fitted = fit_base(space, settings, runs.source)
+
+    screened = screen(fitted, lambda base: bases_at(runs, base), settings, runs.source)
+    base, space, bases = screened.base.candidate, screened.base.space, screened.bases
+
+    progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
+    left = diagnosis_of_base(screened, settings)
+    if not left.test.rejected:
+        return finished("none", runs, noise, numbers, screened, left, settings, library, progress)
+
+    progress("something is missing: fitting every effect that could explain it")
+    searched = search(space, base, left, bases, settings, progress)
+    if not_to_the_point(space, base, left, searched) or stands_for_a_curve(space, left, searched, bases):
+        where = locate(space.bare.observe, left.scores, bases)
+        found = fit_discrepancy(space, base, left.linear, where.balance, where.variable)
+        return finished(
+            "unnamed", runs, noise, numbers, screened, left, settings, library, progress, searched, where=where,
+            discrepancy=found,
+        )  # fmt: skip
+
+    assert searched.best is not None and searched.diagnosis is not None
+    progress(f"what else explains as much as {' and '.join(searched.best.effects)}?")
+    alike = classes(space, searched.best, searched.ladder, left.scores, settings)
+    verdict = "named" if all(len(members) == 1 for members in alike.members) else "class"
+    remains = None
+    if searched.diagnosis.test.rejected_with_margin:
+        remains = locate(space.bare.observe, searched.diagnosis.scores, bases)
+    return finished(
+        verdict, runs, noise, numbers, screened, left, settings, library, progress, searched, alike, remains
+    )
+
+
+# --- the stages that are no room of their own -----------------------------------------------------------
+
+
+def pose(
+    runs: Runs,
+    robot: Robot,
+    sd: np.ndarray,
+    settings: Settings,
+    stated: Mapping[str, tuple[float, float]] | None = None,
+    library: Library = effects.BY_NAME,
+) -> CandidateSpace:
+    """The base problem of a table, and room for the effects that its data can show.
+
+    Rows are padded to a multiple, so that tables of about one size share what is compiled; what is padded counts
+    for nothing.
+    """
+    kind = observers.kind(runs)
+    index, real = padded(len(runs), kind.pad)
+    names = priors.free_names(robot, runs["configuration"], *kind.free())
+    coordinates = priors.coordinates(robot, names, dict(stated or {}))
+    bare = observers.pose(runs.where(index), robot, coordinates, sd[index])
+    space = candidate_space(bare, visible(library, robot, kind), library, settings.slots, settings.width)
+    return space.without(~real)
+
+
+def visible(library: Library, robot: Robot, kind: type[observers.Observer]) -> tuple[Effect, ...]:
+    """The effects of a library that such data can show and the robot does not have yet."""
+    have = {e.name for e in robot.effects}
+    return tuple(effect() for name, effect in library.items() if name not in have and kind.shows(effect))
+
+
+def padded(rows: int, to: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows with repeats of the first behind them, to a multiple of `to`, and which of them are real."""
+    index = np.concatenate([np.arange(rows), np.zeros(-rows % to, int)])
+    return index, np.arange(len(index)) < rows
+
+
+def bases_at(runs: Runs, base: BaseFit) -> Bases:
+    """Bases of curves over the readings of a fit: over measured ones they would share their noise."""
+    problem = base.space.bare
+    index, _ = padded(len(runs), problem.observe.pad)
+    columns = dict(runs.where(index).columns)
+    reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
+    columns |= {c.column: reading[:, k] for k, c in enumerate(channels.CHANNELS)}
+    robot = problem.robot(jnp.asarray(base.candidate.z[: base.space.free]))
+    return problem.observe.bases(columns, base.space.included, robot)
+
+
+def diagnosis_of_base(screened: Screening, settings: Settings) -> Diagnosis:
+    """What the base leaves, tested against the bootstrap of itself."""
+    space, base = screened.base.space, screened.base.candidate
+    linear, scores, found = screened.diagnosed
+    null = bootstrap(
+        space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
+        settings.seed,
+    )  # fmt: skip
+    return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
+
+
+def not_to_the_point(space: CandidateSpace, base: Candidate, left: Diagnosis, searched: Search) -> bool:
+    """Whether the effects leave far more than noise, and explain less than half of what was there."""
+    if searched.best is None:
+        return True
+    readings = float(np.sum(space.weight > 0))  # what χ² is without anything missing, priors included
+    there, after = (2 * c.cost - readings for c in (base, searched.best))
+    return bool(after > 2 * np.sqrt(2 * readings) and there - after < 0.5 * there)
+
+
+def stands_for_a_curve(space: CandidateSpace, left: Diagnosis, searched: Search, bases: Bases) -> bool:
+    """Whether the fit with effects is rejected where one smooth curve would not be."""
+    rejected = searched.diagnosis is None or searched.diagnosis.test.rejected_with_margin
+    return rejected and one_curve_suffices(space.bare.observe, left, bases)
+
+
+def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
+    """The runs without exact copies of one another, their row numbers, and what to say of that."""
+    columns = [runs[c] for c in observers.kind(runs).identity(runs)]
+    seen: set[tuple[str, ...]] = set()
+    keep, copies = [], []
+    for k in range(len(runs)):
+        row = tuple(str(column[k]) for column in columns)
+        (copies if row in seen else keep).append(k)
+        seen.add(row)
+    if not copies:
+        return runs, np.arange(1, len(runs) + 1), []
+    rows = ", ".join(str(k + 1) for k in copies)
+    said = f"rows {rows} are exact copies of earlier ones and count once"
+    if len(copies) == 1:
+        said = f"row {rows} is an exact copy of an earlier one and counts once"
+    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [said]
+
+
+def in_short(factor: float, found: DiscoveryResult) -> Sensitivity:
+    """What the loop says with another noise."""
+    members = tuple(tuple(e.members) for e in found.effects)
+    return Sensitivity(factor, found.verdict, found.statement, members, found.after.adequate)
+
+
+# --- the result -----------------------------------------------------------------------------------------
+
+
+def finished(
+    verdict: str,
+    runs: Runs,
+    noise: Noise,
+    numbers: np.ndarray | None,
+    screened: Screening,
+    left: Diagnosis,
+    settings: Settings,
+    library: Library,
+    progress: Callable[[str], None],
+    searched: Search | None = None,
+    alike: Classes | None = None,
+    where: Location | None = None,
+    discrepancy: Discrepancy | None = None,
+) -> DiscoveryResult:
+    """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment.
+
+    Args:
+        screened, left: the base fit, and what it leaves.
+        searched, alike: what was tried, and what cannot be told apart.
+        where: something is missing, or remains; discrepancy: the curve of `unnamed`.
+    """
+    space, base = screened.base.space, screened.base.candidate
+    observe, rows = space.bare.observe, len(runs)
+    numbers = np.arange(1, rows + 1) if numbers is None else numbers
+    included = space.included[:rows]
+    before = findings.Fitted(space.equipped, base.z, space.library.indices(empty(settings)))
+    # The candidate that is proposed (the base for `none`, the base with a curve for `unnamed`).
+    best = searched.best if alike is not None and searched is not None and searched.best is not None else base
+    after, ends, robot, z, sd = None, left, findings.proposed_robot(space, best), best.z, best.sd
+    cost, converged, adequate = best.cost, best.converged, not left.test.rejected
+    if discrepancy is not None:
+        after = findings.Fitted(discrepancy.problem, discrepancy.z, None)
+        ends = _diagnosis_beside(space, discrepancy, screened.bases, left)
+        robot, z, sd = discrepancy.robot, discrepancy.z, np.sqrt(np.diag(discrepancy.covariance))
+        cost, converged = discrepancy.chi2[1] / 2, discrepancy.converged
+    elif alike is not None and searched is not None and searched.diagnosis is not None:
+        after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
+        ends = searched.diagnosis
+    adequate_after = not ends.test.rejected_with_margin
+
+    progress("errors on data held out")
+    seen = findings.readings(runs, noise.sd, before, after)
+    error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
+    progress("the next experiment")
+    members = alike.members if alike is not None else ()
+    ladder = alike.ladder if alike is not None else searched.ladder if searched is not None else ()
+    p = left.test.p_value
+    listed = findings.effect_scores(space, left.scores)
+    shown = space.library.indices([s.name for s in listed])
+    result = DiscoveryResult(
+        verdict=verdict,
+        statement=findings.statement(verdict, p, members, where),
+        robot=robot,
+        converged=converged,
+        runs=runs,
+        numbers=numbers,
+        included=included,
+        outliers=tuple(int(numbers[k]) for k in screened.outliers),
+        unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
+        effects=() if alike is None else findings.found_effects(space, base, best, alike, left.test, settings),
+        unnamed=None if discrepancy is None or where is None else findings.unnamed(discrepancy, where, p, rows),
+        remains=None if alike is None or where is None else Remainder(where.balance, where.alike, where.variable),
+        next_experiment=findings.next_experiment(_proposal(space, best, alike, where, discrepancy, settings)),
+        cannot_see=findings.invisible(space, left.scores, settings),
+        needs_histories=_needs_histories(library, type(observe)),
+        alternatives=findings.alternatives(space, best, ladder, settings, plausible=True),
+        implausible=findings.alternatives(space, best, ladder, settings, plausible=False),
+        before=findings.evidence(left.test, adequate),
+        after=findings.evidence(ends.test, adequate_after),
+        chi2=(2 * base.cost, 2 * cost),
+        readings=int(np.sum(space.weight > 0)),
+        base_shift=findings.base_shift(space, base.z, z, sd),
+        scores=listed,
+        cosine=cosines(space, left.scores)[np.ix_(shown, shown)],
+        detail=observe.detail(screened.bases, included, left, ends),
+        readings_of_rows=seen,
+        errors=(error(seen.before), error(seen.after)),
+        errors_held_out={k: (error(a), error(b)) for k, (a, b) in seen.held_out.items()},
+        percent_of=observe.percent_of,
+        noise=_noise(runs, noise, type(observe)),
+        settings=settings,
+        replicates=len(left.test.null.single),
+    )
+    return dataclasses.replace(result, notes=remarks(result))
+
+
+def _diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
+    """A look at the fit with a curve, against the thresholds of the base."""
+    linear, scores, strongest = diagnosed(found.problem, jnp.asarray(found.z), space.library.scored, bases)
+    test = AdequacyTest(strongest, left.test.null, left.test.settings)
+    return Diagnosis(linear, scores, test)
+
+
+def _proposal(
+    space: CandidateSpace,
+    best: Candidate,
+    alike: Classes | None,
+    where: Location | None,
+    discrepancy: Discrepancy | None,
+    settings: Settings,
+) -> Proposal | None:
+    if discrepancy is not None and where is not None:
+        return denser(space, where, settings)
+    return None if alike is None else separating(space, best, alike, settings)
+
+
+def _needs_histories(library: Library, kind: type[observers.Observer]) -> tuple[str, ...]:
+    """Effects of the library that data of this kind cannot show at all, and a history could."""
+    return tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e)))
+
+
+def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:
+    """Channel → where its sd comes from, and its median share of the reading [%]."""
+    with np.errstate(invalid="ignore"):
+        share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
+    return {
+        name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
+        for k, name in enumerate(channels.names())
+        if noise.source[k] != "no readings"
+    }
+
+
+def remarks(found: DiscoveryResult) -> tuple[str, ...]:
+    """What a careful engineer would say of this result, one sentence each."""
+    said = []
+    for rows, why in (
+        (found.unusable, "cannot be simulated: the fitted model slides or fails there"),
+        (found.outliers, "stand alone: outliers, which no effect explains"),
+    ):
+        if rows:
+            said.append(f"rows {', '.join(map(str, rows))} {why}; they are kept out")
+    for name, p in found.base_shift.items():
+        if abs(p.shift_after) > 3:
+            said.append(f"{name} lies {abs(p.shift_after):.1f} prior sds from its prior: it stands in for something")
+    wave = found.unnamed
+    if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
+        said.append(
+            f"the wave stands at another angle in each run (it explains {wave.score_free_in_each_run:.0f} σ² free in "
+            f"each, {wave.score:.0f} with one phase): robot.toml holds the mean; start runs from a mark"
+        )
+    if found.remains is not None:
+        over = found.remains.variable.replace("_", " ")
+        said.append(
+            f"what was found does not explain everything: {found.remains.balance} still lacks something over {over}"
+        )
+    settled, asked = found.replicates, found.settings.replicates
+    if settled < 0.9 * asked:
+        said.append(f"only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs")
+    if 1 / (1 + settled) > min(found.settings.shares.values()):
+        said.append(f"{settled} bootstrap tables are too few for every kind of evidence to count; use 500 or more")
+    return tuple(said)

@@ -1,0 +1,232 @@
+"""A formula proposed for a discrepancy: sparse regression over a dictionary of dimensionless monomials."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from calibration.discovery.projection import Projection, columns_of
+from calibration.discovery.smooth import Smooth
+from calibration.inference.bases import ORDERS
+from calibration.inference.linearization import Linearization
+from mmrjax.effects.curve import BALANCES
+from mmrjax.signals import Signals
+
+#: What a formula is called, in the symbols of the paper.
+SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV"}
+#: Exponents of a factor alone, and in a product of two.
+POWERS, POWERS_PRODUCT = (-1.0, 0.5, 1.0, 2.0, 3.0), (-1.0, 0.5, 1.0, 2.0)
+#: Second terms that are tried beside each first one.
+SECONDS = 40
+#: Signals that settled travel ties to a ratio of the dictionary.
+SAME_AS = {"speed": "speed_motor"}
+#: Least ratio, over its largest, at which an inverse is safe.
+SAFE = 0.1
+#: A simpler formula is preferred up to this rise of the BIC: no evidence worth a mention (Kass and Raftery 1995).
+NO_EVIDENCE = 2.0
+#: How every formula is marked.
+MARK = "a proposal, not a finding"
+
+
+@dataclasses.dataclass(frozen=True)
+class Ratio:
+    """A signal over a fixed value of its unit: dimensionless. `unit` is that value as text."""
+
+    symbol: str
+    unit: str
+    of: str
+    over: float
+
+    def __call__(self, signals: Signals, rows: int) -> np.ndarray:
+        x = np.broadcast_to(np.asarray(getattr(signals, self.of), float), (rows,))
+        return (np.sin(x) if self.of == "slope" else x) / self.over
+
+
+RATIOS = (
+    Ratio("ω_m", "700 rad/s", "speed_motor", 700.0),
+    Ratio("I", "2 A", "current", 2.0),
+    Ratio("U", "24 V", "voltage", 24.0),
+    Ratio("sin α", "0.1", "slope", 0.1),
+    Ratio("m_c", "5 kg", "payload", 5.0),
+)
+#: Rise of the BIC for each variable but the one that the curve is over: one of so many is looked for.
+FOREIGN = 2 * float(np.log(len(RATIOS)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Monomial:
+    """A product of powers of ratios: (index into RATIOS, exponent) of each factor."""
+
+    factors: tuple[tuple[int, float], ...]
+
+    @property
+    def complexity(self) -> float:
+        """What makes it harder to believe: factors, and exponents other than one."""
+        return sum(1 + 0.1 * abs(p - 1) for _, p in self.factors)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Signals that it depends on."""
+        return tuple(RATIOS[k].of for k, _ in self.factors)
+
+    def __str__(self) -> str:
+        said = (f"({RATIOS[k].symbol}/{RATIOS[k].unit})" + (f"^{p:g}" if p != 1 else "") for k, p in self.factors)
+        return " ".join(said)
+
+
+def dictionary(ratios: np.ndarray) -> dict[Monomial, np.ndarray]:
+    """Monomials that can be written down for these ratios, with their values by row.
+
+    A root needs ratios that are never negative, an inverse ones that stay off zero; a ratio that does not vary
+    is left out, as is all but the first of monomials that are proportional to each other here.
+
+    Args:
+        ratios: shape (rows, ratios).
+    """
+    low, high = ratios.min(0), ratios.max(0)
+    lively = [k for k in range(ratios.shape[1]) if high[k] - low[k] > 1e-6 * max(abs(high[k]), abs(low[k]), 1e-9)]
+
+    def safe(k: int, p: float) -> bool:
+        if p < 0:
+            return low[k] > SAFE * high[k]
+        return low[k] >= 0 or p == int(p)
+
+    single = [((k, p),) for k in lively for p in POWERS if safe(k, p)]
+    double = [
+        ((j, p), (k, q))
+        for j, k in itertools.combinations(lively, 2)
+        for p, q in itertools.product(POWERS_PRODUCT, repeat=2)
+        if safe(j, p) and safe(k, q)
+    ]
+    found: dict[Monomial, np.ndarray] = {}
+    directions: list[np.ndarray] = []
+    for factors in sorted(single + double, key=lambda f: Monomial(f).complexity):
+        value = np.prod([ratios[:, k] ** p for k, p in factors], 0)
+        norm = np.linalg.norm(value)
+        if norm > 0 and not any(abs(value @ d) > (1 - 1e-9) * norm for d in directions):
+            found[Monomial(factors)] = value
+            directions.append(value / norm)
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Proposal:
+    """A formula for a discrepancy, by sparse regression over a dictionary of dimensionless monomials.
+
+    Attributes:
+        formula: e.g. `ΔU = 0.42 V (I/2 A)^2 (U/24 V)`; mark: that it is a proposal.
+        terms: its monomials; coefficients, sds: of each [unit of the balance].
+        variables: signals that it depends on, without repeats.
+        explained: fall of χ² at the base fit.
+        gain: BIC of the smooth curve less that of the formula; positive speaks for the formula.
+        tried: size of the dictionary: the more, the less a formula that stands out means.
+    """
+
+    formula: str
+    terms: tuple[Monomial, ...]
+    coefficients: tuple[float, ...]
+    sds: tuple[float, ...]
+    variables: tuple[str, ...]
+    explained: float
+    gain: float
+    tried: int
+    mark: str = MARK
+
+
+def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
+    """The formula of at most two terms with the least BIC; a simpler one where that costs no evidence.
+
+    Forward selection from every first term, with the seconds that help it most, so that a pair is not lost
+    because neither of it is the best alone. A variable other than the curve's has to earn its place.
+
+    Args:
+        counts: whether a row counts, shape (rows,); curve: what the formula is weighed against.
+    """
+    if curve.wave:
+        return _harmonic(balance, curve)
+    if curve.variable == "time":
+        return _decay(linear, balance, counts, curve)
+    rows = len(counts)
+    ratios = np.stack([r(linear.signals, rows) for r in RATIOS], 1)  # type: ignore[arg-type]
+    known = dictionary(ratios[counts])
+    terms = list(known)
+    shapes = np.zeros((rows, len(terms)))
+    for k, value in enumerate(known.values()):
+        shapes[counts, k] = value
+    a, b = Projection(linear)(columns_of(linear, balance, shapes))
+    scale = np.sqrt(np.maximum(np.diag(a), 0))
+    visible = scale > 1e-3 * np.linalg.norm(columns_of(linear, balance, shapes), axis=0)
+    scale = np.where(visible, scale, 1.0)
+    a, b = a / scale / scale[:, None], np.where(visible, b / scale, 0.0)
+    cost = np.log(3 * counts.sum())
+    one = b**2
+    cosine = np.where(visible[:, None] & visible, a, 0.0)
+    apart = 1 - cosine**2
+    two = np.where(
+        apart > 1e-2, (one[:, None] + one - 2 * cosine * b[:, None] * b) / np.maximum(apart, 1e-2), one[:, None]
+    )
+    ranked: list[tuple[tuple[int, ...], float]] = [((int(k),), cost - one[k]) for k in np.flatnonzero(visible)]
+    for (k,), _ in tuple(ranked):
+        second = [int(j) for j in np.argsort(-two[k])[:SECONDS] if j != k and two[k, j] > one[k]]
+        ranked += [((k, j), 2 * cost - two[k, j]) for j in second]
+    if not ranked:
+        return Proposal("none: no term shows in these data", (), (), (), (), 0.0, 0.0, len(terms))
+    located = {SAME_AS.get(curve.variable, curve.variable)}
+    foreign = [len({v for k in chosen for v in terms[k].variables} - located) for chosen, _ in ranked]
+    dear = [bic + FOREIGN * n for (_, bic), n in zip(ranked, foreign, strict=True)]
+    near = [c for c, bic in zip(ranked, dear, strict=True) if bic < min(dear) + NO_EVIDENCE]
+    chosen, bic = min(near, key=lambda c: (sum(terms[k].complexity for k in c[0]), c[1]))
+    part = np.ix_(chosen, chosen)
+    inverse = np.linalg.inv(a[part])
+    value = inverse @ b[list(chosen)] / scale[list(chosen)]
+    sd = np.sqrt(np.diag(inverse)) / scale[list(chosen)]
+    unit = BALANCES[balance][0]
+    picked = tuple(terms[k] for k in chosen)
+    said = " ".join(
+        f"{'-' if v < 0 else '+' if i else ''}{' ' if i else ''}{abs(v):.2g} {unit} {t}"
+        for i, (v, t) in enumerate(zip(value, picked, strict=True))
+    )
+    return Proposal(
+        formula=f"{SYMBOL[balance]} = {said}",
+        terms=picked,
+        coefficients=tuple(map(float, value)),
+        sds=tuple(map(float, sd)),
+        variables=tuple(dict.fromkeys(v for t in picked for v in t.variables)),
+        explained=float(len(chosen) * cost - bic),
+        gain=float(curve.freedom * cost - curve.explained - bic),
+        tried=len(terms),
+    )
+
+
+def _harmonic(balance: str, curve: Smooth) -> Proposal:
+    """A wave is its own formula."""
+    sine, cosine = curve.scale * curve.root @ curve.start
+    size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+    order, unit = ORDERS[curve.variable][0], BALANCES[balance][0]
+    formula = (
+        f"{SYMBOL[balance]} = {size:.2g} {unit} sin({order:.3g} θ_k {'-' if phase < 0 else '+'} {abs(phase):.2g})"
+    )
+    return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
+
+
+def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
+    """What fades with the time since the start: an exponential, its time constant from a grid over the length of the
+    runs. A level beside it is left to the base."""
+    t = linear.variable("time")
+    constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
+    best: tuple[float, tuple] = (np.inf, ())
+    project, cost = Projection(linear), np.log(3 * counts.sum())
+    for tau in constants:
+        a, b = project(columns_of(linear, balance, np.exp(-t / tau)[:, None] * counts[:, None]))
+        if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
+            best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
+    if not best[1]:
+        return Proposal("none: no term shows in these data", (), (), (), (), 0.0, 0.0, len(constants))
+    tau, value, sd = best[1]
+    formula = f"{SYMBOL[balance]} = {value:.2g} {BALANCES[balance][0]} exp(-t / {tau:.2g} s)"
+    gain = float(curve.freedom * cost - curve.explained - best[0])
+    return Proposal(
+        formula, (), (float(value),), (float(sd),), ("time",), float(2 * cost - best[0]), gain, len(constants)
+    )

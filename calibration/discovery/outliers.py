@@ -1,0 +1,103 @@
+"""Outliers: rows with a reading that stands alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from calibration.discovery.candidates import BaseFit, empty, fit_base
+from calibration.discovery.score_tests import Diagnosed, diagnosed
+from calibration.discovery.settings import Settings
+from calibration.inference import bases as bases_room
+from calibration.inference.bases import Bases
+from calibration.inference.held_out import search_in_batches
+
+
+@dataclasses.dataclass(frozen=True)
+class Screening:
+    """The base fit after rows that stand alone were set aside.
+
+    Attributes:
+        base: the fit; outliers: indices of the rows set aside, in the order in which they were.
+        bases: of the curves that a discrepancy is looked for with, at that fit.
+        diagnosed: the fit linearised, and what effects and curves could explain of its residual.
+    """
+
+    base: BaseFit
+    outliers: tuple[int, ...]
+    bases: Bases
+    diagnosed: Diagnosed
+
+
+def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings, where: str) -> Screening:
+    """Set aside rows with a reading that stands alone: its own shift explains more than any effect or curve.
+
+    Args:
+        bases_at: bases of curves at a fit of the base.
+        where: opens messages.
+    """
+    allowed = int(settings.outlier_share * base.space.included.sum())
+    base, outliers = _set_gross_aside(base, settings, where)
+    included = base.space.included
+    count = base.space.weight.shape[1]
+    level = stats.norm.isf(settings.outlier_error / 2 / (count * included.sum()))
+    bases, seen = _look(base, bases_at, settings)
+    while len(outliers) < allowed:
+        included, scores = base.space.included, seen[1]
+        alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
+        k = int(alone.argmax())
+        smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.names(bases)]
+        curves = np.asarray(scores.explained)[smooth]
+        together = max(np.max(np.asarray(scores.single) ** 2), np.max(curves))
+        if alone[k] < level or alone[k] ** 2 < together:
+            break
+        far = np.array([k])
+        if not base.space.bare.observe.policy.one_by_one:
+            far = np.argsort(-alone)[: allowed - len(outliers)]
+        far = far[(alone[far] >= level) & (alone[far] ** 2 >= together)]
+        outliers = (*outliers, *map(int, far))
+        base = _again(base, far, settings, where)
+        bases, seen = _look(base, bases_at, settings)
+    return Screening(base, outliers, bases, seen)
+
+
+def _look(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> tuple[Bases, Diagnosed]:
+    space, bases = base.space, bases_at(base)
+    z = jnp.asarray(base.candidate.z)
+    return bases, jax.device_get(diagnosed(space.problem(empty(settings)), z, space.library.scored, bases))
+
+
+def _again(base: BaseFit, rows: np.ndarray, settings: Settings, where: str) -> BaseFit:
+    again = fit_base(base.space.without(rows), settings, where)
+    return dataclasses.replace(again, unusable=tuple(sorted({*base.unusable, *again.unusable})))
+
+
+def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[BaseFit, tuple[int, ...]]:
+    """Set aside rows that lie so far off that they bend the fit, and with it every score.
+
+    They are looked for at a robust fit: Cauchy's weights, iterated (Holland and Welsch 1977).
+    """
+    space, batch = base.space, base.space.bare.observe.policy.batch
+    data, included = space.bare.data, space.included
+    sd, measured, weight = (np.asarray(x) for x in (data.sd, data.measured, data.weight))
+
+    def off(reading: np.ndarray) -> np.ndarray:
+        return np.max(np.abs((reading - measured) / sd) * (weight > 0), 1)
+
+    far, start = off(base.reading), base.candidate.z
+    if far[included].max() < settings.gross:
+        return base, ()
+    none = [space.library.indices(empty(settings))] * batch
+    for _ in range(settings.reweightings):
+        robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
+        found, seen = search_in_batches(space.equipped, [start] * batch, [robust] * batch, none)
+        far, start = off(seen.reading[0]), found.z[0]
+    gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
+    if not gross.any() or gross.sum() > settings.outlier_share * included.sum():
+        return base, ()
+    return _again(base, np.flatnonzero(gross), settings, where), tuple(map(int, np.flatnonzero(gross)))

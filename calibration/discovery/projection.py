@@ -1,0 +1,70 @@
+"""Linear algebra at one fit: columns projected against the free parameters, and the defect of a balance by row."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.inference.linearization import PROBED, Linearization
+
+
+class Projection:
+    """What is left of any columns after the free parameters have been fitted again.
+
+    Args:
+        linear: at the base fit of settled rows; its prior rows are those of the free parameters.
+    """
+
+    def __init__(self, linear: Linearization) -> None:
+        jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+        self.readings = linear.readings
+        half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+        self.half = half[:, : self.readings]
+        self.left = (residual - half.T @ (half @ residual))[: self.readings]
+
+    def __call__(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A = Cᵀ (I - P) C and b = -Cᵀ (I - P) e: coefficients a explain 2 bᵀa - aᵀA a of χ².
+
+        Args:
+            columns: whitened change of the readings per unit, shape (readings, columns).
+        """
+        inside = self.half @ columns
+        return columns.T @ columns - inside.T @ inside, -columns.T @ self.left
+
+
+@dataclasses.dataclass(frozen=True)
+class Defect:
+    """What a balance lacks in each row by itself, after what the free parameters absorb.
+
+    Attributes:
+        value, sd: [unit of the balance], shape (rows,); NaN where the readings do not show it.
+    """
+
+    value: np.ndarray
+    sd: np.ndarray
+
+
+def defect(linear: Linearization, balance: str) -> Defect:
+    """The defect of a balance in each row: least squares of the row's residual along its sensitivity.
+
+    δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i
+    (of histories: at that instant, falling to zero at the knots beside it; NaN between knots).
+    """
+    places = linear.places()
+    shapes = np.zeros((linear.rows, len(places)))
+    shapes[places, np.arange(len(places))] = 1.0
+    columns = columns_of(linear, balance, shapes)
+    a, b = Projection(linear)(columns)
+    norm2, whole = np.diag(a), np.sum(columns**2, 0)
+    seen = norm2 > 1e-6 * np.maximum(whole, 1e-300)
+    norm2 = np.where(seen, norm2, np.nan)
+    value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
+    value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
+    return Defect(value, sd)
+
+
+def columns_of(linear: Linearization, balance: str, shapes: np.ndarray) -> np.ndarray:
+    """Change of the readings by terms of a balance, shape (readings, terms), of shapes (rows, terms)."""
+    return np.asarray(linear.columns(PROBED.index(balance), jnp.asarray(shapes)))

@@ -1,0 +1,139 @@
+"""The search for effects: singles, then further ones beside the best, as long as the fit is rejected."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
+from calibration.discovery.score_tests import ScoreTable, Statistics, diagnosed
+from calibration.discovery.settings import Settings
+from calibration.inference.bases import Bases
+
+#: Pairs of instances that are looked through for pairs of effects.
+PAIRS = 4000
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """What was tried.
+
+    Attributes:
+        ladder: every candidate that was fitted.
+        best: the one that is proposed, None where none is plausible; diagnosis: what it leaves.
+    """
+
+    ladder: tuple[Candidate, ...]
+    best: Candidate | None
+    diagnosis: Diagnosis | None
+
+
+def diagnose(
+    space: CandidateSpace, fitted: Candidate, bases: Bases, null: Statistics, settings: Settings
+) -> Diagnosis:
+    """Look at a fit, and test what it leaves."""
+    z = jnp.asarray(fitted.z)
+    seen = diagnosed(space.problem(fitted.active), z, space.library.scored, bases)
+    linear, scores, found = jax.device_get(seen)
+    return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
+
+
+def search(
+    space: CandidateSpace,
+    base: Candidate,
+    left: Diagnosis,
+    bases: Bases,
+    settings: Settings,
+    progress: Callable[[str], None],
+) -> Search:
+    """Effects that explain what the base leaves, as few as leave nothing that is beyond doubt.
+
+    Args:
+        base: the fit without effects; left: what it leaves.
+    """
+    ladder = _singles(space, base, left.scores, settings)
+    best, diagnosis, seen = _best(ladder), None, None
+    while best is not None:
+        seen = best
+        diagnosis = diagnose(space, best, bases, left.test.null, settings)
+        if not diagnosis.test.rejected_with_margin or len(best.effects) == _most(space, settings):
+            break
+        progress(f"{' and '.join(best.effects)} leaves something: fitting further effects beside it")
+        more = _extend(space, best, diagnosis.scores, base, left.scores, settings)
+        best = _accepted(_best(more), ladder, settings)
+        ladder += more
+    return Search(tuple(ladder), seen, diagnosis)
+
+
+def _most(space: CandidateSpace, settings: Settings) -> int:
+    """Effects that the data allow, no more than there are slots."""
+    return int(min(settings.slots, max(1, space.included.sum() // settings.rows_per_effect)))
+
+
+def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = ()) -> list[str]:
+    """Effects by their best |score|, the strongest first; those to leave out come last."""
+    strength = space.library.largest(np.abs(np.asarray(scores.single)))
+    strength[list(space.library.indices(without))] = 0.0
+    return [space.library.names[k] for k in np.argsort(-strength)]
+
+
+def _singles(space: CandidateSpace, base: Candidate, scores: ScoreTable, settings: Settings) -> list[Candidate]:
+    wanted = [filled([name], settings) for name in _ranked(space, scores)[: _batch(space)]]
+    return fit_candidates(space, [(w, start(space, base, w, settings, scores)) for w in wanted], settings)
+
+
+def _batch(space: CandidateSpace) -> int:
+    return space.bare.observe.policy.batch
+
+
+def _extend(
+    space: CandidateSpace,
+    best: Candidate,
+    scores: ScoreTable,
+    base: Candidate,
+    scores_base: ScoreTable,
+    settings: Settings,
+) -> list[Candidate]:
+    """One effect more beside the best, and pairs from the base."""
+    names = _ranked(space, scores, best.effects)[: _batch(space)]
+    sources = {filled([*best.effects, name], settings): (best, scores) for name in names}
+    if len(best.effects) == 1:
+        for pair in _pairs(space, scores_base):
+            one, other = filled(pair, settings), filled(pair[::-1], settings)
+            if one not in sources and other not in sources:
+                sources[one] = (base, scores_base)
+    proposals = [(w, start(space, at, w, settings, by)) for w, (at, by) in sources.items()]
+    return fit_candidates(space, proposals, settings)
+
+
+def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
+    """Pairs of effects by their joint score, the strongest first, a batch of them."""
+    of, names = space.library.of, space.library.names
+    pair = np.triu(np.asarray(scores.pair))
+    found: list[tuple[str, str]] = []
+    for flat in np.argsort(-pair, axis=None)[:PAIRS]:
+        i, j = sorted((int(of[flat // len(of)]), int(of[flat % len(of)])))
+        if i != j and (names[i], names[j]) not in found:
+            found.append((names[i], names[j]))
+        if len(found) == _batch(space):
+            break
+    return found
+
+
+def _best(candidates: Sequence[Candidate]) -> Candidate | None:
+    sound = [c for c in candidates if c.plausible and np.isfinite(c.cost)]
+    return min(sound, key=lambda c: c.cost) if sound else None
+
+
+def _accepted(c: Candidate | None, ladder: Sequence[Candidate], settings: Settings) -> Candidate | None:
+    """The candidate, if it explains so much more than any with one effect fewer that every effect is needed."""
+    if c is None:
+        return None
+    fewer = [x.cost for x in ladder if len(x.effects) == len(c.effects) - 1 and x.plausible]
+    return c if 2 * (min(fewer, default=np.inf) - c.cost) >= settings.needed**2 else None

@@ -1,0 +1,108 @@
+"""Smooth curves over a variable in a balance, linear at a fit, with the prior that the data find most likely."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.discovery.projection import Projection, columns_of
+from calibration.inference.bases import ORDERS
+from calibration.inference.linearization import Linearization
+from mmrjax.effects.curve import ORDINATES, weights
+
+#: Priors that are tried for the ordinates: correlation lengths [spacings], sizes [σ that an ordinate makes].
+LENGTHS, SIZES = (1.0, 1.5, 2.5, 4.0), tuple(np.geomspace(0.3, 300.0, 25))
+#: Prior sd of a curve's level and trend, over that of its shape.
+WIDE = 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Smooth:
+    """A smooth curve (or a wave) at the base fit, with the prior that these data find most likely.
+
+    Attributes:
+        effect, variable: name of the curve, and what it is over; low, high: ends of its range; scale: its amplitude.
+        root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
+        start: ordinates in prior coordinates, y = L z, shape (ordinates,).
+        explained: fall of χ²; freedom: how many parameters that took.
+    """
+
+    effect: str
+    variable: str
+    low: float
+    high: float
+    scale: float
+    root: np.ndarray
+    start: np.ndarray
+    explained: float
+    freedom: float
+
+    @property
+    def wave(self) -> bool:
+        """Whether it repeats with the angle of a shaft."""
+        return self.variable in ORDERS
+
+    @property
+    def ordinates(self) -> tuple[str, ...]:
+        """Parameters of the effect that make its shape."""
+        return ("y_sin", "y_cos") if self.wave else ORDINATES
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The other parameters of the effect."""
+        if self.wave:
+            return {"amplitude": self.scale, "order_shaft": ORDERS[self.variable][0]}
+        return {"amplitude": self.scale, "low": self.low, "high": self.high}
+
+    def basis(self, x: np.ndarray) -> np.ndarray:
+        """What each ordinate counts at x, shape (points, ordinates)."""
+        return _basis(self.variable, x, self.low, self.high)
+
+
+def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
+    if variable in ORDERS:
+        return np.stack([np.sin(x), np.cos(x)], 1)
+    return np.asarray(weights(jnp.asarray(x), low, high))  # type: ignore[arg-type]
+
+
+def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:
+    """The curve of a variable in a balance, linear at the base fit.
+
+    The ordinates are a Gaussian process with covariance s² exp(-½ (Δ/l)²) over their distance Δ, and a level
+    and a trend WIDE times as large, which base parameters can hide; size s and length l are those of the
+    greatest evidence (Rasmussen and Williams 2006, eqs. (2.39), (5.8)). Of a wave sine and cosine are independent.
+
+    Args:
+        counts: whether a row counts, shape (rows,).
+    """
+    x = linear.variable(variable)
+    low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
+    if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
+        high = low + max(abs(low), 1.0)  # the variable stands still: an offset is all that can be seen
+    basis = _basis(variable, x, low, high)
+    a, b = Projection(linear)(columns_of(linear, balance, basis))
+    size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
+    roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length) for length in LENGTHS]
+    best: tuple[float, tuple] = (-np.inf, ())
+    for root, sigmas in itertools.product(roots, SIZES):
+        scale = sigmas * size
+        inner, pull = scale**2 * root.T @ a @ root, scale * root.T @ b
+        there = np.eye(len(root)) + inner
+        z = np.linalg.solve(there, pull)
+        evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(there)[1]
+        if evidence > best[0]:
+            explained = 2 * pull @ z - z @ inner @ z
+            best = evidence, (scale, root, z, float(explained), float(np.trace(np.linalg.solve(there, inner))))
+    name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{variable}"
+    return Smooth(name, variable, low, high, *best[1])
+
+
+def _smoothness(length: float) -> np.ndarray:
+    """L of the prior covariance of the ordinates at a correlation length [spacings]."""
+    distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
+    across = np.linspace(-1.0, 1.0, len(ORDINATES))
+    broad = WIDE**2 * (1 + np.outer(across, across)) + 1e-6 * np.eye(len(ORDINATES))
+    return np.linalg.cholesky(np.exp(-0.5 * (distance / length) ** 2) + broad)

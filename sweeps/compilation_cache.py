@@ -1,0 +1,142 @@
+"""The compilation cache: programs that XLA has compiled, kept on disk so that the next process reads them.
+
+It lies in `$MMRJAX_CACHE`, else `$XDG_CACHE_HOME/mmrjax`, else `~/.cache/mmrjax`; `MMRJAX_CACHE=off` switches it off.
+JAX keys an entry by program, compiler version, flags and device; a folder of its own for each version of jaxlib and
+each kind of processor keeps native code of one machine from another with the same home. Importable without jax.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import os
+import platform
+import re
+import warnings
+from pathlib import Path
+
+VARIABLE = "MMRJAX_CACHE"
+OFF = ("off", "0", "no", "false")
+#: Size beyond which the oldest entries are dropped when the cache is enabled, down to half of it [bytes].
+LIMIT = 4 * 2**30
+
+
+def location(path: Path | None = None) -> Path | None:
+    """Folder of the cache, which need not exist yet; None where it is switched off or no place for it is known.
+
+    Args:
+        path: folder to hold caches; None takes it from the environment.
+    """
+    if path is None:
+        stated = os.environ.get(VARIABLE, "").strip()
+        if stated.lower() in OFF:
+            return None
+        if stated:
+            path = Path(stated)
+        else:
+            base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+            path = (base if base.is_absolute() else Path("~/.cache")) / "mmrjax"
+    try:
+        path = path.expanduser()
+    except RuntimeError:  # nobody's home
+        return None
+    return path / f"xla-{importlib.metadata.version('jaxlib')}-{_processor()}"
+
+
+def _processor() -> str:
+    """What of this processor native code depends on, as a short word."""
+    try:
+        known = re.findall(r"^(?:flags|Features)\s*:.*", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.M)[:1]
+    except OSError:
+        known = []
+    kind = " ".join([platform.machine(), platform.processor(), *known])
+    return f"{platform.machine()}-{hashlib.sha256(kind.encode()).hexdigest()[:8]}"
+
+
+def enable(path: Path | None = None) -> Path | None:
+    """Keep every compiled program, however small, and read those that earlier processes kept.
+
+    To be called before anything compiles. A cache that JAX has been given by its own settings
+    (`JAX_COMPILATION_CACHE_DIR`) stays. An entry that cannot be read is compiled again.
+
+    Args:
+        path: folder to hold caches; None: see `location`.
+
+    Returns:
+        The folder; None where the cache is switched off or its place cannot be written to, which is no error.
+    """
+    folder = location(path)
+    if folder is None:
+        return None
+    # On some processors XLA logs an error for each program that it reads: tuning flags of its own compiler that it
+    # takes for features of another machine (openxla/xla issue 44565). What fails is raised, not only logged.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is not None:
+        return Path(jax.config.jax_compilation_cache_dir)
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # who may write here may run code
+        _prune(folder.parent)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return None
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache entry")
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    jax.config.update("jax_raise_persistent_cache_errors", False)
+    return folder
+
+
+def _entries(folder: Path) -> list[tuple[float, int, Path]]:
+    """Time of writing, size [bytes] and path of every entry."""
+    found = []
+    for path in folder.iterdir() if folder.is_dir() else ():
+        try:
+            state = path.stat()
+        except OSError:  # dropped by another process meanwhile
+            continue
+        found.append((state.st_mtime, state.st_size, path))
+    return found
+
+
+def _prune(caches: Path) -> None:
+    """Drop the oldest entries of all versions if they have become too many."""
+    entries = [entry for folder in caches.glob("xla-*") for entry in _entries(folder)]
+    size = sum(entry[1] for entry in entries)
+    if size <= LIMIT:
+        return
+    for _, bytes_, path in sorted(entries):
+        path.unlink(missing_ok=True)
+        size -= bytes_
+        if size <= LIMIT / 2:
+            return
+
+
+@dataclasses.dataclass(frozen=True)
+class Contents:
+    """What the cache holds.
+
+    Attributes:
+        path: its folder; None where it is switched off.
+        entries: compiled programs in it; size: of them all [bytes].
+    """
+
+    path: Path | None
+    entries: int
+    size: int
+
+    def __str__(self) -> str:
+        if self.path is None:
+            return f"off ({VARIABLE}=off)" if os.environ.get(VARIABLE) else "off"
+        return f"{self.path}: {self.entries} programs, {self.size / 1e6:.1f} MB"
+
+
+def describe(path: Path | None = None) -> Contents:
+    """Where the cache lies and what it holds."""
+    folder = location(path)
+    entries = [] if folder is None else _entries(folder)
+    return Contents(folder, len(entries), sum(entry[1] for entry in entries))

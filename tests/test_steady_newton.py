@@ -1,0 +1,95 @@
+"""Newton's method with implicit derivatives: problems with exact roots and gradients, and programs without callbacks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.newton import root
+from mmrjax.fidelities.steady import steady
+
+TOLERANCE = 1e-13
+
+
+def circle(y, radius):
+    """Where a circle of `radius` meets the bisector and a third unknown follows."""
+    return jnp.stack([y[0] ** 2 + y[1] ** 2 - radius**2, y[0] - y[1], y[2] - radius * y[0]])
+
+
+def meeting(radius):
+    return root(circle, jnp.array([1.0, 0.5, 0.0]), radius, TOLERANCE)[0]
+
+
+def exact(radius):
+    return np.array([radius / 2**0.5, radius / 2**0.5, radius**2 / 2**0.5])
+
+
+def test_root_and_derivatives_are_exact():
+    radius = 2.3
+    np.testing.assert_allclose(meeting(radius), exact(radius), rtol=1e-13)
+    slope = np.array([2**-0.5, 2**-0.5, 2**0.5 * radius])
+    np.testing.assert_allclose(jax.jacfwd(meeting)(radius), slope, rtol=1e-12)
+    np.testing.assert_allclose(jax.jacrev(meeting)(radius), slope, rtol=1e-12)
+    bend = np.array([0.0, 0.0, 2**0.5])
+    for twice in (jax.jacfwd(jax.jacrev(meeting)), jax.jacrev(jax.jacfwd(meeting)), jax.jacfwd(jax.jacfwd(meeting))):
+        np.testing.assert_allclose(twice(radius), bend, rtol=1e-11, atol=1e-12)
+
+
+def test_root_of_a_batch_is_that_of_its_members():
+    radii = jnp.asarray([0.3, 1.0, 7.0])
+    np.testing.assert_allclose(jax.vmap(meeting)(radii), [exact(float(r)) for r in radii], rtol=1e-12)
+    np.testing.assert_allclose(jax.vmap(jax.jacrev(meeting))(radii)[:, 2], 2**0.5 * radii, rtol=1e-12)
+
+
+def test_root_has_no_derivative_by_its_start():
+    start = jnp.array([1.0, 0.5, 0.0])
+    assert not jax.jacfwd(lambda s: root(circle, s, 2.3, TOLERANCE)[0])(start).any()
+
+
+def test_root_reports_members_without_one_and_harms_no_other():
+    radii = jnp.asarray([1.0, jnp.nan, 2.0])
+    _, solved = jax.vmap(lambda r: root(circle, jnp.array([1.0, 0.5, 0.0]), r, TOLERANCE))(radii)
+    assert solved.tolist() == [True, False, True]
+    nowhere = root(lambda y, a: y**2 + a, jnp.array([1.0]), 1.0, TOLERANCE)
+    assert not nowhere[1]
+
+
+def test_root_derivative_is_zero_where_the_linearisation_is_singular():
+    def flat(y, a):  # every y[1] is a root
+        return jnp.stack([y[0] - a, 0.0 * y[1]])
+
+    def at(a):
+        return root(flat, jnp.array([0.0, 0.0]), a, TOLERANCE)[0]
+
+    assert jax.jacfwd(at)(1.0).tolist() == jax.jacrev(at)(1.0).tolist() == [0.0, 0.0]
+
+
+# --- programs that the compilation cache keeps --------------------------------------------------------
+
+
+def lowered(function, *arguments) -> str:
+    return jax.jit(function).lower(*arguments).as_text()
+
+
+def holds_callback(program: str) -> bool:
+    return "callback" in program
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev, jax.hessian])
+def test_steady_programs_hold_no_host_callback(rebuild, theta, derivative):
+    runs = Conditions(voltage=[15.0, 24.0, 33.0], slope_deg=5.0)
+    few = theta[:2]
+
+    def readings(x, run):
+        answer = steady(rebuild(theta.at[:2].set(x)), run)
+        return jnp.stack([answer.total_current, answer.motor_speed, answer.speed])
+
+    assert not holds_callback(lowered(jax.vmap(derivative(readings), in_axes=(None, 0)), few, runs))
+
+
+def test_search_for_callbacks_can_fail():
+    def called(x):
+        return jax.pure_callback(np.sin, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    assert holds_callback(lowered(called, jnp.ones(3)))
