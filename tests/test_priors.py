@@ -71,7 +71,12 @@ def test_relative_prior_is_log_normal_with_that_spread(robot):
 
 def test_friction_pairs_keep_their_ratio_unless_freed(robot):
     z = jnp.ones(1)
-    moved = priors.coordinates(robot, ["6T2A.ground.friction.static"]).robot(robot, z).configurations["6T2A"].ground.friction
+    moved = (
+        priors.coordinates(robot, ["6T2A.ground.friction.static"])
+        .robot(robot, z)
+        .configurations["6T2A"]
+        .ground.friction
+    )
     np.testing.assert_allclose(moved.dynamic / moved.static, 0.8)
     assert moved.static > 0.4
     both = ["6T2A.ground.friction.static", "6T2A.ground.friction.dynamic"]
