@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.inference import checks, observers, priors, treatments
+from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
 from calibration.inference.priors import GUIDED
-from mmrjax import channels, nominal, params
+from mmrjax import channels, fidelities, nominal, params
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.signals import CONVERGED
@@ -54,7 +54,7 @@ def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
 
 
 def test_in_track_the_guide_friction_stands_for_the_product(base):
-    names = priors.default_names(["6T2A", "4W2T"], base, guides_are_output=True)
+    names = priors.default_names(["6T2A", "4W2T"], base, computed=fidelities.facts("track").computes)
     assert GUIDE_FRICTION in names and GUIDE_SHARE not in names and len(names) == 11
     turned, known = priors.guided(base, "6T2A")
     fields, mean = priors.known(turned), known[GUIDE_FRICTION][0]
@@ -119,7 +119,7 @@ def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
 @pytest.mark.slow
 def test_a_friction_law_too_stiff_for_the_step_is_said(base, made):
     stiff = params.replace(base, {CREEP: jnp.asarray(0.02)})
-    (said,) = treatments.too_stiff(stiff, made.conditions(stiff))
+    (said,) = fidelities.get("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2: the track model's step of 0.0001 s is above the largest stable one")
 
 
