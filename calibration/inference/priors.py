@@ -111,7 +111,7 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
     return tuple(f"{configuration}.{name}" for name in names)
 
 
-def default_names(configurations: Iterable[str], robot: Robot, *, guides_are_output: bool = False) -> tuple[str, ...]:
+def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = ()) -> tuple[str, ...]:
     """The default set of free parameters for data of these configurations.
 
     Args:
