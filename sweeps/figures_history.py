@@ -45,6 +45,11 @@ class Start:
     settled: float
 
     @property
+    def gets_under_way(self) -> bool:
+        """Whether there are stages to tell apart."""
+        return self.status in ("converged", "not_settled")
+
+    @property
     def ended(self) -> tuple[float, float]:
         """Current [A] and speed [mm/s] at the end: the running gear may ripple, so the means over the last 0.15 s."""
         last = _end(self.time)
@@ -118,7 +123,7 @@ def _inrush(axes: Axes, start: Start, colour: str) -> None:
         place = (1e3 * start.time[peak], start.current[peak])
         axes.plot(*place, "o", ms=5, color=colour)
         axes.annotate(
-            f"peak {start.current[peak]:.0f} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
+            f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
             textcoords="offset points", fontsize=8.5, va="top",
         )  # fmt: skip
     _stages(axes, start, 1e3)
@@ -135,9 +140,9 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     axes.set(xlabel="time [s]", ylabel="total current [A]")
     _stages(axes, start)
     if cut:
-        note(axes, f"peak {peak:.0f} A cut off", x=0.02, y=0.8, color=colour)
+        note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
     during = (start.time > start.starting) & (start.time < start.slipping)
-    if during.any():
+    if start.slipping - start.starting > 0.15 * last and start.gets_under_way:
         middle = float(np.median(start.current[during]))
         at = (start.starting + start.slipping) / 2
         axes.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
@@ -155,7 +160,7 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
     axes.set_ylabel("speed [mm/s]")
     _stages(axes, start)
     axes.text(0.02 * last, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
-    if 0 < start.settled < last:
+    if 0 < start.settled < last and start.gets_under_way:
         axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
         text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
         axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
@@ -170,6 +175,8 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
 
 def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
     """Shade the stages behind a plot over time in units of 1/`scale` s and name them at the top."""
+    if not start.gets_under_way:
+        return
     bounds = scale * np.array([0.0, start.starting, start.slipping, start.time[-1]])
     left_edge, right_edge = axes.get_xlim()
     for (stage, shade, name), left, right in zip(_STAGES, bounds[:-1], bounds[1:], strict=True):

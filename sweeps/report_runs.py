@@ -45,7 +45,7 @@ def write(
     known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0}
     if histories is not None:
         known |= _histories(album, robot, runs, names, histories)
-    chain = np.flatnonzero(figures_power.drawable(runs))[:CHAINS]
+    chain = np.flatnonzero(figures_power.drawable(runs) & (runs["status"] == "converged"))[:CHAINS]
     if chain.size:
         picked = {key: value[chain] for key, value in runs.items()}
         album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain]))
