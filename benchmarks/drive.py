@@ -90,12 +90,12 @@ def main() -> None:
     jax.config.update("jax_enable_x64", not arguments.float32)
     import jax.numpy as jnp
 
-    from mmrjax import nominal
+    from mmrjax import robots
     from mmrjax.conditions import Conditions
     from mmrjax.fidelities.drive import drive_batch
     from mmrjax.signals import FAILED
 
-    robot, times = nominal.nominal(), jnp.asarray(INSTANTS)
+    robot, times = robots.nominal(), jnp.asarray(INSTANTS)
 
     @jax.jit
     def run(runs):

@@ -27,12 +27,12 @@ def main() -> None:
     jax.config.update("jax_enable_x64", not arguments.float32)
     import jax.numpy as jnp
 
-    from mmrjax import nominal
+    from mmrjax import robots
     from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady_batch
     from mmrjax.signals import CONVERGED
 
-    robot = nominal.nominal()
+    robot = robots.nominal()
 
     def batch(size: int):
         wheeled, slope, payload, voltage = conditions(size).T

@@ -20,7 +20,7 @@ from calibration.inference import errors as residual
 from mmrjax import params
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.nominal import ROBOTS
+from mmrjax.robots import ROBOTS
 from sweeps import figures_data, figures_sweep, outputs, report, report_tables
 
 PAPER_FIGURES = {
