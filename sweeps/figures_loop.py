@@ -9,7 +9,6 @@ from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscr
 from calibration.inference.details import TimeStatistics
 from mmrjax import channels
 from mmrjax.channels import MM, RPM
-from sweeps.figures_calibration import short
 from sweeps.figures_style import (
     BLUE,
     FAINT,
@@ -20,6 +19,7 @@ from sweeps.figures_style import (
     colours_of,
     figure,
     note,
+    short,
 )
 
 #: Effects on the ladder and on the map of look-alikes.

@@ -111,3 +111,8 @@ def colours_of(configurations: np.ndarray) -> dict[str, str]:
     palette = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
     names = dict.fromkeys(map(str, configurations))
     return {name: palette[k % len(palette)] for k, name in enumerate(names)}
+
+
+def short(name: str) -> str:
+    """A parameter's name without the words that every such name has."""
+    return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")
