@@ -672,24 +672,3 @@ def test_a_fourth_channel_is_one_row(tmp_path):
     assert errors["rows"] == 1 and errors["missing"] == 1
     assert errors["rms_percent"] == pytest.approx(100 * 0.5 / 15)
     assert "terminal_voltage_V: 1 of 2 readings are missing" in compared.stdout
-
-
-def test_reproduce_writes_the_papers_rows(mmrjax, tmp_path):
-    code, out, _ = mmrjax("reproduce", "--out", "p")
-    assert code == 0 and out.rstrip().splitlines()[-1] == "p"
-    result = json.loads((tmp_path / "p" / "result.json").read_text())
-    assert result["schema"] == "mmrjax.reproduce/1" and result["rows"] == 20
-    assert result["errors"]["paper"]["total_current"]["rms_percent"] == pytest.approx(4.0, abs=0.05)
-    rows = table(tmp_path / "p" / "rows.csv")
-    assert len(rows) == 20 and sum(row["status"] == "slides" for row in rows) == 6
-    assert sorted(p.name for p in (tmp_path / "p").iterdir()) == [
-        "config.resolved.toml", "figures", "manifest.json", "report.html", "result.json", "robot.toml", "rows.csv",
-    ]  # fmt: skip
-
-
-def test_reproduce_of_a_robot_of_another_kind_is_not_set_against_the_bench(mmrjax, tmp_path, crawler):
-    code, _, err = mmrjax("reproduce", "--robot", crawler, "--out", "p")
-    assert code == 0 and "the paper's runs are of 6T2A, 4W2T; none of them is this robot's" in err
-    page = (tmp_path / "p" / "report.html").read_text()
-    assert "not set against the bench" in page and 'id="fig11_motor_friction"' in page
-    assert 'id="fig28_current_over_slope"' not in page and not (tmp_path / "p" / "rows.csv").exists()
