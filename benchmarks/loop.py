@@ -189,9 +189,9 @@ def engine_of(robot: str, series: bool = False):
 
     jax.config.update("jax_enable_x64", True)
     from calibration.discovery import loop
-    from mmrjax import nominal
+    from mmrjax import robots
 
-    return loop.Engine(nominal.ROBOTS[robot](), series=series)
+    return loop.Engine(robots.ROBOTS[robot](), series=series)
 
 
 def work(task: tuple) -> dict:

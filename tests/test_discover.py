@@ -18,7 +18,7 @@ from calibration.discovery import bases as curves
 from calibration.discovery import discrepancy as discover
 from calibration.discovery import loop
 from calibration.discovery.score_tests import PROBED
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 
@@ -31,7 +31,7 @@ STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("tracked", "wheel
 @pytest.fixture(scope="module")
 def engine():
     # The library plays no part here; one effect keeps what is compiled small.
-    return loop.Engine(nominal.nominal(), {"churning": BY_NAME["churning"]}, size=1)
+    return loop.Engine(robots.nominal(), {"churning": BY_NAME["churning"]}, size=1)
 
 
 @pytest.fixture(

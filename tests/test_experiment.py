@@ -14,7 +14,7 @@ from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.discovery import experiments as experiment
 from calibration.discovery import loop, menu
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
 
 PAIRS = {
@@ -32,7 +32,7 @@ STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("tracked", "wheel
 @pytest.fixture(scope="module")
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
-    base = params.replace(nominal.nominal(), g.CLIMBING)
+    base = params.replace(robots.nominal(), g.CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
     read = eqx.filter_jit(menu.readings)
 
@@ -90,7 +90,7 @@ def test_reverse_travel_turns_the_sign_of_a_biased_slope_alone(shown):
 @pytest.fixture(scope="module")
 def engine():
     names = sorted({n for pair in PAIRS for n in pair})
-    return loop.Engine(nominal.nominal(), {n: BY_NAME[n] for n in names}, size=1)
+    return loop.Engine(robots.nominal(), {n: BY_NAME[n] for n in names}, size=1)
 
 
 @pytest.fixture(scope="module")

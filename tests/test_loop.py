@@ -18,7 +18,7 @@ from calibration.discovery import active_set as slots
 from calibration.discovery import bases as curves
 from calibration.discovery import loop
 from calibration.discovery import score_tests as trace
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
 
 #: The analyst's prior on the surface, which Table 5 does not know.
@@ -35,7 +35,7 @@ SEARCHED = (
 @pytest.fixture(scope="module")
 def engine():
     """Compiled once for every table of this file: all have 81 to 96 rows, thus one padded size."""
-    return loop.Engine(nominal.nominal(), {n: BY_NAME[n] for n in SEARCHED}, size=2)
+    return loop.Engine(robots.nominal(), {n: BY_NAME[n] for n in SEARCHED}, size=2)
 
 
 @pytest.fixture(scope="module")

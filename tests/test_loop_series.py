@@ -21,7 +21,7 @@ from calibration.discovery import loop
 from calibration.discovery import result as loop_outcome
 from calibration.discovery import score_tests as trace
 from calibration.inference import problem
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME, UNNAMED
 
 STATED = {
@@ -36,7 +36,7 @@ SEARCHED = ("rotating_inertia", "series_resistance", "churning", "grouser_polygo
 @pytest.fixture(scope="module")
 def engine():
     """Compiled once for every table of this file: all have the same instants."""
-    return loop.Engine(nominal.nominal(), {n: BY_NAME[n] for n in SEARCHED}, size=1, series=True)
+    return loop.Engine(robots.nominal(), {n: BY_NAME[n] for n in SEARCHED}, size=1, series=True)
 
 
 @pytest.fixture(scope="module")

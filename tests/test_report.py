@@ -16,17 +16,16 @@ import pytest
 from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
-from mmrjax import channels, fidelities, params
+from mmrjax import channels, fidelities, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.nominal import ROBOTS
+from mmrjax.robots import ROBOTS
 from mmrjax.signals import GRAVITY
 from sweeps import (
     compare,
     figures_power,
     figures_sweep,
-    outputs,
     report_comparison,
     report_runs,
     report_sweep,

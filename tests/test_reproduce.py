@@ -17,12 +17,12 @@ from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
 from calibration.inference import errors as residual
-from mmrjax import params
+from mmrjax import outputs, params
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.nominal import ROBOTS
+from mmrjax.robots import ROBOTS
 from mmrjax.tables import TRACKED, WHEELED
-from sweeps import cli, outputs
+from sweeps import cli
 from sweeps.paper import data
 
 FIGURES = {
