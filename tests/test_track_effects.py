@@ -37,7 +37,7 @@ def slopes():
         return params.replace(bare, amplitudes | {"6T2A.track.guide_share": share})
 
     def observed(reading):
-        return jnp.stack([getattr(reading, name) for name in OUTPUTS])
+        return jnp.stack([reading[name] for name in OUTPUTS])
 
     def resolved(theta, run):
         answer = track(robot(theta, jnp.asarray(0.98)), run, duration=0.4, rolling=True)
