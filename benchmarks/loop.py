@@ -39,7 +39,7 @@ SIZES = 3.0
 #: Proposals that are carried out, one after the other, to resolve a class.
 EXPERIMENTS = 3
 #: The analyst's prior on the surface, which Table 5 does not know.
-STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("tracked", "wheeled")}
+STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 
 
 def make(kind: str, seed: int) -> g.Case | None:

@@ -30,7 +30,7 @@ OUTSIDE = ("pulley_ovality", "belt_splice", "supply_recovery", "oil_warming")
 #: The analyst's priors on the surface, which Table 5 does not know.
 STATED = {
     f"{c}.ground.friction.{name}": prior
-    for c in ("tracked", "wheeled")
+    for c in ("6T2A", "4W2T")
     for name, prior in (("static", (0.6, 0.09)), ("dynamic", (0.48, 0.08)))
 }
 
