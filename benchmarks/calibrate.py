@@ -20,14 +20,12 @@ import numpy as np  # noqa: E402
 import reference  # noqa: E402  (tests/reference.py, plain NumPy and SciPy)
 from scipy.optimize import least_squares, root  # noqa: E402
 
-from calibration.inference import noise  # noqa: E402
 from calibration.data import runs as records  # noqa: E402
-from calibration.inference import identifiability, priors, problem  # noqa: E402
+from calibration.inference import identifiability, noise, observers, priors, problem  # noqa: E402
 from calibration.inference import optimizers as fit  # noqa: E402
-from calibration.inference import result as outcome  # noqa: E402
 from calibration.inference.calibrate import calibrate  # noqa: E402
 from calibration.inference.errors import relative_error, summary  # noqa: E402
-from mmrjax import nominal, params  # noqa: E402
+from mmrjax import channels, nominal, params  # noqa: E402
 from mmrjax.fidelities.steady import steady_batch  # noqa: E402
 
 STATED = "current=2%,motor_speed=0.5%,speed=1%"
@@ -41,17 +39,19 @@ def accuracy(runs: records.Runs) -> dict[str, Any]:
     lines = {"the paper's simulation": relative_error(paper, measured)}
     for name in ("nominal", "sm1", "sm2"):
         robot = params.replace(nominal.ROBOTS[name](), {k: jnp.asarray(v) for k, v in CLIMBS.items()})
-        r = steady_batch(robot, runs.command()).reading
-        simulated = np.stack([r.total_current, r.motor_speed, r.speed], 1)
+        shown = steady_batch(robot, runs.conditions(robot)).reading
+        simulated = np.stack([shown[name] for name in channels.names()], 1)
         lines[f"{name}, adhesion raised to 0.6, not fitted"] = relative_error(simulated, measured)
     record: dict[str, Any] = {}
     for words, stated in (("noise estimated", None), (f"noise {STATED}", STATED)):
         found = calibrate(runs, nominal.nominal(), noise=stated)
-        lines[f"calibrated, {words}: fitted"] = relative_error(found.after, measured)
+        after = np.stack([r.after for r in found.readings.values()], 1)
+        lines[f"calibrated, {words}: fitted"] = relative_error(after, measured)
         for kind, held in found.held_out.items():
             with np.errstate(invalid="ignore"):
-                lines[f"calibrated, {words}: held out by {kind}"] = relative_error(held.reading, measured)
-        record[words] = outcome.document(found)["parameters"]
+                reading = np.stack(list(held.reading.values()), 1)
+                lines[f"calibrated, {words}: held out by {kind}"] = relative_error(reading, measured)
+        record[words] = found.to_json()["parameters"]
     print("rms of eq. (35) [%] of current, motor speed, speed (rows that have a prediction)")
     for words, error in lines.items():
         three = [summary(error[:, k]) for k in range(3)]
@@ -64,7 +64,8 @@ def pose(runs: records.Runs, extra: tuple[str, ...] = ()) -> problem.Problem:
     """The packaged problem with stated noise, at a robot that climbs."""
     base = params.replace(nominal.nominal(), {k: jnp.asarray(v) for k, v in CLIMBS.items()})
     names = (*priors.default_names(runs["configuration"], base), *extra)
-    return problem.build(runs, base, priors.coordinates(base, names), noise.of(runs, STATED).sd)
+    sd = noise.of(runs, observers.kind(runs).sizes(runs), STATED).sd
+    return observers.pose(runs, base, priors.coordinates(base, names), sd)
 
 
 def coverage(runs: records.Runs, draws: int) -> dict[str, Any]:
@@ -185,7 +186,7 @@ def plain_residuals(runs: records.Runs, posed: problem.Problem) -> tuple[Any, li
 def plain_side(values: dict[str, float], runs: records.Runs, k: int) -> Plain:
     """One row for the plain model, its mass as the table states it."""
     wheeled, payload = bool(runs["configuration"][k] == "4W2T"), float(runs["payload_kg"][k])
-    mass = {f"{'wheeled' if wheeled else 'tracked'}.mass": float(runs["total_mass_kg"][k]) - payload}
+    mass = {f"{runs['configuration'][k]}.mass": float(runs["total_mass_kg"][k]) - payload}
     slope = math.radians(runs["slope_deg"][k])
     return Plain(float(runs["supply_voltage_V"][k]), slope, payload, wheeled, p=values | mass)
 

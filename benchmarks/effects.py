@@ -14,37 +14,38 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import balances, nominal, params
+from mmrjax import balances, channels, nominal, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.robot import Robot
+from mmrjax.tables import TRACKED, WHEELED
 
 jax.config.update("jax_enable_x64", True)
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "effects.md"
 #: Adhesion at which all of Table 8 climbs, from standstill too; Table 5's does not hold 20 degrees.
 ADHESION = {
-    f"{c}.ground.friction.{k}": v for c in ("tracked", "wheeled") for k, v in (("static", 0.6), ("dynamic", 0.48))
+    f"{c}.ground.friction.{k}": v for c in (TRACKED, WHEELED) for k, v in (("static", 0.6), ("dynamic", 0.48))
 }
-#: What a display resolves: 0.02 A, 5 rpm, 3 mm/s; only the ratios matter for look-alikes.
-SHOWN = np.array([1.0, 30 / np.pi, 1000.0])
+#: In the units of the channels' columns; only the ratios of what a display resolves matter for look-alikes.
+SHOWN = 1 / np.array(channels.factors())
 NOISE = np.array([0.02, 5.0, 3.0])
 #: Base parameters that every fit frees, projected out.
 FREED = (
-    *(f"tracked.{n}" for n in ("track.loss_coulomb", "track.loss_viscous", "track.guide_share")),
-    *(f"wheeled.{n}" for n in ("track.loss_coulomb", "track.loss_viscous")),
+    *(f"{TRACKED}.{n}" for n in ("track.loss_coulomb", "track.loss_viscous", "track.guide_share")),
+    *(f"{WHEELED}.{n}" for n in ("track.loss_coulomb", "track.loss_viscous")),
     *(
         f"{c}.ground.{n}"
-        for c in ("tracked", "wheeled")
+        for c in (TRACKED, WHEELED)
         for n in ("rolling_resistance", "friction.static", "friction.speed_static")
     ),
 )
 ALIKE = 0.95
 STARTS = np.concatenate([[0.0], np.geomspace(1e-4, 0.05, 40), np.linspace(0.06, 2.0, 98)])  # [s]
 
-SETTLED = tuple(e for e in ALL if not e.transient and e.name != "battery_sag")
+SETTLED = tuple(e for e in ALL if not e.transient and not e.needs_battery)
 PASSING = tuple(e for e in ALL if e not in SETTLED)
 
 
@@ -57,15 +58,19 @@ def amplitude(effect: type[Effect]) -> params.Spec:
     return next(p.spec for p in params.walk(effect()) if p.spec.amplitude)
 
 
+def _shown(reading: dict[str, jax.Array]) -> jax.Array:
+    return jnp.stack([reading[name] for name in channels.names()], -1)
+
+
 def examples(battery: float = 0.0) -> Conditions:
     """6T2A, unladen, at 15 V on the level and at 33 V on 20 degrees."""
     return Conditions(voltage=[15.0, 33.0], slope_deg=[0.0, 20.0], battery=battery)
 
 
 def table8() -> Conditions:
-    axes = (0.0, 1.0), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
-    w, s, m, v = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4).T
-    return Conditions(v, np.radians(s), m, w)
+    axes = (0, 1), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
+    configuration, slope, payload, voltage = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4).T
+    return Conditions(configuration, voltage, slope, payload)
 
 
 def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,8 +84,7 @@ def sensitivities() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     def readings(theta):
         member = params.replace(full, {n: theta[k] for k, n in enumerate(names)})
-        r = jax.vmap(steady, in_axes=(None, 0))(member, runs).reading
-        return jnp.stack([r.total_current, r.motor_speed, r.speed], -1)
+        return _shown(jax.vmap(steady, in_axes=(None, 0))(member, runs).reading)
 
     jacobian = np.asarray(jax.jit(jax.jacfwd(readings))(start)) * SHOWN[:, None]
     sizes = [amplitude(e).prior_sd(0.0) for e in SETTLED] + [1.0] * len(FREED)
@@ -106,7 +110,7 @@ def look_alikes(effects: np.ndarray, base: np.ndarray) -> tuple[list[list[str]],
 
 def passing() -> np.ndarray:
     """Largest change of each reading through 2 s from standstill by one prior sd of each effect that only a
-    series shows, at `examples`; `battery_sag` on the battery; shape (effects, 2, 3)."""
+    history shows, at `examples`, on the battery where it needs one; shape (effects, 2, 3)."""
     full = robot(PASSING)
     names = [f"effects.{e.name}.amplitude" for e in PASSING]
 
@@ -116,15 +120,14 @@ def passing() -> np.ndarray:
 
         def one(c):
             s = drive(member, c, jnp.asarray(STARTS), tolerance=1e-8, max_steps=16384).signals
-            r = jax.vmap(lambda s: balances.sensor(member, s))(s)
-            return jnp.stack([r.total_current, r.motor_speed, r.speed], -1)
+            return _shown(balances.sensor(member, s))
 
         runs = examples()
         return jax.vmap(one)(dataclasses.replace(runs, battery=jnp.full(2, battery)))
 
     changes = []
     for k, effect in enumerate(PASSING):
-        battery = 1.0 if effect.name == "battery_sag" else 0.0
+        battery = float(effect.needs_battery)
         there = history(jnp.zeros(len(PASSING)).at[k].set(amplitude(effect).prior_sd(0.0)), battery)
         change = np.abs(np.asarray(there - history(jnp.zeros(len(PASSING)), battery)))
         changes.append(change.max(1) * SHOWN)
@@ -135,11 +138,24 @@ def _number(value: float) -> str:
     return "0" if abs(value) < 5e-4 else f"{value:+.2g}" if abs(value) < 10 else f"{value:+.0f}"
 
 
-def _about(effect: type[Effect]) -> tuple[str, str]:
-    """Equation (up to the source) and source, each on one line."""
-    text = " ".join((effect.__doc__ or "").split())
-    equation, _, source = text.partition("Source:")
-    return equation.strip().rstrip("."), source.strip().replace("|", "∣")
+def _about(effect: type[Effect]) -> tuple[str, str, str]:
+    """Equation, what it stands for, and source, each on one line."""
+    text, _, source = (effect.__doc__ or "").partition("Source:")
+    equation, meaning = (" ".join(part.split()).replace("|", "∣") for part in text.split("\n\n")[:2])
+    return equation.rstrip("."), meaning, " ".join(source.split()).replace("|", "∣")
+
+
+def _declared(effect: type[Effect]) -> str:
+    """What it declares beside its equation, in words."""
+    words = [
+        "dissipative" * effect.dissipative,
+        "in histories alone" * effect.transient,
+        f"settles to `{effect.settles_to}`" * bool(effect.settles_to),
+        "on the battery alone" * effect.needs_battery,
+        "odd in travel" * effect.odd_in_travel,
+        f"on {effect.movers} alone" * bool(effect.movers),
+    ]
+    return ", ".join(filter(None, words)) or "-"
 
 
 def page() -> str:
@@ -155,8 +171,14 @@ def page() -> str:
         "adds in `mass`, `inertia`, `inductance` and `sensor`. This page is written by `benchmarks/effects.py`",
         "from the library itself; a test fails when the two differ.",
         "",
-        "| effect | balance | equation | unit | plausible: sd, bounds | shape parameters |",
-        "|---|---|---|---|---|---|",
+        "An effect declares what others have to know of it: that a positive amplitude only takes power out",
+        "(`dissipative`), that settled travel shows nothing of it (`transient`) or cannot tell it from another",
+        "(`settles_to`), that it acts on the on-board battery alone (`needs_battery`) or on tracks or wheels alone",
+        "(`movers`), that it keeps its sign in space when the robot is turned about (`odd_in_travel`). A robot file",
+        'may name the configurations that one acts on: `[effects.churning] configurations = ["4W2T"]`.',
+        "",
+        "| effect | balance | equation | unit | plausible: sd, bounds | shape parameters | declares |",
+        "|---|---|---|---|---|---|---|",
     ]
     for effect in ALL:
         spec = amplitude(effect)
@@ -166,8 +188,8 @@ def page() -> str:
         where = effect.balance + (f": {effect.channel}" if effect.channel else "")
         low, high = spec.bounds
         lines.append(
-            f"| `{effect.name}` | {where} | {_about(effect)[0].replace('|', '∣')} | {spec.unit} | "
-            f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} |"
+            f"| `{effect.name}` | {where} | {_about(effect)[0]} | {spec.unit} | "
+            f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {_declared(effect)} |"
         )
     lines += [
         "",
@@ -187,7 +209,7 @@ def page() -> str:
         lines.append(f"| `{effect.name}` | {numbers} | {share[k]:.2f} | {names} |")
     lines += [
         "",
-        "## What only a series shows",
+        "## What only a history shows",
         "",
         "Largest change of each reading through the first 2 s from standstill, for one standard deviation",
         "(`battery_sag` on a full battery, which then takes the place of both voltages). `cogging` stays below",
@@ -198,8 +220,8 @@ def page() -> str:
     ]
     for k, effect in enumerate(PASSING):
         lines.append(f"| `{effect.name}` | " + " | ".join(_number(x).lstrip("+") for x in start[k].ravel()) + " |")
-    lines += ["", "## Sources", ""]
-    lines += [f"- `{effect.name}`: {_about(effect)[1]}" for effect in ALL]
+    lines += ["", "## What they stand for, and sources", ""]
+    lines += ["- `{}`: {} {}".format(effect.name, *_about(effect)[1:]) for effect in ALL]
     return "\n".join(lines) + "\n"
 
 

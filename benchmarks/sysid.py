@@ -26,10 +26,10 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mujoco import sysid  # noqa: E402
 
+from calibration.inference import observers, priors, problem  # noqa: E402
 from calibration.inference import optimizers as fit  # noqa: E402
-from calibration.inference import priors, problem  # noqa: E402
-from mmrjax import nominal, params  # noqa: E402
-from mmrjax.conditions import Conditions
+from mmrjax import channels, nominal, params  # noqa: E402
+from mmrjax.conditions import Conditions  # noqa: E402
 
 VOLTAGES = (12.0, 24.0)
 STEP, SAMPLES = 5e-4, 200  # [s]
@@ -93,14 +93,19 @@ def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
     count, samples = len(VOLTAGES), len(times)
     run, sample = np.repeat(np.arange(count), samples), np.tile(np.arange(1, samples + 1), count)
     clock = jnp.asarray(np.tile(np.r_[0.0, times], (count, 1)))
-    observe = problem.Series(Conditions(voltage=VOLTAGES, adhesion=0.0), clock, jnp.asarray(run), jnp.asarray(sample))
-    only_speed = jnp.asarray([0.0, 1.0, 0.0])
+    rows_of = np.arange(count * samples).reshape(count, samples)
+    observe = observers.Histories(
+        Conditions(voltage=VOLTAGES, adhesion=0.0),
+        *map(jnp.asarray, (clock, run, sample, rows_of, rows_of[:, [0, -1]])),
+    )
+    motor = channels.index("motor_speed")
+    only_speed = jnp.zeros(len(channels.CHANNELS)).at[motor].set(1.0)
     rows = count * samples
 
     def fitted(speeds: Any) -> fit.Optimum:
-        measured = jnp.zeros((rows, 3)).at[:, 1].set(ratio * speeds.ravel())
+        measured = jnp.zeros((rows, len(only_speed))).at[:, motor].set(ratio * speeds.ravel())
         data = problem.Data(
-            measured, jnp.full((rows, 3), ratio * NOISE), jnp.tile(only_speed, (rows, 1)), jnp.zeros(len(NAMES)),
+            measured, jnp.full(measured.shape, ratio * NOISE), jnp.tile(only_speed, (rows, 1)), jnp.zeros(len(NAMES)),
             jnp.asarray(problem.STIFFNESS),
         )  # fmt: skip
         posed = problem.Problem(robot, coordinates, observe, data)

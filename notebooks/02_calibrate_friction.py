@@ -32,14 +32,13 @@ import numpy as np
 from IPython.display import Image
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from calibration.data import runs as records
+import calibration
 from calibration.inference import priors
-from calibration.inference import result as outcome
-from calibration.inference.calibrate import calibrate
-from mmrjax import nominal
+from mmrjax import params
+from mmrjax.fidelities.steady import steady_batch
 
-runs = records.read("measured")
-base = nominal.nominal()
+runs = calibration.read_runs("measured")
+base = calibration.read_robot("nominal")
 print(f"{len(runs)} runs of {', '.join(np.unique(runs['configuration']))}")
 
 # %% [markdown]
@@ -67,16 +66,14 @@ for name in names:
 # finite and a penalty leads back to robots that can climb.
 
 # %%
-found = calibrate(runs, base)
-document = outcome.document(found)
-print(document["optimizer"]["agreement"], f"({document['optimizer']['starts_infeasible']} began where a row slides)")
-for name, p in document["parameters"].items():
-    low, high = p["interval"]
-    holds = "its prior" if p["held_by_prior"] else "the data"
-    print(f"{name:<40}{p['value']:>9.4g}  [{low:.3g}, {high:.3g}]  {p['shift_in_prior_sd']:+.1f} sd, held by {holds}")
+found = calibration.calibrate(runs, base)
+print(found.starts.statement(), f"({found.starts.infeasible} began where a row slides)")
+for name, p in found.parameters.items():
+    low, high = p.interval
+    print(f"{name:<40}{p.value:>9.4g}  [{low:.3g}, {high:.3g}]  {p.shift:+.1f} sd, held by the {p.held_by}")
 
 # %%
-from sweeps import figures_calibration, figures_sweep
+from sweeps import figures_calibration, figures_comparison
 from sweeps.figures_style import style
 
 
@@ -107,7 +104,7 @@ show(figures_calibration.profiles, found)
 # predict it.
 
 # %%
-show(figures_calibration.before_after, document)
+show(figures_calibration.before_after, found)
 
 # %% [markdown]
 # ## What friction cannot explain
@@ -117,30 +114,36 @@ show(figures_calibration.before_after, document)
 # both voltages. Finding those effects is another tool's work; freeing the electrics here would only hide them.
 
 # %%
-table = outcome.rows_table(found)
-columns = dict(zip(records.CHANNELS, records.MEASURED, strict=True))
-show(figures_sweep.errors_over, table, columns)
+show(figures_comparison.errors_over, found.rows())
 
 # %%
-for note in document["notes"]:
+for note in found.notes:
     print("-", note)
 
 # %% [markdown]
 # ## The gradient, by hand
-# Nothing in this is hidden. The derivative of one row's current with respect to the prior-scaled parameters,
-# by the implicit function theorem, against running the model twice:
+# Nothing in this is hidden. The derivative of one row's current with respect to a parameter of the calibrated
+# robot, by the implicit function theorem, against running the model twice:
 
 # %%
-z = jnp.asarray(found.z)
-exact = jax.jacfwd(lambda z: found.problem.observation(z).reading[2, 0])(z)
-step = jnp.zeros_like(z).at[2].set(1e-5)
-twice = (found.problem.observation(z + step).reading[2, 0] - found.problem.observation(z - step).reading[2, 0]) / 2e-5
-print(f"d current / d guide share: {float(exact[2]):.6f} A a prior sd, twice run {float(twice):.6f}")
+name, row = "6T2A.track.guide_share", 2
+
+
+def current(value):
+    """Total current of one row [A] as a function of the guide share."""
+    robot = params.replace(found.robot, {name: value})
+    return steady_batch(robot, runs.conditions(robot)).total_current[row]
+
+
+share, step = jnp.asarray(found.parameters[name].value), 1e-6
+exact = jax.jacfwd(current)(share)
+twice = (current(share + step) - current(share - step)) / (2 * step)
+print(f"d current / d guide share: {float(exact):.6f} A, twice run {float(twice):.6f}")
 
 # %%
 assert found.converged and found.starts.agree == 64
-assert np.all(found.status_after == 0)  # the calibrated robot climbs every row
-assert document["errors"]["after"]["fitted"]["total_current"]["rms_percent"] < 9.5
-assert document["errors"]["after"]["fitted"]["motor_speed"]["rms_percent"] > 5  # friction cannot mend the electrics
-assert document["parameters"]["6T2A.ground.friction.static"]["interval"][0] > np.tan(np.radians(20))
-assert abs(float(exact[2]) - float(twice)) < 1e-5
+assert np.all(found.status == "converged")  # the calibrated robot climbs every row
+assert found.errors_after["total_current"].rms_percent < 9.5
+assert found.errors_after["motor_speed"].rms_percent > 5  # friction cannot mend the electrics
+assert found.parameters["6T2A.ground.friction.static"].interval[0] > np.tan(np.radians(20))
+assert abs(float(exact) - float(twice)) < 1e-5

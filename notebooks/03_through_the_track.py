@@ -73,24 +73,24 @@ robot = params.replace(
 )
 
 
-def run(mu, command):
+def run(mu, conditions):
     """One run from a rolling start, as a function of the guide friction."""
-    return track(params.replace(robot, {friction: mu}), command, duration=0.6, rolling=True)
+    return track(params.replace(robot, {friction: mu}), conditions, duration=0.6, rolling=True)
 
 
 @jax.jit
 def runs_and_slopes(mu):
     """All four runs at once, and the derivative of every number in them with respect to mu."""
     every_row = jax.vmap(run, in_axes=(None, 0))
-    return jax.jvp(lambda m: every_row(m, rows.command()), (mu,), (jnp.ones(()),))
+    return jax.jvp(lambda m: every_row(m, rows.conditions(robot)), (mu,), (jnp.ones(()),))
 
 
 values, slopes = runs_and_slopes(jnp.asarray(0.20))  # of Table 4
 for k in range(len(rows)):
     print(
         f"{rows['slope_deg'][k]:4.0f} deg: {STATUSES[int(values.result.status[k])]}, "
-        f"{float(values.result.reading.total_current[k]):.2f} A (measured {rows['total_current_A'][k]:.2f} A), "
-        f"d current / d mu_t = {float(slopes.result.reading.total_current[k]):.2f} A"
+        f"{float(values.result.total_current[k]):.2f} A (measured {rows['total_current_A'][k]:.2f} A), "
+        f"d current / d mu_t = {float(slopes.result.total_current[k]):.2f} A"
     )
 
 # %% [markdown]
@@ -98,9 +98,9 @@ for k in range(len(rows)):
 
 # %%
 h = 2e-5
-either_side = [runs_and_slopes(jnp.asarray(0.20 + sign * h))[0].result.reading.total_current for sign in (1, -1)]
+either_side = [runs_and_slopes(jnp.asarray(0.20 + sign * h))[0].result.total_current for sign in (1, -1)]
 twice = np.asarray(either_side[0] - either_side[1]) / (2 * h)
-exact = np.asarray(slopes.result.reading.total_current)
+exact = np.asarray(slopes.result.total_current)
 print("carried along:", exact.round(4))
 print("run twice:    ", twice.round(4))
 
@@ -121,7 +121,7 @@ left.set(xlabel="time [ms]", ylabel="total current [A]", title="the current ripp
 swing = np.asarray(slopes.signals.total_current[0])
 middle.plot(1e3 * time, swing, lw=0.7)
 middle.set(xlabel="time [ms]", ylabel="d current / d mu_t [A]", title="derivative at an instant")
-pitch = 35e-3 / float(values.result.reading.speed[0])  # s, one grouser period
+pitch = 35e-3 / float(values.result.speed[0])  # s, one grouser period
 window = round(2 * pitch / 1e-3)
 smooth = np.convolve(swing, np.ones(window) / window, "valid")
 right.plot(1e3 * time[window - 1 :], smooth)
@@ -196,8 +196,8 @@ target, sd = rows["total_current_A"], 0.05 * rows["total_current_A"]
 mu = jnp.asarray(0.20)
 for step in range(5):
     value, slope = runs_and_slopes(mu)
-    error = (np.asarray(value.result.reading.total_current) - target) / sd
-    change = np.asarray(slope.result.reading.total_current) / sd
+    error = (np.asarray(value.result.total_current) - target) / sd
+    change = np.asarray(slope.result.total_current) / sd
     print(f"step {step}: mu_t = {float(mu):.5f}, rms error {np.sqrt(np.mean(error**2)) * 5:.2f} %")
     move = float(error @ change / (change @ change))
     mu = mu - move
@@ -209,7 +209,7 @@ for step in range(5):
 
 # %%
 lumped = jnp.asarray(0.20)
-current = jax.jit(lambda m: steady_batch(params.replace(robot, {friction: m}), rows.command()).reading.total_current)
+current = jax.jit(lambda m: steady_batch(params.replace(robot, {friction: m}), rows.conditions(robot)).total_current)
 for _ in range(5):
     error, change = (np.asarray(current(lumped)) - target) / sd, np.asarray(jax.jacfwd(current)(lumped)) / sd
     lumped = lumped - float(error @ change / (change @ change))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from calibration.data.errors import InputError
-from mmrjax import __version__
+from mmrjax import __version__, fidelities
 
 INTERRUPTED = 130
 
@@ -23,10 +24,21 @@ app = typer.Typer(
     "converge (their status says why); 4 bad data; 130 interrupted (the same command takes it up again).",
 )  # fmt: skip
 
-_Model = Annotated[str | None, typer.Option("--model", help="Fidelity: steady, drive or track.  \\[default: steady]")]
+
+def _defaults(option: str, shown: float = math.inf) -> str:
+    """Default of a fidelity's option by fidelity, as a help text has it; of `simulate` at most `shown`."""
+    found = {name: o.default for name, facts in fidelities.TABLE.items() for o in facts.options if o.name == option}
+    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in found.items()}
+    texts = [f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else list(capped.values())
+    return f"\\[default: {'; '.join(texts)}]"
+
+
+_Model = Annotated[
+    str | None,
+    typer.Option("--model", help=f"Fidelity: {', '.join(fidelities.NAMES)}.  \\[default: {fidelities.NAMES[0]}]"),
+]
 _Duration = Annotated[
-    float | None,
-    typer.Option("--duration", help="Length of a run (s).  \\[default: drive 30, simulate 5; track 1.5]"),
+    float | None, typer.Option("--duration", help=f"Length of a run (s).  {_defaults('duration', shown=5.0)}")
 ]
 _Robot = Annotated[
     str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  \\[default: nominal]")
@@ -51,9 +63,7 @@ _Mass = Annotated[
 _Surface = Annotated[
     str, typer.Option(help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood.")
 ]
-_Step = Annotated[
-    float | None, typer.Option("--step", help="Integration step of the track model (s).  \\[default: 1e-4]")
-]
+_Step = Annotated[float | None, typer.Option("--step", help=f"Integration step (s).  {_defaults('step')}")]
 _Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
 _Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
 _Report = Annotated[bool | None, typer.Option("--report/--no-report", help="Write report.html.  \\[default: report]")]
@@ -61,9 +71,17 @@ _Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from th
 _Discharge = Annotated[
     float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  \\[default: 0]")
 ]
+_NoCache = Annotated[
+    bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
+]
 _Chunk = Annotated[
     int | None,
-    typer.Option("--chunk", help="Runs in one vmapped call.  \\[default: steady 16384, drive 4096, track 512]"),
+    typer.Option(
+        "--chunk",
+        help="Runs in one vmapped call.  \\[default: "
+        + ", ".join(f"{name} {facts.chunk}" for name, facts in fidelities.TABLE.items())
+        + "]",
+    ),
 ]
 
 
@@ -96,6 +114,7 @@ def simulate(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Simulate one run, or the runs of a CSV file, and write a run folder.
 
@@ -108,7 +127,7 @@ def simulate(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
         discharge_mAh=discharge, report=report,
     )  # fmt: skip
-    resolved = _prepared(config.resolve(config.Simulate, None, options))
+    resolved = _prepared(config.resolve(config.Simulate, None, options), no_cache)
     from sweeps import simulate as room
 
     cells = _cells(configuration, voltage, slope, payload, mass, surface)
@@ -146,8 +165,9 @@ def sweep(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
-    """Simulate every combination of a grid in vmapped batches: Table 8 in both configurations by default.
+    """Simulate every combination of a grid in vmapped batches: Table 8 in every configuration by default.
 
     An axis is 0,5,10 or first:last:step as 0:20:0.5. An interrupted sweep goes on with the same command
     and the same --out.
@@ -172,7 +192,7 @@ def sweep(
         "slopes_deg": config.axis("--slopes", slopes),
         "surface": surface,
     }
-    resolved = _prepared(config.resolve(config.Sweep, config_file, options))
+    resolved = _prepared(config.resolve(config.Sweep, config_file, options), no_cache)
     from sweeps import sweep as room
 
     return room.sweep(resolved, out, force)
@@ -195,6 +215,7 @@ def compare(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
     from sweeps import config
@@ -202,10 +223,35 @@ def compare(
     options = _options(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
     )
-    resolved = _prepared(config.resolve(config.Compare, None, options))
+    resolved = _prepared(config.resolve(config.Compare, None, options), no_cache)
     from sweeps import compare as room
 
     return room.compare(resolved, data, own_mass, out, force)
+
+
+@app.command(epilog="Example: mmrjax reproduce --robot found/robot.toml --model track")
+def reproduce(
+    model: Annotated[
+        str | None, typer.Option("--model", help="steady, or track for Figs. 23-27 too.  \\[default: steady]")
+    ] = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    out: _Out = None,
+    force: _Force = False,
+    no_cache: _NoCache = False,
+) -> int:
+    """Remake the paper's figures and tables with a robot: the bench's rows, Figs. 5a-29, row by row.
+
+    With --model track the running gear is resolved: Figs. 23-27, how the weight divides.
+    """
+    from sweeps import config
+
+    options = _options(model=model, robot=robot, set=set_, effects=effects)
+    resolved = _prepared(config.resolve(config.Reproduce, None, options), no_cache)
+    from sweeps import reproduce as room
+
+    return room.reproduce(resolved, out, force)
 
 
 @app.command(epilog="Example: mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20")
@@ -228,6 +274,7 @@ def render(
     battery: _Battery = None,
     discharge: _Discharge = None,
     force: _Force = False,
+    no_cache: _NoCache = False,
 ) -> int:
     """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
 
@@ -244,7 +291,7 @@ def render(
         battery=battery,
         discharge_mAh=discharge,
     )
-    resolved = _prepared(config.resolve(config.Render, None, options))
+    resolved = _prepared(config.resolve(config.Render, None, options), no_cache)
     from sweeps import render as room
 
     cells = _cells(configuration, voltage, slope, payload, mass, surface)
@@ -289,6 +336,7 @@ def calibrate(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
 
@@ -301,7 +349,7 @@ def calibrate(
         "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
         "noise": noise, "starts": starts, "seed": seed, "profiles": profiles, "hold_out": hold_out,
     }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Calibrate, None, options))
+    resolved = _prepared(config.resolve(config.Calibrate, None, options), no_cache)
     from sweeps import calibrate as room
 
     return room.calibrate(resolved, data, out, force)
@@ -332,6 +380,7 @@ def loop(
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
+    no_cache: _NoCache = False,
 ) -> int:
     """Find what the model lacks: fit it, trace what is left to an effect, add that, report errors before and after.
 
@@ -343,15 +392,16 @@ def loop(
     options = _options(robot=robot, set=set_, effects=effects, report=report) | {
         "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
     }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Loop, None, options))
+    resolved = _prepared(config.resolve(config.Loop, None, options), no_cache)
     from sweeps import loop as room
 
     return room.loop(resolved, data, out, force)
 
 
 @app.command()
-def doctor() -> int:
-    """Check this installation: versions, devices, a solved run against its known answer, a writable folder."""
+def doctor(no_cache: _NoCache = False) -> int:
+    """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""
+    _start_jax(no_cache)
     from sweeps import doctor as room
 
     return room.doctor()
@@ -364,19 +414,30 @@ def _options(**given: Any) -> dict[str, Any]:
     return {**given, "set": config.settings(given["set"]), "effects": tuple(effects) if effects else None}
 
 
-def _prepared(resolved: Any) -> Any:
+def _prepared(resolved: Any, no_cache: bool = False) -> Any:
     """A command's configuration, once the environment is ready for the jax that the command will import.
 
     Runs of the track model have hung for good, one sweep in seven on two cores, with every thread asleep in
     XLA's CPU executor (jax 0.10.2); with this flag none of twelve did (docs/benchmarks.md). Whoever sets
     XLA_FLAGS, be it to nothing, is heeded.
     """
-    if getattr(resolved, "model", None) == "track":
+    if hasattr(resolved, "model") and fidelities.facts(resolved.model).one_thread:
         os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    _start_jax(no_cache)
+    return resolved
+
+
+def _start_jax(no_cache: bool) -> None:
+    """Import jax with double precision, and with the compilation cache unless it is not wanted."""
+    from sweeps import compilation_cache
+
+    if not no_cache:
+        compilation_cache.enable()
     import jax
 
+    if no_cache:
+        jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_enable_x64", True)
-    return resolved
 
 
 def _cells(

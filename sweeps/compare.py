@@ -83,7 +83,7 @@ def missing(table: dict[str, np.ndarray]) -> list[str]:
     lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels.CHANNELS}
     rows = len(table["status"])
     return [
-        f"{column}: {'all readings are missing' if count == rows else f'{count} of {rows} readings are missing'}; they weigh nothing"
+        f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing; they weigh nothing"
         for column, count in lost.items()
         if count
     ]

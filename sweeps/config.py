@@ -1,28 +1,27 @@
-"""What a command is told: options and TOML files, checked into one frozen record, composed of the parts that apply."""
+"""What a command is told: options and TOML files, checked into one frozen record of the parts that apply."""
 
 from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import CONDITIONS
+from mmrjax import fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 
-Model = Literal["steady", "drive", "track"]
-#: Length of a run [s] and runs in one vmapped call, by fidelity, where none is stated.
-DURATION = {"steady": 0.0, "drive": 30.0, "track": 1.5}
-STEP = 1e-4  # of the track model [s], where none is stated
-CHUNK = {"steady": 16_384, "drive": 4_096, "track": 512}
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(gt=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
+#: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
+SHOWN = 5.0
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 
@@ -47,39 +46,62 @@ class RobotPart(Part):
 
 
 class ModelPart(Part):
-    """Which fidelity."""
+    """Which fidelity, one of `mmrjax.fidelities`."""
 
-    model: Model = "steady"
+    model: str = fidelities.NAMES[0]
+
+    @field_validator("model")
+    @classmethod
+    def _known(cls, model: str) -> str:
+        if model not in fidelities.TABLE:
+            raise PydanticCustomError("unknown", f"input should be {_either(map(repr, fidelities.TABLE))}")
+        return model
+
+
+def _either(names: Iterable[str]) -> str:
+    """«a, b or c»."""
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _having(option: str) -> dict[str, fidelities.Option]:
+    """The fidelities that have an option, with their kind of it."""
+    return {name: o for name, facts in fidelities.TABLE.items() for o in facts.options if o.name == option}
+
+
+def _most(option: str) -> float:
+    return max(o.most for o in _having(option).values())
 
 
 class FidelityPart(ModelPart):
-    """Which fidelity simulates, and how.
+    """Which fidelity simulates, and its options.
 
     Attributes:
-        duration_s: length of a run of `drive` or `track` [s]; None takes `DURATION`.
-        step_s: integration step of `track` [s].
+        duration_s: length of a run [s]; step_s: integration step [s]; None takes the fidelity's default.
     """
 
-    duration_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = None
-    step_s: Annotated[float, Field(gt=0, le=0.01, allow_inf_nan=False)] = STEP
+    duration_s: Annotated[float, Field(gt=0, le=_most("duration"), allow_inf_nan=False)] | None = None
+    step_s: Annotated[float, Field(gt=0, le=_most("step"), allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
     def _acts(self) -> Self:
-        if self.duration_s is not None and self.model == "steady":
-            raise PydanticCustomError("idle", "duration_s acts with model drive or track only")
-        if self.step_s != STEP and self.model != "track":
-            raise PydanticCustomError("idle", "step_s acts with model track only")
+        for name in ("duration", "step"):
+            value, having = getattr(self, f"{name}_s"), _having(name)
+            usual = {option.default for option in having.values()}
+            if value is not None and self.model not in having and value not in usual:
+                raise PydanticCustomError("idle", f"{name}_s acts with model {_either(having)} only")
         return self
 
     @property
-    def duration(self) -> float:
-        """Length of a run [s]."""
-        return DURATION[self.model] if self.duration_s is None else self.duration_s
+    def options(self) -> dict[str, float]:
+        """Every option of the fidelity, as stated or by default."""
+        facts = fidelities.facts(self.model)
+        return facts.resolved(**{option.name: getattr(self, f"{option.name}_s") for option in facts.options})
 
     @property
     def runs_at_once(self) -> int:
         """Runs in one vmapped call."""
-        return CHUNK[self.model]
+        return fidelities.facts(self.model).chunk
 
 
 class BatchPart(FidelityPart):
@@ -155,12 +177,15 @@ class OutputPart(Part):
 
 
 class Simulate(RobotPart, FidelityPart, SupplyPart, OutputPart):
-    """A few given runs, with `drive` and `track` from standstill: short enough that the start is seen."""
+    """A few given runs; those over time from standstill."""
 
     @property
-    def duration(self) -> float:
-        """Length of a run [s]."""
-        return min(super().duration, 5.0) if self.duration_s is None else self.duration_s
+    def options(self) -> dict[str, float]:
+        """Every option of the fidelity; a run is short where its length is not stated."""
+        options = super().options
+        if self.duration_s is None and "duration" in options:
+            options["duration"] = min(options["duration"], SHOWN)
+        return options
 
 
 class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, OutputPart):
@@ -172,7 +197,7 @@ class Compare(RobotPart, FidelityPart, OutputPart):
 
 
 class Render(RobotPart, FidelityPart, SupplyPart):
-    """One run of the fidelity that can be drawn."""
+    """One run of the fidelity that pictures are made from."""
 
     model: Literal["track"] = "track"
 
@@ -312,6 +337,8 @@ def as_toml(config: Part) -> str:
     lines = []
     values = config.model_dump()
     table = values.pop("set")
+    if isinstance(config, FidelityPart):
+        values |= {"duration_s": None, "step_s": None} | {f"{name}_s": v for name, v in config.options.items()}
     for key, value in values.items():
         if value is None:  # left to the fidelity or the robot
             continue

@@ -12,13 +12,15 @@ from collections.abc import Callable
 from rich.console import Console
 from rich.table import Table
 
+from sweeps import compilation_cache
 from sweeps.store import PACKAGES
 
 
 def doctor() -> int:
     """Print one line a check; returns 0 when all pass, 1 otherwise."""
     checks: dict[str, Callable[[], str]] = {
-        "Python": _python, "packages": _packages, "devices": _devices, "a solved run": _run,
+        "Python": _python, "packages": _packages, "devices": _devices, "compilation cache": _cache,
+        "a solved run": _run,
         "derivatives": _derivative, "writing here": _folder,
     }  # fmt: skip
     table = Table()
@@ -47,8 +49,11 @@ def _packages() -> str:
 def _devices() -> str:
     import jax
 
-    jax.config.update("jax_enable_x64", True)
     return ", ".join(str(d) for d in jax.devices())
+
+
+def _cache() -> str:
+    return str(compilation_cache.describe())
 
 
 def _run() -> str:
@@ -60,11 +65,12 @@ def _run() -> str:
     from mmrjax.fidelities.steady import steady_batch
 
     robot = nominal.nominal()
-    losses = [p.name for p in params.walk(robot) if "friction_" in p.name or "loss_" in p.name or "rolling" in p.name]
-    ideal = params.replace(robot, {name: jnp.asarray(0.0) for name in [*losses, "6T2A.track.guide_share"]})
+    words = ("friction_", "loss_", "rolling", "guide_share")
+    losses = [p.name for p in params.walk(robot) if any(word in p.name for word in words)]
+    ideal = params.replace(robot, dict.fromkeys(losses, jnp.asarray(0.0)))
     start = time.perf_counter()
     answer = steady_batch(ideal, Conditions(voltage=jnp.array([24.0])))  # type: ignore[arg-type]
-    found, known = float(answer.reading.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
+    found, known = float(answer.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
     if not math.isclose(found, known, rel_tol=1e-9):
         raise ArithmeticError(f"no-load speed {found} rad/s; known {known} rad/s")
     return f"no-load speed {found:.3f} rad/s = 24 V / C_E ({time.perf_counter() - start:.1f} s with compiling)"
@@ -80,7 +86,7 @@ def _derivative() -> str:
     robot, run = nominal.nominal(), Conditions()
 
     def current(friction: jax.Array) -> jax.Array:
-        return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).reading.total_current  # type: ignore[arg-type]
+        return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).total_current  # type: ignore[arg-type]
 
     x, h = robot.motor.friction_coulomb, 1e-6
     exact, central = float(jax.grad(current)(x)), float((current(x + h) - current(x - h)) / (2 * h))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data.runs import CHANNELS
-from calibration.inference.calibrate import Calibration
 from calibration.inference.identifiability import Z95
-from sweeps.figures_style import BLUE, CHANNEL_WORDS, FAINT, INK, ORANGE, VERMILION, figure
+from calibration.inference.result import CalibrationResult
+from mmrjax import channels
+from sweeps.figures_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure
+
+#: Runs of which histories are drawn.
+HISTORIES = 6
 
 
 def short(name: str) -> str:
@@ -19,27 +20,19 @@ def short(name: str) -> str:
     return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")
 
 
-def parameters(found: Calibration) -> Figure:
+def parameters(found: CalibrationResult) -> Figure:
     """Where each parameter lies in prior sds, with its 95 % interval, over the prior's own."""
-    names, profile, coordinates = found.identifiability.names, found.profile, found.problem.coordinates
-    fig, grid = figure(1, 1, 1.1 + 0.32 * len(names))
+    fig, grid = figure(1, 1, 1.1 + 0.32 * len(found.parameters))
     axes = grid[0, 0]
     axes.axvspan(-Z95, Z95, color="#eeeeee", lw=0, zorder=0)
     axes.axvline(0, color=FAINT, lw=0.9)
-    for row, z in enumerate(found.z):
-        sd = found.identifiability.sd[row]
-        low, high = z - Z95 * sd, z + Z95 * sd
-        if profile is not None:
-            low, high = (float(np.interp(v, profile.value[row], profile.z[row])) for v in
-                         (profile.low[row], profile.high[row]))  # fmt: skip
-        held = found.identifiability.held_by_prior[row]
-        colour = FAINT if held else BLUE
-        axes.plot([low, high], [row, row], color=colour, lw=2.4, solid_capstyle="butt")
-        axes.plot(z, row, "o", color=colour, ms=6)
-        value = float(coordinates.value(found.z)[row])
-        words = f"{value:.3g} {coordinates.units[row]}".removesuffix(" -")
+    for row, p in enumerate(found.parameters.values()):
+        colour = FAINT if p.held_by == "prior" else BLUE
+        axes.plot(p.interval_shift, [row, row], color=colour, lw=2.4, solid_capstyle="butt")
+        axes.plot(p.shift, row, "o", color=colour, ms=6)
+        words = f"{p.value:.3g} {p.unit}".removesuffix(" -")
         axes.text(1.01, row, words, transform=axes.get_yaxis_transform(), va="center", fontsize=8.5, color=INK)
-    axes.set_yticks(range(len(names)), [short(n) for n in names])
+    axes.set_yticks(range(len(found.parameters)), [short(n) for n in found.parameters])
     axes.set(xlabel="shift from the prior [prior sds]")
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
@@ -47,26 +40,22 @@ def parameters(found: Calibration) -> Figure:
     return fig
 
 
-def profiles(found: Calibration) -> Figure:
+def profiles(found: CalibrationResult) -> Figure:
     """Profile likelihood of each parameter: rise of the objective over its value, with the 95 % level."""
-    assert found.profile is not None
-    names, profile = found.identifiability.names, found.profile
-    columns = 4
-    rows = -(-len(names) // columns)
-    fig, grid = figure(rows, columns, 2.1 * rows, sharey=True)
-    for k, axes in enumerate(grid.flat):
-        if k >= len(names):
-            axes.set_visible(False)
-            continue
-        near = profile.rise[k] < 12
+    profiled = [(name, p, p.profile) for name, p in found.parameters.items() if p.profile is not None]
+    rows = -(-len(profiled) // 4)
+    fig, grid = figure(rows, 4, 2.1 * rows, sharey=True)
+    for axes in grid.flat[len(profiled) :]:
+        axes.set_visible(False)
+    for axes, (name, p, profile) in zip(grid.flat, profiled, strict=False):
+        near = profile.rise < 12
         axes.axhline(Z95**2, color=ORANGE, lw=1)
-        axes.axvspan(profile.low[k], profile.high[k], color="#e3eef7", lw=0, zorder=0)
-        axes.plot(profile.value[k][near], profile.rise[k][near], "o-", ms=3, color=BLUE)
-        axes.axvline(float(found.problem.coordinates.value(found.z)[k]), color=INK, lw=0.9)
-        prior = float(found.problem.coordinates.value(np.zeros(len(names)))[k])
-        axes.plot(prior, 0.3, "^", color=VERMILION, ms=6, clip_on=False)
-        axes.set_title(short(names[k]), fontsize=9)
-        axes.set_xlabel(f"[{found.problem.coordinates.units[k]}]")
+        axes.axvspan(*p.interval, color="#e3eef7", lw=0, zorder=0)
+        axes.plot(profile.value[near], profile.rise[near], "o-", ms=3, color=BLUE)
+        axes.axvline(p.value, color=INK, lw=0.9)
+        axes.plot(p.prior.median, 0.3, "^", color=VERMILION, ms=6, clip_on=False)
+        axes.set_title(short(name), fontsize=9)
+        axes.set_xlabel(f"[{p.unit}]")
         axes.set_ylim(0, 10)
         axes.locator_params(axis="x", nbins=4)
     for row in grid:
@@ -75,7 +64,7 @@ def profiles(found: Calibration) -> Figure:
     return fig
 
 
-def correlations(found: Calibration) -> Figure:
+def correlations(found: CalibrationResult) -> Figure:
     """Posterior correlation of every pair of parameters, and the singular values."""
     names = [short(n) for n in found.identifiability.names]
     fig, grid = figure(1, 2, 1.6 + 0.36 * len(names), width_ratios=[1.7, 1.0])
@@ -101,23 +90,24 @@ def correlations(found: Calibration) -> Figure:
     return fig
 
 
-def before_after(document: dict[str, Any]) -> Figure:
-    """rms of (35) by channel: before, fitted, and with each kind of block held out."""
-    lines = {"before": document["errors"]["before"]["fitted"], "fitted": document["errors"]["after"]["fitted"]}
-    lines |= {f"held out: {k.replace('_', ' + ')}": v["all"] for k, v in document["held_out_by"].items()}
-    fig, grid = figure(1, 3, 1.1 + 0.36 * len(lines), sharey=True)
-    for axes, channel in zip(grid[0], CHANNELS, strict=True):
+def before_after(found: CalibrationResult) -> Figure:
+    """rms errors by channel: before, fitted, and with each kind of block held out."""
+    lines = {"before": found.errors_before, "fitted": found.errors_after}
+    lines |= {f"held out: {kind.replace('_', ' + ')}": held.errors for kind, held in found.held_out.items()}
+    fig, grid = figure(1, len(channels.CHANNELS), 1.1 + 0.36 * len(lines), sharey=True)
+    for axes, channel in zip(grid[0], channels.CHANNELS, strict=True):
+        most = int(np.isfinite(found.readings[channel.name].measured).sum())
         for row, (words, by) in enumerate(lines.items()):
-            rms, rows = by[channel]["rms_percent"], by[channel]["rows"]
+            errors = by[channel.name]
             colour = FAINT if words == "before" else BLUE if words == "fitted" else ORANGE
-            if rows:
-                axes.barh(row, rms, color=colour, height=0.62)
-                missing = "" if rows == document["rows"] else f" ({rows} of {document['rows']} rows)"
-                axes.text(rms, row, f" {rms:.1f}{missing}", va="center", fontsize=8.5)
+            if errors.rows:
+                axes.barh(row, errors.rms_percent, color=colour, height=0.62)
+                missing = "" if errors.rows == most else f" ({errors.rows} of {most} rows)"
+                axes.text(errors.rms_percent, row, f" {errors.rms_percent:.1f}{missing}", va="center", fontsize=8.5)
             else:
-                axes.text(0, row, " no row reached", va="center", fontsize=8.5)
-        axes.set_title(CHANNEL_WORDS[channel][0])
-        axes.set_xlabel("rms error (35) [%]")
+                axes.text(0, row, " no row reached" if most else " no readings", va="center", fontsize=8.5)
+        axes.set_title(channel.label)
+        axes.set_xlabel("rms error [%]")
         axes.margins(x=0.55)
         axes.grid(axis="y", visible=False)
     grid[0, 0].set_yticks(range(len(lines)), list(lines))
@@ -125,17 +115,16 @@ def before_after(document: dict[str, Any]) -> Figure:
     return fig
 
 
-def histories(table: dict[str, np.ndarray], columns: dict[str, str]) -> Figure:
+def histories(table: dict[str, np.ndarray]) -> Figure:
     """Time histories: measured dots and the fitted line, a row of panels for each run (six at most)."""
-    names = list(dict.fromkeys(table["run_id"]))[:6] if "run_id" in table else [None]
-    fig, grid = figure(len(names), len(columns), 2.2 * len(names))
+    names = list(dict.fromkeys(table["run_id"]))[:HISTORIES] if "run_id" in table else [None]
+    fig, grid = figure(len(names), len(channels.CHANNELS), 2.2 * len(names))
     for row, name in zip(grid, names, strict=True):
         pick = np.ones(len(table["time_s"]), bool) if name is None else table["run_id"] == name
         order = np.flatnonzero(pick)[np.argsort(table["time_s"][pick])]
-        for axes, (channel, column) in zip(row, columns.items(), strict=True):
-            axes.plot(table["time_s"][order], table[column][order], "o", ms=3, color=INK)
-            axes.plot(table["time_s"][order], table[f"after_{column}"][order], color=BLUE)
-            words, unit = CHANNEL_WORDS[channel]
-            axes.set(xlabel="time [s]", ylabel=f"{words} [{unit}]")
+        for axes, channel in zip(row, channels.CHANNELS, strict=True):
+            axes.plot(table["time_s"][order], table[channel.column][order], "o", ms=3, color=INK)
+            axes.plot(table["time_s"][order], table[f"after_{channel.column}"][order], color=BLUE)
+            axes.set(xlabel="time [s]", ylabel=axis_label(channel))
         row[0].set_title(name or "the run")
     return fig

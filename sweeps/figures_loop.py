@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.data.runs import CHANNELS, MM, RPM
-from calibration.discovery.discrepancy import Discrepancy
-from calibration.discovery.loop import Finding, Loop
-from sweeps.figures_calibration import short
+from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.inference.details import TimeStatistics
+from mmrjax import channels
+from mmrjax.channels import MM, RPM
 from sweeps.figures_style import (
     BLUE,
-    CHANNEL_WORDS,
-    CONFIGURATION,
     FAINT,
     GREEN,
     INK,
     ORANGE,
     SKY,
+    colours_of,
     figure,
     note,
+    short,
 )
 
 #: Effects on the ladder and on the map of look-alikes.
@@ -36,13 +34,13 @@ DEFECT_WORDS = {
 def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
     order = np.lexsort((table["payload_kg"], table["slope_deg"], table["supply_voltage_V"], table["configuration"]))
-    fig, grid = figure(3, 1, 5.4, sharex=True)
+    fig, grid = figure(len(channels.CHANNELS), 1, 1.8 * len(channels.CHANNELS), sharex=True)
     groups = [f"{table['configuration'][k]}, {table['supply_voltage_V'][k]:g} V" for k in order]
     edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
     x = np.arange(len(order))
-    for axes, channel in zip(grid[:, 0], CHANNELS, strict=True):
-        before = table[f"residual_before_{channel}_sigma"][order]
-        after = table[f"residual_after_{channel}_sigma"][order]
+    for axes, channel in zip(grid[:, 0], channels.CHANNELS, strict=True):
+        before = table[f"residual_before_{channel.name}_sigma"][order]
+        after = table[f"residual_after_{channel.name}_sigma"][order]
         axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
         axes.axhline(0, color=FAINT, lw=0.8)
         if verdict == "none":
@@ -52,7 +50,7 @@ def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
             axes.plot(x, after, "o", ms=4, color=BLUE, label="after: with what was found")
         for edge in edges:
             axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
-        axes.set_ylabel(f"{CHANNEL_WORDS[channel][0]} [σ]")
+        axes.set_ylabel(f"{channel.label} [σ]")
     grid[0, 0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
     starts = [0, *edges]
     grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)],
@@ -70,24 +68,25 @@ def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
     """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
     running mean as a line."""
     names = list(dict.fromkeys(table.get("run_id", np.zeros(len(table["row"]), str))))[:RUNS_SHOWN]
-    fig, grid = figure(3, len(names), 5.4, sharex="col", sharey="row")
+    count = len(channels.CHANNELS)
+    fig, grid = figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
     whens = [("before", ORANGE)] if verdict != "none" else []
     whens += [("after", BLUE)]
     for column, name in enumerate(names):
         mine = np.flatnonzero(table["run_id"] == name) if "run_id" in table else np.arange(len(table["row"]))
         mine = mine[np.argsort(table["time_s"][mine])]
-        for axes, channel in zip(grid[:, column], CHANNELS, strict=True):
+        for axes, channel in zip(grid[:, column], channels.CHANNELS, strict=True):
             axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
             axes.axhline(0, color=FAINT, lw=0.8)
             for when, colour in whens:
-                y = table[f"residual_{when}_{channel}_sigma"][mine]
+                y = table[f"residual_{when}_{channel.name}_sigma"][mine]
                 axes.plot(table["time_s"][mine], y, ".", ms=3, color=colour, alpha=0.35)
                 if len(y) >= AVERAGED:
                     smooth = np.convolve(y, np.ones(AVERAGED) / AVERAGED, "valid")
                     edge = AVERAGED // 2
                     axes.plot(table["time_s"][mine][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
             if column == 0:
-                axes.set_ylabel(f"{CHANNEL_WORDS[channel][0]} [σ]")
+                axes.set_ylabel(f"{channel.label} [σ]")
         first = mine[0]
         grid[0, column].set_title(
             f"{name}\n{table['configuration'][first]} {table['supply_voltage_V'][first]:g} V "
@@ -99,31 +98,28 @@ def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
     return fig
 
 
-def series(document: dict[str, Any]) -> Figure:
+def time_statistics(detail: TimeStatistics, verdict: str) -> Figure:
     """What only histories tell: memory of the residual, waves in shaft angle, drift in time."""
-    told = document["series"]
-    whens = [("before", ORANGE), ("after", BLUE)] if document["verdict"] != "none" else [("after", BLUE)]
-    fig, grid = figure(1, 4, 2.9, width_ratios=[1, 1, 1, 1.5])
-    samples = told["samples"]
-    for axes, channel in zip(grid[0, :3], CHANNELS, strict=True):
-        lags = np.arange(1, told["before"]["memory"]["lags"] + 1)
-        limit = 2 / np.sqrt(samples)
+    sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)]
+    sides = sides if verdict != "none" else sides[1:]
+    count = len(channels.CHANNELS)
+    fig, grid = figure(1, count + 1, 2.9, width_ratios=[1] * count + [1.5])
+    for axes, channel in zip(grid[0, :count], channels.CHANNELS, strict=True):
+        lags = np.arange(1, detail.before.memory.lags + 1)
+        limit = 2 / np.sqrt(detail.samples)
         axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
         axes.axhline(0, color=FAINT, lw=0.8)
-        for when, colour in whens:
-            axes.plot(
-                lags, told[when]["memory"]["autocorrelation"][channel], "o-", ms=3, lw=1, color=colour, label=when
-            )
-        axes.set_title(CHANNEL_WORDS[channel][0])
+        for when, side, colour in sides:
+            axes.plot(lags, side.memory.autocorrelation[channel.name], "o-", ms=3, lw=1, color=colour, label=when)
+        axes.set_title(channel.label)
         axes.set_xlabel("lag [samples]")
     grid[0, 0].set_ylabel("autocorrelation of the residual")
     grid[0, 0].legend(loc="best")
-    axes = grid[0, 3]
-    words = [o["order"] for o in told["before"]["orders"]]
-    lines = [*(f"{w}" for w in words), "drift in time"]
-    for k, (when, colour) in enumerate(whens):
-        values = [*(o["explained"] for o in told[when]["orders"]), told[when]["drift"]["explained"]]
-        place = np.arange(len(lines)) + (k - (len(whens) - 1) / 2) * 0.36
+    axes = grid[0, count]
+    lines = [*(word for word, _ in detail.before.orders), "drift in time"]
+    for k, (_, side, colour) in enumerate(sides):
+        values = [*(o.explained for o in side.orders.values()), side.drift.explained]
+        place = np.arange(len(lines)) + (k - (len(sides) - 1) / 2) * 0.36
         axes.barh(place, np.sqrt(values), height=0.34, color=colour)
     axes.set_yticks(range(len(lines)), lines, fontsize=8)
     axes.invert_yaxis()
@@ -132,20 +128,20 @@ def series(document: dict[str, Any]) -> Figure:
     return fig
 
 
-def ladder(document: dict[str, Any]) -> Figure:
+def ladder(found: DiscoveryResult) -> Figure:
     """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
-    rungs = document["scores"][:RUNGS]
-    named = {e["name"] for e in document["effects"]}
-    alike = {n for e in document["effects"] for n in e["class"]} - named
+    rungs = found.scores[:RUNGS]
+    named = {e.name for e in found.effects}
+    alike = {n for e in found.effects for n in e.members} - named
     fig, grid = figure(1, 1, 1.1 + 0.24 * len(rungs))
     axes = grid[0, 0]
-    root = [np.sqrt(r["score"]) for r in rungs]
-    colours = [BLUE if r["name"] in named else SKY if r["name"] in alike else "#c9c9c9" for r in rungs]
+    root = [np.sqrt(r.score) for r in rungs]
+    colours = [BLUE if r.name in named else SKY if r.name in alike else "#c9c9c9" for r in rungs]
     axes.barh(range(len(rungs)), root, color=colours, height=0.72)
-    level = document["evidence"]["before"]["single"]["threshold"]
+    level = found.before.kinds["single"].threshold
     axes.axvline(level, color=ORANGE, lw=1.6)
     axes.text(level, -0.9, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
-    axes.set_yticks(range(len(rungs)), [f"{r['name']}  ({r['balance']})" for r in rungs])
+    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="what the effect alone would explain, after the base has been fitted again [σ]")
@@ -153,58 +149,60 @@ def ladder(document: dict[str, Any]) -> Figure:
     return fig
 
 
-def null(found: Finding) -> Figure:
+#: Kinds of evidence that are drawn, and what their statistics are.
+KINDS = {
+    "single": "strongest effect [σ]",
+    "curve": "strongest curve [normal deviate]",
+    "chi2": "χ² of the residuals",
+}
+
+
+def null(before: Evidence) -> Figure:
     """The strongest statistics among bootstrap tables in which nothing is missing, and those of the data."""
-    gate = found.base.gate
-    words = {
-        "single": ("strongest effect [σ]", gate.found.single),
-        "curve": ("strongest curve [normal deviate]", gate.found.curve),
-        "chi2": ("χ² of the residuals", gate.found.chi2),
-    }
-    fig, grid = figure(1, 3, 2.5)
-    for axes, (kind, (text, value)) in zip(grid[0], words.items(), strict=True):
-        axes.hist(getattr(gate.null, kind), bins=30, color="#c9c9c9")
-        axes.axvline(gate.threshold(kind), color=ORANGE, lw=1.6)
-        axes.axvline(float(value), color=BLUE, lw=2)
+    fig, grid = figure(1, len(KINDS), 2.5)
+    for axes, (name, text) in zip(grid[0], KINDS.items(), strict=True):
+        kind = before.kinds[name]
+        axes.hist(kind.null, bins=30, color="#c9c9c9")
+        axes.axvline(kind.threshold, color=ORANGE, lw=1.6)
+        axes.axvline(kind.found, color=BLUE, lw=2)
         axes.set_xlabel(text)
         axes.set_yticks([])
     note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
     return fig
 
 
-def errors(document: dict[str, Any]) -> Figure:
+def errors(found: DiscoveryResult) -> Figure:
     """rms error (35) before and after, fitted and held out by every kind of block."""
-    lines = {"fitted": (document["errors"]["before"]["fitted"], document["errors"]["after"]["fitted"])}
-    lines |= {
-        f"held out by\n{k.replace('_', ', ')}": (v["before"], v["after"]) for k, v in document["held_out_by"].items()
-    }
-    fig, grid = figure(1, 3, 2.9, sharey=False)
-    for axes, channel in zip(grid[0], CHANNELS, strict=True):
+    lines = {"fitted": found.errors}
+    lines |= {f"held out by\n{k.replace('_', ', ')}": v for k, v in found.errors_held_out.items()}
+    fig, grid = figure(1, len(channels.CHANNELS), 2.9, sharey=False)
+    for place, channel in enumerate(channels.CHANNELS):
+        axes = grid[0, place]
         for k, (colour, when) in enumerate(((ORANGE, "before"), (BLUE, "after"))):
-            values = [v[k][channel]["rms_percent"] for v in lines.values()]
+            values = [v[k][channel.name]["rms_percent"] for v in lines.values()]
             axes.barh(np.arange(len(lines)) + 0.4 * k - 0.2, values, height=0.38, color=colour, label=when)
             for row, v in enumerate(values):
                 axes.text(v, row + 0.4 * k - 0.2, f" {v:.2g}", va="center", fontsize=8, color=INK)
-        axes.set_yticks(range(len(lines)), list(lines) if channel == CHANNELS[0] else [""] * len(lines))
+        axes.set_yticks(range(len(lines)), list(lines) if place == 0 else [""] * len(lines))
         axes.invert_yaxis()
         axes.margins(x=0.16)
         axes.grid(axis="y", visible=False)
-        axes.set_title(CHANNEL_WORDS[channel][0])
+        axes.set_title(channel.label)
         axes.set_xlabel("rms error [%]")
     grid[0, -1].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
     return fig
 
 
-def defects(table: dict[str, np.ndarray], document: dict[str, Any]) -> Figure:
+def defects(table: dict[str, np.ndarray], verdict: str) -> Figure:
     """What each equation lacks, run by run, over the variable that shows it, before and after."""
-    whens = ("before",) if document["verdict"] in ("none", "unnamed") else ("before", "after")
+    whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
     fig, grid = figure(len(whens), 3, 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
     for row, when in enumerate(whens):
         for axes, (balance, (words, unit, column, label)) in zip(grid[row], DEFECT_WORDS.items(), strict=True):
             x = table["total_" + column if column == "current_A" else column]
             y = table[f"defect_{when}_{balance}"] * (1e3 if balance == "slip" else 1.0)
             axes.axhline(0, color=FAINT, lw=0.8)
-            for name, colour in CONFIGURATION.items():
+            for name, colour in colours_of(table["configuration"]).items():
                 mine = table["configuration"] == name
                 axes.plot(x[mine], y[mine], "o", ms=4.5, color=colour, label=name)
             axes.set_title(f"{balance}, {when}")
@@ -215,11 +213,10 @@ def defects(table: dict[str, np.ndarray], document: dict[str, Any]) -> Figure:
     return fig
 
 
-def look_alikes(looped: Loop, found: Finding, document: dict[str, Any]) -> Figure:
+def look_alikes(found: DiscoveryResult) -> Figure:
     """|cos| between what the base leaves of two effects' signatures, for the effects that score highest."""
-    names = [s["name"] for s in document["scores"] if s["score"] > 0][:ALIKE]
-    index = [looped.engine.names.index(n) for n in names]
-    cosine = looped.cosines(found.base)[np.ix_(index, index)]
+    names = [s.name for s in found.scores if s.score > 0][:ALIKE]
+    cosine = found.cosine[: len(names), : len(names)]
     fig, grid = figure(1, 1, 5.6)
     axes = grid[0, 0]
     shown = axes.imshow(cosine, cmap="Blues", vmin=0, vmax=1)
@@ -235,17 +232,17 @@ def look_alikes(looped: Loop, found: Finding, document: dict[str, Any]) -> Figur
     return fig
 
 
-def base_shift(document: dict[str, Any]) -> Figure:
+def base_shift(found: DiscoveryResult) -> Figure:
     """Where each base parameter lies in prior sds, before and after the effects were added."""
-    shift = document["base_shift"]
+    shift = found.base_shift
     fig, grid = figure(1, 1, 1.0 + 0.27 * len(shift))
     axes = grid[0, 0]
     axes.axvspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
     axes.axvline(0, color=FAINT, lw=0.9)
     for row, p in enumerate(shift.values()):
-        axes.plot([p["shift_before"], p["shift_after"]], [row, row], color="#c9c9c9", lw=1.6, zorder=1)
-        axes.plot(p["shift_before"], row, "o", ms=6, mfc="white", color=ORANGE)
-        axes.plot(p["shift_after"], row, "o", ms=5, color=BLUE)
+        axes.plot([p.shift_before, p.shift_after], [row, row], color="#c9c9c9", lw=1.6, zorder=1)
+        axes.plot(p.shift_before, row, "o", ms=6, mfc="white", color=ORANGE)
+        axes.plot(p.shift_after, row, "o", ms=5, color=BLUE)
     axes.set_yticks(range(len(shift)), [short(n) for n in shift])
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
@@ -254,7 +251,7 @@ def base_shift(document: dict[str, Any]) -> Figure:
     return fig
 
 
-def curve(table: dict[str, np.ndarray], found: Discrepancy) -> Figure:
+def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy) -> Figure:
     """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
     column, factor, words = VARIABLE_WORDS.get(
         found.variable, ("", 1.0, f"phase of the wave, {found.variable} [rad]")
@@ -262,15 +259,14 @@ def curve(table: dict[str, np.ndarray], found: Discrepancy) -> Figure:
     fig, grid = figure(1, 1, 3.4)
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
-    there = np.isfinite(found.defect.value)
-    if "time_s" not in table:  # one by one the samples of a history say little
-        axes.errorbar(np.asarray(table[column])[there] * factor, found.defect.value[there],
-                      2 * found.defect.sd[there],
+    if found.defect is not None and found.defect_sd is not None:
+        there = np.isfinite(found.defect)
+        axes.errorbar(np.asarray(table[column])[there] * factor, found.defect[there], 2 * found.defect_sd[there],
                       fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip
     scale = SHOWN.get(found.variable, 1.0)
-    low, high = found.curve - 1.96 * found.sd, found.curve + 1.96 * found.sd
-    axes.fill_between(found.grid * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
-    axes.plot(found.grid * scale, found.curve, color=GREEN, label="smooth curve")
+    low, high = found.value - 1.96 * found.sd, found.value + 1.96 * found.sd
+    axes.fill_between(found.at * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
+    axes.plot(found.at * scale, found.value, color=GREEN, label="smooth curve")
     axes.set(xlabel=words, ylabel=f"missing in {found.balance} [{found.unit}]")
     axes.legend(loc="best")
     return fig

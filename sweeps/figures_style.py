@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -14,28 +14,24 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from mmrjax import channels
+
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
 # Okabe and Ito (2008), without the yellow that white paper swallows.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
-CONFIGURATION = {"6T2A": BLUE, "4W2T": VERMILION}
-MODEL = {"nominal": BLUE, "sm1": ORANGE, "sm2": GREEN}
-MODEL_WORDS = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
-CHANNEL_WORDS = {
-    "total_current": ("total current", "A"),
-    "motor_speed": ("motor speed", "rpm"),
-    "speed": ("speed", "mm/s"),
-}
-#: Statuses on the page and in the figures' hatched cells.
-STATUS_WORDS = {
-    "converged": "settled",
-    "stalled": "stalls",
-    "slides": "slides",
-    "not_settled": "not settled",
-    "battery_empty": "battery empty",
-    "failed": "failed",
-    "tips": "tips over",
-}
+_CYCLE = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANGE, "v"), (SKY, "P"))
+
+
+def looks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each configuration, in the order in which they first come."""
+    return {name: _CYCLE[k % len(_CYCLE)] for k, name in enumerate(dict.fromkeys(map(str, names)))}
+
+
+def axis_label(channel: channels.Channel) -> str:
+    """A channel with its unit."""
+    return f"{channel.label} [{channel.unit}]"
+
 
 _RC = {
     "font.family": "DejaVu Sans",  # comes with matplotlib
@@ -108,3 +104,15 @@ def note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: A
     """A remark in a corner of the axes (axes fractions)."""
     keywords = {"fontsize": 8.5, "color": INK, "va": "top", "ha": "left", **keywords}
     axes.text(x, y, words, transform=axes.transAxes, **keywords)
+
+
+def colours_of(configurations: np.ndarray) -> dict[str, str]:
+    """A colour for each configuration of a table, in the order of their first rows."""
+    palette = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+    names = dict.fromkeys(map(str, configurations))
+    return {name: palette[k % len(palette)] for k, name in enumerate(names)}
+
+
+def short(name: str) -> str:
+    """A parameter's name without the words that every such name has."""
+    return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")

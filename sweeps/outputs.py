@@ -43,8 +43,3 @@ def columns(result: Result) -> dict[str, np.ndarray]:
 def readings(reading: dict[str, Any]) -> dict[str, np.ndarray]:
     """What the instruments show, by column, in the columns' units."""
     return {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.CHANNELS}
-
-
-def columns_track(trajectory: Any) -> dict[str, np.ndarray]:
-    """As `columns`, of runs of the track model, with the share of the weight that its guides carry."""
-    return {**columns(trajectory.result), "guide_share": np.asarray(trajectory.steady.guide_share)}

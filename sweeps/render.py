@@ -9,6 +9,7 @@ import jax
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import render as pictures
+from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
 from sweeps import run, words
@@ -23,7 +24,7 @@ def render(
 ) -> int:  # fmt: skip
     """Draw one run (of options, by column) from standstill, as a picture or a film; returns the exit code."""
     try:
-        pictures.instants(file, begin, end, slow, config.duration)
+        pictures.instants(file, begin, end, slow, config.options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
     if file.exists() and not force:
@@ -32,9 +33,10 @@ def render(
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
     robot = load_robot(config)
     conditions = run.commanded(robot, one_run(robot, given), config)
+    run.refuse(robot, conditions, config)
     with progress(1, quiet=False) as advance:
         told = run.shares(advance, 1)
-        trajectory = run.track_runs(robot, conditions, config, rolling=False, progress=told)
+        trajectory = track_batch(robot, conditions, **config.options, progress=told)
         told(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
     aside = file.with_name(f".{file.stem}.writing{file.suffix}")

@@ -2,63 +2,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from calibration.discovery import result as loop_outcome
-from calibration.discovery.discrepancy import Discrepancy
-from calibration.discovery.loop import Finding, Loop
+from calibration.discovery.result import DiscoveryResult
+from calibration.inference.details import Detail, EquationDefects, TimeStatistics
 from sweeps import figures_loop
-from sweeps.report import COLUMNS, Album, render, words_shown
+from sweeps.report import Album, columns, first_rows, render, words_shown
+
+Section = Callable[[Album, DiscoveryResult], None]
 
 
-def write(
-    folder: Path,
-    looped: Loop,
-    found: Finding,
-    seen: loop_outcome.Readings,
-    document: dict[str, Any],
-    curve: Discrepancy | None = None,
-    *,
-    robot_name: str,
-) -> Path:
+def _run_by_run(album: Album, found: DiscoveryResult) -> None:
+    table = found.rows_table()
+    album.add("before_after", lambda: figures_loop.before_after(table, found.verdict))
+    album.add("defects", lambda: figures_loop.defects(table, found.verdict))
+
+
+def _over_time(album: Album, found: DiscoveryResult) -> None:
+    assert isinstance(found.detail, TimeStatistics)
+    detail = found.detail
+    album.add("before_after", lambda: figures_loop.over_time(found.rows_table(), found.verdict))
+    album.add("series", lambda: figures_loop.time_statistics(detail, found.verdict))
+
+
+#: What a page shows of one kind of data, by the type of the result's detail.
+SECTIONS: dict[type[Detail], Section] = {EquationDefects: _run_by_run, TimeStatistics: _over_time}
+
+
+def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
     """Write `report.html` and `figures/` for a pass of the loop.
 
     Args:
         folder: an existing run folder.
-        looped, found, seen, document: the loop, what it found, and what `loop_outcome` made of it.
-        curve: of an `unnamed` discrepancy.
         robot_name: name or file of the robot that it began with.
 
     Returns:
         The path of the page.
     """
-    table = loop_outcome.rows_table(looped, found, seen)
     album = Album(Path(folder))
-    series = looped.engine.series
-    album.add(
-        "before_after",
-        lambda: (figures_loop.over_time if series else figures_loop.before_after)(table, found.verdict),
-    )
-    album.add("errors", lambda: figures_loop.errors(document))
-    if series:
-        album.add("series", lambda: figures_loop.series(document))
-    else:
-        album.add("defects", lambda: figures_loop.defects(table, document))
-    if curve is not None:
-        album.add("curve", lambda: figures_loop.curve(table, curve))
-    album.add("ladder", lambda: figures_loop.ladder(document))
-    album.add("null", lambda: figures_loop.null(found))
-    album.add("look_alikes", lambda: figures_loop.look_alikes(looped, found, document))
-    album.add("base_shift", lambda: figures_loop.base_shift(document))
-    rows = min(len(looped.runs), 200)
+    SECTIONS[type(found.detail)](album, found)
+    album.add("errors", lambda: figures_loop.errors(found))
+    if found.unnamed is not None:
+        curve = found.unnamed
+        album.add("curve", lambda: figures_loop.curve(found.rows_table(), curve))
+    album.add("ladder", lambda: figures_loop.ladder(found))
+    album.add("null", lambda: figures_loop.null(found.before))
+    album.add("look_alikes", lambda: figures_loop.look_alikes(found))
+    album.add("base_shift", lambda: figures_loop.base_shift(found))
     return render(
         Path(folder),
         "loop.html.j2",
         album,
-        title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(looped.runs.source).name}",
-        document=document,
-        rows=[{k: v[i] for k, v in table.items()} for i in range(rows)],
-        columns=COLUMNS,
+        title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
+        document=found.to_json(),
+        rows=first_rows(found.rows_table()),
+        columns=columns(),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
+from mmrjax import fidelities
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.drive import drive_batch
-from mmrjax.fidelities.steady import steady_batch
+from mmrjax.fidelities.base import Run
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
@@ -25,53 +24,33 @@ from sweeps.console import progress as bar
 from sweeps.console import say
 from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder
 
-if TYPE_CHECKING:
-    from mmrjax.fidelities.track import Trajectory
-
 
 def simulate(
     robot: Robot, conditions: Conditions, config: FidelityPart, progress: Callable[[float], None]
 ) -> dict[str, np.ndarray]:
     """One batch in the fidelity that the configuration names: the columns that it adds to its runs.
 
-    `progress` is told by the track model alone, which takes long, the share that is done.
+    `progress` is called with the share that is done, by a fidelity that takes long.
     """
-    if config.model == "steady":
-        return outputs.columns(jax.device_get(steady_batch(robot, conditions)))
-    if config.model == "drive":
-        answer = drive_batch(robot, conditions, jnp.array([0.0, config.duration]))
-        return outputs.columns(jax.device_get(answer.result))
-    run = track_runs(robot, conditions, config, rolling=True, progress=progress)
-    return outputs.columns_track(jax.device_get(run))
+    return ended(fidelities.get(config.model).run(robot, conditions, config.options, progress))
 
 
-def track_runs(
-    robot: Robot, conditions: Conditions, config: FidelityPart, *, rolling: bool, progress: Callable[[float], None]
-) -> Trajectory:
-    """Runs of the track model, from standstill or rolling at the steady fidelity's speed.
+def ended(batch: Run) -> dict[str, np.ndarray]:
+    """The columns of how a batch of runs ended, with those of its fidelity alone."""
+    result, own = jax.device_get((batch.result, batch.columns))
+    return {**outputs.columns(result), **{name: np.asarray(values) for name, values in own.items()}}
+
+
+def refuse(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:
+    """Refuse what some run could not bear, before the first is simulated.
 
     Raises:
-        BadConfiguration: no whole number of steps, or a step too large for the stiffness.
+        BadConfiguration: no whole number of steps, a step too large for the stiffness, and the like.
     """
-    from mmrjax.fidelities import track  # mujoco is imported only where it is used
-
     try:
-        return track.track_batch(
-            robot, conditions, duration=config.duration, step=config.step_s, rolling=rolling, progress=progress
-        )
+        fidelities.get(config.model).check(robot, conditions, config.options)
     except ValueError as error:
-        raise BadConfiguration(f"--model track: {error}") from error
-
-
-def _bear(robot: Robot, runs: Runs, config: FidelityPart) -> None:
-    """Refuse a step that some run of any chunk cannot bear, before the first is simulated."""
-    from mmrjax.fidelities import stability, track
-    from mmrjax.running_gear import RunningGear
-
-    try:
-        stability.refuse(robot, runs.conditions(robot), RunningGear(), config.step_s, track.SAMPLE)
-    except ValueError as error:
-        raise BadConfiguration(f"--model track: {error}") from error
+        raise BadConfiguration(f"--model {config.model}: {error}") from error
 
 
 def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
@@ -81,24 +60,28 @@ def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
 
 
-def evaluate(robot: Robot, runs: Runs, config: FidelityPart, folder: RunFolder) -> dict[str, np.ndarray]:
-    """Simulate every run and return the table of conditions and outcomes, with a bar where it takes long.
+def evaluate(
+    robot: Robot,
+    runs: Runs,
+    config: FidelityPart,
+    folder: RunFolder,
+    advance: Callable[[float], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Simulate every run and return the table of conditions and outcomes.
 
     Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
     The last chunk is filled up with its last run, so that all chunks share one compilation.
+
+    Args:
+        advance: called with the number of runs done since its last call; of a chunk under way, its share. None:
+            a bar on stderr where it takes long.
     """
-    slow = config.model == "track" or len(runs) > config.runs_at_once
-    with bar(len(runs), quiet=not slow) as advance:
-        return {**conditions(robot, runs), **_outcomes(robot, runs, config, folder, advance)}
-
-
-def _outcomes(
-    robot: Robot, runs: Runs, config: FidelityPart, folder: RunFolder, advance: Callable[[float], None]
-) -> dict[str, np.ndarray]:
-    # `advance` is called with the number of runs done since its last call; of a chunk under way, its share.
+    if advance is None:
+        slow = fidelities.facts(config.model).slow or len(runs) > config.runs_at_once
+        with bar(len(runs), quiet=not slow) as advance:
+            return evaluate(robot, runs, config, folder, advance)
     size = min(config.runs_at_once, len(runs))
-    if config.model == "track" and len(runs) > size:
-        _bear(robot, runs, config)
+    refuse(robot, commanded(robot, runs, config), config)
     parts = []
     for first in range(0, len(runs), size):
         rows = np.minimum(np.arange(first, first + size), len(runs) - 1)
@@ -114,7 +97,8 @@ def _outcomes(
         else:
             advance(count)
         parts.append(part)
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    outcome = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return {**conditions(robot, runs), **outcome}
 
 
 def shares(advance: Callable[[float], None], count: int) -> Callable[[float], None]:

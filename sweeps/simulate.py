@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
-from mmrjax import balances, channels
-from mmrjax.fidelities.drive import drive_batch
+from mmrjax import channels, fidelities
+from mmrjax.fidelities.base import History, Run
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
@@ -23,7 +21,6 @@ from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run, read_runs
 from sweeps.store import RunFolder, open_folder
 
-_POINTS = 1001  # of a history
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
 
@@ -36,20 +33,12 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     """
     robot = load_robot(config)
     runs = read_runs(given, robot, measured=False) if isinstance(given, str) else one_run(robot, given)
-    if config.model != "steady" and len(runs) > _HISTORIES:
+    if fidelities.facts(config.model).histories and len(runs) > _HISTORIES:
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
     with open_folder("simulate", config, robot, out, force, runs) as folder:
-        histories = None
-        if config.model == "steady":
-            table = run.evaluate(robot, runs, config, folder)
-        else:
-            with progress(len(runs), quiet=config.model != "track") as advance:
-                told = run.shares(advance, len(runs))
-                outcome, histories = _histories(folder, robot, runs, config, told)
-                table = {**run.conditions(robot, runs), **outcome}
-                told(1.0)
+        table, histories = _simulated(folder, robot, runs, config)
         print_runs({key: value[:_SHOWN] for key, value in table.items()})
         if len(runs) > _SHOWN:
             say(f"... and {len(runs) - _SHOWN} more in runs.csv")
@@ -63,47 +52,49 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         return run.leave(folder, config, robot, table, {"schema": "mmrjax.simulate/1"}, runs)
 
 
-def _histories(
-    folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate,
-    told: Callable[[float], None],
-) -> tuple[dict[str, np.ndarray], Any]:  # fmt: skip
-    """Write the runs over time, of the track model with every reaction; the columns of their ends, and the runs."""
+def _simulated(
+    folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
+) -> tuple[dict[str, np.ndarray], Run | None]:
+    """The table of the runs; where the fidelity keeps them over time these are written, and returned too."""
+    fidelity = fidelities.get(config.model)
+    if fidelity.histories is None:
+        return run.evaluate(robot, runs, config, folder), None
     conditions = run.commanded(robot, runs, config)
-    if config.model == "drive":
-        times = jnp.linspace(0.0, config.duration, _POINTS)
-        trajectory = jax.device_get(drive_batch(robot, conditions, times))
-        folder.write_table("history.csv", history_table(robot, trajectory, trajectory.distance, runs))
-        return outputs.columns(trajectory.result), trajectory
-    trajectory = jax.device_get(run.track_runs(robot, conditions, config, rolling=False, progress=told))
-    folder.write_table("history.csv", history_table(robot, trajectory, trajectory.q[..., 0], runs))
-    folder.write_table("reactions.csv", reactions_table(trajectory, runs))
-    return outputs.columns_track(trajectory), trajectory
+    run.refuse(robot, conditions, config)
+    with progress(len(runs), quiet=not fidelity.facts.slow) as advance:
+        told = run.shares(advance, len(runs))
+        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
+        told(1.0)
+    folder.write_table("history.csv", history_table(robot, batch.history, runs))
+    if batch.history.reactions is not None:
+        folder.write_table("reactions.csv", reactions_table(batch.history, runs))
+    return {**run.conditions(robot, runs), **run.ended(batch)}, batch
 
 
 def _names(runs: records.Runs) -> np.ndarray:
     return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
 
 
-def history_table(robot: Robot, trajectory: Any, distance: np.ndarray, runs: records.Runs) -> dict[str, np.ndarray]:
+def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
-    signals = trajectory.signals
+    signals = history.signals
     return {
-        "run_id": np.repeat(_names(runs), trajectory.time.shape[-1]),
-        "time_s": trajectory.time.ravel(),
-        **{name: np.ravel(value) for name, value in outputs.readings(balances.sensor(robot, signals)).items()},
+        "run_id": np.repeat(_names(runs), history.time.shape[-1]),
+        "time_s": history.time.ravel(),
+        **{name: np.ravel(value) for name, value in outputs.readings(history.reading).items()},
         "theoretical_speed_mm_s": signals.speed_theoretical.ravel() / channels.MM,
-        "distance_m": distance.ravel(),
+        "distance_m": history.distance.ravel(),
         "voltage_V": signals.voltage.ravel(),
         "traction_N": robot.sides * signals.traction.ravel(),
     }
 
 
-def reactions_table(trajectory: Any, runs: records.Runs) -> dict[str, np.ndarray]:
+def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Loads inside one side's running gear over time [N], a row a sample."""
-    loads = trajectory.reactions
+    loads = history.reactions
     table = {
-        "run_id": np.repeat(_names(runs), trajectory.time.shape[-1]),
-        "time_s": trajectory.time.ravel(),
+        "run_id": np.repeat(_names(runs), history.time.shape[-1]),
+        "time_s": history.time.ravel(),
         "guide_N": loads.guided.sum(-1).ravel(),
         "front_N": loads.support[..., 0].ravel(),
         "rear_N": loads.support[..., 1].ravel(),

@@ -4,18 +4,28 @@ import csv
 import dataclasses
 import json
 import math
+import subprocess
+import sys
+from pathlib import Path
 
+import jax.numpy as jnp
+import jsonschema
 import numpy as np
 import pytest
 
+import calibration
 from calibration.data import robot_file
-from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
-from calibration.inference import result as outcome
+from calibration.inference import noise, observers, priors
+from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
-from mmrjax import nominal
+from mmrjax import channels, nominal
 from mmrjax.fidelities.steady import steady_batch
+
+ROOT = Path(__file__).resolve().parents[1]
+SCHEMA = json.loads((ROOT / "docs" / "schemas" / "calibrate.schema.json").read_text(encoding="utf-8"))
+STATED = "current=9%,motor_speed=6%,speed=4%"
 
 
 @pytest.fixture(scope="module")
@@ -30,29 +40,29 @@ def found(measured):
 
 @pytest.fixture(scope="module")
 def document(found):
-    return outcome.document(found)
+    return found.to_json()
 
 
 def changed(runs, **columns):
     return dataclasses.replace(runs, columns={**runs.columns, **columns})
 
 
-def quick(runs, **keywords):
+def quick(runs, robot=None, **keywords):
     """Only what is wrong with the data matters: few starts, no profiles, no blocks."""
-    return calibrate(runs, nominal.nominal(), starts=2, profiles=False, blocks=(), **keywords)
+    return calibrate(runs, robot or nominal.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords})
 
 
 def test_packaged_data_calibrate_and_the_report_says_what_it_must(found, document):
     assert found.converged and document["optimizer"]["agreement"] == "all 64 starts end at the same optimum"
     assert found.starts.infeasible > 0  # nominal adhesion among them
-    assert set(document["parameters"]) == {*found.identifiability.names} and len(document["parameters"]) == 11
+    assert tuple(document["parameters"]) == found.identifiability.names and len(document["parameters"]) == 11
     for entry in document["parameters"].values():
         low, high = entry["interval"]
         assert low <= entry["value"] <= high and entry["sd"] > 0 and entry["unit"]
         assert {"prior", "held_by_prior", "shift_in_prior_sd"} <= set(entry)
     for when in ("before", "after"):
         for what in ("fitted", "held_out"):
-            for channel in records.CHANNELS:
+            for channel in channels.names():
                 assert {"rms_percent", "max_percent", "rms_sigma"} <= set(document["errors"][when][what][channel])
     assert set(document["held_out_by"]) == {"slope", "voltage", "payload", "configuration", "voltage_configuration"}
     text = " ".join(document["notes"])
@@ -69,33 +79,62 @@ def test_packaged_data_figures_are_what_they_were(document):
     assert document["held_out_by"]["slope"]["unreachable_rows"] == [5, 10, 15, 20]
 
 
+def test_document_is_as_its_schema_says(document):
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    jsonschema.validate(document, SCHEMA)
+
+
+def test_schema_can_fail(document):
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**document, "chi2": {}}, SCHEMA)
+
+
 def test_estimated_noise_is_that_of_the_misfit(found):
-    error = (found.after - found.runs.measured()) / found.sd
-    freedom = len(found.runs) - found.identifiability.leverage.sum(0)
-    np.testing.assert_allclose((error**2).sum(0), freedom, rtol=0.01)
+    leverage = dict(zip(channels.names(), found.identifiability.leverage.sum(0), strict=True))
+    for name, readings in found.readings.items():
+        assert np.sum(readings.sigma**2) == pytest.approx(len(found) - leverage[name], rel=0.01)
+    left = 3 * len(found) - sum(leverage.values())
+    assert found.chi_square.degrees_of_freedom == pytest.approx(left)
+    assert found.chi_square.value == pytest.approx(left, rel=0.01) and not found.chi_square.tests_adequacy
 
 
-def test_calibrated_robot_reaches_every_row_and_is_a_robot_file(found, measured, tmp_path):
-    robot_file.write(found.robot, tmp_path / "robot.toml")
-    again = robot_file.read(tmp_path / "robot.toml")
-    answer = steady_batch(again, measured.command())
+def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_path):
+    found.save(tmp_path / "fitted")
+    assert sorted(p.name for p in (tmp_path / "fitted").iterdir()) == ["result.json", "robot.toml", "rows.csv"]
+    jsonschema.validate(json.loads((tmp_path / "fitted" / "result.json").read_text()), SCHEMA)
+    again = robot_file.read(tmp_path / "fitted" / "robot.toml")
+    answer = steady_batch(again, measured.conditions(again))
     np.testing.assert_array_equal(answer.status, 0)
-    np.testing.assert_allclose(answer.reading.speed, found.after[:, 2], rtol=1e-9)
+    np.testing.assert_allclose(answer.speed, found.readings["speed"].after, rtol=1e-9)
+    table = rows_of(tmp_path / "fitted" / "rows.csv")
+    assert len(table) == 20 and table[0]["status"] == "converged"
+    assert float(table[3]["after_speed_mm_s"]) == pytest.approx(1e3 * found.readings["speed"].after[3], rel=1e-8)
 
 
-def test_rows_table_has_every_row(found):
-    table = outcome.rows_table(found)
+def test_result_is_by_name_and_says_all_of_a_parameter(found):
+    p = found.parameters["6T2A.ground.friction.static"]
+    assert p.interval[0] < p.value < p.interval[1] and p.interval_shift[0] < p.shift < p.interval_shift[1]
+    assert p.unit == "-" and p.held_by in ("data", "prior") and p.prior.family == "log-normal"
+    assert p.profile.rise.min() == 0.0 and p.profile.value[p.profile.rise.argmin()] == pytest.approx(p.value)
+    assert found.tied["6T2A.ground.friction.dynamic"].leader == "6T2A.ground.friction.static"
+    assert found.main_blocks is found.held_out["slope"]
+    assert set(found.held_out["slope"].blocks) == {"0.0", "5.0", "10.0", "15.0", "20.0"}
+
+
+def test_rows_have_every_row(found):
+    table = found.rows()
     assert all(len(column) == 20 for column in table.values())
-    np.testing.assert_allclose(table["after_speed_mm_s"], found.after[:, 2] * 1e3)
+    np.testing.assert_allclose(table["after_speed_mm_s"], found.readings["speed"].after * 1e3)
 
 
 def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured):
     with_sd = changed(measured, total_current_sd_A=np.full(20, 0.05), speed_sd_mm_s=np.full(20, 4.0))
-    made = noise.of(with_sd, "current=2%")
+    sizes = observers.kind(with_sd).sizes(with_sd)
+    made = noise.of(with_sd, sizes, "current=2%")
     assert made.source == ("stated", "estimated", "columns") and made.estimated.tolist() == [False, True, False]
     np.testing.assert_allclose(made.sd[:, 0], 0.02 * measured["total_current_A"])
     np.testing.assert_allclose(made.sd[:, 2], 4e-3)
-    assert noise.of(measured, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
+    assert noise.of(measured, sizes, "motor_speed=30rpm").sd[0, 1] == pytest.approx(math.pi)
 
 
 @pytest.mark.parametrize(
@@ -126,11 +165,11 @@ def test_too_few_rows_are_refused(measured):
 def test_a_configuration_without_rows_is_refused_where_named_and_left_out_where_not(measured):
     tracked = measured.where(measured["configuration"] == "6T2A")
     with pytest.raises(
-        BadConfiguration, match=r"--free wheeled.mass: measured has no 4W2T rows, so nothing measures it"
+        BadConfiguration, match=r"--free 4W2T.mass: measured has no 4W2T rows, so nothing measures it"
     ):
         quick(tracked, free=["default", "4W2T.mass"])
-    names = quick(tracked).identifiability.names
-    assert names and all(n.startswith("tracked.") for n in names)
+    names = quick(tracked).parameters
+    assert names and all(n.startswith("6T2A.") for n in names)
 
 
 def test_a_stuck_channel_is_refused(measured):
@@ -185,16 +224,14 @@ def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
     said = " ".join(made.notes)
     assert "motor.inductance: nothing in these data measures it" in said and "start-up current" in said
     assert "6T2A.mass: nothing in these data measures it" in said and "a scale" in said
-    entry = outcome.parameters(made)["motor.inductance"]
-    assert entry["held_by_prior"] and not entry["measured_by_data"]
-    assert entry["variance_ratio"] == pytest.approx(1.0)
+    entry = made.parameters["motor.inductance"]
+    assert entry.held_by == "prior" and not entry.measured_by_data
+    assert entry.variance_ratio == pytest.approx(1.0)
 
 
 def test_infeasible_starts_are_refused_with_the_rows(measured):
     says = r"no start is feasible: measured rows 5, 10 were measured in steady travel, but the model slides there"
-    with pytest.raises(
-        BadConfiguration, match=says + r".*tracked.ground.friction.static = 0.32 .*free it, or raise it"
-    ):
+    with pytest.raises(BadConfiguration, match=says + r".*6T2A.ground.friction.static = 0.32 .*free it, or raise it"):
         quick(measured, fix=["6T2A.ground.friction.static"])
 
 
@@ -204,10 +241,10 @@ def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     rows = measured.where(np.array([1, 3, 4]))
     free = ["6T2A.ground.friction.static", "6T2A.track.guide_share"]
     made = quick(rows, model="drive", free=free, noise="current=10%,motor_speed=6%,speed=4%")
-    assert made.converged and made.starts.agree == 2 and (made.status_after == 0).all()
+    assert made.converged and made.starts.agree == 2 and (made.status == "converged").all()
     assert made.adhesion_used[2] > 0.9
-    for entry in outcome.parameters(made).values():
-        assert abs(entry["with_steady"]["apart_in_sd"]) < 0.01
+    assert all(abs(p.with_steady.apart_in_sd) < 0.01 for p in made.parameters.values())
+    jsonschema.validate(made.to_json(), SCHEMA)
     assert any(note.startswith("rows 3: read from a rolling start; from standstill") for note in made.notes)
 
 
@@ -217,8 +254,6 @@ def rows_of(path):
 
 
 def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypatch, capsys):
-    import sys
-
     from sweeps import cli
 
     monkeypatch.chdir(tmp_path)
@@ -240,10 +275,181 @@ def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypa
     code, out, _ = mmrjax("compare", "measured", "--robot", "c/robot.toml", "--no-report", "--out", "d")
     assert code == 0
     errors = json.loads((tmp_path / "d" / "result.json").read_text())["errors"]["all"]
-    for channel in records.CHANNELS:
+    for channel in channels.names():
         fitted = result["errors"]["after"]["fitted"][channel]["rms_percent"]
         assert errors[channel]["rms_percent"] == pytest.approx(fitted, rel=1e-6)
-    code, _, err = mmrjax("calibrate", "measured", "--free", "tracked.mu")
-    assert code == 2 and "--free tracked.mu: no such parameter" in err
+    code, _, err = mmrjax("calibrate", "measured", "--free", "6T2A.mu")
+    assert code == 2 and "--free 6T2A.mu: no such parameter" in err
     code, _, err = mmrjax("calibrate", "nowhere.csv")
     assert code == 4 and "no such file" in err
+
+
+# --- missing readings -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def gaps(measured):
+    """The table without motor speed, and without two readings of the current."""
+    current = measured["total_current_A"].copy()
+    current[[2, 7]] = np.nan
+    columns = {k: v for k, v in measured.columns.items() if k != "motor_speed_rpm"}
+    return dataclasses.replace(measured, columns={**columns, "total_current_A": current})
+
+
+@pytest.fixture(scope="module")
+def found_with_gaps(gaps):
+    return calibrate(gaps, nominal.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
+
+
+def test_a_table_with_missing_readings_calibrates_and_says_so(found_with_gaps):
+    made = found_with_gaps
+    assert made.converged and (made.status == "converged").all()
+    assert made.notes[:2] == (
+        "total_current_A: 2 of 20 readings are missing (rows 3, 8)",
+        "motor_speed_rpm: no readings; what they would show is not fitted",
+    )
+    assert {c: e.rows for c, e in made.errors_after.items()} == {"total_current": 18, "motor_speed": 0, "speed": 20}
+    assert made.noise["motor_speed"].source == "no readings"
+    assert made.chi_square.degrees_of_freedom == pytest.approx(38 - made.identifiability.leverage.sum())
+    assert made.identifiability.leverage[2, 0] == 0 and not made.identifiability.leverage[:, 1].any()
+    # the share of the speed is that of the misfit of the readings that are there
+    sigma = made.readings["speed"].sigma
+    assert np.sum(sigma**2) == pytest.approx(20 - made.identifiability.leverage[:, 2].sum(), rel=0.01)
+    jsonschema.validate(json.loads(json.dumps(made.to_json())), SCHEMA)
+
+
+def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
+    table = found_with_gaps.rows()
+    assert np.isfinite(table["after_motor_speed_rpm"]).all() and np.isnan(table["motor_speed_rpm"]).all()
+    assert np.isfinite(table["after_total_current_A"][2]) and np.isnan(table["error_total_current_sigma"][2])
+
+
+def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps):
+    robot = nominal.nominal()
+    coordinates = priors.coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
+    sd = noise.of(gaps, observers.kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
+    posed = observers.pose(gaps, robot, coordinates, sd)
+    starts = 0.3 * jnp.ones((5, len(coordinates)))  # as many as `found_with_gaps` compiled
+    lost = jnp.isnan(gaps.measured())
+    assert lost.sum() == 22
+    ends = [
+        fit.searches(posed, starts, dataclasses.replace(posed.data, measured=posed.data.measured + number * lost))[0]
+        for number in (0.0, 1e6)
+    ]
+    np.testing.assert_array_equal(ends[0].z, ends[1].z)
+    np.testing.assert_array_equal(ends[0].sd, ends[1].sd)
+    np.testing.assert_array_equal(ends[0].cost, ends[1].cost)
+
+
+def test_too_few_readings_are_counted(gaps):
+    with pytest.raises(
+        BadData, match=r"5 readings in 3 rows cannot fit 6 parameters; at least 6 readings are needed"
+    ):
+        quick(gaps.where(np.array([1, 2, 3])), noise="current=2%,speed=1%")
+
+
+# --- other robots, another channel ----------------------------------------------------------------------
+
+ROVER = """
+sides = 4
+configurations = ["rover"]
+[battery]
+cells = 4
+[rover]
+like = "4W2T"
+mass = 6.0
+[rover.ground.friction]
+static = 0.6
+"""
+
+
+def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(tmp_path):
+    (tmp_path / "rover.toml").write_text(ROVER)
+    rover = robot_file.read(tmp_path / "rover.toml")
+    conditions = records.Runs(
+        "rover.csv",
+        {
+            "configuration": np.full(8, "rover"), "supply_voltage_V": np.repeat([15.0, 24.0], 4),
+            "total_mass_kg": np.full(8, 6.0), "payload_kg": np.zeros(8), "slope_deg": np.tile([0.0, 4.0, 8.0, 12.0], 2),
+        },
+    )  # fmt: skip
+    creep = "rover.ground.friction.speed_static"
+    truth = robot_file.change(rover, {creep: 0.05}, where="test")
+    shown = steady_batch(truth, conditions.conditions(truth))
+    runs = changed(conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.CHANNELS})
+    made = quick(runs, rover, noise="current=1%,motor_speed=0.5%,speed=1%")
+    assert set(made.parameters) == {f"rover.{name}" for name in priors.FRICTION}
+    low, high = made.parameters[creep].interval
+    assert made.converged and low < 0.05 < high and made.parameters[creep].value > 0.03  # nominal 0.02
+    assert max(e.rms_sigma for e in made.errors_after.values()) < 0.5
+    made.save(tmp_path / "fitted")
+    again = robot_file.read(tmp_path / "fitted" / "robot.toml")
+    assert again.configurations.names == ("rover",) and again.sides == 4 and again.battery.cells == 4
+
+
+def test_a_configuration_that_the_robot_lacks_lists_those_that_it_has(measured, tmp_path):
+    (tmp_path / "rover.toml").write_text(ROVER)
+    says = r"measured row 1?1?, configuration: got (4W2T|6T2A); expected one of these; .*allowed: rover"
+    with pytest.raises(BadData, match=says):
+        quick(measured, robot_file.read(tmp_path / "rover.toml"))
+
+
+def test_former_names_are_taken_and_told(measured):
+    told = []
+    with pytest.raises(BadConfiguration, match=r"--free 6T2A\.mu: no such parameter"):
+        quick(measured, free=["tracked.mu"], fix=["wheeled.*"], tell=told.append)
+    assert told == ["tracked.mu is now 6T2A.mu", "wheeled.* is now 4W2T.*"]
+
+
+FOURTH_CHANNEL = """
+import dataclasses, jax
+jax.config.update("jax_enable_x64", True)
+import numpy as np
+from mmrjax import channels, nominal
+channels.CHANNELS = (*channels.CHANNELS, channels.Channel(
+    name="terminal_voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V", factor=1.0,
+    label="terminal voltage", word="voltage", range=(0.0, 100.0), sd_largest=10.0,
+    read=lambda robot, signals: signals.voltage, sd_share=0.01,
+))
+import calibration
+runs = calibration.read_runs("measured")
+volts = runs["supply_voltage_V"] * 1.001
+runs = dataclasses.replace(runs, columns={**runs.columns, "terminal_voltage_V": volts})
+stated = "current=9%,motor_speed=6%,speed=4%,voltage=0.1%"
+found = calibration.calibrate(runs, nominal.nominal(), starts=2, profiles=False, blocks=(), noise=stated)
+assert found.converged and found.readings["terminal_voltage"].after.shape == (20,)
+np.testing.assert_allclose(found.readings["terminal_voltage"].sigma, -1 / 1.001, rtol=1e-6)
+np.testing.assert_allclose(found.rows()["after_terminal_voltage_V"], runs["supply_voltage_V"])
+assert found.chi_square.degrees_of_freedom > 80 - len(found.parameters)
+assert found.to_json()["errors"]["after"]["fitted"]["terminal_voltage"]["rows"] == 20
+"""
+
+
+def test_a_fourth_channel_is_one_row_of_the_table():
+    done = subprocess.run(
+        [sys.executable, "-c", FOURTH_CHANNEL], cwd=ROOT, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+
+
+# --- from Python ------------------------------------------------------------------------------------------
+
+
+def test_public_names_load_no_jax_until_they_are_asked_for():
+    code = (
+        "import calibration, sys; print('jax' in sys.modules, calibration.read_runs.__name__, len(dir(calibration)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.stdout.startswith("False read"), done.stdout + done.stderr
+    assert calibration.calibrate is calibrate and calibration.read_robot is robot_file.load
+    with pytest.raises(AttributeError, match="no attribute calibrat"):
+        calibration.calibrat  # noqa: B018
+
+
+def test_single_precision_is_refused():
+    code = (
+        "import calibration\n"
+        "calibration.calibrate(calibration.read_runs('measured'), calibration.read_robot('nominal'))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert 'set jax.config.update("jax_enable_x64", True) first' in done.stderr

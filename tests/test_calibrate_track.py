@@ -7,18 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.inference import checks
 from calibration.data import runs as records
+from calibration.inference import checks, observers, priors
+from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
-from calibration.inference import priors
-from calibration.inference import result as outcome
 from calibration.inference.calibrate import calibrate
-from calibration.inference.priors import GUIDE_FRICTION, GUIDE_SHARE, GUIDED
-from mmrjax import nominal, params
+from calibration.inference.priors import GUIDED
+from mmrjax import channels, fidelities, nominal, params
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.signals import CONVERGED
 
+GUIDE_FRICTION, GUIDE_SHARE = f"6T2A.{priors.GUIDE_FRICTION}", f"6T2A.{priors.GUIDE_SHARE}"
 STATIC = "6T2A.ground.friction.static"
 CREEP = "6T2A.ground.friction.speed_static"
 STATED = "current=1%,motor_speed=0.5%,speed=1%"
@@ -37,19 +37,14 @@ def seen(base):
     conditions = records.read("measured").where(np.array([5, 7]))
     robot = params.replace(base, {GUIDE_FRICTION: jnp.asarray(TRUTH), GUIDE_SHARE: jnp.asarray(GUIDED)})
     run = jax.jit(jax.vmap(lambda c: track(robot, c, duration=1.0, rolling=True)))
-    return conditions, run(conditions.command())
+    return conditions, run(conditions.conditions(robot))
 
 
 @pytest.fixture(scope="module")
 def made(seen):
     """The table of those runs."""
     conditions, runs = seen
-    reading = runs.result.reading
-    columns = {
-        "total_current_A": np.asarray(reading.total_current),
-        "motor_speed_rpm": np.asarray(reading.motor_speed) / records.RPM,
-        "speed_mm_s": np.asarray(reading.speed) / records.MM,
-    }
+    columns = {c.column: np.asarray(runs.result.reading[c.name]) / c.factor for c in channels.CHANNELS}
     return dataclasses.replace(conditions, source="made", columns={**conditions.columns, **columns})
 
 
@@ -59,9 +54,9 @@ def test_the_share_of_the_guides_is_what_the_track_model_puts_out(seen):
 
 
 def test_in_track_the_guide_friction_stands_for_the_product(base):
-    names = priors.default_names(["6T2A", "4W2T"], base, "track")
+    names = priors.default_names(["6T2A", "4W2T"], base, computed=fidelities.facts("track").computes)
     assert GUIDE_FRICTION in names and GUIDE_SHARE not in names and len(names) == 11
-    turned, known = priors.guided(base)
+    turned, known = priors.guided(base, "6T2A")
     fields, mean = priors.known(turned), known[GUIDE_FRICTION][0]
     assert float(fields[GUIDE_SHARE].value) == GUIDED
     assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
@@ -80,14 +75,22 @@ def found(base, made, told):
     return calibrate(made, base, model="track", free=free, noise=STATED, starts=2, tell=told.append)
 
 
+@pytest.fixture(scope="module")
+def posed(base, made):
+    """The problem that `found` solves."""
+    guided, known = priors.guided(base, "6T2A")
+    coordinates = priors.coordinates(guided, [GUIDE_FRICTION, STATIC], known)
+    coordinates = dataclasses.replace(coordinates, stated=())
+    sd = noise_room.of(made, observers.kind(made).sizes(made), STATED).sd
+    return observers.pose(made, guided, coordinates, sd, "track")
+
+
 @pytest.mark.slow
-def test_jacobian_through_the_rollout_is_the_central_difference(found):
+def test_jacobian_through_the_rollout_is_the_central_difference(posed):
     at, step = jnp.asarray([0.5, -0.5]), 1e-4
-    _, jacobian, seen = fit.linearised(found.problem, at, found.problem.data)
+    _, jacobian, seen = fit.linearised(posed, at, posed.data)
     assert (np.asarray(seen.status) == CONVERGED).all()
-    moved = [
-        [fit.linearised(found.problem, at + s * e, found.problem.data)[0] for s in (step, -step)] for e in np.eye(2)
-    ]
+    moved = [[fit.linearised(posed, at + s * e, posed.data)[0] for s in (step, -step)] for e in np.eye(2)]
     central = np.stack([(up - down) / (2 * step) for up, down in moved], 1)
     np.testing.assert_allclose(jacobian, central, rtol=0.01, atol=1e-4 * np.abs(central).max())
     assert (np.abs(jacobian[:6]).max(0) > 0.1).all()  # both move the readings
@@ -95,28 +98,28 @@ def test_jacobian_through_the_rollout_is_the_central_difference(found):
 
 @pytest.mark.slow
 def test_track_calibration_recovers_the_guide_friction(found, made, told):
-    document = outcome.document(found)
-    answer = document["parameters"][GUIDE_FRICTION]
-    assert found.converged and found.starts.agree == 2 and (found.status_after == CONVERGED).all()
-    assert answer["value"] == pytest.approx(TRUTH, rel=0.01)
-    assert answer["interval"][0] < TRUTH < answer["interval"][1]
-    assert abs(answer["with_steady"]["apart_in_sd"]) < 1.96
-    assert found.profile is None and not found.held_out  # minutes each, so only when asked for
+    answer = found.parameters[GUIDE_FRICTION]
+    assert found.converged and found.starts.agree == 2 and (found.status == "converged").all()
+    assert answer.value == pytest.approx(TRUTH, rel=0.01)
+    assert answer.interval[0] < TRUTH < answer.interval[1]
+    assert abs(answer.with_steady.apart_in_sd) < 1.96
+    assert "its product with the share of the guides" in answer.prior.source
+    assert not found.profiled and not found.held_out  # minutes each, so only when asked for
     assert any("round 1" in t for t in told) and any("start 2 of 2" in t for t in told)
-    said = " ".join(document["notes"])
+    said = " ".join(found.notes)
     assert "the track model puts 98% of the weight on them" in said and "2 of 2 parameters lie within" in said
 
 
 @pytest.mark.slow
 def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
-    current = steady_batch(found.robot, made.command()).reading.total_current
+    current = steady_batch(found.robot, made.conditions(found.robot)).total_current
     np.testing.assert_allclose(current, made["total_current_A"], rtol=5e-3)
 
 
 @pytest.mark.slow
 def test_a_friction_law_too_stiff_for_the_step_is_said(base, made):
     stiff = params.replace(base, {CREEP: jnp.asarray(0.02)})
-    (said,) = checks.too_stiff(made, stiff)
+    (said,) = fidelities.get("track").cautions(stiff, made.conditions(stiff))
     assert said.startswith("rows 1, 2: the track model's step of 0.0001 s is above the largest stable one")
 
 
@@ -125,13 +128,12 @@ def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady()
     """docs/benchmarks.md, Calibration through the track model; some ten minutes on two cores."""
     runs = records.read("measured")
     found = calibrate(runs, nominal.nominal(), model="track", starts=1)
-    assert found.converged and (found.status_after == CONVERGED).all()
-    steady = outcome.parameters(calibrate(runs, nominal.nominal(), blocks=()))
-    low, high = steady[GUIDE_SHARE]["interval"]
-    here = outcome.parameters(found)
-    for name, entry in here.items():
-        assert abs(entry["with_steady"]["apart_in_sd"]) < 1.96, name
+    assert found.converged and (found.status == "converged").all()
+    steady = calibrate(runs, nominal.nominal(), blocks=()).parameters
+    low, high = steady[GUIDE_SHARE].interval
+    for name, entry in found.parameters.items():
+        assert abs(entry.with_steady.apart_in_sd) < 1.96, name
         if name == GUIDE_FRICTION:
-            assert 0.2 * low < entry["value"] * GUIDED < 0.2 * high
+            assert 0.2 * low < entry.value * GUIDED < 0.2 * high
         else:
-            assert steady[name]["interval"][0] < entry["value"] < steady[name]["interval"][1], name
+            assert steady[name].interval[0] < entry.value < steady[name].interval[1], name

@@ -157,6 +157,10 @@ REFUSED = {
     "no rate": (stating("memory_size = 1.0"), r"cannot be computed \(NotImplementedError: seal_drag has a memory"),
     "source": (GOOD.replace("Source: none, an example.", ""), r"its docstring states no equation with its «Source:»"),
     "no default": (EXPLICIT.replace("        0.0, unit", "        unit"), r"cannot be made without arguments"),
+    "no field": (
+        GOOD.replace("amplitude: Scalar", "size: Scalar"),
+        r"cannot be made without arguments \(.*amplitude.*\); give every field a default",
+    ),
     "present at rest": (EXPLICIT.replace("        0.0, unit", "        0.1, unit"), r"amplitude: got default 0\.1"),
     "no amplitude": (EXPLICIT.replace(", amplitude=True", ""), r"its amplitudes are none; expected one field"),
     "no sd": (EXPLICIT.replace(" sd=0.1", " relative_sd=0.1"), r"amplitude: expected a prior with sd > 0"),

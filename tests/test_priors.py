@@ -71,7 +71,12 @@ def test_relative_prior_is_log_normal_with_that_spread(robot):
 
 def test_friction_pairs_keep_their_ratio_unless_freed(robot):
     z = jnp.ones(1)
-    moved = priors.coordinates(robot, ["6T2A.ground.friction.static"]).robot(robot, z).tracked.ground.friction
+    moved = (
+        priors.coordinates(robot, ["6T2A.ground.friction.static"])
+        .robot(robot, z)
+        .configurations["6T2A"]
+        .ground.friction
+    )
     np.testing.assert_allclose(moved.dynamic / moved.static, 0.8)
     assert moved.static > 0.4
     both = ["6T2A.ground.friction.static", "6T2A.ground.friction.dynamic"]
@@ -86,22 +91,22 @@ def test_choose_takes_default_groups_and_fixes(robot):
     assert priors.choose(robot, default, ["motor.*"], ["motor.inertia"]) == tuple(
         n for n in EVERY if n.startswith("motor.") and n != "motor.inertia"
     )
-    assert priors.choose(robot, default, fix=["tracked.*"]) == tuple(n for n in default if n.startswith("wheeled"))
+    assert priors.choose(robot, default, fix=["6T2A.*"]) == tuple(n for n in default if n.startswith("4W2T."))
 
 
 @pytest.mark.parametrize(
     ("free", "fix", "says"),
     [
-        (["tracked.mu"], [], r"--free tracked.mu: no such parameter; .*allowed: tracked\."),
+        (["6T2A.mu"], [], r"--free 6T2A.mu: no such parameter; .*allowed: 6T2A\."),
         (
             ["rolling_resistance"],
             [],
-            r"allowed: 6T2A.ground.rolling_resistance, wheeled.ground.rolling_resistance",
+            r"allowed: 6T2A.ground.rolling_resistance, 4W2T.ground.rolling_resistance",
         ),
         (["engine.*"], [], r"--free engine.\*: no parameters below it; .*motor.\*"),
         ([], ["gearbox.raito"], r"--fix gearbox.raito: .*did you mean gearbox.ratio\?"),
         (["motor.resistance"], ["motor.resistance"], "--free and --fix both name motor.resistance"),
-        ([], ["tracked.*", "wheeled.*"], "--fix leaves no parameter to fit"),
+        ([], ["6T2A.*", "4W2T.*"], "--fix leaves no parameter to fit"),
     ],
 )
 def test_choose_refuses_with_the_choices(robot, free, fix, says):
@@ -109,10 +114,17 @@ def test_choose_refuses_with_the_choices(robot, free, fix, says):
         priors.choose(robot, priors.default_names(("6T2A", "4W2T"), robot), free, fix)
 
 
+def test_default_set_is_friction_of_what_has_rows_with_the_guides_share_on_tracks(robot):
+    names = priors.default_names(["4W2T"], robot)
+    assert names == tuple(f"4W2T.{n}" for n in priors.FRICTION)
+    assert set(priors.friction(robot, "6T2A")) == {f"6T2A.{n}" for n in (*priors.FRICTION, priors.GUIDE_SHARE)}
+
+
 def test_parse_prior_reads_all_forms():
     name = "6T2A.ground.friction.static"
     assert priors.parse_prior(f"{name}=0.45±0.05") == (name, 0.45, 0.05)
     assert priors.parse_prior(f"{name}=4.5e-1+-0.05") == (name, 0.45, 0.05)
+    assert priors.parse_prior("crawler-2.mass=4±0.1") == ("crawler-2.mass", 4.0, 0.1)
     assert priors.parse_prior(f"{name} =0.45 ± 10%".replace(" =", "="))[2] == pytest.approx(0.045)
 
 

@@ -1,5 +1,6 @@
 """Robots as TOML files: written and read back the same, and refused in one sentence."""
 
+import equinox as eqx
 import pytest
 
 from calibration.data import robot_file
@@ -27,6 +28,106 @@ def test_file_states_only_what_differs(tmp_path):
     assert base.pop("motor.resistance") == 0.611 and robot == base
 
 
+ROVER = """
+sides = 4
+configurations = ["rover", "6T2A"]
+[battery]
+cells = 4
+[rover]
+like = "4W2T"
+mass = 6.0
+[rover.ground.friction]
+static = 0.6
+[effects.churning]
+amplitude = 1e-4
+configurations = ["rover"]
+[effects.bending_loss]
+amplitude = 0.02
+"""
+
+CRAWLER = """
+configurations = ["crawler-2"]
+[crawler-2]
+movers = "tracks"
+mass = 4.0
+radius = 0.03
+inertia = 1e-4
+[crawler-2.track]
+loss_coulomb = 0.1
+loss_viscous = 0.01
+guide_share = 0.2
+[crawler-2.ground]
+rolling_resistance = 0.05
+[crawler-2.ground.friction]
+static = 0.7
+dynamic = 0.5
+"""
+
+
+@pytest.mark.parametrize("text", [ROVER, CRAWLER], ids=["rover", "crawler"])
+def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
+    (tmp_path / "mine.toml").write_text(text)
+    robot = robot_file.read(tmp_path / "mine.toml")
+    robot_file.write(robot, tmp_path / "again.toml")
+    again = robot_file.read(tmp_path / "again.toml")
+    assert eqx.tree_equal(robot, again)
+    assert (again.configurations.names, again.sides, again.battery.cells) == (
+        robot.configurations.names,
+        robot.sides,
+        robot.battery.cells,
+    )
+    assert [(e.name, e.configurations) for e in again.effects] == [(e.name, e.configurations) for e in robot.effects]
+
+
+def test_like_starts_from_that_configuration(tmp_path):
+    (tmp_path / "mine.toml").write_text(ROVER)
+    robot, base = robot_file.read(tmp_path / "mine.toml"), nominal.nominal()
+    assert robot.configurations.names == ("rover", "6T2A") and robot.sides == 4 and robot.battery.cells == 4
+    rover, wheeled = robot.configurations["rover"], base.configurations["4W2T"]
+    assert float(rover.mass) == 6.0 and float(rover.ground.friction.static) == 0.6
+    assert float(rover.on_tracks) == 0.0 and float(rover.radius) == float(wheeled.radius)
+    assert [e.configurations for e in robot.effects] == [("rover",), ()]
+
+
+def test_movers_start_from_the_defaults_of_the_fields(tmp_path):
+    (tmp_path / "mine.toml").write_text(CRAWLER)
+    crawler = robot_file.read(tmp_path / "mine.toml").configurations["crawler-2"]
+    assert float(crawler.on_tracks) == 1.0
+    assert float(crawler.track.guide_friction) == 0.20 and float(crawler.ground.friction.speed_static) == 0.02
+
+
+def test_former_names_load_with_a_note(tmp_path):
+    path, notes = tmp_path / "old.toml", []
+    path.write_text(
+        'schema = "mmrjax.robot/1"\n[tracked]\nmass = 12.5\n[tracked.ground]\nrolling_resistance = 0.05\n'
+        "[wheeled]\nmass = 11\n"
+    )
+    robot = robot_file.load(str(path), notes=notes)
+    assert float(robot.configurations["6T2A"].mass) == 12.5 and float(robot.configurations["4W2T"].mass) == 11.0
+    assert notes == [
+        "tracked.mass is now 6T2A.mass, and so with 1 more of tracked",
+        "wheeled.mass is now 4W2T.mass",
+    ]
+    notes.clear()
+    robot = robot_file.change(robot, {"tracked.mass": 12.0, "sides": 3.0}, where="--set", notes=notes)
+    assert float(robot.configurations["6T2A"].mass) == 12.0 and robot.sides == 3
+    assert notes == ["tracked.mass is now 6T2A.mass"]
+
+
+def test_a_configuration_may_have_a_former_name(tmp_path):
+    (tmp_path / "mine.toml").write_text('configurations = ["tracked"]\n[tracked]\nlike = "6T2A"\nmass = 9\n')
+    notes = []
+    robot = robot_file.read(tmp_path / "mine.toml", notes=notes)
+    assert float(robot.configurations["tracked"].mass) == 9.0 and notes == []
+
+
+def test_set_on_a_configuration_that_is_not_there_lists_those_that_are(robot):
+    with pytest.raises(
+        BadConfiguration, match=r"--set, rover\.mass: no such parameter; the robot has .*, 6T2A, 4W2T"
+    ):
+        robot_file.change(robot, {"rover.mass": 3.0}, where="--set")
+
+
 REFUSED = {
     "misspelt table": (
         "[motr]\nresistance = 1",
@@ -36,7 +137,7 @@ REFUSED = {
         "[motor]\nresistanc = 1",
         r"motor\.resistanc: no such parameter; did you mean motor\.resistance",
     ),
-    "negative mass": ("[tracked]\nmass = -3", r"tracked\.mass: got -3; expected 0\.5 to 200 kg"),
+    "negative mass": ("[6T2A]\nmass = -3", r"6T2A\.mass: got -3; expected 0\.5 to 200 kg"),
     "NaN": ("[motor]\nresistance = nan", r"motor\.resistance: got nan"),
     "word": ("[motor]\nresistance = 'low'", r"motor\.resistance: got 'low'; expected a number"),
     "boolean": ("[motor]\nresistance = true", r"got True; expected a number"),
@@ -44,11 +145,70 @@ REFUSED = {
     "effect is no table": ("effects = 3", r"effects: got 3; expected tables"),
     "effect stands as a number": ("[effects]\nchurning = 3", r"effects\.churning: no such parameter"),
     "unknown base": ("base = 'best'", r"base: got best; allowed: nominal, sm1, sm2"),
-    "other schema": ("schema = 'x/9'", r"schema: got x/9; expected mmrjax\.robot/1"),
+    "other schema": ("schema = 'x/9'", r"schema: got x/9; expected mmrjax\.robot/2"),
+    "unknown configuration": ("[8T]\nmass = 2", r"8T\.mass: no such parameter; the robot has .*gearbox, 6T2A, 4W2T"),
+    "no configurations": ("configurations = []", r"configurations: got \[\]; expected a list of names, at least one"),
+    "configurations as a word": (
+        "configurations = 'rover'",
+        r"configurations: got 'rover'; expected a list of names",
+    ),
+    "a configuration twice": (
+        "configurations = ['6T2A', '6T2A']",
+        r"configurations: 6T2A stands 2 times; name each once",
+    ),
+    "a configuration with a dot": (
+        "configurations = ['a.b']",
+        r"configurations: got 'a\.b'; expected letters, digits",
+    ),
+    "a configuration named as a part": (
+        "configurations = ['motor']",
+        r"motor is the name of something else in a robot",
+    ),
+    "a configuration from nowhere": (
+        "configurations = ['rover']",
+        r'rover: the base has no such configuration; state like = "6T2A" \(one of 6T2A, 4W2T\), or movers',
+    ),
+    "a configuration that is not listed": (
+        "[rover]\nlike = '4W2T'",
+        r"rover: not among the configurations, 6T2A, 4W2T; add it to configurations",
+    ),
+    "a configuration as a number": (
+        "configurations = ['rover']\nrover = 3",
+        r"rover: got 3; expected a table \[rover\]",
+    ),
+    "like nothing": (
+        "configurations = ['rover']\n[rover]\nlike = '4W'",
+        r"rover\.like: got 4W; did you mean 4W2T\? allowed: 6T2A, 4W2T",
+    ),
+    "moves on legs": (
+        "configurations = ['rover']\n[rover]\nmovers = 'legs'",
+        r"rover\.movers: got legs; allowed: tracks, wheels",
+    ),
+    "like and movers": (
+        "configurations = ['rover']\n[rover]\nlike = '4W2T'\nmovers = 'wheels'",
+        r"rover: states both like and movers; state one of them",
+    ),
+    "parameters missing": (
+        "configurations = ['rover']\n[rover]\nmovers = 'wheels'\nmass = 3\n[rover.track]\nguide_share = 0",
+        r"rover: movers without like starts from nothing; track\.loss_coulomb, track\.loss_viscous, "
+        r"ground\.friction\.static, ground\.friction\.dynamic, ground\.rolling_resistance, radius, inertia are missing",
+    ),
+    "no sides": ("sides = 0", r"sides: got 0; expected a whole number, 1 to 12 \(motors driven alike\)"),
+    "half a side": ("sides = 2.5", r"sides: got 2\.5; expected a whole number"),
+    "sides as a boolean": ("sides = true", r"sides: got True; expected a whole number"),
+    "cells as a word": ("[battery]\ncells = 'x'", r"battery\.cells: got 'x'; expected a whole number, 1 to 100"),
+    "old and new name": (
+        "[tracked]\nmass = 12\n[6T2A]\nmass = 11",
+        r"tracked\.mass: its new name 6T2A\.mass is stated too; state it once",
+    ),
+    "old name of what is not there": (
+        "configurations = ['4W2T']\n[tracked]\nmass = 12",
+        r"tracked\.mass: no such parameter; the robot has battery, motor, gearbox, 4W2T",
+    ),
     "not TOML": ("motor = [", r"not a readable TOML file"),
     "friction speeds reversed": (
         "[6T2A.ground.friction]\nspeed_static = 0.5\nspeed_dynamic = 0.1",
-        r"tracked\.ground\.friction\.speed_dynamic: got 0\.1; expected more than speed_static, 0\.5",
+        r"6T2A\.ground\.friction\.speed_dynamic: got 0\.1; expected more than speed_static, 0\.5",
     ),
 }
 

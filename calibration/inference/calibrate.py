@@ -13,7 +13,7 @@ from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
-from calibration.inference import checks, estimates, identifiability, multistart, observers, priors, treatments
+from calibration.inference import checks, estimates, identifiability, multistart, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.multistart import Found
@@ -21,6 +21,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
 from calibration.inference.result import CalibrationResult
+from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 
@@ -40,7 +41,7 @@ def calibrate(
     starts: int | None = None,
     seed: int = 0,
     profiles: bool | None = None,
-    blocks: Sequence[str] | None = None,
+    blocks: Sequence[str] | bool | None = None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> CalibrationResult:
     """Calibrate `robot` to measured runs.
@@ -54,7 +55,8 @@ def calibrate(
         starts: the prior mean and `starts - 1` draws from the prior; for settled rows with a rollout the optimum of
             `steady` and draws from its posterior.
         profiles: whether to profile every parameter.
-        blocks: kinds of blocks to hold out. These three by default as the kind of data and the fidelity say.
+        blocks: kinds of blocks to hold out; True: all that tell something of such data.
+            These three by default as the kind of data and the fidelity say.
         tell: is given a sentence now and then while a long calibration goes on.
 
     Raises:
@@ -67,11 +69,12 @@ def calibrate(
             'calibrate: JAX computes in single precision; set jax.config.update("jax_enable_x64", True) first'
         )
     observe = observers.kind(runs)
-    treatment = treatments.of(observers.fidelity(model))
-    effort = treatment.effort
+    facts = observers.facts(model)
+    effort = facts.effort
     starts = (observe.starts or effort.starts) if starts is None else starts
     profiles = effort.profiles if profiles is None else profiles
-    blocks = (observe.blocks if effort.blocks else ()) if blocks is None else blocks
+    blocks = effort.blocks if blocks is None else blocks
+    kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
 
     former: list[str] = []
     free, fix = (robot_file.current_names(names, robot, former) for names in (free, fix))
@@ -80,9 +83,11 @@ def calibrate(
     for sentence in former:
         tell(sentence)
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-    default = priors.default_names(present, robot, guides_are_output=treatment.guides_are_output)
+    default = priors.default_names(present, robot, computed=facts.computes)
     names = priors.choose(robot, default, free, fix)
-    base, of_product = _guided(robot, present, names, stated) if treatment.guides_are_output else (robot, {})
+    base, of_product = robot, {}
+    if priors.GUIDE_SHARE in facts.computes:
+        base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
     coordinates = dataclasses.replace(coordinates, stated=tuple(stated))
     known = noise_room.of(runs, observe.sizes(runs), noise)
@@ -99,12 +104,12 @@ def calibrate(
         raise checks.infeasible(runs, fitted, status, lost, names)
 
     if posed.observe.long:
-        doing = ["the linear analysis", *["profiles"] * profiles, *["blocks held out"] * bool(blocks)]
+        doing = ["the linear analysis", *["profiles"] * profiles, *["blocks held out"] * bool(kinds)]
         tell(f"optimum found; now {', '.join(doing)}")
     notes += posed.observe.cautions(fitted)
     about = identifiability.analyse(posed, jnp.asarray(z))
     profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about) if profiles else None
-    masks = {kind: holdout.blocks(runs, kind) for kind in blocks}
+    masks = {kind: holdout.blocks(runs, kind) for kind in kinds}
     held = holdout.held_out(posed, jnp.asarray(z), masks)
 
     measured, sd = runs.measured(), np.asarray(posed.data.sd)
@@ -169,7 +174,7 @@ def _searched(
     if not posed.observe.eased:
         return multistart.search_one_by_one(posed, known, points, multistart.first_shares(known), tell), None
     tell("the same with steady first, to begin from its optimum")
-    draws = rng.standard_normal((treatments.of("steady").effort.starts, size))
+    draws = rng.standard_normal((fidelities.facts("steady").effort.starts, size))
     draws[0] = 0.0
     easy = multistart.search(observers.pose(runs, base, posed.coordinates, known.sd), known, draws)
     points[0] = beside = np.asarray(easy.best.z)

@@ -111,16 +111,16 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
     return tuple(f"{configuration}.{name}" for name in names)
 
 
-def default_names(configurations: Iterable[str], robot: Robot, *, guides_are_output: bool = False) -> tuple[str, ...]:
+def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = ()) -> tuple[str, ...]:
     """The default set of free parameters for data of these configurations.
 
     Args:
-        guides_are_output: whether the fidelity puts out the guides' share, as the track model does; the guide
-            friction μ_t then stands in its place.
+        computed: parameters of a configuration that the fidelity puts out, see `fidelities.Facts`; for the guides'
+            share the guide friction μ_t stands then.
     """
     present = set(configurations)
     names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
-    if guides_are_output:
+    if GUIDE_SHARE in computed:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
     return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects))
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
 from mmrjax.fidelities.steady import operating_signals
@@ -31,6 +35,12 @@ from mmrjax.signals import (
 # Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
 # The memories of those effects that have one follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
+
+#: Time after which a run is read as settled [s].
+TIME_SETTLED = 4.0
+#: Instants of a history.
+SAMPLES = 1001
+TIME_INRUSH, SAMPLES_INRUSH = 0.04, 160  # its first instants [s], and how many of them are kept besides
 
 
 class Trajectory(eqx.Module):
@@ -183,3 +193,41 @@ def drive_batch(
 ) -> Trajectory:
     """`drive` over a batch of conditions (leading axis of every field) for one robot, compiled."""
     return jax.vmap(lambda c: drive(robot, c, times, tolerance, max_steps))(conditions)
+
+
+def _settled(robot: Robot, conditions: Conditions) -> Result:
+    # A settled row does not say how its run was started. One from standstill starts by sliding at μ_d, and on
+    # a slope between μ_d and μ_s it never grips, though it was measured there: so from a rolling start, as `track`.
+    times = jnp.asarray([0.0, TIME_SETTLED])
+    return jax.vmap(lambda c: drive(robot, c, times, rolling=True).result)(conditions)
+
+
+def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
+    return Run(drive_batch(robot, conditions, jnp.asarray([0.0, options["duration"]])).result)
+
+
+def _instants(duration: float) -> np.ndarray:
+    """Times of a history [s] from 0 to `duration`, close together while the current rises to its peak."""
+    early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
+    return np.union1d(early, np.linspace(0.0, duration, SAMPLES))
+
+
+def _histories(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> Run:
+    kept = drive_batch(robot, conditions, jnp.asarray(_instants(options["duration"])))
+    return Run(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
+
+
+def _from_standstill(robot: Robot, conditions: Conditions) -> list[str]:
+    run = drive_batch(robot, conditions, jnp.asarray([0.0, TIME_SETTLED]))
+    rows = ", ".join(str(k + 1) for k in np.flatnonzero(np.asarray(run.result.status) != CONVERGED))
+    if not rows:
+        return []
+    return [
+        f"rows {rows}: read from a rolling start; from standstill the calibrated robot does not settle there within "
+        f"{TIME_SETTLED:g} s, since it starts by sliding at μ_d"
+    ]
+
+
+FIDELITY = Fidelity("drive", settled=_settled, run=_run, histories=_histories, cautions=_from_standstill)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import balances
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.robot import Robot
@@ -24,13 +26,13 @@ def _state(unknowns: Float[Array, " 3"], discharge: Float[Array, ""]) -> State:
     return State(_CURRENT * unknowns[0], _SPEED_MOTOR * unknowns[1], _SPEED * unknowns[2], discharge)
 
 
-_settled = eqx.filter_jit(balances.settled)
+_balanced = eqx.filter_jit(balances.settled)
 
 
 @eqx.filter_jit
 def _residual(unknowns: Float[Array, " 3"], run: tuple[Robot, Conditions]) -> Float[Array, " 3"]:
     robot, conditions = run
-    signals, creep = _settled(robot, conditions, _state(unknowns, conditions.discharge))
+    signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge))
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
     torque = jnp.minimum(unknowns[1], -signals.torque_net / _TORQUE)
     return jnp.stack([signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep])
@@ -75,7 +77,7 @@ def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
     _, conditions = _sound(robot, conditions)
-    return _settled(robot, conditions, _root(robot, conditions)[0])[0]
+    return _balanced(robot, conditions, _root(robot, conditions)[0])[0]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -113,7 +115,7 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     """
     sound, conditions = _sound(robot, conditions)
     state, solved = _root(robot, conditions)
-    signals, _ = _settled(robot, conditions, state)
+    signals, _ = _balanced(robot, conditions, state)
     solved = solved & jnp.isfinite(signals.voltage_left + signals.torque_net)
     rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
     stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest
@@ -131,3 +133,14 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
 def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     """`steady` over a batch of conditions (leading axis of every field) for one robot, compiled."""
     return jax.vmap(steady, in_axes=(None, 0))(robot, conditions)
+
+
+def _settled(robot: Robot, conditions: Conditions) -> Result:
+    return jax.vmap(lambda c: operating_point(robot, c)[0])(conditions)
+
+
+def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
+    return Run(steady_batch(robot, conditions))
+
+
+FIDELITY = Fidelity("steady", settled=_settled, run=_run)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import contact, undercarriage
+from mmrjax import contact, fidelities, undercarriage
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
 from mmrjax.fidelities.result import result, withhold
-from mmrjax.fidelities.stability import refuse
+from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.running_gear import RunningGear
@@ -32,10 +34,13 @@ from mmrjax.signals import (
 )
 from mmrjax.undercarriage import Reactions
 
-STEP = 1e-4  # [s]
+STEP = fidelities.facts("track").resolved()["step"]  # [s]
 SAMPLE = 1e-3  # [s]
 WINDOW = 0.4  # share of a run at its end over which it is averaged
 PARTS = 20  # of a run between which progress is told
+#: Length of a run from a rolling start after which it is read as settled [s]. Its last 40 % hold two grouser periods
+#: (34) or more down to 0.29 m/s, and averages over them are within 1e-4 of those of a run of 1.5 s.
+TIME_ROLLED = 0.6
 SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
 
 
@@ -194,6 +199,22 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
     return Trajectory(time[1:], motions.q, motions.v, record.signals, record.reactions, averages, answer)
 
 
+def check(
+    robot: Robot, conditions: Conditions, gear: RunningGear, *, duration: float, step: float, sample: float = SAMPLE
+) -> None:
+    """Refuse what some run of a batch cannot bear.
+
+    Raises:
+        ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
+            ground; the step is above the largest stable one, which the message states.
+    """
+    if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
+        raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
+    if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
+        raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
+    refuse(robot, conditions, gear, step, sample)
+
+
 def track_batch(
     robot: Robot,
     conditions: Conditions,
@@ -203,7 +224,7 @@ def track_batch(
     step: float = STEP,
     sample: float = SAMPLE,
     rolling: bool = False,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress | None = None,
 ) -> Trajectory:
     """`track` over a batch of conditions (leading axis of every field) for one robot, compiled once.
 
@@ -212,15 +233,10 @@ def track_batch(
             interrupted. None makes one call of XLA of it, which cannot.
 
     Raises:
-        ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
-            ground; the step is above the largest stable one, which the message states.
+        ValueError: what `check` refuses.
     """
     gear = RunningGear() if gear is None else gear
-    if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
-        raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
-    if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
-        raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
-    refuse(robot, conditions, gear, step, sample)
+    check(robot, conditions, gear, duration=duration, step=step, sample=sample)
     if progress is not None:
         return _in_parts(robot, conditions, gear, duration, step, sample, rolling, progress)
     return _batch(robot, conditions, gear, duration, step, sample, rolling)
@@ -250,7 +266,7 @@ def _in_parts(
     step: float,
     sample: float,
     rolling: bool,
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> Trajectory:
     # All parts are of one length, for one compilation; what the last one has too many is cut off.
     samples = round(duration / sample)
@@ -297,3 +313,38 @@ def _end(
         return _trajectory(system(robot, conditions, gear, step), start, end, record, sample)
 
     return jax.vmap(one)(conditions, starts, records)
+
+
+def _settled(robot: Robot, conditions: Conditions) -> Result:
+    return jax.vmap(lambda c: track(robot, c, duration=TIME_ROLLED, rolling=True).result)(conditions)
+
+
+def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
+    runs = track_batch(robot, conditions, **options, rolling=True, progress=progress)
+    return Run(runs.result, {"guide_share": runs.steady.guide_share})
+
+
+def _histories(
+    robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
+) -> Run:
+    runs = track_batch(robot, conditions, **options, progress=progress)
+    history = History.of(robot, runs.time, runs.q[..., 0], runs.signals, runs.reactions)
+    return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
+
+
+def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
+    check(robot, conditions, RunningGear(), **options)
+
+
+def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
+    limits = largest_step(robot, conditions)
+    rows = ", ".join(str(k + 1) for k in np.flatnonzero(limits < STEP))
+    if not rows:
+        return []
+    return [
+        f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
+        f"{limits.min():.2g} s, so its readings there are not to be trusted; V_s is too small for μ_s"
+    ]
+
+
+FIDELITY = Fidelity("track", settled=_settled, run=_run, histories=_histories, check=_check, cautions=_too_stiff)

@@ -15,9 +15,10 @@ from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem, data_of
 from mmrjax import fidelities, params
+from mmrjax.fidelities import Facts
 from mmrjax.robot import Robot
 
-__all__ = ["Histories", "Observer", "SettledRuns", "fidelity", "kind", "pose"]
+__all__ = ["Histories", "Observer", "SettledRuns", "facts", "kind", "pose"]
 
 #: In the order in which they are asked whether a table is theirs.
 KINDS: tuple[type[Observer], ...] = (Histories, SettledRuns)
@@ -28,15 +29,15 @@ def kind(runs: Runs) -> type[Observer]:
     return next(k for k in KINDS if k.observes(runs))
 
 
-def fidelity(name: str) -> str:
-    """The name of a fidelity.
+def facts(model: str) -> Facts:
+    """What is known of a fidelity, by its name.
 
     Raises:
         BadConfiguration: no such fidelity.
     """
-    if name not in fidelities.NAMES:
-        raise BadConfiguration(f"--model {name}: no such fidelity; {choices(name, fidelities.NAMES)}")
-    return name
+    if model not in fidelities.TABLE:
+        raise BadConfiguration(f"--model {model}: no such fidelity; {choices(model, fidelities.TABLE)}")
+    return fidelities.facts(model)
 
 
 def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, model: str | None = None) -> Problem:
@@ -50,5 +51,7 @@ def pose(runs: Runs, base: Robot, coordinates: Coordinates, sd: np.ndarray, mode
         BadConfiguration: no such fidelity, or one that cannot simulate data of this kind.
         BadData: a configuration that `base` does not have.
     """
-    observe = kind(runs).of(runs, base, None if model is None else fidelity(model))
+    if model is not None:
+        facts(model)
+    observe = kind(runs).of(runs, base, model)
     return Problem(params.strong(base), coordinates, observe, data_of(runs.measured(), sd, len(coordinates)))

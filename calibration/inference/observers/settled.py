@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadData, number
 from calibration.data.runs import CONDITIONS, Runs
 from calibration.inference import bases as bases_room
-from calibration.inference import treatments
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
@@ -153,7 +152,7 @@ class SettledRuns(Observer):
         return int(included.sum())
 
     def cautions(self, robot: Robot) -> list[str]:
-        return treatments.of(self.fidelity).cautions(robot, self.conditions)
+        return fidelities.get(self.fidelity).cautions(robot, self.conditions)
 
     def linearise(
         self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]

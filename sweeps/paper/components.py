@@ -5,21 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mmrjax.tables import CONFIGURATIONS
-from sweeps import figures_data as data
-from sweeps.figures_style import (
-    CONFIGURATION,
-    FAINT,
-    INK,
-    MODEL,
-    MODEL_WORDS,
-    PURPLE,
-    figure,
-    label_end,
-    note,
-)
+from mmrjax.tables import TRACKED, WHEELED
+from sweeps.figures_style import FAINT, INK, PURPLE, figure, label_end, note
+from sweeps.paper import data
+from sweeps.paper.look import CONFIGURATION, MODEL
+from sweeps.report import words_shown
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -30,25 +23,20 @@ PAPER_IDLE_R2 = 0.995  # of Fig. 18
 _GEAR_SPEEDS = {"15 V": 5000.0, "33 V": 11_500.0}  # motor speeds of the measured rows, about
 
 
-def words_robot(name: str) -> str:
-    """What the report calls a robot: the paper's names for the paper's models, else its own."""
-    return MODEL_WORDS.get(name, name)
-
-
-def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows) -> Figure:
+def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows | None) -> Figure:
     """Fig. 5a: efficiency over output torque; the first robot at two speeds, the others where they differ."""
     fig, grid = figure(1, 1, 3.9)
     axes = grid[0, 0]
     name, robot = next(iter(robots.items()))
     colour = MODEL.get(name, PURPLE)
-    top = 1.25 * max(2.0, _largest_gear_torque(robot, rows))
+    top = 1.25 * max(2.0, 0.0 if rows is None else _largest_gear_torque(robot, rows))
     for (volts, speed), line in zip(_GEAR_SPEEDS.items(), ("-", "--"), strict=True):
         idle = float(robot.gearbox.torque_idle(speed * data.RPM, 1.0))
         inputs = idle + np.geomspace(1e-5, top / float(robot.gearbox.ratio * robot.gearbox.efficiency_load), 300)
         torque, efficiency = data.gear_efficiency(robot, speed, inputs)
         axes.plot(torque, efficiency, line, color=colour)
         at = int(np.searchsorted(torque, 0.18 * top))
-        words = f"{words_robot(name)}, {speed:,.0f} rpm (about {volts})"
+        words = f"{words_shown(name)}, {speed:,.0f} rpm (about {volts})"
         offset = (-4, 6) if volts == "15 V" else (8, -14)
         ha = "right" if volts == "15 V" else "left"
         if volts == "15 V":
@@ -87,7 +75,9 @@ def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows) -> Figure:
                 va="bottom",
             )
             break
-    _mark_rows(axes, robot, rows)
+    if rows is not None:
+        _mark_rows(axes, robot, rows)
+    axes.legend(loc="lower right")
     axes.set(xlabel="torque at the gearbox output, one side [N·m]", ylabel=r"efficiency $\eta_r$ [-]", ylim=(0, 0.9))
     axes.set_xlim(0, top)
     return fig
@@ -96,7 +86,7 @@ def gearbox_efficiency(robots: dict[str, Robot], rows: data.Rows) -> Figure:
 def _gear_torque(robot: Robot, rows: data.Rows) -> np.ndarray:
     table = rows.raised
     wheels = table["theoretical_speed_mm_s"] * data.MM
-    radius = np.array([float(robot.chassis(float(c == CONFIGURATIONS[1])).radius) for c in _kind(rows)])
+    radius = np.array([float(robot.configurations[str(c)].radius) for c in _kind(rows)])
     with np.errstate(divide="ignore", invalid="ignore"):
         return table["power_gear_W"] / robot.sides / (wheels / radius)
 
@@ -110,22 +100,21 @@ def _largest_gear_torque(robot: Robot, rows: data.Rows) -> float:
     return float(np.nanmax(torque)) if np.isfinite(torque).any() else 2.0
 
 
-def _mark_rows(axes, robot: Robot, rows: data.Rows) -> None:  # type: ignore[no-untyped-def]
+def _mark_rows(axes: Axes, robot: Robot, rows: data.Rows) -> None:
     torque = _gear_torque(robot, rows)
     with np.errstate(divide="ignore", invalid="ignore"):
         efficiency = rows.raised["power_gear_W"] / rows.raised["power_motor_W"]
-    for kind in CONFIGURATIONS:
+    for kind in rows.ratio:
         pick = (_kind(rows) == kind) & np.isfinite(torque)
         axes.plot(
             torque[pick],
             efficiency[pick],
-            "o" if kind == "6T2A" else "s",
+            "o" if kind == TRACKED else "s",
             ms=5,
             mec="white",
             color=CONFIGURATION[kind],
-            label=f"the 20 measured conditions, {kind}",
+            label=f"the measured conditions, {kind}",
         )
-    axes.legend(loc="lower right")
 
 
 def battery(robots: dict[str, Robot]) -> Figure:
@@ -191,7 +180,7 @@ def motor_friction(robots: dict[str, Robot]) -> Figure:
         drawn.add(torque.tobytes())
         colour = MODEL.get(name, PURPLE)
         axes.plot(speed, torque, color=colour)
-        words = "SM-1, SM-2 (constant)" if name in ("sm1", "sm2") else words_robot(name)
+        words = "SM-1, SM-2 (constant)" if name in ("sm1", "sm2") else words_shown(name)
         label_end(axes, speed, torque, words, colour)
     first = next(iter(robots.values()))
     rpm, current = SHEET_NO_LOAD
@@ -219,19 +208,21 @@ def idle_track(robots: dict[str, Robot]) -> tuple[Figure, dict[str, float]]:
     name, robot = next(iter(robots.items()))
     speed = np.linspace(0.5, 26.0, 60)
     certainty = {}
-    for kind, words in (("6T2A", "three tracks a side (6T2A)"), ("4W2T", "one track a side (4W2T)")):
+    known = {TRACKED: "three tracks a side", WHEELED: "one track a side"}
+    for kind in data.kinds(robot):
+        words = f"{known[kind]} ({kind})" if kind in known else kind
         current = data.idle_current(robot, kind, speed)
         line, certainty[kind] = data.fit_line(speed, current)
-        colour = CONFIGURATION[kind]
+        colour = CONFIGURATION.get(kind, PURPLE)
         axes.plot(speed[::4], current[::4], "o", color=colour, ms=4)
         axes.plot(speed, line, color=colour)
         label_end(axes, speed, line, f"{words}\nline: R² = {certainty[kind]:.4f}", colour)
         for other in ("sm1", "sm2"):
-            if other in robots and other != name and kind == "6T2A":
+            if other in robots and other != name and kind == TRACKED:
                 flat = data.idle_current(robots[other], kind, speed)
                 axes.plot(speed, flat, color=MODEL[other], lw=1.4)
-                label_end(axes, speed, flat, f"{MODEL_WORDS[other]}, three tracks", MODEL[other])
+                label_end(axes, speed, flat, f"{words_shown(other)}, three tracks", MODEL[other])
     axes.set(xlabel="pulley speed [rad/s]", ylabel="current of one motor [A]", xlim=(0, 26))
     axes.set_ylim(bottom=0)
-    note(axes, f"dots: {words_robot(name)}; lines: straight fits")
+    note(axes, f"dots: {words_shown(name)}; lines: straight fits")
     return fig, certainty

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from calibration.inference import noise
 from calibration.data import runs as records
 from calibration.inference import blocks as holdout
-from calibration.inference import identifiability, priors, problem
+from calibration.inference import identifiability, noise, observers, priors, problem
 from calibration.inference import optimizers as fit
 from calibration.inference.normal_equations import backward, cholesky, forward
 from mmrjax import nominal
@@ -23,7 +22,11 @@ STATED = "current=2%,motor_speed=0.5%,speed=1%"
 
 def pose(runs, robot, names=None, model="steady", stated=STATED):
     names = priors.choose(robot, priors.default_names(runs["configuration"], robot)) if names is None else names
-    return problem.build(runs, robot, priors.coordinates(robot, names), noise.of(runs, stated).sd, model)
+    return observers.pose(runs, robot, priors.coordinates(robot, names), sds(runs, stated), model)
+
+
+def sds(runs, stated):
+    return noise.of(runs, observers.kind(runs).sizes(runs), stated).sd
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +228,7 @@ def test_drive_and_steady_agree_on_settled_rows(measured, truth, posed):
     np.testing.assert_allclose(same.observation(truth).reading, posed.observation(truth).reading, rtol=2e-4)
 
 
-def series_runs(robot, seed=None, noise_share=0.01):
+def history_runs(robot, seed=None, noise_share=0.01):
     """Starts of both configurations as a table of histories, from `drive`."""
     from mmrjax.fidelities.drive import drive_batch
 
@@ -238,7 +241,7 @@ def series_runs(robot, seed=None, noise_share=0.01):
             "slope_deg": np.array([0.0, 10.0, 5.0]),
         },
     )  # fmt: skip
-    run = drive_batch(robot, conditions.command(), jnp.asarray(np.concatenate([[0.0], times])))
+    run = drive_batch(robot, conditions.conditions(robot), jnp.asarray(np.concatenate([[0.0], times])))
     s = jax.tree.map(lambda x: np.asarray(x)[:, 1:], run.signals)
     n = len(times)
     columns = {k: np.repeat(v, n) for k, v in conditions.columns.items()}
@@ -249,7 +252,7 @@ def series_runs(robot, seed=None, noise_share=0.01):
     }  # fmt: skip
     if seed is not None:
         rng = np.random.default_rng(seed)
-        for column in records.MEASURED:
+        for column in records.measured_columns():
             columns[column] = columns[column] * (1 + noise_share * rng.standard_normal(len(columns[column])))
     return records.Runs("made", columns)
 
@@ -261,9 +264,9 @@ def test_histories_calibrate_with_drive():
     names = ("motor.inductance", "motor.inertia", "6T2A.track.loss_coulomb", "6T2A.ground.friction.static")
     c = priors.coordinates(base, names)
     truth = jnp.asarray([1.0, -0.8, 1.2, 1.8])
-    runs = series_runs(c.robot(base, truth), seed=5)
-    assert problem.is_series(runs)
-    posed = problem.build(runs, base, c, noise.of(runs, "current=0.1A,motor_speed=20rpm,speed=5mm/s").sd, "drive")
+    runs = history_runs(c.robot(base, truth), seed=5)
+    assert observers.kind(runs) is observers.Histories
+    posed = observers.pose(runs, base, c, sds(runs, "current=0.1A,motor_speed=20rpm,speed=5mm/s"), "drive")
     best = solve(posed, jnp.zeros(4), posed.data)
     assert best.converged
     about = identifiability.analyse(posed, best.z)
@@ -276,9 +279,9 @@ def test_lbfgs_reaches_the_same_optimum_through_a_rollout():
     """One start-up history of `drive`, one parameter that it tells."""
     base = nominal.nominal()
     c = priors.coordinates(base, ("motor.inertia",))
-    runs = series_runs(c.robot(base, jnp.asarray([1.5])), seed=2)
+    runs = history_runs(c.robot(base, jnp.asarray([1.5])), seed=2)
     runs = runs.where(runs["run_id"] == "a")
-    posed = problem.build(runs, base, c, noise.of(runs, "current=2%,motor_speed=2%,speed=2%").sd, "drive")
+    posed = observers.pose(runs, base, c, sds(runs, "current=2%,motor_speed=2%,speed=2%"), "drive")
     lm = solve(posed, jnp.zeros(1), posed.data)
     other = jax.jit(lambda z: fit.quasi_newton(posed, z, posed.data, max_steps=50))(jnp.zeros(1))
     assert lm.converged and other.converged and abs(lm.z[0]) > 0.5
@@ -286,10 +289,11 @@ def test_lbfgs_reaches_the_same_optimum_through_a_rollout():
     np.testing.assert_allclose(other.z, lm.z, atol=0.05 * float(lm.sd[0]))
 
 
-def test_series_pads_runs_of_different_length():
-    runs = series_runs(nominal.nominal())
+def test_histories_pad_runs_of_different_length():
+    runs = history_runs(nominal.nominal())
     kept = (runs["run_id"] != "b") | (runs["time_s"] < 0.3)
-    seen, whole = (problem.series(r)(nominal.nominal()).reading for r in (runs.where(kept), runs))
+    robot = nominal.nominal()
+    seen, whole = (observers.Histories.of(r, robot)(robot).reading for r in (runs.where(kept), runs))
     np.testing.assert_allclose(seen, whole[kept], rtol=1e-8)
     # against `drive`, which made them: tests/test_histories.py says how close
     np.testing.assert_allclose(seen, runs.measured()[kept], rtol=5e-4, atol=1e-4)

@@ -1,130 +1,34 @@
-"""Figures of runs: from standstill (Figs. 23, 24), over slope (Figs. 28, 29), and where the energy goes."""
+"""Figures of the paper's runs: over slope (Figs. 28, 29), row by row, and where the energy goes."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.inference import errors as residual
-from mmrjax.tables import CONFIGURATIONS
-from sweeps import figures_data as data
-from sweeps.figures import words_robot
+from mmrjax.tables import TRACKED, WHEELED
+from sweeps import words
 from sweeps.figures_style import (
     BLUE,
-    CONFIGURATION,
-    FAINT,
     GREEN,
     INK,
-    MODEL,
     ORANGE,
     PURPLE,
     SKY,
-    STATUS_WORDS,
     VERMILION,
+    axis_label,
     figure,
     label_end,
     note,
 )
+from sweeps.paper import data
+from sweeps.paper.look import CONFIGURATION, MODEL
+from sweeps.report import words_shown
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
-
-_STAGES = (("I", "#fdebd0"), ("II", "#e3eef7"), ("III", "#eaf5ea"))
-STAGE_WORDS = {"I": "starting", "II": "slipping", "III": "uniform"}
-
-
-def _stages(axes: Axes, start: data.Start, scale: float = 1.0) -> None:
-    """Shade the stages behind a plot over time in units of 1/`scale` s and name them at the top."""
-    bounds = scale * np.array([0.0, start.starting, start.slipping, start.time[-1]])
-    left_edge, right_edge = axes.get_xlim()
-    for (stage, shade), left, right in zip(_STAGES, bounds[:-1], bounds[1:], strict=True):
-        right = min(right, right_edge)
-        if right <= left:
-            continue
-        axes.axvspan(left, right, color=shade, zorder=0, lw=0)
-        if (right - left) / (right_edge - left_edge) > 0.15:
-            axes.text(
-                (left + right) / 2,
-                0.985,
-                f"{stage}\n{STAGE_WORDS[stage]}",
-                transform=axes.get_xaxis_transform(),
-                ha="center",
-                va="top",
-                fontsize=8.5,
-                fontweight="bold",
-                color=INK,
-            )
-
-
-def from_standstill(starts: list[data.Start]) -> Figure:
-    """Figs. 23 and 24: total current, V and V_theoretical from standstill, stages shaded."""
-    fig, grid = figure(len(starts), 3, 3.1 * len(starts), width_ratios=[0.85, 1.2, 1.35])
-    for (zoom, current, speed), start in zip(grid, starts, strict=True):
-        colour = CONFIGURATION[start.configuration]
-        peak = int(np.nanargmax(start.current))
-        end = start.time <= 0.04
-        zoom.plot(1e3 * start.time[end], start.current[end], color=colour)
-        zoom.annotate(
-            f"inrush {start.current[peak]:.0f} A\nat {1e3 * start.time[peak]:.1f} ms",
-            (1e3 * start.time[peak], start.current[peak]),
-            xytext=(8, -2),
-            textcoords="offset points",
-            fontsize=8.5,
-            va="top",
-        )
-        zoom.set(xlim=(0, 40), ylim=(0, 1.3 * start.current[peak]), xlabel="time [ms]", ylabel="total current [A]")
-        _stages(zoom, start, 1e3)
-        zoom.set_title(f"{start.configuration}: first 40 ms")
-
-        run = start.current[start.time > start.starting]
-        top = 1.75 * float(np.nanmax(run[len(run) // 20 :]))
-        last = float(start.time[-1])
-        current.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
-        current.set(xlim=(0, last), ylim=(0, top), xlabel="time [s]", ylabel="total current [A]")
-        current.set_title("Fig. 23: total current (inrush cut off)")
-        _stages(current, start)
-        during = (start.time > start.starting) & (start.time < start.slipping)
-        if during.any():
-            middle = float(np.nanmedian(start.current[during]))
-            at = (start.starting + start.slipping) / 2
-            current.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
-        settled = start.current[start.time > 0.9 * last]  # the running gear may ripple: mean, above the crests
-        current.annotate(
-            f"{settled.mean():.2f} A",
-            (0.9 * last, settled.max()),
-            xytext=(0, 5),
-            ha="right",
-            textcoords="offset points",
-        )
-
-        speed.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
-        speed.plot(start.time, start.speed, color=colour)
-        speed.set(xlim=(0, last), ylim=(0, 1.38 * float(np.nanmax(start.theoretical))), xlabel="time [s]")
-        speed.set_ylabel("speed [mm/s]")
-        speed.set_title(r"Fig. 24: $V_x$ and $V_{x\,teor}$")
-        _stages(speed, start)
-        top = float(np.nanmax(start.theoretical))
-        speed.text(0.02 * last, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
-        if 0 < start.settled < last:
-            speed.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
-            words = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
-            speed.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], words, fontsize=8.5)
-        half = int(np.searchsorted(start.speed, 0.5 * start.speed[-1]))
-        speed.annotate(
-            "$V_x$ (robot)",
-            (start.time[min(half, len(start.time) - 1)], 0.5 * start.speed[-1]),
-            xytext=(6, -12),
-            textcoords="offset points",
-            color=colour,
-            fontsize=8.5,
-        )
-        if start.status != "converged":
-            note(speed, f"ends: {STATUS_WORDS[start.status]}", y=0.15, color=VERMILION)
-    return fig
-
 
 _MODES = {1: (BLUE, "o"), 2: (SKY, "v"), 3: (GREEN, "^"), 4: (VERMILION, "s")}
 
@@ -133,9 +37,9 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
     """Fig. 28: total current over slope in four loading modes, with the measured points and R² (A1)."""
     slopes = np.linspace(0, 20, 81)
     lines = data.current_over_slope(robot, rows.ratio, slopes)
-    fig, grid = figure(1, 2, 4.4, sharey=True)
+    fig, grid = figure(1, len(rows.ratio), 4.4, sharey=True)
     certainty = []
-    for axes, kind in zip(grid[0], CONFIGURATIONS, strict=True):
+    for axes, kind in zip(grid[0], rows.ratio, strict=True):
         for mode, (voltage, payload) in data.MODES.items():
             colour, marker = _MODES[mode]
             own, raised = lines[kind, mode]
@@ -187,7 +91,7 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
     slopes = np.array([0.0, 5.0, 10.0, 15.0, 20.0])
     errors: dict[str, Any] = {}
     for name, robot in robots.items():
-        ratio = rows[name].ratio["6T2A"]
+        ratio = rows[name].ratio[TRACKED]
         colour = MODEL.get(name, PURPLE)
         for battery in (False, True):
             if battery and name == "sm1":
@@ -199,16 +103,16 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
                     axes.plot(slopes, error[:, channel], ":" if battery else "-", color=colour, marker="o", ms=4)
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=MODEL.get(n, PURPLE), marker="o", ms=4, label=words_robot(n)) for n in robots]
+    handles = [Line2D([], [], color=MODEL.get(n, PURPLE), marker="o", ms=4, label=words_shown(n)) for n in robots]
     handles.append(Line2D([], [], color=INK, ls=":", marker="o", ms=4, label="on a full battery (mode 2)"))
     paper = residual.relative_error(next(iter(rows.values())).paper, next(iter(rows.values())).measured)
     table = next(iter(rows.values())).conditions
     for mode, voltage in ((1, 15.0), (2, 33.0)):
-        pick = (table["configuration"] == "6T2A") & (table["supply_voltage_V"] == voltage)
+        pick = (table["configuration"] == TRACKED) & (table["supply_voltage_V"] == voltage)
         for row, channel in ((0, 0), (1, 2)):
             grid[row, mode - 1].plot(slopes, paper[pick, channel], "-", color=INK, marker="d", ms=5, lw=1)
     handles.append(Line2D([], [], color=INK, marker="d", ms=5, lw=1, label="the paper's own simulation"))
-    for row, words in ((0, "error in current [%]"), (1, "error in speed [%]")):
+    for row, label in ((0, "error in current [%]"), (1, "error in speed [%]")):
         for mode in (1, 2):
             axes = grid[row, mode - 1]
             axes.axhspan(-7, 7, color="#eef3ee", zorder=0)
@@ -218,7 +122,7 @@ def model_errors(robots: dict[str, Robot], rows: dict[str, data.Rows]) -> tuple[
         high = max(a.get_ylim()[1] for a in grid[row])
         for axes in grid[row]:
             axes.set_ylim(low, high)
-        grid[row, 0].set_ylabel(words)
+        grid[row, 0].set_ylabel(label)
     grid[0, 0].set_title("mode 1: 15 V, 0 kg")
     grid[0, 1].set_title("mode 2: 33 V, 8 kg")
     note(grid[0, 0], "shaded: ±7 %, the paper's claim", x=0.02, y=0.04, va="bottom", fontsize=8, color="#447744")
@@ -242,15 +146,13 @@ _SPLIT_COLOURS = {
 
 def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str, Any]]]:
     """Where the supply's power goes at twelve operating points, in percent, with watts at the end."""
-    asked = [(c, u, p, s) for c in CONFIGURATIONS for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
+    asked = [(c, u, p, s) for c in ratio for u, p in ((15.0, 0.0), (33.0, 8.0)) for s in (0.0, 10.0, 20.0)]
     kind, voltage, payload, slope = (np.array(v) for v in zip(*asked, strict=True))
 
     def at(adhesion: np.ndarray) -> tuple[data.Columns, data.Columns]:
         return data.energy_split(
             robot,
-            data.command(
-                robot, configuration=kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion
-            ),
+            data.conditions(robot, kind, voltage=voltage, payload=payload, slope_deg=slope, adhesion=adhesion),
         )
 
     points, _ = at(np.ones(len(asked)))
@@ -285,8 +187,8 @@ def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str
     for k, (c, u, _p, s) in enumerate(asked):
         labels.append(f"{c}  {u:.0f} V  {_p:.0f} kg  {s:.0f}°" + (" *" if slides[k] else ""))
         alive = np.isfinite(total[k])
-        words = f"{total[k]:.0f} W" if alive else STATUS_WORDS[lifted_points["status"][k]]
-        axes.text(101 if alive else 1, height[k], words, va="center", fontsize=8.5)
+        text = f"{total[k]:.0f} W" if alive else words.short(str(lifted_points["status"][k]))
+        axes.text(101 if alive else 1, height[k], text, va="center", fontsize=8.5)
         table.append(
             {"point": labels[-1], "total": float(total[k])}
             | {item: float(lifted[item][k]) for item in (*data.SPLIT, "other")}
@@ -294,26 +196,26 @@ def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str
     axes.set_yticks(height, labels, fontsize=8.5)
     axes.invert_yaxis()
     axes.grid(False)
-    words = "\n* slides on its own adhesion; shown with adhesion raised" if slides.any() else ""
-    axes.set(xlabel=f"share of the power taken from the supply [%]{words}", xlim=(0, 108), xticks=range(0, 101, 20))
+    remark = "\n* slides on its own adhesion; shown with adhesion raised" if slides.any() else ""
+    axes.set(xlabel=f"share of the power taken from the supply [%]{remark}", xlim=(0, 108), xticks=range(0, 101, 20))
     fig.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=8)
     return fig, table
 
 
 def row_parity(rows: data.Rows, name: str) -> Figure:
-    """Simulated over measured for the 20 rows, all three channels, adhesion raised, both masses for 4W2T."""
-    fig, grid = figure(1, 3, 3.7)
-    words = ("total current [A]", "motor speed [rpm]", "speed [mm/s]")
+    """Simulated over measured for the rows, every channel, adhesion raised, both masses for 4W2T."""
+    shown = data.channels_of_paper()
+    fig, grid = figure(1, len(shown), 3.7)
     kind = rows.conditions["configuration"]
     raised, weighed = data.stacked(rows.raised), data.stacked(rows.weighed)
-    moved = (kind == "4W2T") & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
+    moved = (kind == WHEELED) & (np.abs(rows.raised["total_mass_kg"] - rows.weighed["total_mass_kg"]) > 0.05)
     slides = rows.plain["status"] == "slides"
-    for k, axes in enumerate(grid[0]):
+    for k, (axes, channel) in enumerate(zip(grid[0], shown, strict=True)):
         measured = rows.measured[:, k]
         span = np.array([0.0, 1.1 * max(measured.max(), np.nanmax(raised[:, k], initial=0))])
         axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
         axes.plot(span, span, color="#666666", lw=0.9)
-        for c in CONFIGURATIONS:
+        for c in rows.ratio:
             for pick, face, label in (
                 ((kind == c) & ~slides, CONFIGURATION[c], c),
                 ((kind == c) & slides, "white", f"{c}, adhesion raised"),
@@ -321,7 +223,7 @@ def row_parity(rows: data.Rows, name: str) -> Figure:
                 axes.plot(
                     measured[pick],
                     raised[pick, k],
-                    "o" if c == "6T2A" else "s",
+                    "o" if c == TRACKED else "s",
                     color=CONFIGURATION[c],
                     mfc=face,
                     ms=6,
@@ -338,10 +240,10 @@ def row_parity(rows: data.Rows, name: str) -> Figure:
                 mew=1.4,
                 label="4W2T with the robot's own mass",
             )
-        axes.set(xlabel=f"measured {words[k]}", ylabel=f"simulated {words[k]}")
+        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
         axes.set_xlim(*span)
         axes.set_ylim(*span)
         axes.locator_params(nbins=5)
-    note(grid[0, 0], f"{words_robot(name)}; band ±5 %", fontsize=8.5)
+    note(grid[0, 0], f"{words_shown(name)}; band ±5 %", fontsize=8.5)
     fig.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
     return fig

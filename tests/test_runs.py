@@ -5,6 +5,7 @@ import pytest
 
 from calibration.data import runs as records
 from calibration.data.errors import BadData
+from mmrjax.conditions import Conditions
 
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
@@ -28,16 +29,47 @@ def test_packaged_tables_are_tables_a1_and_a2():
     assert np.abs(errors).max() == pytest.approx(6.8, abs=0.05)
 
 
-def test_command_is_in_si_units(tmp_path):
+def test_conditions_are_those_of_the_robot(tmp_path, robot):
     runs = records.read(
         write(tmp_path, f"{HEADER},surface\n{ROW},linoleum\n4W2T,33,21.1,8,20,4,11000,1200,asphalt\n")
     )
-    command = runs.command()
-    assert command.slope == pytest.approx(np.radians([5, 20]))
-    assert command.wheeled.tolist() == [0.0, 1.0]
-    assert command.total_mass.tolist() == [13.1, 21.1]
-    assert command.adhesion == pytest.approx([0.42 / 0.32, 0.60 / 0.38])
+    conditions = runs.conditions(robot)
+    assert isinstance(conditions, Conditions) and conditions.shape == (2,)
+    assert conditions.slope == pytest.approx(np.radians([5, 20]))
+    assert conditions.configuration.tolist() == [0, 1]
+    assert conditions.total_mass.tolist() == [13.1, 21.1]
+    assert conditions.adhesion == pytest.approx([0.42 / 0.32, 0.60 / 0.38])
     assert runs.measured()[0] == pytest.approx([2.75, 4800 * 2 * np.pi / 60, 0.4])
+
+
+def test_a_configuration_that_the_robot_lacks_is_refused_with_those_it_has(tmp_path, robot):
+    runs = records.read(write(tmp_path, f"{HEADER}\n{ROW}\n{ROW.replace('6T2A', '6T2')}\n"))
+    says = r"runs\.csv row 2, configuration: got 6T2; expected one of these; did you mean 6T2A\? allowed: 6T2A, 4W2T"
+    with pytest.raises(BadData, match=says):
+        runs.conditions(robot)
+
+
+def test_missing_readings_are_nan_and_counted(tmp_path):
+    header = HEADER.replace(",motor_speed_rpm", "")
+    runs = records.read(write(tmp_path, f"{header}\n6T2A,15,13.1,0,5,2.75,400\n6T2A,15,13.1,0,5,,400\n"))
+    np.testing.assert_array_equal(np.isnan(runs.measured()), [[False, True, False], [True, True, False]])
+    assert runs.missing() == [
+        "total_current_A: 1 of 2 readings are missing (rows 2)",
+        "motor_speed_rpm: no readings; what they would show is not fitted",
+    ]
+    assert np.isnan(runs.deviations()).all()
+
+
+def test_a_table_without_any_known_channel_is_refused(tmp_path):
+    header, row = ",".join(HEADER.split(",")[:5]), "6T2A,15,13.1,0,5"
+    with pytest.raises(BadData, match=r"no column of a channel; expected at least one of total_current_A, motor_sp"):
+        records.read(write(tmp_path, f"{header}\n{row}\n"))
+
+
+def test_a_reading_without_its_stated_sd_is_refused(tmp_path):
+    text = f"{HEADER},speed_sd_mm_s\n{ROW},4\n{ROW},\n"
+    with pytest.raises(BadData, match=r"row 2, speed_sd_mm_s: got an empty cell beside a reading; expected its sd"):
+        records.read(write(tmp_path, text))
 
 
 def test_unknown_columns_are_reported_and_kept_out(tmp_path):
@@ -45,9 +77,9 @@ def test_unknown_columns_are_reported_and_kept_out(tmp_path):
     assert runs.unknown == ("operator",) and not runs.has("operator")
 
 
-def test_conditions_alone_suffice_where_nothing_is_compared(tmp_path):
+def test_conditions_alone_suffice_where_nothing_is_compared(tmp_path, robot):
     path = write(tmp_path, "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,15,0,5\n")
-    assert records.read(path, measured=False).command().total_mass is None
+    assert records.read(path, measured=False).conditions(robot).total_mass is None
     with pytest.raises(BadData, match="column total_mass_kg is missing"):
         records.read(path)
 
@@ -83,10 +115,10 @@ REFUSED = {
         f"{HEADER}\n{ROW.replace('4800', 'fast')}",
         r"motor_speed_rpm: got fast; expected a number, -30000",
     ),
-    "empty cell": (f"{HEADER}\n{ROW.replace('400', '', 1).replace('48', '4800')}", r"got an empty cell|row 1"),
-    "unknown configuration": (
-        f"{HEADER}\n{ROW.replace('6T2A', '6T2')}",
-        r"configuration: got 6T2; expected one of these; did you mean 6T2A",
+    "empty condition": (f"{HEADER}\n{ROW.replace(',5,', ',,')}", r"row 1, slope_deg: got an empty cell; expected a"),
+    "no configuration": (
+        f"{HEADER}\n{ROW.replace('6T2A', '')}",
+        r"configuration: got an empty cell; expected the name of one of the robot's configurations",
     ),
     "unknown surface": (
         f"{HEADER},surface\n{ROW},ice",

@@ -1,4 +1,4 @@
-"""The numbers behind the report's figures and tables: every one asked of mmrjax, none computed here twice."""
+"""The numbers behind the paper's figures and tables: every one asked of mmrjax, none computed here twice."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.data import runs as records
-from calibration.data.runs import MM, RPM
 from calibration.inference import errors as residual
-from mmrjax.tables import CONFIGURATIONS, SURFACES, adhesion_ratio
+from mmrjax import channels
+from mmrjax.channels import MM, RPM
+from mmrjax.conditions import Conditions
+from mmrjax.tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
+from sweeps import figures_history
+from sweeps.figures_history import Start
 
 if TYPE_CHECKING:
-    from mmrjax.conditions import Conditions
     from mmrjax.robot import Robot
 
 Columns = dict[str, np.ndarray]
@@ -22,62 +25,65 @@ _CHUNK = 256  # one compiled shape for every question that the report asks of `s
 #: Surface of Table 5 that stands for "adhesion raised": the first on which all 20 measured rows climb.
 RAISED_SURFACE = "smooth_concrete_floor"
 RAISED_MARGIN = 1.06  # where that is not enough for a robot: least adhesion over the largest demand
+FIG_23, FIG_24 = "Fig. 23: total current", r"Fig. 24: $V_x$ and $V_{x\,teor}$"  # titles
 #: Loading modes of Fig. 28: supply voltage [V], payload [kg].
 MODES = {1: (15.0, 0.0), 2: (33.0, 0.0), 3: (33.0, 5.0), 4: (33.0, 8.0)}
 
 
-def command(
-    robot: Robot,
-    *,
-    configuration: Any,
-    voltage: Any = 33.0,
-    payload: Any = 0.0,
-    slope_deg: Any = 0.0,
-    total_mass: Any = None,
-    adhesion: Any = 1.0,
-    battery: Any = 0.0,
-    discharge: Any = 0.0,
-) -> Conditions:
-    """A batch of conditions in the report's units; the total mass is stated for every row."""
-
-    wheeled = np.asarray(np.asarray(configuration) == CONFIGURATIONS[1], float)
-    own = np.array([float(robot.configurations["6T2A"].mass), float(robot.configurations["4W2T"].mass)])[
-        wheeled.astype(int)
-    ]
-    mass = own + np.asarray(payload) if total_mass is None else total_mass
-    slope = np.radians(slope_deg)
-    return Conditions(voltage, slope, payload, wheeled, battery, discharge, adhesion, mass)
+def shared(robot: Robot) -> tuple[str, ...]:
+    """The paper's configurations that a robot has; its runs on the bench can be set against these alone."""
+    return tuple(c for c in CONFIGURATIONS if c in robot.configurations)
 
 
-def operating_points(robot: Robot, conditions: Conditions) -> Columns:
+def kinds(robot: Robot) -> tuple[str, ...]:
+    """The configurations that are shown of a robot: the paper's, or where it has none of them its own."""
+    return shared(robot) or robot.configurations.names
+
+
+def conditions(robot: Robot, configuration: Any, **given: Any) -> Conditions:
+    """A batch of conditions with configurations by name; the total mass, if not given, is the robot's own."""
+    made = Conditions(np.asarray(configuration), **given).resolved(robot)
+    if made.total_mass is not None:
+        return made
+    own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
+    return dataclasses.replace(made, total_mass=own[np.asarray(made.configuration)] + made.payload)
+
+
+def operating_points(robot: Robot, asked: Conditions) -> Columns:
     """Steady operating points of a batch, in the columns of `runs.csv`."""
     import jax
 
     from mmrjax.fidelities.steady import steady_batch
     from sweeps import outputs
 
-    rows = conditions.voltage.shape[0]
+    rows = asked.shape[0]
     parts = []
     for first in range(0, rows, _CHUNK):
         index = np.minimum(np.arange(first, first + _CHUNK), rows - 1)
-        part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], conditions))
+        part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))
         parts.append(jax.tree.map(np.asarray, part))
     answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
     return {**outputs.columns(answer), "total_mass_kg": np.asarray(answer.mass)}
 
 
+def channels_of_paper() -> tuple[channels.Channel, ...]:
+    """The channels that the paper's tables have."""
+    table = records.read("measured")
+    return tuple(c for c in channels.CHANNELS if table.has(c.column))
+
+
 def stacked(table: Columns) -> np.ndarray:
-    """Current [A], motor speed [rpm] and speed [mm/s] of a table, shape (rows, 3)."""
-    return np.stack([np.asarray(table[c], float) for c in records.MEASURED], 1)
+    """The paper's channels of a table, in their columns' units, shape (rows, channels)."""
+    return np.stack([np.asarray(table[c.column], float) for c in channels_of_paper()], 1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """The 20 rows of Tables A1 and A2 and what a robot says of each.
+    """The rows of Tables A1 and A2 whose configuration a robot has, and what it says of each.
 
     Attributes:
         conditions: the measured table.
-        measured, paper: shape (20, 3), of the bench and of the paper's own simulation.
+        measured, paper: shape (rows, channels), of the bench and of the paper's own simulation.
         plain: this robot on its own adhesion, mass as printed.
         raised: the same on the raised adhesion.
         weighed: raised, and with the robot's own mass instead of the printed one.
@@ -97,46 +103,54 @@ class Rows:
         return np.array([self.ratio[c] for c in self.conditions["configuration"]])
 
 
-def rows(robot: Robot) -> Rows:
-    """Simulate the 20 measured rows with `robot`: as it is, with adhesion raised, and with its own mass."""
-    table = records.read("measured")
-    paper = records.read("simulated_by_paper")
+def rows(robot: Robot) -> Rows | None:
+    """Simulate the measured rows with `robot`: as it is, with adhesion raised, and with its own mass.
+
+    None where the robot has none of their configurations.
+    """
+    if not shared(robot):
+        return None
+    table, paper = (
+        table.where(np.isin(table["configuration"], shared(robot)))
+        for table in map(records.read, ("measured", "simulated_by_paper"))
+    )
     kind = table["configuration"]
-    asked = {
+    asked: dict[str, Any] = {
         "configuration": kind,
         "voltage": table["supply_voltage_V"],
         "payload": table["payload_kg"],
         "slope_deg": table["slope_deg"],
     }
-    plain = operating_points(robot, Conditions(robot, total_mass=table["total_mass_kg"], **asked))
+    mass = table["total_mass_kg"]
+    plain = operating_points(robot, conditions(robot, total_mass=mass, **asked))
     ratio = {}
-    for c in CONFIGURATIONS:
+    for c in shared(robot):
         largest = float(np.max(np.abs(plain["adhesion_used"][kind == c])))
-        listed = adhesion_ratio(RAISED_SURFACE, c == CONFIGURATIONS[1])
+        listed = adhesion_ratio(RAISED_SURFACE, c == TRACKED)
         ratio[c] = max(listed, RAISED_MARGIN * largest) if largest > 1 else 1.0
     adhesion = np.array([ratio[c] for c in kind])
-    raised = operating_points(robot, Conditions(robot, total_mass=table["total_mass_kg"], adhesion=adhesion, **asked))
-    weighed = operating_points(robot, Conditions(robot, adhesion=adhesion, **asked))
+    raised = operating_points(robot, conditions(robot, total_mass=mass, adhesion=adhesion, **asked))
+    weighed = operating_points(robot, conditions(robot, adhesion=adhesion, **asked))
     return Rows(table, stacked(table.columns), stacked(paper.columns), plain, raised, weighed, ratio)
 
 
 def raised_words(robot: Robot, ratio: dict[str, float]) -> str:
     """The raised coefficients in words, with their source."""
-    own = {c: float(robot.chassis(float(k)).ground.friction.static) for k, c in enumerate(CONFIGURATIONS)}
     surface = SURFACES[RAISED_SURFACE]
-    listed = (surface.tracked_x, surface.wheeled_x)
     parts = []
-    for k, c in enumerate(CONFIGURATIONS):
-        if ratio[c] == 1.0:
-            parts.append(f"{c} unchanged at {own[c]:.2f}")
+    for c, raised in ratio.items():
+        own = float(robot.configurations[c].ground.friction.static)
+        if raised == 1.0:
+            parts.append(f"{c} unchanged at {own:.2f}")
             continue
-        table = " (Table 5, smooth concrete floor)" if abs(own[c] * ratio[c] - listed[k]) < 1e-6 else ""
-        parts.append(f"{c} from {own[c]:.2f} to {own[c] * ratio[c]:.2f}{table}")
+        listed = surface.tracked_x if c == TRACKED else surface.wheeled_x
+        table = " (Table 5, smooth concrete floor)" if abs(own * raised - listed) < 1e-6 else ""
+        parts.append(f"{c} from {own:.2f} to {own * raised:.2f}{table}")
     return "; ".join(parts)
 
 
 def errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
-    """Errors (35) of the three channels [%], shape (rows, 3); NaN where there is no number."""
+    """Errors (35) of the paper's channels [%], shape (rows, channels); NaN where there is no number."""
     return residual.relative_error(stacked(simulated), measured)
 
 
@@ -180,15 +194,15 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
     from mmrjax import balances
     from mmrjax.signals import State
 
-    conditions = Conditions(robot, configuration=np.full(speed_wheel.shape, configuration))
-    chassis = robot.chassis(float(configuration == CONFIGURATIONS[1]))
+    asked = conditions(robot, np.full(speed_wheel.shape, configuration))
+    chassis = robot.configurations[configuration]
     zero = np.zeros_like(speed_wheel)
 
     def torque_net(current: float) -> np.ndarray:
         state = State(zero + current, speed_wheel * robot.gearbox.ratio, chassis.radius * speed_wheel, zero)
-        signals = balances.begin(robot, conditions, state, direction=zero + 1.0)
+        signals = balances.begin(robot, asked, state, direction=zero + 1.0)
         signals = dataclasses.replace(signals, normal=zero, traction=zero)
-        signals = balances.motor(robot, balances.electrical(robot, balances.supply(robot, conditions, signals)))
+        signals = balances.motor(robot, balances.electrical(robot, balances.supply(robot, asked, signals)))
         return np.asarray(balances.gearbox(robot, chassis, balances.track(robot, chassis, signals)).torque_net)
 
     low, high = 5.0, 10.0
@@ -205,77 +219,37 @@ def fit_line(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
 # --- runs ---------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class Start:
-    """A run from standstill: time [s], total current [A], V and V_theoretical [mm/s], stage limits [s]."""
-
-    configuration: str
-    status: str
-    time: np.ndarray
-    current: np.ndarray
-    speed: np.ndarray
-    theoretical: np.ndarray
-    starting: float  # end of stage I: the slide has reached its maximum, the shafts have spun up
-    slipping: float  # end of stage II: the slide is back within V_s for good; equals `starting` if it never left
-    settled: float  # t': speed within 1 % of its last value
-
-
 def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[Start]:
-    """From standstill on the flat with `drive`, both configurations, stages read from the signals."""
+    """From standstill on the flat with `drive`, each of the paper's configurations."""
     from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    run = drive_batch(robot, Conditions(robot, configuration=np.array(CONFIGURATIONS), voltage=voltage), times)
-    return starts_of(robot, run)
+    return starts_of(robot, drive_batch(robot, conditions(robot, kinds(robot), voltage=voltage), times))
 
 
 def starts_of(robot: Robot, run: Any) -> list[Start]:
-    """Two runs from standstill, 6T2A and 4W2T, of either fidelity that has a history."""
-    from mmrjax.signals import STATUSES
-
-    answer = []
-    for k, kind in enumerate(CONFIGURATIONS):
-        times = np.asarray(run.time[k])
-        sliding = np.asarray(run.signals.speed_sliding[k])
-        speed = np.asarray(run.signals.speed[k]) / MM
-        static = float(robot.chassis(float(k)).ground.friction.speed_static)
-        beyond = np.nonzero(sliding > static)[0]
-        starting = float(times[int(np.argmax(sliding))])
-        slipping = float(times[min(int(beyond[-1]) + 1, len(times) - 1)]) if beyond.size else starting
-        last = speed[-max(len(speed) // 10, 1) :].mean()
-        late = np.nonzero(np.abs(speed - last) > 0.01 * np.abs(last))[0]
-        settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
-        answer.append(
-            Start(
-                kind,
-                STATUSES[int(run.result.status[k])],
-                times,
-                np.asarray(run.signals.total_current[k]),
-                speed,
-                np.asarray(run.signals.speed_theoretical[k]) / MM,
-                starting,
-                max(slipping, starting),
-                settled,
-            )
-        )
-    return answer
+    """Runs of the paper's configurations from standstill, of any fidelity that has histories."""
+    names = kinds(robot)
+    return figures_history.starts(
+        robot, run, run.result.status, [robot.configurations.index(c) for c in names], names
+    )
 
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:
     """Current [A] over slope for the loading modes: (configuration, mode) → (own adhesion, raised)."""
-    asked = [(c, mode, r) for c in CONFIGURATIONS for mode in MODES for r in (1.0, ratio[c])]
-    kinds, voltage, payload, adhesion = (
+    asked = [(c, mode, r) for c in ratio for mode in MODES for r in (1.0, ratio[c])]
+    kind, voltage, payload, adhesion = (
         np.repeat(np.array(v), len(slopes)) for v in zip(*((c, *MODES[mode], r) for c, mode, r in asked), strict=True)
     )
-    conditions = Conditions(
+    at = conditions(
         robot,
-        configuration=kinds,
+        kind,
         voltage=voltage.astype(float),
         payload=payload.astype(float),
         slope_deg=np.tile(slopes, len(asked)),
         adhesion=adhesion.astype(float),
     )
-    current = operating_points(robot, conditions)["total_current_A"].reshape(len(asked), len(slopes))
+    current = operating_points(robot, at)["total_current_A"].reshape(len(asked), len(slopes))
     return {(c, mode): (current[2 * k], current[2 * k + 1]) for k, (c, mode, _) in enumerate(asked[::2])}
 
 
@@ -287,13 +261,13 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
     answer = {}
     for mode, voltage in ((1, 15.0), (2, 33.0)):
         table = rows_of.conditions
-        pick = (table["configuration"] == CONFIGURATIONS[0]) & (table["supply_voltage_V"] == voltage)
+        pick = (table["configuration"] == TRACKED) & (table["supply_voltage_V"] == voltage)
         if battery and mode == 1:
             continue
         there = table.where(pick)
-        conditions = Conditions(
+        at = conditions(
             robot,
-            configuration=there["configuration"],
+            there["configuration"],
             voltage=voltage,
             payload=there["payload_kg"],
             slope_deg=there["slope_deg"],
@@ -301,7 +275,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
             adhesion=ratio,
             battery=float(battery),
         )
-        answer[mode] = errors(operating_points(robot, conditions), rows_of.measured[pick])
+        answer[mode] = errors(operating_points(robot, at), rows_of.measured[pick])
     return answer
 
 
@@ -309,7 +283,7 @@ def supply_errors(robot: Robot, ratio: float, rows_of: Rows, battery: bool) -> d
 SPLIT = ("winding", "motor friction", "gearbox", "track and guides", "slip", "rolling resistance", "lift")
 
 
-def energy_split(robot: Robot, conditions: Conditions) -> tuple[Columns, Columns]:
+def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     """Operating points and the power [W] that each item of `SPLIT` takes of the supply's power.
 
     Returns:
@@ -320,16 +294,16 @@ def energy_split(robot: Robot, conditions: Conditions) -> tuple[Columns, Columns
     from mmrjax import balances
     from mmrjax.signals import State
 
-    points = operating_points(robot, conditions)
-    wheel = points["theoretical_speed_mm_s"] * MM / np.asarray(robot.chassis(conditions.wheeled).radius)
+    points = operating_points(robot, asked)
+    wheel = points["theoretical_speed_mm_s"] * MM / np.asarray(robot.chassis(asked.configuration).radius)
     current = points["power_supply_W"] / points["voltage_V"] / robot.sides
     state = State(
         current,
         wheel * robot.gearbox.ratio,
         points["theoretical_speed_mm_s"] * MM * (1 - points["slip"]),
-        conditions.discharge,
+        asked.discharge,
     )
-    at, _ = eqx.filter_jit(balances.settled)(robot, conditions, state)
+    at, _ = eqx.filter_jit(balances.settled)(robot, asked, state)
     sides = robot.sides
     split = {
         "winding": sides * at.voltage_drop * at.current,
@@ -343,3 +317,25 @@ def energy_split(robot: Robot, conditions: Conditions) -> tuple[Columns, Columns
     split = {k: np.asarray(v) for k, v in split.items()}
     split["other"] = points["power_supply_W"] - sum(split.values())
     return points, split
+
+
+def table(rows: Rows) -> Columns:
+    """The paper's rows side by side: measured, the paper's simulation, and the robot three ways."""
+    asked = rows.conditions
+    columns = {key: asked[key] for key in ("configuration", *records.CONDITIONS)}
+    for k, channel in enumerate(channels_of_paper()):
+        columns[channel.column] = rows.measured[:, k]
+        columns[f"paper_{channel.column}"] = rows.paper[:, k]
+        for name in ("plain", "raised", "weighed"):
+            columns[f"{name}_{channel.column}"] = getattr(rows, name)[channel.column]
+    return columns | {"status": rows.plain["status"]}
+
+
+def summary(rows: Rows) -> dict[str, dict[str, Any]]:
+    """Errors (35) of every channel against the bench: of the robot three ways, and of the paper's simulation."""
+    ways = {name: errors(getattr(rows, name), rows.measured) for name in ("plain", "raised", "weighed")}
+    ways["paper"] = residual.relative_error(rows.paper, rows.measured)
+    return {
+        way: {c.name: residual.summary(values[:, k]) for k, c in enumerate(channels_of_paper())}
+        for way, values in ways.items()
+    }

@@ -1,0 +1,141 @@
+"""What a fidelity is: functions from a robot and conditions to results, the same for all."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from mmrjax import balances, fidelities
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities import Effort, Facts, Option
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import Result, Signals
+from mmrjax.undercarriage import Reactions
+
+#: Is called now and then with the share of the work that is done, 0..1.
+Progress = Callable[[float], None]
+
+
+class History(eqx.Module):
+    """Runs over time; fields have shape (runs, samples).
+
+    Attributes:
+        time: [s]; distance: travelled along the slope [m].
+        signals: every signal; reading: what the instruments show [SI], by channel.
+        reactions: loads inside the running gear of one side, where the fidelity resolves them.
+    """
+
+    time: Float[Array, "runs samples"]
+    distance: Float[Array, "runs samples"]
+    signals: Signals
+    reading: dict[str, Scalar]
+    reactions: Reactions | None = None
+
+    @staticmethod
+    def of(
+        robot: Robot, time: Array, distance: Array, signals: Signals, reactions: Reactions | None = None
+    ) -> History:
+        """A history with its readings."""
+        return History(time, distance, signals, balances.sensor(robot, signals), reactions)
+
+
+class Run(eqx.Module):
+    """A batch of runs.
+
+    Attributes:
+        result: of each run, shape (runs,).
+        columns: what this fidelity alone knows, by the column of `runs.csv`, in the column's unit; shape (runs,).
+        history: of the runs over time, where it was asked for.
+    """
+
+    result: Result
+    columns: dict[str, Scalar] = eqx.field(default_factory=dict)
+    history: History | None = None
+
+
+class Simulate(Protocol):
+    """Simulates a batch."""
+
+    def __call__(
+        self, robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None, /
+    ) -> Run:
+        """Simulate a batch in one call.
+
+        Args:
+            conditions: shape (runs,), names of configurations resolved.
+            options: all of the fidelity's, from `Facts.resolved`.
+            progress: called by those that take long.
+
+        Raises:
+            ValueError: what `Fidelity.check` refuses.
+        """
+        ...
+
+
+def _nothing_to_refuse(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
+    pass
+
+
+def _nothing_to_say(robot: Robot, conditions: Conditions) -> list[str]:
+    return []
+
+
+@dataclasses.dataclass(frozen=True)
+class Fidelity:
+    """One way to simulate a robot. Each module of a fidelity ends with its own.
+
+    Attributes:
+        name: its line in `fidelities.TABLE`.
+        settled: a batch of conditions to results, pure and traceable, with numbers wherever it can give some,
+            whatever the status: what calibrations differentiate (forward).
+        run: results of a batch, as sweeps make them.
+        histories: a batch from standstill, kept over time; None where there is no time.
+        check: refuses, with ValueError, what some run of any batch could not bear; before the first is simulated.
+        cautions: what to know before the settled readings of a calibrated robot are trusted, a sentence each.
+    """
+
+    name: str
+    settled: Callable[[Robot, Conditions], Result]
+    run: Simulate
+    histories: Simulate | None = None
+    check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _nothing_to_refuse
+    cautions: Callable[[Robot, Conditions], list[str]] = _nothing_to_say
+
+    @property
+    def facts(self) -> Facts:
+        """What was known of it before it was imported."""
+        return fidelities.facts(self.name)
+
+    @property
+    def description(self) -> str:
+        """One line."""
+        return self.facts.description
+
+    @property
+    def options(self) -> tuple[Option, ...]:
+        """Options that it has."""
+        return self.facts.options
+
+    @property
+    def chunk(self) -> int:
+        """Runs in one vmapped call."""
+        return self.facts.chunk
+
+    @property
+    def effort(self) -> Effort:
+        """What a calibration through it does where nobody states it."""
+        return self.facts.effort
+
+    @property
+    def rollout(self) -> bool:
+        """Whether it integrates over time."""
+        return self.facts.rollout
+
+    def resolved(self, **given: float | None) -> dict[str, float]:
+        """See `Facts.resolved`."""
+        return self.facts.resolved(**given)

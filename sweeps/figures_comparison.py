@@ -1,0 +1,87 @@
+"""Figures of a comparison with measured runs: parity, and errors over each condition."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mmrjax import channels
+from sweeps.figures_style import axis_label, figure, looks, note
+
+
+def parity(table: dict[str, np.ndarray]) -> Figure:
+    """Simulated over measured, one panel a channel; a reading that is missing is not drawn."""
+    fig, grid = figure(1, len(channels.CHANNELS), 3.6)
+    look = looks(table["configuration"])
+    for axes, channel in zip(grid[0], channels.CHANNELS, strict=True):
+        measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
+        both = np.isfinite(measured) & np.isfinite(simulated)
+        ends = np.concatenate([measured[both], simulated[both]]) if both.any() else np.array([0.0, 1.0])
+        low, high = min(0.0, float(ends.min())), max(0.0, float(ends.max()))
+        span = np.array([low - 0.05 * (high - low) * (low < 0), high + 0.05 * (high - low)])
+        axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
+        axes.plot(span, span, color="#666666", lw=0.9)
+        for kind, (colour, marker) in look.items():
+            pick = both & (table["configuration"] == kind)
+            if pick.any():
+                axes.plot(
+                    measured[pick],
+                    simulated[pick],
+                    marker,
+                    ms=5,
+                    mec="white",
+                    mew=0.5,
+                    color=colour,
+                    label=kind,
+                    rasterized=bool(pick.sum() > 2000),
+                )
+        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
+        axes.set_xlim(*span)
+        axes.set_ylim(*span)
+        if not both.any():
+            note(axes, "no row has both numbers")
+    if grid[0, 0].get_legend_handles_labels()[0]:
+        grid[0, 0].legend(loc="lower right")
+    note(grid[0, 0], "band: ±5 %")
+    return fig
+
+
+def errors_over(table: dict[str, np.ndarray]) -> Figure:
+    """Error (35) of each channel over each condition."""
+    conditions = {"slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "payload_kg": "payload [kg]"}
+    fig, grid = figure(
+        len(channels.CHANNELS), len(conditions), 2.3 * len(channels.CHANNELS), sharex="col", sharey="row"
+    )
+    look = looks(table["configuration"])
+    for row, channel in zip(grid, channels.CHANNELS, strict=True):
+        error = table[f"error_{channel.name}_percent"]
+        for axes, (condition, words) in zip(row, conditions.items(), strict=True):
+            axes.axhspan(-5, 5, color="#eef3ee", zorder=0)
+            axes.axhline(0, color="#666666", lw=0.9)
+            levels = np.unique(table[condition])
+            shift = 0.012 * max(1e-9, float(np.ptp(levels))) if levels.size > 1 else 0.02
+            sides = np.linspace(-1, 1, len(look)) if len(look) > 1 else (0.0,)
+            for side, (kind, (colour, marker)) in zip(sides, look.items(), strict=True):
+                pick = (table["configuration"] == kind) & np.isfinite(error)
+                if pick.any():
+                    axes.plot(
+                        table[condition][pick] + side * shift,
+                        error[pick],
+                        marker,
+                        ms=5,
+                        mec="white",
+                        mew=0.5,
+                        color=colour,
+                        label=kind,
+                        rasterized=bool(pick.sum() > 2000),
+                    )
+            if row[0] is grid[-1, 0]:
+                axes.set_xlabel(words)
+                if levels.size <= 8:
+                    axes.set_xticks(levels)
+        row[0].set_ylabel(f"{channel.label}\nerror [%]")
+    for axes in grid[0]:
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(loc="best")
+            break
+    return fig

@@ -1,0 +1,191 @@
+"""Figures of runs from standstill: current and speeds over time, the inrush marked, the stages of a start shaded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mmrjax.channels import MM
+from sweeps import words
+from sweeps.figures_style import FAINT, INK, VERMILION, figure, looks, note
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+INRUSH = 0.04  # s, shown enlarged
+_STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", "#eaf5ea", "uniform"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """A run from standstill, with numbers up to its last finite sample.
+
+    Attributes:
+        name: heading; configuration; status.
+        time: [s]; current: of all motors [A]; speed, theoretical: V and r_k ω_k [mm/s].
+        starting: end of stage I [s]: the slide has reached its maximum, the shafts have spun up.
+        slipping: end of stage II [s]: the slide is back within V_s for good; `starting` if it never left.
+        settled: t' [s]: the speed within 1 % of its last value.
+    """
+
+    name: str
+    configuration: str
+    status: str
+    time: np.ndarray
+    current: np.ndarray
+    speed: np.ndarray
+    theoretical: np.ndarray
+    starting: float
+    slipping: float
+    settled: float
+
+    @property
+    def gets_under_way(self) -> bool:
+        """Whether there are stages to tell apart."""
+        return self.status in ("converged", "not_settled")
+
+    @property
+    def ended(self) -> tuple[float, float]:
+        """Current [A] and speed [mm/s] at the end: the running gear may ripple, so the means over the last 0.15 s."""
+        last = _end(self.time)
+        return float(self.current[last].mean()), float(self.speed[last].mean())
+
+
+def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int], names: Sequence[str]) -> list[Start]:
+    """Members of a batch of runs from standstill, of any fidelity that has histories.
+
+    Args:
+        history: time and signals of the batch; status: codes of how its members ended.
+        which: index of each member's configuration in `robot`; names: headings of the members.
+    """
+    from mmrjax.signals import STATUSES
+
+    answer = []
+    for k, name in enumerate(names):
+        current = np.asarray(history.signals.total_current[k])
+        finite = np.flatnonzero(np.isfinite(current))
+        upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
+        times, sliding = np.asarray(history.time[k])[upto], np.asarray(history.signals.speed_sliding[k])[upto]
+        speed = np.asarray(history.signals.speed[k])[upto] / MM
+        kind = robot.configurations.names[int(which[k])]
+        starting = slipping = settled = 0.0
+        if finite.size:
+            static = float(robot.configurations[kind].ground.friction.speed_static)
+            beyond = np.nonzero(sliding > static)[0]
+            starting = float(times[int(np.argmax(sliding))])
+            slipping = float(times[min(int(beyond[-1]) + 1, len(times) - 1)]) if beyond.size else starting
+            last = speed[_end(times)].mean()
+            late = np.nonzero(np.abs(speed - last) > 0.01 * np.abs(last))[0]
+            settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
+        theoretical = np.asarray(history.signals.speed_theoretical[k])[upto] / MM
+        ended = STATUSES[int(status[k])]
+        stages = (starting, max(slipping, starting), settled)
+        answer.append(Start(name, kind, ended, times, current[upto], speed, theoretical, *stages))
+    return answer
+
+
+def _end(time: np.ndarray) -> np.ndarray:
+    """Samples of the last 0.15 s, some pitches of the running gear, of a short run its last tenth."""
+    return time >= time[-1] - min(0.15, 0.1 * float(time[-1]))
+
+
+def from_standstill(shown: list[Start], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
+    """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded."""
+    fig, grid = figure(len(shown), 3, 3.1 * len(shown), width_ratios=[0.85, 1.2, 1.35])
+    look = looks(start.configuration for start in shown)
+    for (zoom, current, speed), start in zip(grid, shown, strict=True):
+        zoom.set_title(f"{start.name}\nfirst {1e3 * INRUSH:.0f} ms")
+        current.set_title(current_title)
+        speed.set_title(speed_title)
+        if not start.time.size:
+            note(zoom, f"no numbers: {words.short(start.status)}", color=VERMILION)
+            continue
+        colour = look[start.configuration][0]
+        _inrush(zoom, start, colour)
+        _current(current, start, colour)
+        _speeds(speed, start, colour)
+    return fig
+
+
+def _inrush(axes: Axes, start: Start, colour: str) -> None:
+    peak = int(np.argmax(start.current))
+    early = start.time <= INRUSH
+    axes.plot(1e3 * start.time[early], start.current[early], color=colour)
+    top = 1.3 * max(float(start.current[early].max()), 1e-3)
+    axes.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * float(start.current[early].min())), top))
+    axes.set(xlabel="time [ms]", ylabel="total current [A]")
+    if early[peak]:
+        place = (1e3 * start.time[peak], start.current[peak])
+        axes.plot(*place, "o", ms=5, color=colour)
+        axes.annotate(
+            f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
+            textcoords="offset points", fontsize=8.5, va="top",
+        )  # fmt: skip
+    _stages(axes, start, 1e3)
+
+
+def _current(axes: Axes, start: Start, colour: str) -> None:
+    last, peak = float(start.time[-1]), float(start.current.max())
+    run = start.current[start.time > start.starting]
+    run = run[len(run) // 20 :] if len(run) > 20 else start.current
+    top = max(1.75 * float(run.max()), 0.1)
+    cut = peak > top
+    axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
+    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * peak))
+    axes.set(xlabel="time [s]", ylabel="total current [A]")
+    _stages(axes, start)
+    if cut:
+        note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
+    during = (start.time > start.starting) & (start.time < start.slipping)
+    if start.slipping - start.starting > 0.15 * last and start.gets_under_way:
+        middle = float(np.median(start.current[during]))
+        at = (start.starting + start.slipping) / 2
+        axes.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
+    crest = start.current[_end(start.time)].max()
+    axes.annotate(
+        f"{start.ended[0]:.2f} A", (0.98 * last, crest), xytext=(0, 5), ha="right", textcoords="offset points"
+    )
+
+
+def _speeds(axes: Axes, start: Start, colour: str) -> None:
+    last, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
+    axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
+    axes.plot(start.time, start.speed, color=colour)
+    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
+    axes.set_ylabel("speed [mm/s]")
+    _stages(axes, start)
+    axes.text(0.02 * last, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
+    if 0 < start.settled < last and start.gets_under_way:
+        axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
+        text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
+        axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
+    half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
+    axes.annotate(
+        "$V_x$ (robot)", (start.time[half], start.speed[half]), xytext=(6, -12), textcoords="offset points",
+        color=colour, fontsize=8.5,
+    )  # fmt: skip
+    if start.status != "converged":
+        note(axes, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
+
+
+def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
+    """Shade the stages behind a plot over time in units of 1/`scale` s and name them at the top."""
+    if not start.gets_under_way:
+        return
+    bounds = scale * np.array([0.0, start.starting, start.slipping, start.time[-1]])
+    left_edge, right_edge = axes.get_xlim()
+    for (stage, shade, name), left, right in zip(_STAGES, bounds[:-1], bounds[1:], strict=True):
+        right = min(right, right_edge)
+        if right <= left:
+            continue
+        axes.axvspan(left, right, color=shade, zorder=0, lw=0)
+        if (right - left) / (right_edge - left_edge) > 0.15:
+            axes.text(
+                (left + right) / 2, 0.985, f"{stage}\n{name}", transform=axes.get_xaxis_transform(), ha="center",
+                va="top", fontsize=8.5, fontweight="bold", color=INK,
+            )  # fmt: skip

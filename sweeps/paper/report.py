@@ -1,0 +1,106 @@
+"""The page of `reproduce`: the paper's figures and tables remade for a robot, beside the bench and the paper."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.inference import errors as residual
+from mmrjax.nominal import ROBOTS
+from mmrjax.tables import TRACKED
+from sweeps import figures_history, report
+from sweeps.paper import components, data, runs, tables
+from sweeps.report import words_shown
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+
+def write(folder: Path, *, robot: Robot, robot_name: str, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
+    """Write `report.html` and `figures/` for a robot and its nominal fellows.
+
+    Args:
+        folder: an existing run folder.
+        robot: any robot; one that has none of the paper's configurations is not set against the bench.
+        robot_name: its name or file.
+        model: fidelity; gear: whether it resolves the running gear, so that there are Figs. 23-27 from it too.
+
+    Returns:
+        The path of the page, and what the robot says of the paper's rows, None where it has none of their
+        configurations.
+    """
+    nominal = ROBOTS["nominal"]()
+    shown = report.named(robot, robot_name)
+    name = Path(robot_name).name if shown["robot"] == words_shown(Path(robot_name).name) else shown["robot"]
+    robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
+    album = report.Album(folder)
+    known: dict[str, Any] = {"gear": None, "errors": [], "sliding": [], "measured": 0, "raised": ""}
+    rows = {n: r for n, r in ((n, data.rows(member)) for n, member in robots.items()) if r is not None}
+    mine = rows.get(name)
+    ratio = dict.fromkeys(data.kinds(robot), 1.0) if mine is None else mine.ratio
+    if mine is not None:
+        known |= _against_the_bench(album, robots, rows, name)
+    starts = data.starts(robot)
+    album.add("fig23_24_from_standstill", lambda: figures_history.from_standstill(starts, data.FIG_23, data.FIG_24))
+    if gear:
+        from sweeps.paper import running_gear
+
+        known["gear"] = running_gear.draw(album, robot)
+    known["energy"] = album.add("energy_split", lambda: runs.energy(robot, ratio))
+    album.add("fig05a_gearbox_efficiency", lambda: components.gearbox_efficiency(robots, mine))
+    album.add("fig10_battery", lambda: components.battery(robots))
+    album.add("fig11_motor_friction", lambda: components.motor_friction(robots))
+    known["idle"] = album.add("fig18_idle_track", lambda: components.idle_track(robots))
+    known |= {
+        "rows": tables.row_by_row(nominal, rows["nominal"]),
+        "facts": tables.facts(nominal, rows["nominal"]),
+        "raised_nominal": data.raised_words(nominal, rows["nominal"].ratio),
+        "starts": starts,
+        "split": data.SPLIT,
+        "paper_channels": {c.name: (c.label, c.unit) for c in data.channels_of_paper()},
+        "paper_idle_r2": components.PAPER_IDLE_R2,
+    }
+    title = f"The paper's figures and tables: {shown['robot']}"
+    return report.render(folder, "paper.html.j2", album, title=title, model=model, **shown, **known), mine
+
+
+def _against_the_bench(
+    album: report.Album, robots: dict[str, Robot], rows: dict[str, data.Rows], name: str
+) -> dict[str, Any]:
+    mine, robot = rows[name], robots[name]
+    album.add("rows", lambda: runs.row_parity(mine, name))
+    certainty = album.add("fig28_current_over_slope", lambda: runs.current_over_slope(robot, mine))
+    if TRACKED in mine.ratio:
+        album.add("fig29_model_errors", lambda: runs.model_errors(robots, rows))
+    return {
+        "certainty": certainty,
+        "errors": tables.errors(_variants(name, rows), mine),
+        "raised": data.raised_words(robot, mine.ratio),
+        "sliding": list(zip(*_sliding_rows(mine), strict=True)),
+        "measured": len(mine.conditions),
+    }
+
+
+def _variants(name: str, rows: dict[str, data.Rows]) -> dict[str, np.ndarray]:
+    """Errors of the rows under the names that the table of errors shows."""
+    mine = rows[name]
+    error = data.errors
+    answer = {
+        f"{words_shown(name)}: own adhesion, mass as printed": error(mine.plain, mine.measured),
+        f"{words_shown(name)}: adhesion raised, mass as printed": error(mine.raised, mine.measured),
+        f"{words_shown(name)}: adhesion raised, the robot's own mass": error(mine.weighed, mine.measured),
+    }
+    if name != "nominal":
+        pick = np.isin(rows["nominal"].conditions["configuration"], list(mine.ratio))
+        nominal = rows["nominal"]
+        answer["nominal (PM): adhesion raised, its own mass"] = error(nominal.weighed, nominal.measured)[pick]
+    return answer | {"the paper's own simulation": residual.relative_error(mine.paper, mine.measured)}
+
+
+def _sliding_rows(rows: data.Rows) -> tuple[np.ndarray, ...]:
+    pick = rows.plain["status"] != "converged"
+    table = rows.conditions
+    shown = (table["configuration"], table["supply_voltage_V"], table["slope_deg"], rows.plain["status"])
+    return tuple(column[pick] for column in shown)

@@ -1,0 +1,59 @@
+"""The report of `compare`: a simulation set against a table of measured runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweeps import figures_comparison
+from sweeps.report import Album, columns, first_rows, named, render, statuses
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+
+def write(
+    folder: Path,
+    *,
+    robot: Robot,
+    robot_name: str,
+    model: str,
+    data_name: str,
+    table: dict[str, np.ndarray],
+    summary: dict[str, dict[str, dict[str, Any]]],
+    notes: list[str],
+) -> Path:
+    """Write `report.html` and `figures/` for a simulation set against a table of measured runs.
+
+    Args:
+        folder: an existing run folder.
+        robot: the robot that was simulated; robot_name: its name or file; model: fidelity.
+        data_name: of the table; of a file only the last part is shown.
+        table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
+        summary: group (`all`, each configuration) → channel → rows, rms_percent, max_percent, r2.
+        notes: what to say of readings that are missing.
+
+    Returns:
+        The path of the page.
+    """
+    album = Album(folder)
+    album.add("parity", lambda: figures_comparison.parity(table))
+    album.add("errors", lambda: figures_comparison.errors_over(table))
+    known = named(robot, robot_name)
+    return render(
+        folder,
+        "comparison.html.j2",
+        album,
+        title=f"{known['robot']} against {Path(data_name).name}",
+        model=model,
+        data_name=Path(data_name).name,
+        rows=first_rows(table),
+        total=len(table["status"]),
+        statuses=statuses(table),
+        summary=summary,
+        notes=notes,
+        columns=columns(),
+        **known,
+    )

@@ -1,0 +1,128 @@
+"""The report of `simulate`: each run's readings, its limits, its history from standstill, where its power goes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mmrjax import channels
+from sweeps import figures_power
+from sweeps.report import Album, columns, first_rows, named, render, statuses
+
+if TYPE_CHECKING:
+    from mmrjax.fidelities.base import Run
+    from mmrjax.robot import Robot
+
+HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
+
+
+def write(
+    folder: Path,
+    *,
+    robot: Robot,
+    robot_name: str,
+    model: str,
+    runs: dict[str, np.ndarray],
+    histories: Run | None = None,
+) -> Path:
+    """Write `report.html` and `figures/` for a few finished runs.
+
+    Args:
+        folder: an existing run folder.
+        robot: the robot that was simulated; robot_name: its name or file.
+        model: fidelity.
+        runs: the finished table of runs.
+        histories: the same as a batch with its history, of a fidelity that keeps it.
+
+    Returns:
+        The path of the page.
+    """
+    album = Album(folder)
+    names = labels(runs)
+    known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0}
+    if histories is not None:
+        known |= _histories(album, robot, runs, names, histories)
+    chain = np.flatnonzero(figures_power.drawable(runs) & (runs["status"] == "converged"))[:CHAINS]
+    if chain.size:
+        picked = {key: value[chain] for key, value in runs.items()}
+        album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain]))
+    single = len(names) == 1
+    return render(
+        folder,
+        "runs.html.j2",
+        album,
+        title=f"Run of {names[0]}" if single else f"{len(names)} runs",
+        model=model,
+        total=len(names),
+        rows=[{"label": name, **row} for name, row in zip(names, first_rows(runs), strict=False)],
+        statuses=statuses(runs),
+        limits=limits(robot, {key: value[0] for key, value in runs.items()}) if single else [],
+        chained=len(chain),
+        most=CHAINS,
+        columns=columns(),
+        **known,
+        **named(robot, robot_name),
+    )
+
+
+def labels(runs: dict[str, np.ndarray]) -> list[str]:
+    """A heading for each run: its name where it has one, and its conditions."""
+    answer = []
+    for k in range(len(runs["status"])):
+        at = (
+            f"{runs['configuration'][k]}, {runs['supply_voltage_V'][k]:g} V, {runs['payload_kg'][k]:g} kg, "
+            f"{runs['slope_deg'][k]:g}°"
+        )
+        answer.append(f"{runs['run_id'][k]}: {at}" if "run_id" in runs else at)
+    return answer
+
+
+def _histories(
+    album: Album, robot: Robot, runs: dict[str, np.ndarray], names: list[str], histories: Run
+) -> dict[str, Any]:
+    from sweeps import figures_history
+
+    which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
+    history, status = histories.history, histories.result.status
+    starts = figures_history.starts(robot, history, status, which, names[:HISTORIES])
+    album.add("history", lambda: figures_history.from_standstill(starts))
+    known: dict[str, Any] = {"shown": len(starts), "starts": starts}
+    if history.reactions is not None:
+        from sweeps import figures_gear
+
+        known["averaged"] = 1e3 * float(history.time[0, 1] - history.time[0, 0])
+        share = histories.columns["guide_share"]
+        gears = figures_gear.gears(robot, history, status, share, which, names[:GEARS])
+        gears = [g for g in gears if g.rolls]
+        if gears and all(g.time[-1] > 2 * figures_gear.TAIL for g in gears):
+            known["ripple"] = album.add("ripple", lambda: figures_gear.current_ripple(gears))
+            album.add("reactions", lambda: figures_gear.reactions(gears))
+            tracked = [g for g in gears if g.on_tracks]
+            if tracked:
+                album.add(
+                    "touchdown", lambda: figures_gear.touchdown(tracked[0], f"{tracked[0].name}: touchdowns dotted")
+                )
+    return known
+
+
+def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
+    """How much of each limit a run uses: words, its value, the limit, and the share of it [%]."""
+    radius = float(robot.configurations[str(run["configuration"])].radius)
+    rpm = channels.RPM
+    shaft = float(run["theoretical_speed_mm_s"]) * channels.MM / radius * float(robot.gearbox.ratio) / rpm
+    asked = [
+        ("adhesion", float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
+        ("motor speed", shaft, float(robot.motor.speed_limit) / rpm, "{:.0f}", " rpm"),
+        ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / rpm, "{:.0f}", " rpm"),
+        ("winding, long running", float(run["temperature_winding_C"]), float(robot.motor.temperature_limit), "{:.0f}",
+         " °C"),
+    ]  # fmt: skip
+    return [
+        {"words": words, "value": form.format(value) + unit, "limit": form.format(limit) + unit,
+         "percent": 100 * abs(value) / limit}
+        for words, value, limit, form, unit in asked
+        if math.isfinite(value)
+    ]  # fmt: skip

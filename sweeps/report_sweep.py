@@ -1,0 +1,123 @@
+"""The report of a sweep: how its runs ended, which limits they exceed, and every channel over the grid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mmrjax import channels
+from sweeps import figures_sweep, words
+from sweeps.report import Album, named, render, statuses
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+Table = dict[str, np.ndarray]
+_AXES = {
+    "configuration": ("configuration", ""),
+    "supply_voltage_V": ("supply voltage", " V"),
+    "payload_kg": ("payload", " kg"),
+    "slope_deg": ("slope", "°"),
+}
+
+
+def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Table) -> Path:
+    """Write `report.html` and `figures/` for a finished sweep.
+
+    Args:
+        folder: an existing run folder.
+        robot: the robot that was simulated; robot_name: its name or file.
+        model: fidelity.
+        runs: the finished table of runs, any grid.
+
+    Returns:
+        The path of the page.
+    """
+    album = Album(folder)
+    for channel in channels.CHANNELS:
+        album.add(f"sweep_{channel.name}", lambda c=channel: figures_sweep.sweep(runs, c))
+    return render(
+        folder,
+        "sweep.html.j2",
+        album,
+        title=f"Sweep of {len(runs['status'])} runs",
+        model=model,
+        counts=counts(runs),
+        volts_drawn=_drawn(runs),
+        **named(robot, robot_name),
+    )
+
+
+def counts(runs: Table) -> dict[str, Any]:
+    """Counts of a finished sweep per status and limit, its axes in words, and the extremes of the settled runs."""
+    status = statuses(runs)
+    for s in status:
+        s["where"] = "" if s["name"] == "converged" else _where(runs, runs["status"] == s["name"])
+    flags = []
+    for flag, meaning in words.FLAGS.items():
+        over = np.array([flag in str(f).split(";") for f in runs["flags"]])
+        if over.any():
+            flags.append({"name": flag, "count": int(over.sum()), "meaning": meaning, "where": _where(runs, over)})
+    return {
+        "total": len(runs["status"]),
+        "status": status,
+        "flags": flags,
+        "axes": [{"name": name, "values": _levels(runs[c], unit)} for c, (name, unit) in _AXES.items()],
+        "extremes": _extremes(runs),
+    }
+
+
+def _levels(values: np.ndarray, unit: str) -> str:
+    levels = np.unique(values)
+    if levels.dtype.kind not in "fiu":
+        return ", ".join(dict.fromkeys(map(str, values)))
+    if levels.size > 8:
+        return f"{levels[0]:.3g} to {levels[-1]:.3g}{unit}, {levels.size} values"
+    return ", ".join(f"{v:.4g}" for v in levels) + unit
+
+
+def _where(runs: Table, pick: np.ndarray) -> str:
+    """Where in the sweep the picked runs lie, by configuration: the ranges of slope and voltage."""
+    parts = []
+    for kind in dict.fromkeys(map(str, runs["configuration"])):
+        mine = pick & (runs["configuration"] == kind)
+        if mine.any():
+            ranges = []
+            for column, unit in (("slope_deg", "°"), ("supply_voltage_V", " V")):
+                levels = np.unique(runs[column][mine])
+                if levels.size <= 4:
+                    ranges.append(", ".join(f"{v:.4g}" for v in levels) + unit)
+                else:
+                    ranges.append(f"{levels[0]:.3g} to {levels[-1]:.3g}{unit}")
+            parts.append(f"{kind}: {int(mine.sum())} at {' and '.join(ranges)}")
+    return "; ".join(parts)
+
+
+def _extremes(runs: Table) -> list[dict[str, str]]:
+    settled = np.nonzero(runs["status"] == "converged")[0]
+    asked = [(f"largest {c.label}", c.column, f"{{:.{max(c.resolution - 1, 0)}f}} {c.unit}", 1.0)
+             for c in channels.CHANNELS]  # fmt: skip
+    asked += [
+        ("largest slip", "slip", "{:.1f} %", 100.0),
+        ("hottest winding", "temperature_winding_C", "{:.0f} °C", 1.0),
+    ]
+    answer = []
+    for name, column, form, scale in asked:
+        if column not in runs or not np.isfinite(runs[column][settled]).any():
+            continue
+        k = int(settled[np.nanargmax(runs[column][settled])])
+        point = ", ".join(
+            str(runs[c][k]) if not unit and runs[c].dtype.kind not in "fiu" else f"{runs[c][k]:.4g}{unit}"
+            for c, (_, unit) in _AXES.items()
+        )
+        answer.append({"words": name, "value": form.format(scale * runs[column][k]), "at": point})
+    return answer
+
+
+def _drawn(runs: Table) -> str:
+    shown = figures_sweep.panels(runs["supply_voltage_V"])
+    if sum(int(mask.sum()) for _, mask in shown) == len(runs["status"]):
+        return ""
+    return f"{', '.join(name for name, _ in shown)} of {np.unique(runs['supply_voltage_V']).size} voltages"

@@ -1,0 +1,221 @@
+"""The registry of fidelities: every one keeps the contract, broken ones do not, and a new one is a file and a line."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import channels, fidelities, params
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities import Effort, Facts, Option
+from mmrjax.fidelities.base import Fidelity, History, Run
+from mmrjax.fidelities.steady import operating_point, steady_batch
+from mmrjax.signals import STATUSES, Result
+
+ROOT = Path(__file__).resolve().parents[1]
+RUNS = Conditions(configuration=[0, 1], voltage=24.0, slope_deg=[5.0, 0.0])
+SHORT = 0.03  # [s]
+
+
+def short(fidelity: Fidelity) -> dict[str, float]:
+    has = {option.name for option in fidelity.options}
+    return fidelity.resolved(**({"duration": SHORT} if "duration" in has else {}))
+
+
+# --- the contract -----------------------------------------------------------------------------------
+
+
+def knows_itself(fidelity: Fidelity, robot) -> None:
+    facts = fidelity.facts
+    assert fidelity.name in fidelities.TABLE and facts.description and facts.chunk >= 1 and facts.effort.starts >= 1
+    assert all(0 < option.default <= option.most and option.meaning and option.unit for option in facts.options)
+    assert fidelity.resolved() == {option.name: option.default for option in facts.options}
+    assert (fidelity.histories is not None) == facts.histories
+    parameters = {p.name for p in params.walk(robot.configurations.members[0])}
+    assert set(facts.computes) <= parameters
+
+
+def settles_traceably(fidelity: Fidelity, robot) -> None:
+    def readings(resistance):
+        result = fidelity.settled(params.replace(robot, {"motor.resistance": resistance}), RUNS)
+        assert isinstance(result, Result)
+        return jnp.stack([result.reading[name] for name in channels.names()]), result
+
+    (slopes, result) = jax.eval_shape(jax.jacfwd(readings, has_aux=True), jnp.asarray(0.611))
+    assert slopes.shape == (len(channels.CHANNELS), 2)
+    assert all(x.shape == (2,) for x in jax.tree.leaves(result))
+
+
+def runs_batches(fidelity: Fidelity, robot) -> None:
+    done = fidelity.run(robot, RUNS, short(fidelity))
+    assert isinstance(done, Run) and done.history is None
+    assert all(x.shape == (2,) for x in jax.tree.leaves(done))
+    assert set(np.asarray(done.result.status)) <= set(range(len(STATUSES)))
+    assert set(done.result.reading) == set(channels.names())
+
+
+def keeps_histories(fidelity: Fidelity, robot) -> None:
+    if fidelity.histories is None:
+        return
+    told: list[float] = []
+    kept = fidelity.histories(robot, RUNS, short(fidelity), told.append)
+    history = kept.history
+    assert isinstance(history, History)
+    assert history.time.shape == history.distance.shape and len(history.time) == 2
+    assert (np.diff(history.time) > 0).all() and abs(history.time[0, -1] - SHORT) < 1e-9
+    assert set(history.reading) == set(channels.names())
+    for name, reading in history.reading.items():
+        assert reading.shape == history.time.shape and np.isfinite(reading).all(), name
+    assert (np.abs(history.distance[:, 0]) < 1e-3).all() and (history.reading["total_current"][:, -1] > 0).all()
+    assert told == sorted(told) and all(0 <= share <= 1 for share in told)
+    assert kept.result.status.shape == (2,)
+
+
+def checks_and_cautions(fidelity: Fidelity, robot) -> None:
+    assert fidelity.check(robot, RUNS, short(fidelity)) is None
+
+
+CONTRACT = (knows_itself, settles_traceably, runs_batches, keeps_histories, checks_and_cautions)
+
+
+@pytest.mark.parametrize("law", CONTRACT, ids=lambda law: law.__name__)
+@pytest.mark.parametrize("name", fidelities.NAMES)
+def test_fidelity_keeps_the_contract(name, law, robot):
+    fidelity = fidelities.get(name)
+    assert fidelity.name == name
+    law(fidelity, robot)
+
+
+def _one_row(robot, conditions):
+    return operating_point(robot, jax.tree.map(lambda x: x[0], conditions))[0]
+
+
+def _no_readings(robot, conditions, options, progress=None):
+    return Run(dataclasses.replace(steady_batch(robot, conditions), reading={}))
+
+
+def _from_the_middle(robot, conditions, options, progress=None):
+    kept = fidelities.get("drive").histories(robot, conditions, {"duration": 2 * SHORT})
+    return kept
+
+
+@pytest.mark.parametrize(
+    ("law", "of", "change"),
+    [
+        (knows_itself, "steady", {"histories": _from_the_middle}),
+        (settles_traceably, "steady", {"settled": _one_row}),
+        (runs_batches, "steady", {"run": _no_readings}),
+        (keeps_histories, "drive", {"histories": _from_the_middle}),
+    ],
+    ids=["knows_itself", "settles_traceably", "runs_batches", "keeps_histories"],
+)
+def test_contract_can_be_broken(law, of, change, robot):
+    with pytest.raises(AssertionError):
+        law(dataclasses.replace(fidelities.get(of), **change), robot)
+
+
+def test_settled_fidelities_agree_where_the_robot_drives(robot):
+    steady, drive = (fidelities.get(name).settled(robot, RUNS) for name in ("steady", "drive"))
+    for name in channels.names():
+        np.testing.assert_allclose(drive.reading[name], steady.reading[name], rtol=1e-3)
+
+
+def test_settled_gives_numbers_where_the_robot_slides(robot):
+    runs = Conditions(voltage=24.0, slope_deg=[20.0])
+    for name in ("steady", "drive"):
+        settled = fidelities.get(name).settled(robot, runs)
+        assert STATUSES[int(settled.status[0])] == "slides"
+        assert all(np.isfinite(reading).all() for reading in settled.reading.values())
+
+
+# --- a new one --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """A fidelity in a file of its own, by a line of the table: the steady one, in another unit of effort."""
+
+    def run(robot, conditions, options, progress=None):
+        return Run(steady_batch(robot, conditions), {"patience": options["patience"] * jnp.ones(conditions.shape)})
+
+    def settled(robot, conditions):
+        return jax.vmap(lambda c: operating_point(robot, c)[0])(conditions)
+
+    module = types.ModuleType("toy_fidelity")
+    module.FIDELITY = Fidelity("toy", settled=settled, run=run)
+    monkeypatch.setitem(sys.modules, "toy_fidelity", module)
+    line = Facts(
+        "toy_fidelity", "steady, and patient", chunk=8, effort=Effort(2, True, False),
+        options=(Option("patience", "s", 3.0, 10.0, "time that it takes"),),
+    )  # fmt: skip
+    monkeypatch.setitem(fidelities.TABLE, "toy", line)
+    return "toy"
+
+
+def test_new_fidelity_is_a_file_and_a_line(toy, robot):
+    fidelity = fidelities.get(toy)
+    for law in CONTRACT:
+        law(fidelity, robot)
+    assert fidelity.run(robot, RUNS, fidelity.resolved(patience=4)).columns["patience"].tolist() == [4.0, 4.0]
+
+
+# --- before anything is imported ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("code", "absent"),
+    [
+        ("from mmrjax import fidelities; fidelities.NAMES, fidelities.facts('track').resolved()", "jax mujoco"),
+        ("from mmrjax import fidelities; fidelities.get('steady'); fidelities.get('drive')", "mujoco"),
+    ],
+)
+def test_facts_need_no_jax_and_steady_no_mujoco(code, absent):
+    code += "; import sys; assert not set(sys.argv[1:]) & set(sys.modules), set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code, *absent.split()], cwd=ROOT, check=True, timeout=120)
+
+
+def test_facts_state_what_the_command_line_needs():
+    assert fidelities.NAMES == ("steady", "drive", "track")
+    assert [fidelities.facts(name).chunk for name in fidelities.NAMES] == [16384, 4096, 512]
+    assert [fidelities.facts(name).resolved() for name in fidelities.NAMES] == [
+        {}, {"duration": 30.0}, {"duration": 1.5, "step": 1e-4},
+    ]  # fmt: skip
+    assert fidelities.facts("drive").resolved(duration=None) == {"duration": 30.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("steady", {"duration": 5.0}, "duration: got 5.0; this fidelity has no such option, its options: none"),
+        ("drive", {"step": 1e-4}, "step: got 0.0001; this fidelity has no such option, its options: duration"),
+        ("drive", {"duration": 0.0}, "duration: got 0; expected more than 0, at most 3600 s"),
+        ("track", {"step": 0.1}, "step: got 0.1; expected more than 0, at most 0.01 s"),
+        ("track", {"duration": float("nan")}, "duration: got nan; expected more than 0, at most 3600 s"),
+    ],
+)
+def test_options_are_refused_in_words(name, given, message):
+    with pytest.raises(ValueError) as refused:
+        fidelities.facts(name).resolved(**given)
+    assert str(refused.value) == message
+
+
+def test_unknown_fidelity_lists_those_there_are():
+    for ask in (fidelities.get, fidelities.facts):
+        with pytest.raises(KeyError, match="no fidelity fast; there are steady, drive, track"):
+            ask("fast")
+
+
+def test_check_refuses_a_step_that_a_run_cannot_bear(robot):
+    track = fidelities.get("track")
+    with pytest.raises(ValueError, match=r"the largest stable step is .* \(run \d of 2\)"):
+        track.check(robot, RUNS, track.resolved(step=1e-3))
+    with pytest.raises(ValueError, match=r"duration: got 0\.00055 s; expected a whole number of samples"):
+        track.check(robot, RUNS, track.resolved(duration=5.5e-4))
