@@ -23,6 +23,7 @@ from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED, amplitude_of, scored, shape_of
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
+from calibration.inference.optimizers import observation
 from mmrjax import params
 from mmrjax.effects import BY_NAME
 
@@ -195,7 +196,7 @@ def test_held_out_readings_are_those_of_a_refit_without_the_block(clean):
         runs = changed(runs, "speed_mm_s", row, 15 * runs["speed_sd_mm_s"][row])
     fitted, brute = ANALYST.base(runs), ANALYST.base(runs.where(~block))
     out = held_out(fitted.space.equipped, fitted.candidate.z, [block], (-1, -1))
-    seen = jax.jit(fitted.space.bare.observation)(jnp.asarray(brute.candidate.z[: brute.space.free]))
+    seen = observation(fitted.space.bare, jnp.asarray(brute.candidate.z[: brute.space.free]))
     expected = np.asarray(seen.reading)[: len(runs)]
     assert out.converged.all() and block.sum() == 6 and np.isnan(out.reading[~block]).all()
     assert (np.abs(out.reading - expected)[block] < 0.05 * sd[block]).all()
@@ -327,8 +328,7 @@ def test_null_of_one_column_is_normal(clean):
     space = clean.space
     one = (scored(space.library["ammeter_offset"]),)
     problem, z = space.bare, clean.base.z[: space.free]
-    linear = jax.jit(lambda z: problem.observe.linearise(problem, z, problem.data, one))(jnp.asarray(z))
-    null = bootstrap(problem, z, linear, one, clean.bases[:1], 384, 0)
+    null = bootstrap(problem, z, clean.left.linear, one, clean.bases[:1], 384, 0)
     assert len(null.single) > 370
     assert stats.kstest(null.single, stats.halfnorm.cdf).pvalue > 0.02
     for factor in (0.8, 1.25):  # the test can fail
