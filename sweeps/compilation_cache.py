@@ -74,8 +74,9 @@ def enable(path: Path | None = None) -> Path | None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
-    if jax.config.jax_compilation_cache_dir is not None:
-        return Path(jax.config.jax_compilation_cache_dir)
+    own = jax.config.values["jax_compilation_cache_dir"]
+    if own is not None:
+        return Path(own)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # who may write here may run code
         _prune(folder.parent)

@@ -102,7 +102,7 @@ class RunFolder:
         file = self.partial / "chunks" / f"{name}.npz"
         aside = file.with_suffix(".writing")
         with aside.open("wb") as stream:
-            np.savez(stream, **columns)  # type: ignore[arg-type]
+            np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
 
     def write_text(self, name: str, text: str) -> None:
@@ -175,6 +175,7 @@ def open_folder(
 def provenance() -> dict[str, Any]:
     """Program, versions and devices that made a result."""
     import jax
+    import jax.numpy as jnp
 
     return {
         "schema": "mmrjax.manifest/1",
@@ -183,7 +184,7 @@ def provenance() -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
         "devices": [str(d) for d in jax.devices()],
-        "float": "float64" if jax.config.jax_enable_x64 else "float32",
+        "float": jnp.result_type(float).name,
     }
 
 
