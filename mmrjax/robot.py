@@ -13,7 +13,7 @@ from jaxtyping import Array, Int
 from mmrjax.chassis import Chassis
 from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
-from mmrjax.params import Scalar
+from mmrjax.params import Scalar, as_float
 from mmrjax.power import Battery
 from mmrjax.tables import RADIUS_PULLEY
 
@@ -71,7 +71,7 @@ class Robot(eqx.Module):
     Attributes:
         configurations: chassis by name, at least one; given as a mapping.
         effects: terms beyond the paper's model; the empty tuple is the paper's model.
-        sides: motors driven alike; all per-side quantities are of one of them (assumption 3).
+        sides: how many motors are driven alike; all per-side quantities are of one of them (assumption 3).
     """
 
     battery: Battery
@@ -79,7 +79,7 @@ class Robot(eqx.Module):
     gearbox: Gearbox
     configurations: Configurations = eqx.field(converter=_configurations)
     effects: tuple[Effect, ...] = ()
-    sides: int = eqx.field(default=2, static=True)
+    sides: Scalar = eqx.field(default=2.0, converter=as_float)
 
     def chassis(self, configuration: Int[Array, ""]) -> Chassis:
         """The chassis of the configuration with this index; traceable and batchable."""
