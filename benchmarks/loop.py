@@ -1,4 +1,4 @@
-"""The closed loop on sealed tables: false findings, right classes, unnamed discrepancies, next experiments.
+"""The closed loop on synthetic tables: false findings, right classes, unnamed discrepancies, next experiments.
 
     python benchmarks/loop.py --clean 1000 --library 400 --variants 200 --outside 300 --pairs 200 --jobs 2
 
@@ -39,11 +39,11 @@ SIZES = 3.0
 #: Proposals that are carried out, one after the other, to resolve a class.
 EXPERIMENTS = 3
 #: The analyst's prior on the surface, which Table 5 does not know.
-STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("tracked", "wheeled")}
+STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 
 
 def make(kind: str, seed: int) -> g.Case | None:
-    """The sealed case of a kind and a seed; None where the effect cannot be made so strong."""
+    """The case of a kind and a seed; None where the effect cannot be made so strong."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
     if kind == "clean":
         return g.case(seed=seed)
@@ -101,11 +101,12 @@ def oracle(case: g.Case) -> list[dict]:
     return answers
 
 
-def one(engine, kind: str, seed: int, replicates: int) -> dict:
+def one(robot, kind: str, seed: int, replicates: int) -> dict:
     """A case made, looped over and scored against its label."""
-    from calibration.inference import noise
     from calibration.data import runs as records
-    from calibration.discovery import loop
+    from calibration.discovery.discover import discover_at
+    from calibration.discovery.settings import settings_for
+    from calibration.inference import noise, observers
 
     case = make(kind, seed)
     if case is None:
@@ -115,14 +116,16 @@ def one(engine, kind: str, seed: int, replicates: int) -> dict:
         case.write(table, Path(folder) / "label.json")
         runs = records.read(table)
     began = time.perf_counter()
-    looped = loop.Loop(engine, runs, noise.of(runs).sd, stated=STATED, replicates=replicates, seed=seed)
-    found = looped.run()
-    return {"kind": kind, "seed": seed, "seconds": time.perf_counter() - began, **judged(case, found, looped)}
+    observer = observers.kind(runs)
+    settings = settings_for(observer, replicates, seed)
+    found = discover_at(runs, robot, noise.of(runs, observer.sizes(runs)), settings, STATED)
+    return {"kind": kind, "seed": seed, "seconds": time.perf_counter() - began, **judged(case, found, robot)}
 
 
-def judged(case: g.Case, found, looped) -> dict:
+def judged(case: g.Case, found, robot) -> dict:
     """Verdict and label side by side."""
-    name = looped.engine.names
+    named = found.verdict in ("named", "class")
+    fitted = Again(found, robot) if named else None
     return {
         "truth": [
             {**{k: e[k] for k in ("name", "class", "balance", "sigmas", "sizes")}, **o}
@@ -130,52 +133,93 @@ def judged(case: g.Case, found, looped) -> dict:
         ],
         "sigmas_together": case.label["sigmas_together"],
         "verdict": found.verdict,
-        "classes": [[name[k] for k in c] for c in found.classes],
-        "unnamed": found.unnamed,
-        "p_value": found.base.gate.p_value,
-        "outliers": list(found.outliers),
-        "chi2": [2 * found.base.hypothesis.cost, 2 * found.after.hypothesis.cost],
-        "experiments": carried_out(case, found, looped) if found.verdict == "class" else [],
-        **(after(case, found, looped) if found.verdict in ("named", "class") else {}),
+        "classes": [list(e.members) for e in found.effects],
+        "unnamed": located(found),
+        "p_value": found.before.p_value,
+        "outliers": [int(k) - 1 for k in found.outliers],
+        "chi2": list(found.chi2),
+        "experiments": carried_out(case, fitted) if found.verdict == "class" else [],
+        **(after(case, found, fitted) if named else {}),
     }
 
 
-def after(case: g.Case, found, looped) -> dict:
+def located(found) -> tuple | None:
+    """(balance, variable, balances that act alike) of what has no name, or remains."""
+    if found.unnamed is not None:
+        return found.unnamed.balance, found.unnamed.variable, found.unnamed.balances_alike
+    if found.remains is not None:
+        return found.remains.balance, found.remains.variable, found.remains.balances_alike
+    return None
+
+
+class Again:
+    """The fits of a finished loop, made again by its stages for what its result does not hold.
+
+    Attributes:
+        space: the rows that count; base: the fit without effects, a `Candidate`.
+        candidates: the proposed one first, then those that are indistinguishable from it, by the names of their
+            effects.
+    """
+
+    def __init__(self, found, robot) -> None:
+        import jax
+        import jax.numpy as jnp
+
+        from calibration.discovery import discover
+        from calibration.discovery.candidates import filled, fit_base, fit_candidates, start
+        from calibration.discovery.score_tests import diagnosed
+
+        self.settings = settings = found.settings
+        space = discover.pose(found.runs, robot, found.readings_of_rows.sd, settings, STATED)
+        included = np.zeros(len(space.included), bool)
+        included[: len(found.runs)] = found.included
+        fitted = fit_base(space.without(~included), settings, found.runs.source)
+        self.space = space = fitted.space
+        self.base = base = fitted.candidate
+        bare = space.problem(base.active)
+        bases = discover.bases_at(found.runs, fitted)
+        scores = jax.device_get(diagnosed(bare, jnp.asarray(base.z), space.library.scored, bases))[1]
+        best = [e.name for e in found.effects]
+        sets = [best]
+        for k, effect in enumerate(found.effects):
+            sets += [[*best[:k], name, *best[k + 1 :]] for name in list(effect.members)[1:]]
+        wanted = [filled(names, settings) for names in sets]
+        starts = [(w, start(space, base, w, settings, scores)) for w in wanted]
+        self.candidates = {" + ".join(c.effects): c for c in fit_candidates(space, starts, settings)}
+
+
+def after(case: g.Case, found, fitted: Again) -> dict:
     """Errors held out by slope before and after, over the noise's sd, and the bias of the base parameters."""
-    from calibration.inference import blocks as holdout
+    seen = found.readings_of_rows
 
-    masks = list(holdout.blocks(looped.runs, "slope").values())
-    rows = len(looped.runs)
-    used, sd = looped.counts[:rows], np.asarray(looped.problem.data.sd)[:rows]
+    def rms(readings: np.ndarray) -> float:
+        error = (readings - seen.measured) / seen.sd
+        return float(np.sqrt(np.nanmean(error[found.included] ** 2)))
 
-    def rms(h) -> float:
-        error = (looped.held_out(h, masks)[0] - looped.runs.measured()) / sd
-        return float(np.sqrt(np.nanmean(error[used] ** 2)))
-
-    base, proposed = found.base.hypothesis, found.after.hypothesis
-    c = looped.coordinates.base
+    c = fitted.space.coordinates.base
     value = np.array([case.constants[n] for n in c.names])
     truth = (np.where(c.scale, np.log(value), value) - np.asarray(c.location)) / np.asarray(c.spread)
-    bias = [((h.z[: len(c)] - truth) / h.sd[: len(c)]).tolist() for h in (base, proposed)]
-    return {"held_out": [rms(base), rms(proposed)], "bias": bias}
+    both = fitted.base, next(iter(fitted.candidates.values()))
+    bias = [((x.z[: len(c)] - truth) / x.sd[: len(c)]).tolist() for x in both]
+    return {"held_out": [rms(r) for r in seen.held_out["slope"]], "bias": bias}
 
 
-def carried_out(case: g.Case, found, looped) -> list[dict]:
+def carried_out(case: g.Case, fitted: Again) -> list[dict]:
     """Experiments proposed and carried out one after the other, until one alternative or nothing to do is left."""
-    from calibration.discovery import experiments as experiment
+    from calibration.discovery import experiments
 
-    seen = whole = experiment.prospect(looped, experiment.alternatives(looped, found))
+    seen = whole = experiments.prospect(fitted.space, fitted.candidates, fitted.settings)
     done: dict[str, dict] = {}
     said: list[dict] = []
     while len(seen.names) > 1 and len(said) < EXPERIMENTS:
-        proposal = experiment.choose(seen)
-        new = [name for name in proposal.experiments if name not in (experiment.NONE, *done)]
+        proposal = experiments.choose(seen)
+        new = [name for name in proposal.experiments if name not in (experiments.NONE, *done)]
         if not new:
-            said.append({"experiments": [experiment.NONE], "left": seen.names})
+            said.append({"experiments": [experiments.NONE], "left": seen.names})
             break
         for name in new:
             done[name] = case.carry_out(name, seed=1000 * len(done) + case.label["seed"])
-        says = experiment.supported(whole, done)
+        says = experiments.supported(whole, done)
         what = {k: getattr(proposal, k) for k in ("experiments", "expected_sigma", "settles", "separates")}
         said.append(what | {"chi2": says.chi2, "best": says.best, "left": says.left})
         seen = whole.among(says.left)
@@ -183,21 +227,23 @@ def carried_out(case: g.Case, found, looped) -> list[dict]:
 
 
 @functools.cache
-def engine_of(robot: str, series: bool = False):
-    """What a worker compiles once for all its tables, or histories."""
+def robot_of(name: str):
+    """The robot of a worker; what its loops compile is kept on disk for the other one."""
     import jax
 
+    from sweeps import compilation_cache
+
+    compilation_cache.enable()
     jax.config.update("jax_enable_x64", True)
-    from calibration.discovery import loop
     from mmrjax import robots
 
-    return loop.Engine(robots.ROBOTS[robot](), series=series)
+    return robots.ROBOTS[name]()
 
 
 def work(task: tuple) -> dict:
     """One case in a worker."""
     kind, seed, replicates, robot = task
-    return one(engine_of(robot), kind, seed, replicates)
+    return one(robot_of(robot), kind, seed, replicates)
 
 
 def _guarded(work, task: tuple) -> dict:

@@ -12,11 +12,10 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pysindy
-from loop import MIMIC, STATED, campaign, engine_of, interval, make, oracle
+from loop import MIMIC, STATED, campaign, interval, make, oracle, robot_of
 
 KINDS = ("clean", "library", "outside", "pairs")
 #: Effects that are refitted beside a fit: the loop's own number.
@@ -50,34 +49,44 @@ class Ladder:
     """Fits of sets of effects, each made once.
 
     Args:
-        looped: the loop of the table, which fits; base: its fit without effects.
+        runs: the table; fitted: its base fit.
+        settings: of the loop.
     """
 
-    def __init__(self, looped, base) -> None:
-        self.looped, self.base = looped, base
-        self.curves = looped._curves(base)
-        self.fitted: dict = {frozenset(): base}
+    def __init__(self, runs, fitted, settings) -> None:
+        from calibration.discovery.discover import bases_at
+
+        self.space, self.base, self.settings = fitted.space, fitted.candidate, settings
+        self.bases = bases_at(runs, fitted)
+        self.fitted: dict = {self.base.key: self.base}
         self.looks: dict = {}
 
-    def look(self, h) -> tuple:
+    def look(self, candidate) -> tuple:
         """A fit linearised, and the scores of the library there."""
-        key = frozenset(h.effects)
-        if key not in self.looks:
-            self.looks[key] = self.looped.look(h, self.curves)[:2]
-        return self.looks[key]
+        import jax
+        import jax.numpy as jnp
 
-    def beside(self, h) -> list:
+        from calibration.discovery.score_tests import diagnosed
+
+        if candidate.key not in self.looks:
+            problem, z = self.space.problem(candidate.active), jnp.asarray(candidate.z)
+            seen = diagnosed(problem, z, self.space.library.scored, self.bases)
+            self.looks[candidate.key] = jax.device_get(seen)[:2]
+        return self.looks[candidate.key]
+
+    def beside(self, candidate) -> list:
         """Fits with one effect more: the strongest by the score test, as many as the loop itself refits."""
-        looped, scores = self.looped, self.look(h)[1]
-        single = np.abs(np.asarray(scores.single))
-        by_effect = np.array([single[looped.engine.of == k].max() for k in range(len(looped.engine.names))])
-        by_effect[list(h.effects)] = -1.0
-        wanted = [(*h.effects, int(k)) for k in np.argsort(-by_effect)[:BATCH]]
-        new = [w for w in wanted if frozenset(w) not in self.fitted]
-        empty = (-1,) * (looped.engine.size - len(h.effects) - 1)
-        found = looped.fit_all([((*w, *empty), looped.start(h, (*w, *empty), scores)) for w in new])
-        self.fitted |= {frozenset(w): x for w, x in zip(new, found, strict=True)}
-        return [self.fitted[frozenset(w)] for w in wanted]
+        from calibration.discovery.candidates import filled, fit_candidates, start
+
+        space, settings, scores = self.space, self.settings, self.look(candidate)[1]
+        strength = space.library.largest(np.abs(np.asarray(scores.single)))
+        strength[list(space.library.indices(candidate.effects))] = -1.0
+        names = [space.library.names[k] for k in np.argsort(-strength)[:BATCH]]
+        wanted = [filled([*candidate.effects, name], settings) for name in names]
+        new = [w for w in wanted if frozenset(w) - {""} not in self.fitted]
+        found = fit_candidates(space, [(w, start(space, candidate, w, settings, scores)) for w in new], settings)
+        self.fitted |= {c.key: c for c in found}
+        return [self.fitted[frozenset(w) - {""}] for w in wanted]
 
 
 def stepwise(ladder: Ladder, criterion) -> list[str]:
@@ -87,21 +96,21 @@ def stepwise(ladder: Ladder, criterion) -> list[str]:
         criterion: of χ² with priors, free parameters and readings. A free parameter is a constant of the base,
             an amplitude or a shape.
     """
-    looped = ladder.looped
-    n = 3 * int(looped.counts.sum())
-    shaped = np.array([bool(s) for s in looped.coordinates.shapes], int)
+    space = ladder.space
+    n = int(np.sum(space.weight > 0))
+    shaped = dict(zip(space.coordinates.names, map(bool, space.coordinates.shapes), strict=True))
 
-    def value(h) -> float:
-        k = len(looped.coordinates.base) + sum(1 + shaped[j] for j in h.effects)
-        return criterion(2 * h.cost, k, n)
+    def value(candidate) -> float:
+        k = space.free + sum(1 + shaped[name] for name in candidate.effects)
+        return criterion(2 * candidate.cost, k, n)
 
     best = ladder.base
-    while len(best.effects) < looped.engine.size:
+    while len(best.effects) < ladder.settings.slots:
         further = min(ladder.beside(best), key=value)
         if value(further) >= value(best):
             break
         best = further
-    return [looped.engine.names[k] for k in best.effects]
+    return list(best.effects)
 
 
 # --- PySINDy --------------------------------------------------------------------------------------------
@@ -134,61 +143,61 @@ def sparse(theta: np.ndarray, target: np.ndarray, known: bool) -> np.ndarray:
     return min(supports, key=value)
 
 
-def columns(looped, linear, scores) -> np.ndarray:
-    """Signature of every effect, at the shape whose score is the strongest, shape (rows that count, 3, effects)."""
-    at = [looped._best_instance(scores, k) for k in range(len(looped.engine.names))]
-    whole = np.asarray(linear.signatures)[:, at]
-    return whole.reshape(-1, 3, len(at))[looped.counts]
+def strongest(space, scores) -> list[int]:
+    """Of every effect, its instance at the shape whose score is the strongest."""
+    return [space.library.best_instance(name, scores.single) for name in space.library.names]
 
 
-def sindy(looped, linear, scores) -> list[str]:
+def sindy(space, linear, scores) -> list[str]:
     """STLSQ on the defect of each of the three equations, over the effects' unit terms.
 
     A term of another balance, or of an instrument, is taken as the defects that change the readings as it does.
     """
-    from calibration.discovery.result import defects
-    from calibration.discovery.score_tests import PROBED
+    from calibration.inference.linearization import PROBED
+    from calibration.inference.observers.settled import EQUATIONS
 
-    found = defects(looped, SimpleNamespace(linear=linear))
-    signatures = columns(looped, linear, scores)
-    there = looped.counts[: len(looped.runs)]
-    sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][looped.counts] for b in found], 2)
+    rows, at = space.included, strongest(space, scores)
+    whole = np.asarray(linear.signatures)[:, at]
+    signatures = whole.reshape(len(rows), -1, len(at))[rows]  # rows that count, channels, effects
+    sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][rows] for b in EQUATIONS], 2)
     terms = np.linalg.solve(sensitivity, signatures)  # rows, equations, effects
+    lacks = -np.linalg.solve(sensitivity, np.asarray(linear.by_row())[rows][..., None])[..., 0]
     names: set[str] = set()
-    whole = np.sqrt(np.sum(signatures**2, (0, 1)))
-    for k, values in enumerate(found.values()):
+    size = np.sqrt(np.sum(signatures**2, (0, 1)))
+    for k in range(len(EQUATIONS)):
         moved = np.sqrt(np.sum((sensitivity[:, :, k, None] * terms[:, None, k]) ** 2, (0, 1)))
-        seen = np.flatnonzero(moved > UNSEEN * np.maximum(whole, 1e-12))
-        kept = sparse(terms[:, k, seen], values[there], known=False)
-        names |= {looped.engine.names[j] for j in seen[kept]}
+        seen = np.flatnonzero(moved > UNSEEN * np.maximum(size, 1e-12))
+        kept = sparse(terms[:, k, seen], lacks[:, k], known=False)
+        names |= {space.library.names[j] for j in seen[kept]}
     return sorted(names)
 
 
-def sindy_refit(looped, linear, scores) -> list[str]:
+def sindy_refit(space, linear, scores) -> list[str]:
     """STLSQ on all three equations together, weighted by the readings' sds, the constants refitted beside it.
 
     Both sides are what a linear refit of the constants leaves of them (Frisch, Waugh and Lovell).
     """
     jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    theta = np.zeros((len(residual), len(looped.engine.names)))
-    at = [looped._best_instance(scores, k) for k in range(theta.shape[1])]
-    theta[: len(np.asarray(linear.signatures))] = np.asarray(linear.signatures)[:, at]
+    theta = np.zeros((len(residual), len(space.library)))
+    theta[: linear.readings] = np.asarray(linear.signatures)[:, strongest(space, scores)]
     root = np.linalg.qr(jacobian)[0]
     left, target = theta - root @ (root.T @ theta), residual - root @ (root.T @ residual)
     seen = np.linalg.norm(left, axis=0) > UNSEEN * np.maximum(np.linalg.norm(theta, axis=0), 1e-12)
     counts = np.abs(target) + np.abs(left[:, seen]).sum(1) > 0  # rows that pad the table are zero
     kept = sparse(left[counts][:, seen], -target[counts], known=True)
-    return [looped.engine.names[j] for j in np.flatnonzero(seen)[kept]]
+    return [space.library.names[j] for j in np.flatnonzero(seen)[kept]]
 
 
 # --- the campaign ---------------------------------------------------------------------------------------
 
 
-def one(engine, kind: str, seed: int) -> dict:
+def one(robot, kind: str, seed: int) -> dict:
     """A case made, and what each method names."""
-    from calibration.inference import noise
     from calibration.data import runs as records
-    from calibration.discovery import loop
+    from calibration.discovery.candidates import fit_base
+    from calibration.discovery.discover import pose
+    from calibration.discovery.settings import settings_for
+    from calibration.inference import noise, observers
 
     case = make(kind, seed)
     if case is None:
@@ -198,13 +207,15 @@ def one(engine, kind: str, seed: int) -> dict:
         case.write(table, Path(folder) / "label.json")
         runs = records.read(table)
     began = time.perf_counter()
-    looped = loop.Loop(engine, runs, noise.of(runs).sd, stated=STATED, seed=seed)
-    base = looped.base_fit()
-    ladder = Ladder(looped, base)
-    linear, scores = ladder.look(base)
+    observer = observers.kind(runs)
+    settings = settings_for(observer, seed=seed)
+    space = pose(runs, robot, noise.of(runs, observer.sizes(runs)).sd, settings, STATED)
+    fitted = fit_base(space, settings, runs.source)
+    space, ladder = fitted.space, Ladder(runs, fitted, settings)
+    linear, scores = ladder.look(ladder.base)
     named = {
         "aicc": stepwise(ladder, aicc), "bic": stepwise(ladder, bic),
-        "sindy": sindy(looped, linear, scores), "sindy_refit": sindy_refit(looped, linear, scores),
+        "sindy": sindy(space, linear, scores), "sindy_refit": sindy_refit(space, linear, scores),
     }  # fmt: skip
     truth = [
         {**{k: e[k] for k in ("name", "class", "balance", "sigmas", "sizes")}, **o}
@@ -277,9 +288,9 @@ def summary(lines: list[dict]) -> list[str]:
 
 
 def work(task: tuple) -> dict:
-    """One case in a worker that keeps its engine."""
+    """One case in a worker."""
     kind, seed, _, robot = task
-    return one(engine_of(robot), kind, seed)
+    return one(robot_of(robot), kind, seed)
 
 
 if __name__ == "__main__":

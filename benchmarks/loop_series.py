@@ -1,4 +1,4 @@
-"""The closed loop on sealed time histories: false findings, right names, discrepancies without one.
+"""The closed loop on synthetic time histories: false findings, right names, discrepancies without one.
 
     python benchmarks/loop_series.py --clean 16 --library 30 --outside 16 --pairs 8 --jobs 2
 
@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import generator as g
 import generator_series as gs
-from loop import EQUATION, SIZES, campaign, engine_of, interval
+from loop import EQUATION, SIZES, campaign, interval, located, robot_of
 
 KINDS = ("clean", "library", "outside", "pairs")
 #: Effects of these histories; `thermal_drift` and `battery_sag` need longer ones and a battery.
@@ -30,7 +30,7 @@ OUTSIDE = ("pulley_ovality", "belt_splice", "supply_recovery", "oil_warming")
 #: The analyst's priors on the surface, which Table 5 does not know.
 STATED = {
     f"{c}.ground.friction.{name}": prior
-    for c in ("tracked", "wheeled")
+    for c in ("6T2A", "4W2T")
     for name, prior in (("static", (0.6, 0.09)), ("dynamic", (0.48, 0.08)))
 }
 
@@ -57,43 +57,42 @@ def work(task: tuple) -> dict:
     case = make(kind, seed)
     if case is None:
         return {"kind": kind, "seed": seed, "skipped": True}
-    return {"kind": kind, "seed": seed, **judged(engine_of(robot, series=True), *case, seed, replicates)}
+    return {"kind": kind, "seed": seed, **judged(robot_of(robot), *case, seed, replicates)}
 
 
-def judged(engine, table: dict, label: dict, seed: int, replicates: int) -> dict:
+def judged(robot, table: dict, label: dict, seed: int, replicates: int) -> dict:
     """The loop over a case, verdict and label side by side."""
-    from calibration.inference import noise
-    from calibration.data import runs as records
-    from calibration.discovery import loop
-    from calibration.discovery import result as loop_outcome
+    from calibration.data.runs import Runs
+    from calibration.discovery.discover import discover_at
+    from calibration.discovery.findings import size_of
+    from calibration.discovery.settings import settings_for
+    from calibration.inference import noise, observers
+    from mmrjax.effects import BY_NAME
 
-    runs = records.Runs("sealed", dict(table))
+    runs = Runs("synthetic", dict(table))
     began = time.perf_counter()
-    looped = loop.Loop(engine, runs, noise.of(runs).sd, stated=STATED, replicates=replicates, seed=seed)
-    found = looped.run()
+    observer = observers.kind(runs)
+    settings = settings_for(observer, replicates, seed)
+    found = discover_at(runs, robot, noise.of(runs, observer.sizes(runs)), settings, STATED)
     seconds = time.perf_counter() - began
-    name = looped.engine.names
-    left = {s["name"]: s["sigmas_per_prior_sd"] for s in loop_outcome.scores(looped, found.base)}
-    sd = {n: loop.amplitude_of(e).spec.prior_sd(0.0) for n, e in zip(name, looped.engine.effects, strict=True)}
+    left = {s.name: s.sigmas_per_prior_sd for s in found.scores}
     truth = [
         {
             **{k: e[k] for k in ("name", "class", "balance", "amplitude", "sigmas")},
             # what the loop's own base, which frees more than the generator's, leaves of it
-            "sigmas_left": left[e["class"]] * abs(e["amplitude"]) / sd[e["class"]] if e["class"] else None,
+            "sigmas_left": left[e["class"]] * abs(e["amplitude"]) / size_of(BY_NAME[e["class"]]())
+            if e["class"]
+            else None,
         }
         for e in label["effects"]
     ]
-    p = len(looped.coordinates.base)
-    after = found.after.hypothesis
+    amplitudes = {e.name: next(iter(e.parameters.values())) for e in found.effects}
     return {
         "seconds": seconds, "truth": truth, "verdict": found.verdict,
-        "classes": [[name[k] for k in c] for c in found.classes], "unnamed": found.unnamed,
-        "p_value": found.base.gate.p_value, "outliers": len(found.outliers),
-        "chi2": [2 * found.base.hypothesis.cost, 2 * after.cost], "readings": 3 * len(runs),
-        "amplitudes": {
-            name[k]: [float(a * sd[name[k]]), float(3.0 * after.sd[p + s] * sd[name[k]])]
-            for s, (k, a) in enumerate(zip(after.which, after.amplitude, strict=True)) if k >= 0
-        },
+        "classes": [list(e.members) for e in found.effects], "unnamed": located(found),
+        "p_value": found.before.p_value, "outliers": len(found.outliers),
+        "chi2": list(found.chi2), "readings": found.readings,
+        "amplitudes": {name: [a.value, a.sd] for name, a in amplitudes.items()},
     }  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from reference import NOMINAL, SIDES, G
 
 #: Constants of a robot that climbs 20 degrees: `reference.NOMINAL` on a surface that holds.
 CLIMBING: dict[str, float] = dict(NOMINAL)
-for _c in ("tracked", "wheeled"):
+for _c in ("6T2A", "4W2T"):
     CLIMBING |= {f"{_c}.ground.friction.static": 0.60, f"{_c}.ground.friction.dynamic": 0.48}
 
 #: Relative standard deviation within which a constant is known (guide share: of its nominal 0.3).
@@ -36,10 +36,10 @@ TOLERANCES: dict[str, float] = {
     "gearbox.efficiency_load": 0.03,
     "gearbox.friction_coulomb": 0.15,
     "gearbox.friction_viscous": 0.15,
-    "tracked.track.guide_share": 0.3,
+    "6T2A.track.guide_share": 0.3,
     **{
         f"{c}.{name}": sd
-        for c in ("tracked", "wheeled")
+        for c in ("6T2A", "4W2T")
         for name, sd in {
             "track.loss_coulomb": 0.15,
             "track.loss_viscous": 0.15,
@@ -59,7 +59,7 @@ def perturbed(rng: np.random.Generator, names: Sequence[str] = tuple(TOLERANCES)
     p = dict(CLIMBING)
     for name in names:
         p[name] *= 1 + scale * TOLERANCES[name] * float(np.clip(rng.standard_normal(), -2, 2))
-    for c in ("tracked", "wheeled"):
+    for c in ("6T2A", "4W2T"):
         p[f"{c}.ground.friction.dynamic"] = 0.8 * p[f"{c}.ground.friction.static"]
     return p
 
@@ -81,7 +81,7 @@ class Conditions:
 def conditions(wheeled, U, slope_deg, payload, p: Mapping[str, float] = CLIMBING) -> Conditions:
     """Conditions with the mass as weighed, to 10 g."""
     w, u, s, m = (np.asarray(x, float) for x in np.broadcast_arrays(wheeled, U, slope_deg, payload))
-    own = np.where(w > 0.5, p["wheeled.mass"], p["tracked.mass"])
+    own = np.where(w > 0.5, p["4W2T.mass"], p["6T2A.mass"])
     return Conditions(w, u, np.radians(s), m, np.round(own + m, 2))
 
 
@@ -249,14 +249,14 @@ def _instant(x: np.ndarray, c: Conditions, p: Mapping[str, float], terms: Sequen
     """Every quantity of settled forward travel at x = (I [A], w [rad/s], V [m/s]), shape (3, rows)."""
 
     def both(name: str) -> np.ndarray:
-        return np.where(c.wheeled > 0.5, p["wheeled." + name], p["tracked." + name])
+        return np.where(c.wheeled > 0.5, p["4W2T." + name], p["6T2A." + name])
 
     def extra(balance: str) -> Any:
         return sum((t.of(s) for t in terms if t.form.balance == balance), 0.0)
 
     s = SimpleNamespace(I=x[0], w=x[1], V=x[2], wheeled=c.wheeled, slope=c.slope, payload=c.payload, U=c.U)
     s.R, s.C = p["motor.resistance"], p["motor.torque_constant"]
-    s.r, s.M_t0, s.M_own, s.r_pulley = both("radius"), both("track.loss_coulomb"), both("mass"), p["tracked.radius"]
+    s.r, s.M_t0, s.M_own, s.r_pulley = both("radius"), both("track.loss_coulomb"), both("mass"), p["6T2A.radius"]
     s.w_k = s.w / p["gearbox.ratio"]
     s.V_teor = s.r * s.w_k
     s.M = c.mass
@@ -304,7 +304,7 @@ def _slope(x, c, p, terms, f0) -> np.ndarray:
 def solve(c: Conditions, p: Mapping[str, float], terms: Sequence[Term] = ()) -> tuple[np.ndarray, np.ndarray]:
     """Operating points by Newton's method over all rows: x of shape (3, rows), and whether each is sound."""
     no_load = 0.9 * c.U / p["motor.torque_constant"]
-    radius = np.where(c.wheeled > 0.5, p["wheeled.radius"], p["tracked.radius"])
+    radius = np.where(c.wheeled > 0.5, p["4W2T.radius"], p["6T2A.radius"])
     x = np.stack([0.1 * c.U / p["motor.resistance"], no_load, radius * no_load / p["gearbox.ratio"]])
     with np.errstate(all="ignore"):
         for _ in range(25):
@@ -447,13 +447,13 @@ def _free(how: str, U: np.ndarray, wheeled: int, motors: int, p: Mapping[str, fl
 
     `how` is `lifted`, `motor` (nothing on its shaft), `brake` (a brake on it) or `stall` (shaft held).
     """
-    chassis = ("tracked.", "wheeled.")[wheeled]
+    chassis = ("6T2A.", "4W2T.")[wheeled]
     R, C, zero = p["motor.resistance"], p["motor.torque_constant"], np.zeros_like(U)
 
     def left(x: np.ndarray, shown: bool = False) -> np.ndarray:
         i, w = x
         s = SimpleNamespace(
-            I=i, w=w, w_k=w / p["gearbox.ratio"], U=U, R=R, C=C, r=p[chassis + "radius"], r_pulley=p["tracked.radius"],
+            I=i, w=w, w_k=w / p["gearbox.ratio"], U=U, R=R, C=C, r=p[chassis + "radius"], r_pulley=p["6T2A.radius"],
             M_t0=p[chassis + "track.loss_coulomb"], M=zero, N=zero, D=zero, P=zero, payload=zero, slope=zero,
             wheeled=zero + wheeled, V=zero,
         )  # fmt: skip

@@ -78,7 +78,7 @@ def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str,
     """d/dt of STATES, shape (8, runs); terms are (form, amplitude, shapes)."""
 
     def both(name: str) -> np.ndarray:
-        return np.where(c.wheeled > 0.5, p["wheeled." + name], p["tracked." + name])
+        return np.where(c.wheeled > 0.5, p["4W2T." + name], p["6T2A." + name])
 
     def extra(balance: str) -> Any:
         return sum((a * form.of(s, q) for form, a, q in terms if form.balance == balance), 0.0)

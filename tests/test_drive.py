@@ -138,7 +138,7 @@ def test_drive_energy_balance_can_fail(robot, grid, drive_table8):
 
 def check_settled(run, point, where):
     for channel in ("total_current", "motor_speed", "speed"):
-        end, root = getattr(run.result.reading, channel), getattr(point.reading, channel)
+        end, root = run.result.reading[channel], point.reading[channel]
         np.testing.assert_allclose(np.asarray(end)[where], np.asarray(root)[where], rtol=1e-3, err_msg=channel)
 
 
@@ -188,12 +188,12 @@ def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
     answer, point = go(robot), steady_batch(robot, runs)
     assert names(answer) == names(point) == ["converged", "converged", "slides"]
     for name in ("total_current", "motor_speed", "speed"):
-        here, there = np.asarray(getattr(answer.reading, name)), np.asarray(getattr(point.reading, name))
+        here, there = np.asarray(answer.reading[name]), np.asarray(point.reading[name])
         np.testing.assert_allclose(here[:2], there[:2], rtol=1e-6)
 
     def speed(model, static):
         changed = params.replace(robot, {"6T2A.ground.friction.static": static})
-        return model(changed).reading.speed[1]
+        return model(changed).reading["speed"][1]
 
     slopes = [
         jax.jvp(lambda x, m=m: speed(m, x), (jnp.asarray(0.32),), (jnp.ones(()),))[1]
@@ -208,8 +208,8 @@ def test_drive_that_starts_rolling_remembers_as_if_it_had_long_been(robot):
     run = Conditions(voltage=24.0, slope_deg=np.degrees(0.1))
     answer = jax.jit(lambda r: drive(r, run, jnp.asarray([0.0, 1.0]), rolling=True))(warm)
     here, point, bare = answer.result.reading, steady(warm, run).reading, steady(robot, run).reading
-    assert abs(point.motor_speed / bare.motor_speed - 1) > 1e-4
-    np.testing.assert_allclose(here.motor_speed, point.motor_speed, rtol=1e-6)
+    assert abs(point["motor_speed"] / bare["motor_speed"] - 1) > 1e-4
+    np.testing.assert_allclose(here["motor_speed"], point["motor_speed"], rtol=1e-6)
     memory = answer.signals.memory["thermal_drift"]
     np.testing.assert_allclose(memory[1], memory[0], rtol=1e-6)
 
@@ -252,7 +252,7 @@ def test_drive_statuses(small):
     expected = ["converged", "stalled", "slides", "battery_empty", "failed", "stalled", "converged", "converged"]
     assert names(run.result)[:8] == expected
     assert list(np.asarray(run.result.flags)[[0, 6, 7, 8]]) == [0b010, 0b010, 0b011, 0b100]
-    for field in (run.result.reading.speed, run.result.reading.total_current, run.result.power_ground):
+    for field in (run.result.reading["speed"], run.result.reading["total_current"], run.result.power_ground):
         assert np.isfinite(np.delete(np.asarray(field), [3, 4])).all()  # no NaN but where the status says why
         assert np.isnan(np.asarray(field)[[3, 4]]).all()
     short = go(runs, 0.05)
@@ -279,7 +279,7 @@ def test_drive_discharges_a_full_battery_to_its_clear_end(small):
     assert names(end.result) == ["battery_empty"] * 9
     assert names(steady_batch(robot, Conditions(battery=[1.0], discharge=s.discharge[-1])))[0] == "converged"
     point = steady_batch(robot, Conditions(battery=[1.0], discharge=s.discharge[-1]))
-    np.testing.assert_allclose(run.result.reading.speed[0], point.reading.speed[0], rtol=1e-3)
+    np.testing.assert_allclose(run.result.reading["speed"][0], point.reading["speed"][0], rtol=1e-3)
 
 
 # --- batches ----------------------------------------------------------------------------------------
@@ -308,11 +308,11 @@ def test_drive_compiles_once_for_other_numbers(robot, small, compilations):
 
 def test_drive_bad_members_leave_neighbours_alone(small):
     _, go = small
-    clean = dict(voltage=np.full(9, 24.0), slope=np.linspace(0, 0.1, 9), payload=np.zeros(9))
+    clean = dict(voltage=np.full(9, 24.0), slope_deg=np.degrees(np.linspace(0, 0.1, 9)), payload=np.zeros(9))
     alone = go(Conditions(**clean), 1.0)
     bad = {k: v.copy() for k, v in clean.items()}
     bad["voltage"][[1, 3]] = [np.nan, 0.0]
-    bad["slope"][5] = 0.6
+    bad["slope_deg"][5] = np.degrees(0.6)
     bad["payload"][7] = np.nan
     mixed = go(Conditions(**bad), 1.0)
     assert names(mixed.result)[1] == names(mixed.result)[7] == "failed"

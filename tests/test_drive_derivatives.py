@@ -10,11 +10,11 @@ from mmrjax.fidelities.drive import drive
 from mmrjax.signals import STATUSES
 
 RUNS = {
-    "tracked_24V": dict(voltage=24.0, slope=0.03, payload=2.0),
-    "wheeled_33V_spinning": dict(voltage=33.0, slope=np.radians(15.0), wheeled=1.0),
+    "tracked_24V": dict(voltage=24.0, slope_deg=np.degrees(0.03), payload=2.0),
+    "wheeled_33V_spinning": dict(voltage=33.0, slope_deg=15.0, configuration=1),
     "tracked_battery": dict(battery=1.0, discharge=3600.0),
-    "wheeled_15V": dict(voltage=15.0, wheeled=1.0, payload=8.0),
-    "tracked_slides": dict(voltage=24.0, slope=np.radians(20.0)),
+    "wheeled_15V": dict(voltage=15.0, configuration=1, payload=8.0),
+    "tracked_slides": dict(voltage=24.0, slope_deg=20.0),
 }
 TIMES = np.array([0.0, 1e-4, 1e-3, 0.02, 0.15, 0.6, 1.5])
 
@@ -135,7 +135,7 @@ def test_every_free_parameter_changes_drive(free, theta, jacobians):
 
 def test_every_free_parameter_changes_steady(free, theta, steady_numbers, scales):
     names = [p.name for p in free]
-    conditions = [dict(voltage=24.0, slope=0.05), dict(voltage=24.0, wheeled=1.0, slope=0.05)]
+    conditions = [dict(voltage=24.0, slope_deg=3.0, configuration=k) for k in (0, 1)]
     conditions += [dict(battery=1.0, discharge=3600.0)]
     jacobian = jax.jit(jax.jacfwd(steady_numbers))
     found = [np.abs(np.asarray(jacobian(theta, Conditions(**c))) * scales).max(0) > 1e-8 for c in conditions]

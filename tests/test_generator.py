@@ -1,4 +1,4 @@
-"""The generator of sealed data: its clean tables and its effects against mmrjax, its sizes, labels and noise."""
+"""The generator of synthetic data: its clean tables and its effects against mmrjax, its sizes, labels and noise."""
 
 import ast
 import dataclasses
@@ -33,7 +33,7 @@ def package():
     """Readings of `steady` on GRID, shape (3, rows), for constants and a term of the library."""
     base = params.replace(robots.nominal(), g.CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
-    run = Conditions(GRID.U, GRID.slope, GRID.payload, GRID.wheeled, total_mass=GRID.mass)
+    run = Conditions(GRID.wheeled, GRID.U, np.degrees(GRID.slope), GRID.payload, total_mass=GRID.mass)
 
     every = {p.name: p.value for p in params.walk(full)}
 
@@ -44,7 +44,7 @@ def package():
             values |= {f"effects.{term.name}.{SHAPES[k]}": v for k, v in term.shapes.items()}
         # all of one type, so that one compiled program serves every call
         r = steady_batch(params.replace(full, {k: jnp.asarray(v, float) for k, v in values.items()}), run).reading
-        return np.stack([r.total_current, r.motor_speed, r.speed])
+        return np.stack([r["total_current"], r["motor_speed"], r["speed"]])
 
     return read
 
@@ -185,7 +185,7 @@ def test_compensating_pair_hides_part_of_itself():
     assert made.label["sigmas_together"] < 0.8 * first["sigmas"]
 
 
-def test_table_and_label_are_separate_files_and_the_table_passes_the_door(tmp_path):
+def test_table_and_label_are_separate_files_and_the_table_passes_the_input_checks(tmp_path):
     made = g.case(["windage"], seed=9)
     made.write(tmp_path / "runs.csv", tmp_path / "label.json")
     assert "windage" not in (tmp_path / "runs.csv").read_text()

@@ -1,4 +1,4 @@
-"""The generator of sealed series against `drive`, and its labels."""
+"""The generator of synthetic histories against `drive`, and its labels."""
 
 import dataclasses
 
@@ -30,7 +30,9 @@ def package():
     every = {p.name: p.value for p in params.walk(full)}
 
     def read(battery, values=None):
-        run = Conditions(RUNS.U, RUNS.slope, RUNS.payload, RUNS.wheeled, battery=battery, total_mass=RUNS.mass)
+        run = Conditions(
+            RUNS.wheeled, RUNS.U, np.degrees(RUNS.slope), RUNS.payload, battery=battery, total_mass=RUNS.mass
+        )
         # all of one type, so that one compiled program serves every call
         changed = params.replace(full, {k: jnp.asarray(v, float) for k, v in (every | (values or {})).items()})
         s = drive_batch(changed, run, times, 1e-9, 20000).signals
@@ -72,7 +74,7 @@ def test_effect_of_a_series_agrees_with_drive(package, name):
     assert apart(there, package(battery)) > 3e-5
 
 
-def test_sealed_series_passes_the_door_and_is_reproducible(tmp_path):
+def test_series_passes_the_input_checks_and_is_reproducible(tmp_path):
     options = dict(seed=3, duration=0.2, free=g.FRICTION[:2])
     table, label = gs.case(["rotating_inertia"], 6.0, **options)
     again, _ = gs.case(["rotating_inertia"], 6.0, **options)

@@ -44,15 +44,15 @@ def test_largest_step_falls_with_stiffness(robot):
 @pytest.mark.slow
 def test_beyond_the_largest_step_a_run_goes_wrong_and_below_it_does_not(robot):
     """Uphill on wheels: three times over the limit they chatter and lose speed, at half of it they do not."""
-    steep = dataclasses.replace(TWO, slope=jnp.radians(jnp.asarray([10.0, 10.0])))
+    steep = dataclasses.replace(TWO, slope_deg=jnp.asarray([10.0, 10.0]))
     gear, limit = RunningGear(), float(largest_step(robot, steep)[1])
     assert 0.8e-4 < limit < 1.6e-4
     speed = [
-        float(_batch(robot, steep, gear, 0.5, step, 1e-3, True).result.reading.speed[1]) for step in (5e-5, 5e-4)
+        float(_batch(robot, steep, gear, 0.5, step, 1e-3, True).result.reading["speed"][1]) for step in (5e-5, 5e-4)
     ]
     from mmrjax.fidelities.steady import steady
 
-    right = float(steady(robot, jax.tree.map(lambda x: x[1], steep)).reading.speed)
+    right = float(steady(robot, jax.tree.map(lambda x: x[1], steep)).reading["speed"])
     assert speed[0] == pytest.approx(right, rel=5e-4)
     assert abs(speed[1] / right - 1) > 3e-3
 
@@ -131,7 +131,7 @@ def test_member_that_blows_up_fails_alone(robot):
         jnp.stack([stiff.contact_damping, gear.contact_damping]),
     )
     assert int(answer.status[0]) == FAILED and int(answer.status[1]) != FAILED
-    assert np.isnan(float(answer.reading.speed[0])) and np.isfinite(float(answer.reading.speed[1]))
+    assert np.isnan(float(answer.reading["speed"][0])) and np.isfinite(float(answer.reading["speed"][1]))
 
 
 @pytest.mark.slow

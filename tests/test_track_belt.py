@@ -111,21 +111,21 @@ def test_generalized_forces_do_the_work_of_the_contacts(path, robot, wheeled):
     """Power of the generalized forces = power at the contact points - friction on the guide + belt, rate by rate."""
     q, v = _posture(path, wheeled, robot)
     run = Conditions(configuration=wheeled)
-    radius = robot.configurations["4W2T"].radius
-    at = undercarriage.touch(path, radius, run.wheeled, q, v)
+    chassis = robot.chassis(run.configuration)
+    at = undercarriage.touch(path, chassis, q, v)
     signals = balances.begin(robot, run, State(jnp.asarray(3.0), 48 * v[3], v[0], jnp.asarray(0.0)))
-    signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0))
-    done = undercarriage.pull(path, robot.chassis(run.wheeled), signals, at, q[1])
+    signals = dataclasses.replace(signals, resistance=jnp.asarray(5.0), speed_slip_terms=jnp.asarray(0.0))
+    done = undercarriage.pull(path, chassis, signals, at, q[1])
     assert float(at.normal) > 10.0 and float(jnp.abs(done.traction)) > 0.1
 
     def point(q):  # of each contact in the world
-        now = undercarriage.touch(path, radius, run.wheeled, q, v)
+        now = undercarriage.touch(path, chassis, q, v)
         return q[0] + now.lever_x, q[1] + now.lever_z
 
     slope_x, slope_z = jax.jacfwd(point)(q)
     if wheeled:  # a wheel's contact point stays below its axle; the material point there turns with the wheel
         slope_x = slope_x.at[GROUSERS:, 2].set(at.lever_z[GROUSERS:])
-        slope_x = slope_x.at[GROUSERS, 3].set(-radius).at[GROUSERS + 1, 4].set(-radius)
+        slope_x = slope_x.at[GROUSERS, 3].set(-chassis.radius).at[GROUSERS + 1, 4].set(-chassis.radius)
     work = done.force @ slope_x + at.force @ slope_z
     work = work.at[0].add(-signals.resistance).at[2].add(signals.resistance * q[1])
     work = work.at[3].add(-path.radius * jnp.sum(done.guide * (1 - at.weight)) + at.belt.torque_front)
@@ -140,9 +140,10 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
         q, v = _posture(path, wheeled, robot)
         q = q.at[1].add(-1.0).at[2].set(0.0)  # under the ground, so that every contact that can bear does
         run = Conditions(configuration=wheeled)
-        at = undercarriage.touch(path, robot.configurations["4W2T"].radius, run.wheeled, q, 0 * v)
+        chassis = robot.chassis(run.configuration)
+        at = undercarriage.touch(path, chassis, q, 0 * v)
         signals = balances.begin(robot, run, State(*(jnp.asarray(0.0) for _ in range(4))))
-        done = undercarriage.pull(path, robot.chassis(run.wheeled), signals, at, q[1])
+        done = undercarriage.pull(path, chassis, signals, at, q[1])
         teeth = undercarriage.reactions(path, at, done).teeth(path)
         ground = int(jnp.sum(at.force > 0))
         guides = sum(t.size for t in teeth) if wheeled == 0.0 else 0
@@ -151,7 +152,7 @@ def test_contact_pairs_are_720_on_tracks_and_4_on_wheels(path, robot):
 
 def test_teeth_carry_what_the_guide_carries(path, robot):
     q, v = _posture(path, 0.0, robot)
-    at = undercarriage.touch(path, robot.configurations["4W2T"].radius, jnp.asarray(0.0), q, v)
+    at = undercarriage.touch(path, robot.configurations["6T2A"], q, v)
     signals = balances.begin(robot, Conditions(), State(*(jnp.asarray(0.0) for _ in range(4))))
     loads = undercarriage.reactions(
         path, at, undercarriage.pull(path, robot.configurations["6T2A"], signals, at, q[1])

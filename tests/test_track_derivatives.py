@@ -50,10 +50,10 @@ def averages(robot):
         changes = {}
         for k, name in enumerate(PARAMETERS):
             on_robot = name.startswith(("gearbox", "motor"))
-            for full in [name] if on_robot else [f"tracked.{name}", f"wheeled.{name}"]:
+            for full in [name] if on_robot else [f"6T2A.{name}", f"4W2T.{name}"]:
                 changes[full] = values[full] * (1 + theta[k])
         answer = track(params.replace(robot, changes), run, duration=0.5, rolling=True).result
-        return jnp.stack([getattr(answer.reading, name) for name in OUTPUTS]), answer.status
+        return jnp.stack([answer.reading[name] for name in OUTPUTS]), answer.status
 
     return outputs
 

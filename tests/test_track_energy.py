@@ -31,7 +31,7 @@ def ledger(robot):
     def run(command):
         setup = system(robot, command, RunningGear(), 1e-4)
         radius, gear = setup.path.radius, setup.gear
-        chassis = robot.chassis(command.wheeled)
+        chassis = robot.chassis(command.configuration)
 
         def step(motion, _):
             signals, at, pulled = instant(setup, motion)
@@ -106,7 +106,7 @@ def averages(robot):
         reading = jax.vmap(lambda run: track(robot, run, gear, duration=0.8, step=step, rolling=True).result.reading)(
             runs
         )
-        return jnp.stack([reading.total_current, reading.motor_speed, reading.speed])
+        return jnp.stack([reading["total_current"], reading["motor_speed"], reading["speed"]])
 
     return lambda gear, step: np.asarray(settled(gear, step))
 

@@ -55,14 +55,14 @@ def test_statuses_are_each_member_s_own(runs):
 
 
 def test_broken_member_withholds_its_numbers_and_harms_no_other(runs):
-    speed = runs.result.reading.speed
+    speed = runs.result.reading["speed"]
     assert np.isnan(speed[[TIPPING, BROKEN]]).all()
     assert np.isfinite(np.delete(speed, [TIPPING, BROKEN])).all()
     assert np.isfinite(runs.q[[*TRACKED, *WHEELED, SLIDING, UNPOWERED]]).all()
 
 
 def test_too_steep_a_slope_slides_it_down(runs):
-    assert runs.q[SLIDING, -1, 0] < -1.0 and runs.result.reading.speed[SLIDING] < -1.0
+    assert runs.q[SLIDING, -1, 0] < -1.0 and runs.result.reading["speed"][SLIDING] < -1.0
 
 
 def test_unpowered_robot_stands_still(runs):
@@ -193,9 +193,9 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
 
     theirs = jax.jit(jax.vmap(lumped))(ours.steady.guide_share, commands)
     for name in ("total_current", "motor_speed", "speed"):
-        a, b = (np.asarray(getattr(r.reading, name)) for r in (ours.result, theirs))
+        a, b = (np.asarray(r.reading[name]) for r in (ours.result, theirs))
         np.testing.assert_allclose(a, b, rtol=0.015, err_msg=name)
-    assert float(jnp.max(jnp.abs(ours.result.reading.total_current / theirs.reading.total_current - 1))) < 0.005
+    assert float(jnp.max(jnp.abs(ours.result.reading["total_current"] / theirs.reading["total_current"] - 1))) < 0.005
 
 
 def test_batch_is_its_members(robot):

@@ -13,8 +13,8 @@ from mmrjax.running_gear import RunningGear
 from mmrjax.signals import State
 
 RUNS = {
-    "tracked": dict(voltage=33.0, slope=np.radians(5.0), payload=3.0),
-    "wheeled": dict(voltage=24.0, slope=np.radians(3.0), payload=8.0, wheeled=1.0),
+    "tracked": dict(voltage=33.0, slope_deg=5.0, payload=3.0),
+    "wheeled": dict(voltage=24.0, slope_deg=3.0, payload=8.0, configuration=1),
 }
 STEP = 1e-4
 
@@ -45,7 +45,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
 def test_masses_make_up_the_robot(robot, name):
     run = Conditions(**RUNS[name])
     half = system(robot, run, RunningGear(), STEP).half
-    chassis = robot.chassis(run.wheeled)
+    chassis = robot.chassis(run.configuration)
     assert float(half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
     assert float(2 * half.inertia_pulley) == pytest.approx(float(chassis.inertia))
     assert float(half.inertia) > 0

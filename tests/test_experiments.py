@@ -1,21 +1,24 @@
 """The next experiment: what the menu foresees, which experiment is chosen, and what its readings say."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import equinox as eqx
 import generator as g
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import Analyst, table
 from test_generator import SHAPES
 
-from calibration.inference import noise
-from calibration.data import runs as records
-from calibration.discovery import experiments as experiment
-from calibration.discovery import loop, menu
+from calibration.discovery import experiments, menu
+from calibration.discovery.candidates import Candidate, filled, fit_candidates
+from calibration.discovery.classes import Classes
+from calibration.discovery.discrepancy import Location
+from calibration.discovery.settings import settings_for
+from calibration.inference.observers import SettledRuns
 from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
+from mmrjax.tables import CONFIGURATIONS
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},
@@ -23,7 +26,10 @@ PAIRS = {
     ("rolling_radius", "speed_gain"): {"timing"},
     ("mass_error", "tension_friction"): {"weigh"},
 }
-STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("tracked", "wheeled")}
+MENU = menu.menu(CONFIGURATIONS)
+SPANS = menu.spans(MENU)
+SETTINGS = dataclasses.replace(settings_for(SettledRuns), slots=1)
+ANALYST = Analyst(SETTINGS, {n: BY_NAME[n] for n in sorted({n for pair in PAIRS for n in pair})})
 
 
 # --- what the menu foresees -------------------------------------------------------------------------
@@ -54,7 +60,7 @@ def test_menu_agrees_with_the_generators_own_physics(name, shown):
         term = g.draw(name, np.random.default_rng(1))
         term = dataclasses.replace(term, amplitude=term.amplitude * term.form.size)
     value, there = shown(p, term)
-    for experiment_name, at in menu.spans().items():
+    for experiment_name, at in SPANS.items():
         theirs, sound = g.carried_out(experiment_name, p, [] if term is None else [term])
         np.testing.assert_array_equal(there[at], sound, err_msg=experiment_name)
         np.testing.assert_allclose(value[at][sound], theirs[sound], rtol=1e-6, atol=1e-9, err_msg=experiment_name)
@@ -64,21 +70,21 @@ def test_agreement_can_fail(shown):
     value, _ = shown(g.CLIMBING)
     theirs, _ = g.carried_out("bare motor", g.CLIMBING | {"motor.resistance": 0.6117})
     with pytest.raises(AssertionError):
-        np.testing.assert_allclose(value[menu.spans()["bare motor"]], theirs, rtol=1e-6)
+        np.testing.assert_allclose(value[SPANS["bare motor"]], theirs, rtol=1e-6)
 
 
 def test_menu_and_generator_hold_the_same_experiments():
     ran = [f"{n}, {c}" for n, r in g.RUNS.items() for c in ("6T2A", "4W2T") if r[1]]
     alone = [n for n, r in g.RUNS.items() if not r[1]]
-    assert {e.name for e in menu.MENU} == {*g.ACTS, *ran, *alone}
+    assert {e.name for e in MENU} == {*g.ACTS, *ran, *alone}
     case = g.Case({}, {}, g.conditions(0, 1, 0, 0), g.CLIMBING, (), g.Instruments())
-    sd = menu.sds(case.instruments.stated * [1.0, np.pi / 30, 1e-3])
-    for name, at in menu.spans().items():
+    sd = menu.sds(MENU, case.instruments.stated * [1.0, np.pi / 30, 1e-3])
+    for name, at in SPANS.items():
         np.testing.assert_allclose(case.carry_out(name, 0)["sd"], sd[at], err_msg=name)
 
 
 def test_reverse_travel_turns_the_sign_of_a_biased_slope_alone(shown):
-    at = menu.spans()
+    at = SPANS
     plain, biased = (shown(g.CLIMBING, g.Term("slope_bias", a))[0] for a in (0.0, 0.02))
     change = biased - plain
     assert change[at["reverse, 6T2A"]][0] < 0 < change[at["downhill, 6T2A"]][0]  # of the current
@@ -88,106 +94,99 @@ def test_reverse_travel_turns_the_sign_of_a_biased_slope_alone(shown):
 
 
 @pytest.fixture(scope="module")
-def engine():
-    names = sorted({n for pair in PAIRS for n in pair})
-    return loop.Engine(robots.nominal(), {n: BY_NAME[n] for n in names}, size=1)
-
-
-@pytest.fixture(scope="module")
-def seen(engine, tmp_path_factory):
-    """For each pair: a sealed case of its first, and what both foresee once fitted to its table."""
-    folder = tmp_path_factory.mktemp("sealed")
+def seen():
+    """For each pair: a synthetic case of its first, and what both foresee once fitted to its table."""
     answers = {}
     for pair in PAIRS:
         case = g.case([pair[0]], 12.0, seed=3)
-        case.write(folder / "runs.csv", folder / "label.json")
-        runs = records.read(folder / "runs.csv")
-        looped = loop.Loop(engine, runs, noise.of(runs).sd, stated=STATED)
-        which = [(engine.names.index(n),) for n in pair]
-        fitted = looped.fit_all([(w, np.zeros(len(looped.coordinates))) for w in which])
-        answers[pair] = case, looped, dict(zip(pair, fitted, strict=True))
-    return {p: (c, looped, h, experiment.prospect(looped, h)) for p, (c, looped, h) in answers.items()}
+        space = ANALYST.space(table(case))
+        start = np.zeros(len(space.coordinates))
+        fitted = fit_candidates(space, [(filled([name], SETTINGS), start) for name in pair], SETTINGS)
+        answers[pair] = case, space, dict(zip(pair, fitted, strict=True))
+    return {p: (c, space, f, experiments.prospect(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
 
 
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_is_what_an_engineer_would_do(pair, seen):
-    proposal = experiment.choose(seen[pair][3])
+    proposal = experiments.choose(seen[pair][3])
     assert proposal.name in PAIRS[pair]
     assert proposal.settles and proposal.separates == (pair[1],) and proposal.expected_sigma > 3
-    assert len(proposal.table) == len(menu.MENU) and proposal.table[0].experiments == proposal.experiments
+    assert len(proposal.table) == len(MENU) and proposal.table[0].experiments == proposal.experiments
 
 
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
-    name = experiment.choose(foreseen).name
-    verdicts = [experiment.supported(foreseen, {name: case.carry_out(name, seed)}) for seed in range(10)]
+    name = experiments.choose(foreseen).name
+    verdicts = [experiments.supported(foreseen, {name: case.carry_out(name, seed)}) for seed in range(10)]
     assert sum(v.resolved and v.best == pair[0] for v in verdicts) >= 8
     assert all(pair[0] in v.left for v in verdicts)
 
 
 def foreseeing(sigma):
     """A prospect in which each experiment of the menu shows alternative k `sigma[name][k]` sds off, without doubt."""
-    spans = menu.spans()
-    readings = spans[menu.MENU[-1].name].stop
+    readings = SPANS[MENU[-1].name].stop
     members = len(next(iter(sigma.values())))
     value = np.zeros((members, readings))
     for name, at in sigma.items():
-        value[:, spans[name].start] = at
+        value[:, SPANS[name].start] = at
     names = tuple("abcdefgh"[:members])
-    return experiment.Prospect(
-        names, value, np.zeros((members, readings, 1)), np.ones(readings), np.ones(readings, bool)
-    )
+    half = np.zeros((members, readings, 1))
+    return experiments.Prospect(names, MENU, value, half, np.ones(readings), np.ones(readings, bool), SETTINGS)
 
 
 def test_less_effort_is_preferred_where_more_sigmas_are_no_gain():
-    assert experiment.choose(foreseeing({"weigh": [0, 6.0], "stall": [0, 40.0]})).experiments == ("weigh",)
-    assert experiment.choose(foreseeing({"weigh": [0, 3.0], "stall": [0, 40.0]})).experiments == ("stall",)
+    assert experiments.choose(foreseeing({"weigh": [0, 6.0], "stall": [0, 40.0]})).experiments == ("weigh",)
+    assert experiments.choose(foreseeing({"weigh": [0, 3.0], "stall": [0, 40.0]})).experiments == ("stall",)
 
 
 def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
     seen = foreseeing({"stall": [0, 2.5]})
-    at, rng = menu.spans()["stall"], np.random.default_rng(0)
+    at, rng = SPANS["stall"], np.random.default_rng(0)
     refuted = [
         "b"
-        in experiment.supported(
+        in experiments.supported(
             seen, {"stall": {"value": rng.standard_normal(at.stop - at.start), "sd": np.ones(2)}}
         ).refuted
         for _ in range(4000)
     ]
-    one = next(r for r in experiment.ranked(seen) if r.experiments == ("stall",))
+    one = next(r for r in experiments.ranked(seen) if r.experiments == ("stall",))
     assert np.mean(refuted) == pytest.approx(one.chances[0], abs=0.025)  # three sds of the draws
 
 
 def test_every_two_alternatives_count_not_only_those_with_the_best_fit():
     # `shunt`, the lesser effort, tells both others from the best fit but not from one another; `stall` all three
-    proposal = experiment.choose(foreseeing({"shunt": [0, 9.0, 9.0], "stall": [0, 6.0, 12.0]}))
+    proposal = experiments.choose(foreseeing({"shunt": [0, 9.0, 9.0], "stall": [0, 6.0, 12.0]}))
     assert proposal.experiments == ("stall",) and proposal.settles
 
 
 def test_less_effort_is_preferred_also_beside_a_pair_that_nothing_tells():
-    assert experiment.choose(foreseeing({"weigh": [0, 6.0, 6.0], "stall": [0, 40.0, 40.0]})).experiments == ("weigh",)
+    assert experiments.choose(foreseeing({"weigh": [0, 6.0, 6.0], "stall": [0, 40.0, 40.0]})).experiments == (
+        "weigh",
+    )
 
 
 def test_one_pair_of_many_alternatives_counts():
     far = [9.0 * k for k in range(1, 6)]
-    proposal = experiment.choose(foreseeing({"weigh": [0, 0.0, *far], "stall": [0, *(9.0 * k for k in range(1, 7))]}))
+    proposal = experiments.choose(
+        foreseeing({"weigh": [0, 0.0, *far], "stall": [0, *(9.0 * k for k in range(1, 7))]})
+    )
     assert proposal.experiments == ("stall",) and proposal.settles
 
 
 def test_pair_that_one_experiment_tells_is_worth_more_than_three_that_none_does():
     # three pairs 1.9 sigma apart at most by `stall`; `weigh` tells one of them by 3
-    proposal = experiment.choose(foreseeing({"stall": [0, 1.9, 0.95], "weigh": [0, 1.5, 3.0]}))
+    proposal = experiments.choose(foreseeing({"stall": [0, 1.9, 0.95], "weigh": [0, 1.5, 3.0]}))
     assert "weigh" in proposal.experiments and proposal.expected_sigma >= 2.0
 
 
 def test_two_weak_experiments_are_proposed_together():
-    proposal = experiment.choose(foreseeing({"stall": [0, 1.9], "weigh": [0, 1.9]}))
+    proposal = experiments.choose(foreseeing({"stall": [0, 1.9], "weigh": [0, 1.9]}))
     assert set(proposal.experiments) == {"stall", "weigh"} and proposal.expected_sigma == pytest.approx(1.9 * 2**0.5)
 
 
 def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
-    proposal = experiment.choose(
+    proposal = experiments.choose(
         foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 7.0], "timing": [0, 0.0, 1.0]})
     )
     assert set(proposal.experiments) == {"stall", "weigh"} and proposal.settles
@@ -196,17 +195,17 @@ def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
 
 
 def test_a_second_experiment_that_adds_nothing_is_not():
-    proposal = experiment.choose(foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 0.5]}))
+    proposal = experiments.choose(foreseeing({"stall": [0, 9.0, 9.0], "weigh": [0, 0.0, 0.5]}))
     assert (
         proposal.experiments == ("stall",) and not proposal.settles and proposal.expected_sigma == pytest.approx(9.0)
     )
 
 
 def test_alternatives_that_agree_give_none(seen):
-    _, looped, fitted, _ = seen["series_resistance", "supply_sag"]
+    _, space, fitted, _ = seen["series_resistance", "supply_sag"]
     same = next(iter(fitted.values()))
-    proposal = experiment.choose(experiment.prospect(looped, {"one": same, "the other": same}))
-    assert proposal.name == experiment.NONE
+    proposal = experiments.choose(experiments.prospect(space, {"one": same, "the other": same}, SETTINGS))
+    assert proposal.name == experiments.NONE
     assert proposal.expected_sigma == 0 and proposal.separates == ()
 
 
@@ -215,24 +214,41 @@ def test_unaffected_experiment_separates_nothing(seen):
     assert foreseen.apart(0, 1, "weigh") == 0 and foreseen.apart(0, 1, "zero current") == 0
 
 
-def test_alternatives_are_the_class_best_first(engine):
-    made = [loop.Hypothesis((k,), np.zeros(1), np.zeros(1), float(k), np.zeros(1), True, True) for k in range(4)]
-    found = SimpleNamespace(after=SimpleNamespace(hypothesis=made[2]), ladder=tuple(made), classes=((2, 0),))
-    left = experiment.alternatives(SimpleNamespace(engine=engine), found)
-    assert list(left) == [engine.names[2], engine.names[0]] and list(left.values()) == [made[2], made[0]]
-
-
-def test_nothing_is_proposed_where_nothing_is_missing(seen):
-    looped = seen["mass_error", "tension_friction"][1]
-    best = SimpleNamespace(hypothesis=SimpleNamespace(which=(-1,), effects=()))
-    assert experiment.propose(looped, SimpleNamespace(verdict="none", classes=(), ladder=(), after=best)) is None
-
-
-def test_unnamed_asks_for_finer_steps_in_its_variable():
-    scores = SimpleNamespace(curve=np.array([1.0, 5.0]), explained=np.array([2.0, 60.0]))
-    found = SimpleNamespace(
-        verdict="unnamed", unnamed=("track", "speed", ("track",)), base=SimpleNamespace(scores=scores)
+def candidates(*names):
+    return tuple(
+        Candidate((n,), np.zeros(1), np.zeros(1), float(k), np.zeros(1), True, True) for k, n in enumerate(names)
     )
-    proposal = experiment.propose(SimpleNamespace(engine=SimpleNamespace(series=False), counts=np.ones(90)), found)
+
+
+def test_alternatives_are_the_class_best_first():
+    made = candidates("a", "b", "c", "d")
+    left = experiments.alternatives(made[2], Classes((("c", "a"),), made))
+    assert list(left) == ["c", "a"] and list(left.values()) == [made[2], made[0]]
+
+
+def test_alternatives_of_two_classes_differ_in_one_effect():
+    made = tuple(
+        dataclasses.replace(c, active=pair)
+        for c, pair in zip(candidates("", "", "", ""), [("a", "b"), ("c", "b"), ("d", "a"), ("c", "d")], strict=True)
+    )
+    left = experiments.alternatives(made[0], Classes((("a", "c"), ("b", "d")), made))
+    assert list(left) == ["a + b", "c + b", "d + a"]
+
+
+def test_nothing_is_proposed_where_one_name_is_left(seen):
+    space = seen["mass_error", "tension_friction"][1]
+    (best,) = candidates("mass_error")
+    assert experiments.separating(space, best, Classes((("mass_error",),), (best,)), SETTINGS) is None
+
+
+def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
+    space = seen["mass_error", "tension_friction"][1]
+    runs = int(space.included.sum())
+    where = Location("track", "speed", ("track",), 60.0, 60.0)
+    proposal = experiments.denser(space, where, SETTINGS)
     assert "speed" in proposal.name and "track" in proposal.description
-    assert proposal.expected_sigma == pytest.approx(np.sqrt(60 * 45 / 90))
+    assert proposal.expected_sigma == pytest.approx(np.sqrt(60 * 45 / runs)) and runs == 90
+    weak = experiments.denser(space, dataclasses.replace(where, strongest=4.0), SETTINGS)
+    assert weak.name == experiments.NONE and weak.expected_sigma == 0
+    wave = experiments.denser(space, dataclasses.replace(where, variable="order 2 of the driving shaft"), SETTINGS)
+    assert wave.name == "steady speeds for order 2 of the driving shaft" and "from the mark" in wave.description

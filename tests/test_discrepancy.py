@@ -7,63 +7,70 @@ from types import SimpleNamespace
 
 import equinox as eqx
 import generator as g
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import Analyst, table
 
 from calibration.data import robot_file
-from calibration.inference import noise
-from calibration.data import runs as records
-from calibration.discovery import bases as curves
-from calibration.discovery import discrepancy as discover
-from calibration.discovery import loop
-from calibration.discovery.score_tests import PROBED
-from mmrjax import params, robots
+from calibration.discovery import discover, formula
+from calibration.discovery.discrepancy import fit_discrepancy
+from calibration.discovery.projection import defect
+from calibration.discovery.score_tests import diagnosed
+from calibration.discovery.settings import settings_for
+from calibration.discovery.smooth import smooth
+from calibration.inference import bases
+from calibration.inference.held_out import held_out
+from calibration.inference.linearization import PROBED
+from calibration.inference.observers import SettledRuns
+from mmrjax import channels, params
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 
 #: An effect that no library holds → balance and variable that it acts through.
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}
-#: The analyst's prior on the surface, which Table 5 does not know.
-STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("tracked", "wheeled")}
-
-
-@pytest.fixture(scope="module")
-def engine():
-    # The library plays no part here; one effect keeps what is compiled small.
-    return loop.Engine(robots.nominal(), {"churning": BY_NAME["churning"]}, size=1)
+# The library plays no part here; one effect keeps what is compiled small.
+ANALYST = Analyst(dataclasses.replace(settings_for(SettledRuns), slots=1), {"churning": BY_NAME["churning"]})
 
 
 @pytest.fixture(
     scope="module", params=[pytest.param(c, marks=pytest.mark.slow) if k else c for k, c in enumerate(CASES)]
 )
-def found(request, engine, tmp_path_factory):
-    """A case of 12 sigmas, its loop after the base fit, and what is discovered."""
+def found(request):
+    """A case of 12 sigmas, its base fit, and the discrepancy that is fitted to what that leaves."""
     case = g.case([request.param], 12.0, seed=1)
-    path = tmp_path_factory.mktemp("runs") / "runs.csv"
-    case.write(path, path.with_suffix(".json"))
-    runs = records.read(path)
-    looped = loop.Loop(engine, runs, noise.of(runs).sd, stated=STATED)
-    base = looped.base_fit()
-    linear, _, _ = looped.look(base, looped._curves(base))
-    what = discover.discover(looped, base, linear, *CASES[request.param])
+    runs = table(case)
+    fitted = ANALYST.base(runs)
+    space, base = fitted.space, fitted.candidate
+    bare = space.problem(base.active)
+    seen = diagnosed(bare, jnp.asarray(base.z), space.library.scored, discover.bases_at(runs, fitted))
+    linear = jax.device_get(seen[0])
+    what = fit_discrepancy(space, base, linear, *CASES[request.param])
     truth, sound = g.readings(case.conditions, case.constants, case.terms)
     x, _ = g.solve(case.conditions, case.constants, case.terms)
     term = case.terms[0].of(g._instant(x, case.conditions, case.constants, case.terms))
     return SimpleNamespace(
-        case=case, loop=looped, base=base, linear=linear, what=what, truth=truth[:, sound].T, term=term[sound]
+        case=case,
+        runs=runs,
+        space=space,
+        base=base,
+        linear=linear,
+        what=what,
+        truth=truth[:, sound].T,
+        term=term[sound],
     )
 
 
 def sigmas(found, reading) -> np.ndarray:
     """Rms error against the noise-free truth, by channel [σ of a reading]."""
-    sd = np.asarray(found.loop.problem.data.sd)[: len(reading)]
+    sd = np.asarray(found.space.bare.data.sd)[: len(reading)]
     return np.sqrt(np.mean(((reading - found.truth) / sd) ** 2, 0))
 
 
 def at_rows(found, values) -> np.ndarray:
     """What is known on the grid, at the rows of the table."""
-    x = np.asarray(getattr(found.linear.signals, found.what.variable))[: len(found.loop.runs)]
+    x = np.asarray(getattr(found.linear.signals, found.what.variable))[: len(found.runs)]
     return np.interp(x, found.what.grid, values)
 
 
@@ -82,21 +89,21 @@ def test_curve_takes_the_discrepancy_out_of_the_fit(found):
     before, after = found.what.chi2
     # 12 sigmas are 144 of χ²; six ordinates take no more than 6 of the noise
     assert found.what.converged and 100 < before - after < 200
-    assert (sigmas(found, found.what.reading) < 0.4).all()
+    assert (sigmas(found, found.what.reading[: len(found.runs)]) < 0.4).all()
 
 
 def test_curve_lowers_the_error_at_slopes_that_were_not_seen(found):
-    slopes = found.loop.runs["slope_deg"]
+    slopes = found.runs["slope_deg"]
     blocks = [slopes == s for s in np.unique(slopes)]
-    without, _ = found.loop.held_out(found.base, blocks)
-    with_it, converged = discover.held_out(found.loop, found.what, blocks)
-    assert converged.all() and np.isfinite(with_it).all()
-    before, after = sigmas(found, without), sigmas(found, with_it)
+    without = held_out(found.space.equipped, found.base.z, blocks, (-1,))
+    with_it = held_out(found.what.problem, found.what.z, blocks)
+    assert with_it.converged.all() and np.isfinite(with_it.reading).all()
+    before, after = (sigmas(found, out.reading) for out in (without, with_it))
     assert after.max() < 0.5 < before.max() and np.sum(after**2) < 0.25 * np.sum(before**2)
 
 
 def test_blocks_that_are_left_out_are_not_seen(found):
-    first = np.arange(len(found.loop.runs)) < 20
+    first = np.arange(len(found.runs)) < 20
     spoilt = found.what.problem.data.measured.at[:20].add(1e3)
     other = dataclasses.replace(
         found.what,
@@ -104,7 +111,7 @@ def test_blocks_that_are_left_out_are_not_seen(found):
             found.what.problem, data=dataclasses.replace(found.what.problem.data, measured=spoilt)
         ),
     )
-    a, b = (discover.held_out(found.loop, w, [first])[0] for w in (found.what, other))
+    a, b = (held_out(w.problem, w.z, [first]).reading for w in (found.what, other))
     np.testing.assert_array_equal(a, b)
     assert np.isnan(a[20:]).all()
 
@@ -121,24 +128,24 @@ def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
     assert {p.name: float(p.value) for p in params.walk(robot)} == {
         p.name: float(p.value) for p in params.walk(found.what.robot)
     }
-    r = steady_batch(robot, found.loop.runs.command()).reading
-    seen = jnp.stack([r.total_current, r.motor_speed, r.speed], -1)
-    np.testing.assert_allclose(seen, found.what.reading, rtol=1e-10)
+    reading = steady_batch(robot, found.runs.conditions(robot)).reading
+    seen = jnp.stack([reading[name] for name in channels.names()], -1)
+    np.testing.assert_allclose(seen, found.what.reading[: len(found.runs)], rtol=1e-10)
 
 
 def test_defect_of_each_row_shows_the_discrepancy(found):
     """Its rows scatter about the truth, less what the free parameters absorb of it, by their sds."""
-    defect, rows = found.what.defect, len(found.loop.runs)
+    shown, rows = found.what.defect, len(found.runs)
     k = PROBED.index(found.what.balance)
     change = np.zeros_like(np.asarray(found.linear.defects)[k])
     change[:rows] = np.asarray(found.linear.defects)[k][:rows] * found.term[:, None]
     residual = np.zeros_like(np.asarray(found.linear.residual))
     residual[: change.size] = -change.ravel()
     clean = eqx.tree_at(lambda linear: linear.residual, found.linear, residual)
-    expected = discover.defect(clean, found.what.balance).value[:rows]
-    pull = (defect.value - expected) / defect.sd
+    expected = defect(clean, found.what.balance).value[:rows]
+    pull = (shown.value[:rows] - expected) / shown.sd[:rows]
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
-    assert np.corrcoef(expected, defect.value)[0, 1] > 0.5
+    assert np.corrcoef(expected, shown.value[:rows])[0, 1] > 0.5
 
 
 def test_formula_finds_the_variable(found):
@@ -148,7 +155,7 @@ def test_formula_finds_the_variable(found):
     assert proposal.explained > 100 and proposal.gain > -5
     assert all(abs(c) > 3 * s for c, s in zip(proposal.coefficients, proposal.sds, strict=True))
     unit = found.what.unit
-    assert proposal.formula.startswith(discover.SYMBOL[found.what.balance] + " = ")
+    assert proposal.formula.startswith(formula.SYMBOL[found.what.balance] + " = ")
     assert proposal.formula.count(f" {unit} (") == len(proposal.terms)
 
 
@@ -158,7 +165,7 @@ def test_formula_finds_the_variable(found):
 def test_dictionary_holds_only_what_is_safe():
     rng = np.random.default_rng(3)
     ratios = np.stack([rng.uniform(*b, 40) for b in ((0.5, 1.5), (-1, 1), (0, 2), (1, 1), (0.5, 2))], 1)
-    known = discover.dictionary(ratios)
+    known = formula.dictionary(ratios)
     powers = {k: {p for m in known for j, p in m.factors if j == k} for k in range(5)}
     assert -1.0 in powers[0] and 0.5 in powers[0]
     assert not {-1.0, 0.5} & powers[1]  # of either sign
@@ -172,21 +179,21 @@ def test_dictionary_holds_no_monomial_twice():
     rng = np.random.default_rng(3)
     one = rng.uniform(0.5, 1.5, 40)
     ratios = np.stack([one, 2 * one, *rng.uniform(0.5, 1.5, (3, 40))], 1)
-    assert not any(m.variables == ("current",) for m in discover.dictionary(ratios))  # as ω_m, which is first
+    assert not any(m.variables == ("current",) for m in formula.dictionary(ratios))  # as ω_m, which is first
 
 
 def test_formula_reads_as_text():
-    product = discover.Monomial(((1, 2.0), (2, 1.0)))
+    product = formula.Monomial(((1, 2.0), (2, 1.0)))
     assert str(product) == "(I/2 A)^2 (U/24 V)" and product.variables == ("current", "voltage")
 
 
 def test_every_balance_of_a_curve_has_a_symbol():
-    assert set(discover.SYMBOL) == set(curves.BALANCES)
+    assert set(formula.SYMBOL) == set(bases.BALANCES)
 
 
 def test_no_formula_is_proposed_where_nothing_shows(found):
     blind = eqx.tree_at(lambda linear: linear.defects, found.linear, 0 * np.asarray(found.linear.defects))
-    curve = discover.smooth(found.linear, found.what.balance, found.what.variable, found.loop.counts)
-    proposal = discover.propose(blind, found.what.balance, found.loop.counts, curve)
+    curve = smooth(found.linear, found.what.balance, found.what.variable, found.space.included)
+    proposal = formula.propose(blind, found.what.balance, found.space.included, curve)
     assert proposal.formula == "none: no term shows in these data" and proposal.terms == ()
-    assert np.isnan(discover.defect(blind, found.what.balance).value).all()
+    assert np.isnan(defect(blind, found.what.balance).value).all()

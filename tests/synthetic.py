@@ -1,0 +1,70 @@
+"""What the tests of the closed loop share: synthetic tables with undeclared effects, and the stages of the loop."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import generator as g
+import numpy as np
+
+from calibration.data.runs import Runs
+from calibration.discovery import discover
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.candidates import BaseFit, fit_base
+from calibration.discovery.outliers import screen
+from calibration.discovery.result import DiscoveryResult
+from calibration.discovery.settings import Settings
+from calibration.inference import noise, observers
+from calibration.inference.noise import Noise
+from mmrjax import robots
+from mmrjax.effects import Effect
+
+#: The analyst's prior on the surface, which Table 5 does not know.
+STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
+
+
+def table(made: g.Case | Mapping[str, np.ndarray]) -> Runs:
+    """The runs of a case, without its label."""
+    return Runs("synthetic", dict(made.table if isinstance(made, g.Case) else made))
+
+
+def known(runs: Runs) -> Noise:
+    """The sds that a table states."""
+    return noise.of(runs, observers.kind(runs).sizes(runs))
+
+
+@dataclasses.dataclass(frozen=True)
+class Analyst:
+    """Who looks for effects: settings, library and priors of a file of tests, so that all share what is compiled."""
+
+    settings: Settings
+    library: Mapping[str, type[Effect]]
+    stated: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=lambda: STATED)
+
+    def seeded(self, seed: int) -> Analyst:
+        """The same with another random seed."""
+        return dataclasses.replace(self, settings=dataclasses.replace(self.settings, seed=seed))
+
+    def space(self, runs: Runs) -> CandidateSpace:
+        """What can be fitted to a table."""
+        return discover.pose(runs, robots.nominal(), known(runs).sd, self.settings, self.stated, self.library)
+
+    def base(self, runs: Runs) -> BaseFit:
+        """The base fitted to a table."""
+        return fit_base(self.space(runs), self.settings, runs.source)
+
+    def diagnosis(self, runs: Runs) -> SimpleNamespace:
+        """The stages up to the test whether anything is missing: `screened`, `left`, and what is in them."""
+        fitted = self.base(runs)
+        screened = screen(fitted, lambda base: discover.bases_at(runs, base), self.settings, runs.source)
+        left = discover.diagnosis_of_base(screened, self.settings)
+        base = screened.base
+        return SimpleNamespace(
+            runs=runs, screened=screened, left=left, space=base.space, base=base.candidate, bases=screened.bases
+        )
+
+    def discover(self, runs: Runs) -> DiscoveryResult:
+        """The whole loop."""
+        return discover.discover_at(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
