@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
 
 from mmrjax.chassis import Chassis
 from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
-from mmrjax.params import Scalar, as_float
+from mmrjax.params import Index, Scalar, as_float
 from mmrjax.power import Battery
 from mmrjax.tables import RADIUS_PULLEY
 
@@ -81,7 +80,7 @@ class Robot(eqx.Module):
     effects: tuple[Effect, ...] = ()
     sides: Scalar = eqx.field(default=2.0, converter=as_float)
 
-    def chassis(self, configuration: Int[Array, ""]) -> Chassis:
+    def chassis(self, configuration: Index) -> Chassis:
         """The chassis of the configuration with this index; traceable and batchable."""
         first, *others = self.configurations.members
         chosen = first

@@ -134,7 +134,8 @@ def current_names(names: Iterable[str], robot: Robot, notes: list[str] | None = 
     Args:
         notes: is given a sentence for each former name of a configuration.
     """
-    found, changed = [], {}
+    found: list[str] = []
+    changed: dict[str, list[str]] = {}
     for name in names:
         head, dot, rest = name.partition(".")
         new = OLD_NAMES.get(head, "")
