@@ -25,7 +25,7 @@ from calibration.inference import identifiability, noise, observers, priors, pro
 from calibration.inference import optimizers as fit  # noqa: E402
 from calibration.inference.calibrate import calibrate  # noqa: E402
 from calibration.inference.errors import relative_error, summary  # noqa: E402
-from mmrjax import channels, nominal, params  # noqa: E402
+from mmrjax import channels, params, robots  # noqa: E402
 from mmrjax.fidelities.steady import steady_batch  # noqa: E402
 
 STATED = "current=2%,motor_speed=0.5%,speed=1%"
@@ -38,13 +38,13 @@ def accuracy(runs: records.Runs) -> dict[str, Any]:
     paper = records.read("simulated_by_paper").measured()
     lines = {"the paper's simulation": relative_error(paper, measured)}
     for name in ("nominal", "sm1", "sm2"):
-        robot = params.replace(nominal.ROBOTS[name](), {k: jnp.asarray(v) for k, v in CLIMBS.items()})
+        robot = params.replace(robots.ROBOTS[name](), {k: jnp.asarray(v) for k, v in CLIMBS.items()})
         shown = steady_batch(robot, runs.conditions(robot)).reading
         simulated = np.stack([shown[name] for name in channels.names()], 1)
         lines[f"{name}, adhesion raised to 0.6, not fitted"] = relative_error(simulated, measured)
     record: dict[str, Any] = {}
     for words, stated in (("noise estimated", None), (f"noise {STATED}", STATED)):
-        found = calibrate(runs, nominal.nominal(), noise=stated)
+        found = calibrate(runs, robots.nominal(), noise=stated)
         after = np.stack([r.after for r in found.readings.values()], 1)
         lines[f"calibrated, {words}: fitted"] = relative_error(after, measured)
         for kind, held in found.held_out.items():
@@ -62,7 +62,7 @@ def accuracy(runs: records.Runs) -> dict[str, Any]:
 
 def pose(runs: records.Runs, extra: tuple[str, ...] = ()) -> problem.Problem:
     """The packaged problem with stated noise, at a robot that climbs."""
-    base = params.replace(nominal.nominal(), {k: jnp.asarray(v) for k, v in CLIMBS.items()})
+    base = params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in CLIMBS.items()})
     names = (*priors.default_names(runs["configuration"], base), *extra)
     sd = noise.of(runs, observers.kind(runs).sizes(runs), STATED).sd
     return observers.pose(runs, base, priors.coordinates(base, names), sd)

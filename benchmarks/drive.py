@@ -10,7 +10,7 @@ import time
 
 import jax
 import numpy as np
-from measure import finish, limit_words, machine, over_batches, parser, row_words
+from measure import finish, limit_words, machine, over_batches, parser, row_words, set_precision
 
 options = parser(__doc__.splitlines()[0], "180")
 options.add_argument("--tolerance", type=float, default=1e-6, help="of a step of ours")
@@ -87,15 +87,15 @@ def baseline(ours: np.ndarray) -> dict:
 
 def main() -> None:
     arguments = options.parse_args()
-    jax.config.update("jax_enable_x64", not arguments.float32)
+    set_precision(arguments.float32)
     import jax.numpy as jnp
 
-    from mmrjax import nominal
+    from mmrjax import robots
     from mmrjax.conditions import Conditions
     from mmrjax.fidelities.drive import drive_batch
     from mmrjax.signals import FAILED
 
-    robot, times = nominal.nominal(), jnp.asarray(INSTANTS)
+    robot, times = robots.nominal(), jnp.asarray(INSTANTS)
 
     @jax.jit
     def run(runs):

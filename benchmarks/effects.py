@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import balances, channels, nominal, params
+from mmrjax import balances, channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, Effect
 from mmrjax.fidelities.drive import drive
@@ -50,7 +50,7 @@ PASSING = tuple(e for e in ALL if e not in SETTLED)
 
 
 def robot(effects: tuple[type[Effect], ...]) -> Robot:
-    base = params.replace(nominal.nominal(), ADHESION)
+    base = params.replace(robots.nominal(), ADHESION)
     return dataclasses.replace(base, effects=tuple(effect() for effect in effects))
 
 
@@ -68,7 +68,7 @@ def examples(battery: float = 0.0) -> Conditions:
 
 
 def table8() -> Conditions:
-    axes = (0, 1), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
+    axes = (0, 1), robots.SLOPES_DEG, robots.PAYLOADS_KG, robots.VOLTAGES_V
     configuration, slope, payload, voltage = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4).T
     return Conditions(configuration, voltage, slope, payload)
 

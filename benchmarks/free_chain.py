@@ -35,7 +35,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.contact import force_contact, step
 from mmrjax.fidelities.ripple import period_pitch, ripple
 from mmrjax.fidelities.track import _batch
-from mmrjax.nominal import nominal
+from mmrjax.robots import nominal
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 from mmrjax.signals import GRAVITY, State
 

@@ -235,9 +235,9 @@ def robot_of(name: str):
 
     compilation_cache.enable()
     jax.config.update("jax_enable_x64", True)
-    from mmrjax import nominal
+    from mmrjax import robots
 
-    return nominal.ROBOTS[name]()
+    return robots.ROBOTS[name]()
 
 
 def work(task: tuple) -> dict:

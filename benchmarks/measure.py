@@ -30,6 +30,12 @@ def parser(description: str, batches: str) -> argparse.ArgumentParser:
     return options
 
 
+def set_precision(single: bool) -> None:
+    """Single or double precision; the variable keeps `import mmrjax` from choosing double."""
+    os.environ["JAX_ENABLE_X64"] = str(not single).lower()
+    jax.config.update("jax_enable_x64", not single)
+
+
 def machine() -> dict[str, Any]:
     """Processor, device and versions."""
     cpu = platform.processor() or platform.machine()

@@ -222,7 +222,7 @@ def ours(batch: int, duration: float) -> dict:
 
     from mmrjax.conditions import Conditions
     from mmrjax.fidelities.track import track_batch
-    from mmrjax.nominal import nominal
+    from mmrjax.robots import nominal
 
     runs = Conditions(voltage=np.full(batch, 33.0), payload=np.linspace(0.0, 8.0, batch))
     call = lambda: jax.block_until_ready(track_batch(nominal(), runs, duration=duration))  # noqa: E731

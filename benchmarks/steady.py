@@ -10,7 +10,7 @@ import time
 
 import jax
 import numpy as np
-from measure import finish, limit_words, machine, over_batches, parser, row_words
+from measure import finish, limit_words, machine, over_batches, parser, row_words, set_precision
 
 options = parser(__doc__.splitlines()[0], "65536")
 options.add_argument("--baseline-points", type=int, default=4000, help="points that the loop of SciPy solves")
@@ -24,15 +24,15 @@ def conditions(size: int) -> np.ndarray:
 
 def main() -> None:
     arguments = options.parse_args()
-    jax.config.update("jax_enable_x64", not arguments.float32)
+    set_precision(arguments.float32)
     import jax.numpy as jnp
 
-    from mmrjax import nominal
+    from mmrjax import robots
     from mmrjax.conditions import Conditions
     from mmrjax.fidelities.steady import steady_batch
     from mmrjax.signals import CONVERGED
 
-    robot = nominal.nominal()
+    robot = robots.nominal()
 
     def batch(size: int):
         wheeled, slope, payload, voltage = conditions(size).T

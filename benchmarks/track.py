@@ -20,7 +20,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.stability import largest_step
 from mmrjax.fidelities.track import _batch, track
@@ -49,7 +49,7 @@ ASSUMED = {
 
 
 def table8(size: int = 180):
-    axes = (0.0, 1.0), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
+    axes = (0.0, 1.0), robots.SLOPES_DEG, robots.PAYLOADS_KG, robots.VOLTAGES_V
     rows = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
     wheeled, slope, payload, voltage = np.tile(rows, (-(-size // len(rows)), 1))[:size].T
     return Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
@@ -64,7 +64,7 @@ def timed(call) -> tuple[float, float]:
 
 def speed(batches: list[int]) -> dict:
     """Compile and run time of `batches` runs of 1.5 s from standstill."""
-    robot, gear, found = nominal.nominal(), RunningGear(), {}
+    robot, gear, found = robots.nominal(), RunningGear(), {}
     for size in batches:
         commands = table8(size)
         first = timed(lambda commands=commands: _batch(robot, commands, gear, 1.5, 1e-4, 1e-3, False))
@@ -83,7 +83,7 @@ def speed(batches: list[int]) -> dict:
 
 def derivatives() -> dict:
     """A forward Jacobian by P parameters, and a gradient, beside the run: 16 runs of 0.5 s, rolling."""
-    robot = nominal.nominal()
+    robot = robots.nominal()
     values = {p.name: p.value for p in params.walk(robot)}
     commands = table8()
     commands = jax.tree.map(lambda x: x[:16], commands)
@@ -102,7 +102,7 @@ def derivatives() -> dict:
 
 def assumptions() -> dict:
     """Guide share, current, speed and ripple of 6T2A at 33 V over each constant that the paper does not print."""
-    robot, found = nominal.nominal(), {}
+    robot, found = robots.nominal(), {}
     runs = Conditions(voltage=33.0, slope_deg=[0.0, 5.0], payload=jnp.asarray([0.0, 8.0]))
 
     @jax.jit
@@ -140,7 +140,7 @@ def main() -> None:
         "speed": lambda: speed(batches),
         "derivatives": derivatives,
         "assumptions": assumptions,
-        "step": lambda: {"largest_step_s": float(largest_step(nominal.nominal(), table8()).min())},
+        "step": lambda: {"largest_step_s": float(largest_step(robots.nominal(), table8()).min())},
     }
     found = {name: call() for name, call in parts.items() if chosen.only in (None, name)}
     print(json.dumps(found, indent=1))

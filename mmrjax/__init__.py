@@ -1,3 +1,74 @@
-"""A differentiable, batched simulator of a small tracked or wheeled robot's drive and running gear."""
+"""A differentiable, batched simulator of a small tracked or wheeled robot's drive and running gear.
+
+    import mmrjax as mm
+
+    robot = mm.nominal()
+    one = mm.simulate(robot, mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=10.0, payload=3.0))
+
+Importing it imports no jax, which comes with the first name that is used, and switches jax to double precision;
+where the environment variable JAX_ENABLE_X64 is set, that stands instead (JAX_ENABLE_X64=0: single precision).
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from mmrjax.conditions import Conditions as Conditions
+    from mmrjax.effects import Effect as Effect
+    from mmrjax.errors import UsageError as UsageError
+    from mmrjax.params import replace as replace
+    from mmrjax.results import Results as Results
+    from mmrjax.robot import Robot as Robot
+    from mmrjax.robots import nominal as nominal
+    from mmrjax.signals import STATUSES as STATUSES
+    from mmrjax.simulation import simulate as simulate
+
+#: Where each public name lives.
+_HOME = {
+    "Conditions": "conditions",
+    "Effect": "effects",
+    "Results": "results",
+    "Robot": "robot",
+    "STATUSES": "signals",
+    "UsageError": "errors",
+    "nominal": "robots",
+    "replace": "params",
+    "simulate": "simulation",
+}
+
+__all__ = [
+    "STATUSES",
+    "Conditions",
+    "Effect",
+    "Results",
+    "Robot",
+    "UsageError",
+    "__version__",
+    "nominal",
+    "replace",
+    "simulate",
+]
+
+if "JAX_ENABLE_X64" not in os.environ:
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update("jax_enable_x64", True)
+    else:
+        os.environ["JAX_ENABLE_X64"] = "true"
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -146,7 +146,7 @@ def _planar(inertia: float) -> str:
 
 @functools.cache
 def _template(double: bool) -> tuple[Any, Any]:
-    from mmrjax.nominal import nominal  # topology only: every number is replaced per member
+    from mmrjax.robots import nominal  # topology only: every number is replaced per member
 
     with jax.ensure_compile_time_eval():
         model = mujoco.MjModel.from_xml_string(text(nominal(), RunningGear(), Conditions(), 13.1))

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-Scalar = Float[Array, "..."]
+#: A number, or an array of numbers: one of a batch, or a tracer.
+Scalar = Float[Array, "..."] | float
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,6 +18,17 @@ SLOPES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
 PAYLOADS_KG = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0)
 VOLTAGES_V = (15.0, 24.0, 33.0)
 
+#: Least and greatest value of every condition of a run that is a number, and its unit.
+CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
+    "voltage": (0.0, 100.0, "V"),
+    "slope_deg": (-45.0, 45.0, "deg"),
+    "payload": (0.0, 300.0, "kg"),
+    "battery": (0.0, 1.0, ""),
+    "discharge": (0.0, 360_000.0, "C"),
+    "adhesion": (1e-3, 100.0, ""),
+    "total_mass": (0.1, 500.0, "kg"),
+}
+
 
 class Surface(NamedTuple):
     """Adhesion coefficients of Table 5, longitudinal and lateral, for tracks and for wheels [-]."""

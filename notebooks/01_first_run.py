@@ -26,7 +26,7 @@ jax.config.update("jax_enable_x64", True)  # double precision; before anything i
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.signals import STATUSES
@@ -36,7 +36,7 @@ from mmrjax.signals import STATUSES
 # The robot is a tree of parameters, each with its unit and source. Conditions are a `command`, in SI units.
 
 # %%
-robot = nominal.nominal()
+robot = robots.nominal()
 one = Conditions(voltage=jnp.array([15.0]), slope_deg=jnp.array([5.0]), total_mass=jnp.array([13.1]))
 answer = steady_batch(robot, one)
 

@@ -38,7 +38,7 @@ from matplotlib.figure import Figure
 
 import calibration
 from calibration.data import runs as records
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.running_gear import RunningGear
@@ -68,7 +68,7 @@ rows = measured.where((measured["configuration"] == "6T2A") & (measured["supply_
                       & (measured["slope_deg"] < 20))  # fmt: skip
 friction, share = "6T2A.track.guide_friction", "6T2A.track.guide_share"
 robot = params.replace(
-    nominal.nominal(),
+    robots.nominal(),
     {"6T2A.ground.friction.static": jnp.asarray(0.6), share: jnp.asarray(0.98)},
 )
 

@@ -50,7 +50,7 @@ def named(robot: Robot, robot_name: str) -> dict[str, Any]:
         robot_name: its name or file; of a file only the last part is shown, and a changed packaged robot is said to
             be one.
     """
-    from mmrjax.nominal import ROBOTS
+    from mmrjax.robots import ROBOTS
 
     name = Path(robot_name).name
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):

@@ -96,11 +96,12 @@ def _histories(
         known["averaged"] = 1e3 * float(history.time[0, 1] - history.time[0, 0])
         share = histories.columns["guide_share"]
         gears = figures_gear.gears(robot, history, status, share, which, names[:GEARS])
-        gears = [g for g in gears if g.rolls]
-        if gears and all(g.time[-1] > 2 * figures_gear.TAIL for g in gears):
-            known["ripple"] = album.add("ripple", lambda: figures_gear.current_ripple(gears))
-            album.add("reactions", lambda: figures_gear.reactions(gears))
-            tracked = [g for g in gears if g.on_tracks]
+        # A ripple is of steady travel: the contacts have stopped sliding before the part that is looked at.
+        ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]
+        if ripples:
+            known["ripple"] = album.add("ripple", lambda: figures_gear.current_ripple(ripples))
+            album.add("reactions", lambda: figures_gear.reactions(ripples))
+            tracked = [g for g in ripples if g.on_tracks]
             if tracked:
                 album.add(
                     "touchdown", lambda: figures_gear.touchdown(tracked[0], f"{tracked[0].name}: touchdowns dotted")

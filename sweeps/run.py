@@ -11,14 +11,13 @@ import numpy as np
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
-from mmrjax import fidelities
+from mmrjax import fidelities, outputs
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Run
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration
-from sweeps import outputs
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress as bar
 from sweeps.console import say
@@ -37,8 +36,7 @@ def simulate(
 
 def ended(batch: Run) -> dict[str, np.ndarray]:
     """The columns of how a batch of runs ended, with those of its fidelity alone."""
-    result, own = jax.device_get((batch.result, batch.columns))
-    return {**outputs.columns(result), **{name: np.asarray(values) for name, values in own.items()}}
+    return outputs.columns(*jax.device_get((batch.result, batch.columns)))
 
 
 def refuse(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:

@@ -16,7 +16,7 @@ from mmrjax.fidelities.base import History, Run
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
-from sweeps import outputs, run, words
+from sweeps import run, words
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run, read_runs
 from sweeps.store import RunFolder, open_folder
@@ -81,7 +81,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
         "time_s": history.time.ravel(),
-        **{name: np.ravel(value) for name, value in outputs.readings(history.reading).items()},
+        **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in channels.CHANNELS},
         "theoretical_speed_mm_s": signals.speed_theoretical.ravel() / channels.MM,
         "distance_m": history.distance.ravel(),
         "voltage_V": signals.voltage.ravel(),

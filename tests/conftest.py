@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
@@ -43,19 +43,19 @@ def _room_for_programs():
 
 @pytest.fixture(scope="session")
 def robot():
-    return nominal.nominal()
+    return robots.nominal()
 
 
 @pytest.fixture(scope="session")
 def robot_with_effects():
     """Nominal, with every effect of the library at zero amplitude."""
-    return dataclasses.replace(nominal.nominal(), effects=tuple(effect() for effect in ALL))
+    return dataclasses.replace(robots.nominal(), effects=tuple(effect() for effect in ALL))
 
 
 @pytest.fixture(scope="session")
 def grid():
     """Rows (wheeled, slope [deg], payload [kg], voltage [V]) of Table 8 in both configurations."""
-    axes = (0.0, 1.0), nominal.SLOPES_DEG, nominal.PAYLOADS_KG, nominal.VOLTAGES_V
+    axes = (0.0, 1.0), robots.SLOPES_DEG, robots.PAYLOADS_KG, robots.VOLTAGES_V
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 4)
 
 
@@ -103,7 +103,7 @@ REPRESENTATIVE = (
 @pytest.fixture(scope="session")
 def robot_with_representatives():
     """Nominal, with the representative effects at zero amplitude."""
-    return dataclasses.replace(nominal.nominal(), effects=tuple(BY_NAME[name]() for name in REPRESENTATIVE))
+    return dataclasses.replace(robots.nominal(), effects=tuple(BY_NAME[name]() for name in REPRESENTATIVE))
 
 
 @pytest.fixture(scope="session")

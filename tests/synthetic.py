@@ -18,7 +18,7 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import Settings
 from calibration.inference import noise, observers
 from calibration.inference.noise import Noise
-from mmrjax import nominal
+from mmrjax import robots
 from mmrjax.effects import Effect
 
 #: The analyst's prior on the surface, which Table 5 does not know.
@@ -49,7 +49,7 @@ class Analyst:
 
     def space(self, runs: Runs) -> CandidateSpace:
         """What can be fitted to a table."""
-        return discover.pose(runs, nominal.nominal(), known(runs).sd, self.settings, self.stated, self.library)
+        return discover.pose(runs, robots.nominal(), known(runs).sd, self.settings, self.stated, self.library)
 
     def base(self, runs: Runs) -> BaseFit:
         """The base fitted to a table."""
@@ -67,4 +67,4 @@ class Analyst:
 
     def discover(self, runs: Runs) -> DiscoveryResult:
         """The whole loop."""
-        return discover.discover_at(runs, nominal.nominal(), known(runs), self.settings, self.stated, self.library)
+        return discover.discover_at(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)

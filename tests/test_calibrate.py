@@ -20,7 +20,7 @@ from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
-from mmrjax import channels, nominal
+from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -35,7 +35,7 @@ def measured():
 
 @pytest.fixture(scope="module")
 def found(measured):
-    return calibrate(measured, nominal.nominal())
+    return calibrate(measured, robots.nominal())
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def changed(runs, **columns):
 
 def quick(runs, robot=None, **keywords):
     """Only what is wrong with the data matters: few starts, no profiles, no blocks."""
-    return calibrate(runs, robot or nominal.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords})
+    return calibrate(runs, robot or robots.nominal(), **{"starts": 2, "profiles": False, "blocks": (), **keywords})
 
 
 def test_packaged_data_calibrate_and_the_report_says_what_it_must(found, document):
@@ -298,7 +298,7 @@ def gaps(measured):
 
 @pytest.fixture(scope="module")
 def found_with_gaps(gaps):
-    return calibrate(gaps, nominal.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
+    return calibrate(gaps, robots.nominal(), starts=4, noise="current=9%", profiles=False, blocks=("slope",))
 
 
 def test_a_table_with_missing_readings_calibrates_and_says_so(found_with_gaps):
@@ -325,7 +325,7 @@ def test_a_prediction_is_made_where_a_reading_is_missing(found_with_gaps):
 
 
 def test_a_missing_reading_weighs_nothing_whatever_number_stands_in_its_place(gaps):
-    robot = nominal.nominal()
+    robot = robots.nominal()
     coordinates = priors.coordinates(robot, priors.default_names(["6T2A", "4W2T"], robot))
     sd = noise.of(gaps, observers.kind(gaps).sizes(gaps), "current=9%,speed=4%").sd
     posed = observers.pose(gaps, robot, coordinates, sd)
@@ -405,7 +405,7 @@ FOURTH_CHANNEL = """
 import dataclasses, jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from mmrjax import channels, nominal
+from mmrjax import channels, robots
 channels.CHANNELS = (*channels.CHANNELS, channels.Channel(
     name="terminal_voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V", factor=1.0,
     label="terminal voltage", word="voltage", range=(0.0, 100.0), sd_largest=10.0,
@@ -416,7 +416,7 @@ runs = calibration.read_runs("measured")
 volts = runs["supply_voltage_V"] * 1.001
 runs = dataclasses.replace(runs, columns={**runs.columns, "terminal_voltage_V": volts})
 stated = "current=9%,motor_speed=6%,speed=4%,voltage=0.1%"
-found = calibration.calibrate(runs, nominal.nominal(), starts=2, profiles=False, blocks=(), noise=stated)
+found = calibration.calibrate(runs, robots.nominal(), starts=2, profiles=False, blocks=(), noise=stated)
 assert found.converged and found.readings["terminal_voltage"].after.shape == (20,)
 np.testing.assert_allclose(found.readings["terminal_voltage"].sigma, -1 / 1.001, rtol=1e-6)
 np.testing.assert_allclose(found.rows()["after_terminal_voltage_V"], runs["supply_voltage_V"])

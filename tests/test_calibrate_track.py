@@ -13,7 +13,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
 from calibration.inference.priors import GUIDED
-from mmrjax import channels, fidelities, nominal, params
+from mmrjax import channels, fidelities, params, robots
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.signals import CONVERGED
@@ -28,7 +28,7 @@ TRUTH = 0.12
 @pytest.fixture(scope="module")
 def base():
     """Nominal, with adhesion for the slopes of the tests, and a friction law that is no stiffer for it."""
-    return params.replace(nominal.nominal(), {STATIC: jnp.asarray(0.6), CREEP: jnp.asarray(0.1)})
+    return params.replace(robots.nominal(), {STATIC: jnp.asarray(0.6), CREEP: jnp.asarray(0.1)})
 
 
 @pytest.fixture(scope="module")
@@ -127,9 +127,9 @@ def test_a_friction_law_too_stiff_for_the_step_is_said(base, made):
 def test_packaged_data_calibrate_through_the_track_model_and_agree_with_steady():
     """docs/benchmarks.md, Calibration through the track model; some ten minutes on two cores."""
     runs = records.read("measured")
-    found = calibrate(runs, nominal.nominal(), model="track", starts=1)
+    found = calibrate(runs, robots.nominal(), model="track", starts=1)
     assert found.converged and (found.status == "converged").all()
-    steady = calibrate(runs, nominal.nominal(), blocks=()).parameters
+    steady = calibrate(runs, robots.nominal(), blocks=()).parameters
     low, high = steady[GUIDE_SHARE].interval
     for name, entry in found.parameters.items():
         assert abs(entry.with_steady.apart_in_sd) < 1.96, name

@@ -6,10 +6,12 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 
 import numpy as np
 import pytest
 
+from calibration.data.errors import BadConfiguration
 from sweeps import cli, config, run
 
 MMRJAX = [sys.executable, "-c", "from sweeps.cli import main; main()"]
@@ -142,7 +144,19 @@ USAGE = {
     "step of zero": (["sweep", "--slopes", "0:5:0"], r"--slopes: got 0:5:0"),
     "unknown configuration": (
         ["sweep", "--configurations", "8T"],
-        r"configurations\.0: got '8T'; input should be '6T2A' or '4W2T'",
+        r"configurations: got 8T; the robot has no such configuration; allowed: 6T2A, 4W2T",
+    ),
+    "unknown configuration of one run": (
+        ["simulate", "--configuration", "8T"],
+        r"--configuration: got 8T; the robot has no such configuration; allowed: 6T2A, 4W2T",
+    ),
+    "setting of an unknown configuration": (
+        ["simulate", "--set", "8T.mass=3"],
+        r"--set, 8T\.mass: no such parameter; ",
+    ),
+    "setting of a channel that is not there": (
+        ["simulate", "--set", "effects.torque_gain.amplitude=3"],
+        r"--set, effects\.torque_gain\.amplitude: no such parameter; ",
     ),
     "unknown model": (
         ["sweep", "--model", "magic"],
@@ -163,7 +177,7 @@ USAGE = {
     ),
     "negative mass set": (
         ["sweep", "--set", "6T2A.mass=-1"],
-        r"--set, tracked\.mass: got -1; expected 0\.5 to 200 kg",
+        r"--set, 6T2A\.mass: got -1; expected 0\.5 to 200 kg",
     ),
     "no config file": (["sweep", "--config", "none.toml"], r"none\.toml: not a readable TOML file"),
     "chunk of zero": (["sweep", "--chunk", "0"], r"option chunk: got 0"),
@@ -177,6 +191,7 @@ USAGE = {
         ["sweep", "--duration", "2"],
         r"options: duration_s acts with model drive or track only",
     ),
+    "unknown model of the paper": (["reproduce", "--model", "magic"], r"option model: got 'magic'"),
     "step without the track model": (["simulate", "--step", "1e-5"], r"options: step_s acts with model track only"),
     "duration without end": (["simulate", "--model", "track", "--duration", "inf"], r"option duration_s: got inf"),
     "discharge without battery": (["sweep", "--discharge", "100"], r"options: discharge_mAh acts with battery only"),
@@ -334,9 +349,14 @@ def test_bad_config_files_name_file_and_key(mmrjax, tmp_path):
 BAD_RUNS = {
     "empty": ("", "runs.csv: the file is empty"),
     "missing column": (
-        HEADER.replace(",speed_mm_s", "") + "\n6T2A,15,13.1,0,5,2.75,4800",
-        "column speed_mm_s is missing",
+        HEADER.replace(",slope_deg", "") + "\n6T2A,15,13.1,0,2.75,4800,400",
+        "column slope_deg is missing",
     ),
+    "misspelt channel": (
+        HEADER.replace("speed_mm_s", "spede_mm_s") + "\n6T2A,15,13.1,0,5,2.75,4800,400",
+        "column speed_mm_s is missing; is spede_mm_s meant?",
+    ),
+    "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column of a channel"),
     "slope": (f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400", "runs.csv row 1, slope_deg: got 95; expected -45 to 45"),
     "NaN": (f"{HEADER}\n6T2A,15,13.1,0,5,nan,4800,400", "row 1, total_current_A: got nan"),
     "configuration": (f"{HEADER}\n5T,15,13.1,0,5,1,4800,400", "row 1, configuration: got 5T"),
@@ -387,17 +407,17 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
                  "--no-report", "--out", "s"]  # fmt: skip
     simulated, honest = [], run.simulate
 
-    def interrupted(robot, command, settings, progress):
+    def interrupted(robot, conditions, settings, progress):
         if len(simulated) == 3:
             raise KeyboardInterrupt
-        simulated.append(command.slope.shape)
-        return honest(robot, command, settings, progress)
+        simulated.append(conditions.shape)
+        return honest(robot, conditions, settings, progress)
 
     monkeypatch.setattr(run, "simulate", interrupted)
     code, _, err = mmrjax(*arguments)
     assert code == 130 and "goes on where it stopped" in err
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
-    monkeypatch.setattr(run, "simulate", lambda *a: (simulated.append(a[1].slope.shape), honest(*a))[1])
+    monkeypatch.setattr(run, "simulate", lambda *a: (simulated.append(a[1].shape), honest(*a))[1])
     assert mmrjax(*arguments)[0] == 0
     assert simulated == [(10,)] * 6  # three before, three after: none twice
     resumed = (tmp_path / "s" / "runs.csv").read_text()
@@ -450,14 +470,14 @@ def test_help_is_quick_and_imports_no_jax():
             spent.append(end.children_user - start.children_user + end.children_system - start.children_system)
         return min(spent), done.stdout
 
-    for command in ([], ["simulate"], ["sweep"], ["compare"]):
+    for command in ([], ["simulate"], ["sweep"], ["compare"], ["reproduce"]):
         spent, text = best([*command, "--help"])
         assert spent < 0.5
         assert "Usage" in text
         if command:
             assert f"Example: mmrjax {command[0]}" in text.replace("\n", " ")
             assert "(V)" in text if command == ["simulate"] else True
-            assert "(deg)" in text if command != ["compare"] else True
+            assert "(deg)" in text if command in (["simulate"], ["sweep"]) else True
     probe = "import sys; import sweeps.cli; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", probe]).returncode == 0
 
@@ -504,13 +524,33 @@ def test_help_shows_what_an_option_is_when_it_is_not_given(monkeypatch, capsys):
     with pytest.raises(SystemExit):
         cli.main()
     text = capsys.readouterr().out
-    for default in ("[default: steady]", "[default: 0,5,10,15,20]", "[default: 1e-4]"):
+    for default in ("[default: steady]", "[default: 0,5,10,15,20]", "[default: 0.0001]"):
         assert default in text
 
 
 def test_doctor_finds_this_installation_healthy(mmrjax):
     code, out, _ = mmrjax("doctor")
     assert code == 0 and "fails" not in out and "24 V / C_E" in out
+    assert "compilation cache" in out and ("programs" in out or "off" in out)
+
+
+def test_cache_is_neither_read_nor_written_when_it_is_not_wanted(tmp_path):
+    here = {**os.environ, "MMRJAX_CACHE": str(tmp_path / "cache"), "JAX_PLATFORMS": "cpu"}
+    for name, option in (("without", ["--no-cache"]), ("with", [])):
+        words = [*MMRJAX, "simulate", "--no-report", "--out", str(tmp_path / name), *option]
+        assert subprocess.run(words, capture_output=True, env=here).returncode == 0
+        kept = list((tmp_path / "cache").rglob("*")) if (tmp_path / "cache").exists() else []
+        assert bool(kept) == (name == "with")
+    assert (tmp_path / "with" / "runs.csv").read_text() == (tmp_path / "without" / "runs.csv").read_text()
+
+
+def test_every_command_that_compiles_can_do_without_the_cache(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    for command in ("simulate", "sweep", "compare", "reproduce", "render", "calibrate", "loop", "doctor"):
+        monkeypatch.setattr(sys, "argv", ["mmrjax", command, "--help"])
+        with pytest.raises(SystemExit):
+            cli.main()
+        assert "--no-cache" in capsys.readouterr().out, command
 
 
 def test_axis_takes_values_and_ranges():
@@ -518,3 +558,117 @@ def test_axis_takes_values_and_ranges():
     assert config.axis("--slopes", "0:1:0.25") == (0.0, 0.25, 0.5, 0.75, 1.0)
     assert config.axis("--slopes", "0:1:0.3,9") == (0.0, 0.3, 0.6, pytest.approx(0.9), 9.0)
     assert len(config.axis("--slopes", "0:20:0.1")) == 201
+
+
+def test_configuration_has_what_applies_to_its_command_alone():
+    told = {kind: set(kind.model_fields) for kind in (config.Loop, config.Calibrate, config.Compare, config.Sweep)}
+    assert not told[config.Loop] & {"model", "duration_s", "step_s", "battery", "chunk", "voltages_V"}
+    assert "model" in told[config.Calibrate] and not told[config.Calibrate] & {"duration_s", "battery", "chunk"}
+    assert not told[config.Compare] & {"battery", "discharge_mAh", "chunk", "slopes_deg"}
+    assert "model" not in config.as_toml(config.resolve(config.Loop, None, {"seed": 1}))
+    with pytest.raises(BadConfiguration, match=r"option model: no such key"):
+        config.resolve(config.Loop, None, {"model": "steady"})
+
+
+@pytest.mark.parametrize("model, expected", [("steady", {}), ("drive", {"duration_s": 30.0}),
+                                             ("track", {"duration_s": 1.5, "step_s": 1e-4})])  # fmt: skip
+def test_resolved_configuration_states_the_options_of_its_fidelity(tmp_path, model, expected):
+    written = config.as_toml(config.resolve(config.Sweep, None, {"model": model}))
+    stated = tomllib.loads(written)
+    assert {key: stated[key] for key in ("duration_s", "step_s") if key in stated} == expected
+    (tmp_path / "again.toml").write_text(written)
+    assert config.as_toml(config.resolve(config.Sweep, tmp_path / "again.toml", {})) == written
+
+
+def test_configurations_of_former_versions_are_read(tmp_path):
+    (tmp_path / "old.toml").write_text('model = "steady"\nstep_s = 0.0001\nrobot = "sm1"\n')
+    assert config.resolve(config.Sweep, tmp_path / "old.toml", {}).robot == "sm1"
+
+
+@pytest.fixture(scope="module")
+def crawler(tmp_path_factory):
+    """A robot's TOML file with one configuration of its own name."""
+    path = tmp_path_factory.mktemp("crawler") / "crawler.toml"
+    path.write_text('configurations = ["crawler"]\n[crawler]\nlike = "6T2A"\nmass = 12.0\n')
+    return path
+
+
+def test_robot_with_one_configuration_simulates_and_sweeps_it(mmrjax, tmp_path, crawler):
+    assert mmrjax("simulate", "--robot", crawler, "--no-report", "--out", "one")[0] == 0
+    (run,) = table(tmp_path / "one" / "runs.csv")
+    assert (run["configuration"], run["total_mass_kg"]) == ("crawler", "12")
+    axes = ("--voltages", "24", "--payloads", "0,2", "--slopes", "0,5")
+    assert mmrjax("sweep", "--robot", crawler, *axes, "--out", "grid")[0] == 0
+    assert [row["configuration"] for row in table(tmp_path / "grid" / "runs.csv")] == ["crawler"] * 4
+    assert 'configurations = ["crawler"]' in (tmp_path / "grid" / "config.resolved.toml").read_text()
+    page = (tmp_path / "grid" / "report.html").read_text()
+    assert "6T2A" not in page and "4W2T" not in page and "crawler" in page
+    code, _, err = mmrjax("sweep", "--robot", crawler, "--configurations", "6T2A", "--out", "x")
+    assert code == 2 and "configurations: got 6T2A; the robot has no such configuration; allowed: crawler" in err
+
+
+def test_robot_with_one_configuration_is_compared(mmrjax, tmp_path, crawler):
+    (tmp_path / "runs.csv").write_text(f"{HEADER}\ncrawler,15,12,0,5,2.75,4800,400\n")
+    assert mmrjax("compare", "runs.csv", "--robot", crawler, "--out", "c")[0] == 0
+    assert set(json.loads((tmp_path / "c" / "result.json").read_text())["errors"]) == {"all", "crawler"}
+    code, _, err = mmrjax("compare", "measured", "--robot", crawler, "--out", "x")
+    assert code == 4 and re.search(r"measured row \d+, configuration: got \w+;.* allowed: crawler", err)
+
+
+def test_former_names_of_parameters_load_with_a_note(mmrjax, tmp_path):
+    code, _, err = mmrjax("simulate", "--set", "tracked.mass=12", "--no-report", "--out", "o")
+    assert code == 0 and "6T2A" in err
+    assert table(tmp_path / "o" / "runs.csv")[0]["total_mass_kg"] == "12"
+
+
+def test_missing_readings_weigh_nothing_and_are_said(mmrjax, tmp_path):
+    full = f"{HEADER}\n6T2A,15,13.1,0,0,2.3,4930,420\n6T2A,15,13.1,0,5,2.75,4800,400\n6T2A,15,13.1,0,10,3,4745,390\n"
+    (tmp_path / "full.csv").write_text(full)
+    (tmp_path / "holes.csv").write_text(full.replace(",2.75,4800,400", ",,4800,400"))
+    (tmp_path / "none.csv").write_text("\n".join(line.rpartition(",")[0] for line in full.splitlines()))
+    errors = {}
+    for name in ("full", "holes", "none"):
+        code, out, _ = mmrjax("compare", f"{name}.csv", "--out", name)
+        assert code == 0
+        result = json.loads((tmp_path / name / "result.json").read_text())
+        errors[name] = result["errors"]["all"]
+        said = {"holes": "total_current_A: 1 of 3 readings are missing; they weigh nothing",
+                "none": "speed_mm_s: all readings are missing; they weigh nothing"}.get(name)  # fmt: skip
+        assert result["notes"] == ([said] if said else [])
+        assert said is None or (said in out and said in (tmp_path / name / "report.html").read_text())
+    assert errors["holes"]["total_current"]["rows"] == 2 and errors["holes"]["total_current"]["missing"] == 1
+    assert errors["holes"]["speed"] == errors["full"]["speed"]
+    assert errors["none"]["speed"]["rows"] == 0 and errors["none"]["total_current"] == errors["full"]["total_current"]
+
+
+FOURTH = """
+import dataclasses
+from mmrjax import channels
+channels.CHANNELS += (dataclasses.replace(
+    channels.CHANNELS[0], name="voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V",
+    label="voltage at the motors", word="voltage", range=(0.0, 100.0), read=lambda robot, signals: signals.voltage,
+),)
+from sweeps.cli import main; main()
+"""
+
+
+def test_a_fourth_channel_is_one_row(tmp_path):
+    """Appended to the table before the command line is imported: every command has it, and no code knew."""
+    (tmp_path / "runs.csv").write_text(
+        f"{HEADER},terminal_voltage_V\n6T2A,15,13.1,0,0,2.3,4930,420,14.5\n6T2A,15,13.1,0,5,2.75,4800,400,\n"
+    )
+
+    def command(*arguments):
+        words = [sys.executable, "-c", FOURTH, *arguments]
+        return subprocess.run(words, capture_output=True, text=True, cwd=tmp_path)
+
+    swept = command("sweep", "--slopes", "0,5", "--payloads", "0,2", "--voltages", "24", "--out", "s")
+    assert swept.returncode == 0, swept.stderr
+    assert {row["terminal_voltage_V"] for row in table(tmp_path / "s" / "runs.csv")} == {"24"}
+    assert "voltage at the motors" in (tmp_path / "s" / "report.html").read_text().lower()
+    compared = command("compare", "runs.csv", "--out", "c")
+    assert compared.returncode == 0, compared.stderr
+    errors = json.loads((tmp_path / "c" / "result.json").read_text())["errors"]["all"]["voltage"]
+    assert errors["rows"] == 1 and errors["missing"] == 1
+    assert errors["rms_percent"] == pytest.approx(100 * 0.5 / 15)
+    assert "terminal_voltage_V: 1 of 2 readings are missing" in compared.stdout

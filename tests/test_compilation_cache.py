@@ -23,10 +23,10 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 events = []
 jax.monitoring.register_event_listener(lambda event, **_: events.append(event.rpartition("/")[2]))
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
-robot, runs = nominal.nominal(), Conditions(voltage=[15.0, 33.0], slope_deg=5.0)
+robot, runs = robots.nominal(), Conditions(voltage=[15.0, 33.0], slope_deg=5.0)
 def current(resistance, run):
     return steady(params.replace(robot, {"motor.resistance": resistance}), run).total_current
 slope = jax.jit(jax.vmap(jax.jacfwd(current), in_axes=(None, 0)))(jnp.asarray(0.611), runs)

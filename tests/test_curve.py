@@ -12,7 +12,7 @@ import test_effects as laws
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.discovery import bases as curves
-from mmrjax import balances, effects, nominal, params
+from mmrjax import balances, effects, params, robots
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.fidelities.drive import drive
 from mmrjax.signals import Signals
@@ -35,7 +35,7 @@ def robot(amplitudes=None, kinds=CURVES):
         values = {n: v for n, v in SHAPE.items() if hasattr(effect(), n)}
         values |= {} if amplitudes is None else {"amplitude": amplitudes[k]}
         every.append(params.replace(effect(), {n: jnp.asarray(v) for n, v in values.items()}))
-    return dataclasses.replace(nominal.nominal(), effects=tuple(every))
+    return dataclasses.replace(robots.nominal(), effects=tuple(every))
 
 
 # --- interpolation --------------------------------------------------------------------------------------
@@ -78,7 +78,7 @@ def test_curve_obeys(effect, law):
 def test_curves_at_zero_change_nothing_in_steady_and_none_is_dead():
     both = jax.jit(lambda a: jax.jacfwd(lambda a: (_steady(robot(a)),) * 2, has_aux=True)(a))
     slopes, with_them = both(jnp.zeros(len(CURVES)))
-    np.testing.assert_allclose(with_them, jax.jit(_steady)(nominal.nominal()), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(with_them, jax.jit(_steady)(robots.nominal()), rtol=1e-13, atol=1e-13)
     assert np.isfinite(slopes).all()
     moved = np.abs(slopes * SIZES / with_them[..., None]).max((0, 1))
     assert moved.min() > 1e-4, "dead gradient"
@@ -99,7 +99,7 @@ def _driven(amplitudes):
 
 def test_settled_travel_shows_nothing_of_a_wave():
     waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
-    np.testing.assert_array_equal(jax.jit(_steady)(waves), jax.jit(_steady)(nominal.nominal()))
+    np.testing.assert_array_equal(jax.jit(_steady)(waves), jax.jit(_steady)(robots.nominal()))
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_curves_act_in_drive_and_at_zero_change_nothing():
     sizes = jnp.asarray([laws.size(e) for e in DRIVEN.values()])
     both = jax.jit(lambda a: jax.jvp(_driven, (a,), (0.1 * sizes,)))
     still, slope = both(jnp.zeros(len(DRIVEN)))
-    bare = nominal.nominal()
+    bare = robots.nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, TIMES, tolerance=1e-9)))(STARTS)
     np.testing.assert_allclose(still, laws.readings(bare, plain.signals)[:, 1:], rtol=1e-7, atol=1e-7)
     assert np.isfinite(slope).all() and np.abs(slope / still).max() > 1e-3
@@ -126,7 +126,7 @@ def test_curve_has_finite_derivatives_by_everything_at_rest(effect):
     made = params.replace(effect(), {"amplitude": jnp.asarray(0.3)})
     floats = [f.name for f in dataclasses.fields(Signals) if f.name not in ("memory", "configuration")]
     still = Signals(**{name: jnp.asarray(0.0) for name in floats})
-    slopes = eqx.filter_grad(lambda both: both[0].term(nominal.nominal(), both[1]))((made, still))
+    slopes = eqx.filter_grad(lambda both: both[0].term(robots.nominal(), both[1]))((made, still))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(slopes))
 
 

@@ -22,7 +22,7 @@ from calibration.inference import bases, noise
 from calibration.inference.linearization import PROBED, scored, shape_of
 from calibration.inference.observers import Histories
 from calibration.inference.optimizers import gauss_newton
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME, UNNAMED
 from mmrjax.effects.curve import weights
 
@@ -217,7 +217,7 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(clean):
     runs = clean.runs
     short = runs.where((runs["run_id"] != "start1") | (runs["time_s"] < 0.5))
     mixed = short.where(np.random.default_rng(0).permutation(len(short)))
-    observer = Histories.of(mixed, nominal.nominal())
+    observer = Histories.of(mixed, robots.nominal())
     times, names = mixed["time_s"], mixed["run_id"]
     for k, name in enumerate(np.unique(names)):
         there = times[np.asarray(observer.knots[k])]

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.data import effect_file, robot_file
 from calibration.data.errors import BadConfiguration
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
@@ -225,9 +225,9 @@ def test_robot_file_names_the_configurations_of_an_effect(tmp_path):
 
 def test_robot_file_may_undo_the_configurations_of_a_class(tmp_path):
     library = effect_file.library([written(tmp_path, stating('configurations = ("4W2T",)'))])
-    robot = robot_file.with_effects(nominal.nominal(), ("seal_drag",), library)
+    robot = robot_file.with_effects(robots.nominal(), ("seal_drag",), library)
     assert robot.effects[0].configurations == ("4W2T",)
-    robot = robot_file.with_effects(nominal.nominal(), ("seal_drag",), library, {"seal_drag": []})
+    robot = robot_file.with_effects(robots.nominal(), ("seal_drag",), library, {"seal_drag": []})
     assert robot.effects[0].configurations == ()
     robot_file.write(robot, tmp_path / "robot.toml")
     assert robot_file.read(tmp_path / "robot.toml", library).effects[0].configurations == ()

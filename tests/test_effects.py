@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import mmrjax
-from mmrjax import balances, channels, effects, nominal, params
+from mmrjax import balances, channels, effects, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME, Effect
 from mmrjax.effects.contract import readable
@@ -113,7 +113,7 @@ CONDITIONS = Conditions(
     configuration=["6T2A", "4W2T", "6T2A", "4W2T", "4W2T"],
     battery=[0.0, 0.0, 1.0, 0.0, 1.0],
     discharge=[0.0, 0.0, 3000.0, 0.0, 100.0],
-).resolved(nominal.nominal())
+).resolved(robots.nominal())
 
 
 def random_states(n=400):
@@ -126,7 +126,7 @@ def random_states(n=400):
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
-    return moving(nominal.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge)), memory))
+    return moving(robots.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge)), memory))
 
 
 STATES = random_states()
@@ -142,7 +142,7 @@ def fitted(effect: type[Effect], amplitude: float) -> Effect:
 
 
 def with_effects(*present: Effect, robot=None):
-    return dataclasses.replace(robot or nominal.nominal(), effects=present)
+    return dataclasses.replace(robot or robots.nominal(), effects=present)
 
 
 def terms(effect: Effect, robot=None, signals: Signals = STATES) -> np.ndarray:
@@ -263,7 +263,7 @@ def law_unit(effect: type[Effect]) -> None:
         )
         kept = {n: v * factor(BY_NAME[n].memory_unit, change) for n, v in STATES.memory.items()}
         signals = dataclasses.replace(signals, memory=kept)
-        after = terms(rescaled(start), rescaled(nominal.nominal()), signals)
+        after = terms(rescaled(start), rescaled(robots.nominal()), signals)
         expected = before * factor(balance_unit(effect), change)
         np.testing.assert_allclose(after, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
 
@@ -292,7 +292,7 @@ def known(balance: str, channel: str, instant: str) -> Signals:
     """What a term in this balance may read."""
     state, settled = INSTANTS[instant]
     run = jax.tree.map(lambda x: x[2], CONDITIONS)
-    return readable(nominal.nominal(), run, state, balance, channel, settled=settled)
+    return readable(robots.nominal(), run, state, balance, channel, settled=settled)
 
 
 def law_readable(effect: type[Effect]) -> None:
@@ -676,7 +676,7 @@ def drive_readings():
 
 
 def test_drive_without_amplitudes_is_drive_without_effects(drive_readings):
-    bare = nominal.nominal()
+    bare = robots.nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, jnp.asarray(DRIVEN), tolerance=1e-11)))(CONDITIONS)
     expected = readings(bare, plain.signals)[:, 1:]
     np.testing.assert_allclose(drive_readings(jnp.zeros(len(ALL))), expected, rtol=1e-9, atol=1e-9)
@@ -703,7 +703,7 @@ def test_drive_and_steady_both_feel(k, drive_readings):
 
 
 def _steady_with(changes=None, **amplitudes):
-    robot = params.replace(nominal.nominal(), changes or {})
+    robot = params.replace(robots.nominal(), changes or {})
     present = (fitted(BY_NAME[name], value) for name, value in amplitudes.items())
     return steady_batch(with_effects(*present, robot=robot), CONDITIONS)
 
@@ -794,7 +794,7 @@ def test_effect_acts_on_the_configurations_that_it_names(name, configurations, a
 
 def test_mass_offset_of_named_configurations_is_mass_of_those():
     offset = dataclasses.replace(fitted(BY_NAME["mass_offset"], 1.6), configurations=("6T2A",))
-    heavier = params.replace(nominal.nominal(), {"6T2A.mass": 13.1 + 1.6})
+    heavier = params.replace(robots.nominal(), {"6T2A.mass": 13.1 + 1.6})
     _same(steady_batch(with_effects(offset), CONDITIONS), steady_batch(heavier, CONDITIONS))
 
 
@@ -815,7 +815,7 @@ RUNS = Conditions(
     slope_deg=[3.0, 5.0, 0.0],
     payload=[2.0, 0.0, 0.0],
     battery=[1.0, 0.0, 0.0],
-).resolved(nominal.nominal())
+).resolved(robots.nominal())
 EVERY = {p.name: p.value for p in params.walk(with_effects(*(fitted(e, 0.02 * size(e)) for e in ALL)))}
 THETA = jnp.stack([jnp.asarray(x) for x in EVERY.values()])
 

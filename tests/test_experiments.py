@@ -16,7 +16,7 @@ from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
 from calibration.discovery.settings import settings_for
 from calibration.inference.observers import SettledRuns
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
 from mmrjax.tables import CONFIGURATIONS
 
@@ -38,7 +38,7 @@ ANALYST = Analyst(SETTINGS, {n: BY_NAME[n] for n in sorted({n for pair in PAIRS 
 @pytest.fixture(scope="module")
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
-    base = params.replace(nominal.nominal(), g.CLIMBING)
+    base = params.replace(robots.nominal(), g.CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
     read = eqx.filter_jit(menu.readings)
 

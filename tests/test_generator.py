@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 
-GRID = g.table8(payloads=nominal.PAYLOADS_KG)
+GRID = g.table8(payloads=robots.PAYLOADS_KG)
 #: What the generator calls a shape parameter, and what the library does.
 SHAPES = {
     "knee": "current_ohmic",
@@ -31,7 +31,7 @@ SHAPES = {
 @pytest.fixture(scope="module")
 def package():
     """Readings of `steady` on GRID, shape (3, rows), for constants and a term of the library."""
-    base = params.replace(nominal.nominal(), g.CLIMBING)
+    base = params.replace(robots.nominal(), g.CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
     run = Conditions(GRID.wheeled, GRID.U, np.degrees(GRID.slope), GRID.payload, total_mass=GRID.mass)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive_batch
@@ -24,7 +24,7 @@ ERROR = 1e-5
 @pytest.fixture(scope="module")
 def package():
     """Histories of `drive` for amplitudes of PASSING, shape (3, runs, instants)."""
-    base = params.replace(nominal.nominal(), g.CLIMBING)
+    base = params.replace(robots.nominal(), g.CLIMBING)
     full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in PASSING))
     times = jnp.arange(round(DURATION / EVERY) + 1) * EVERY
     every = {p.name: p.value for p in params.walk(full)}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import reference
 
-from mmrjax import chassis, ground, nominal
+from mmrjax import chassis, ground, robots
 from mmrjax.contact import Friction
 from mmrjax.ground import Ground
 
@@ -45,7 +45,7 @@ def test_slip_limits_are_finite(speed, theoretical, slip):
 
 
 def test_ground_traction_equals_adhesion_at_its_largest():
-    surface = nominal.nominal().configurations["6T2A"].ground
+    surface = robots.nominal().configurations["6T2A"].ground
     speeds = np.linspace(0, 0.5, 2001)
     largest = np.max(surface.traction(speeds, 60.0, 1.0))
     np.testing.assert_allclose(largest, surface.force_adhesion(60.0, 1.0), rtol=1e-9)
@@ -66,5 +66,5 @@ def test_adhesion_ratio_restores_table5(robot, surface, tracked, wheeled):
         (True, robot.configurations["6T2A"], tracked),
         (False, robot.configurations["4W2T"], wheeled),
     ):
-        ratio = nominal.adhesion_ratio(surface, on_tracks)
+        ratio = robots.adhesion_ratio(surface, on_tracks)
         np.testing.assert_allclose(body.ground.force_adhesion(1.0, ratio), phi, rtol=1e-12)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive
@@ -44,7 +44,7 @@ def test_grid_holds_the_instants_and_is_fine_where_a_start_is_young():
 
 
 def test_histories_follow_drive():
-    robot = nominal.nominal()
+    robot = robots.nominal()
     times = jnp.asarray(np.concatenate([[0.0], TIMES]))
     s = jax.jit(jax.vmap(lambda c: drive(robot, c, times, tolerance=1e-9, max_steps=20000).signals))(RUNS)
     expected = np.stack([np.asarray(getattr(s, k)) for k in STATE], -1)[:, 1:]
@@ -64,7 +64,7 @@ def test_histories_follow_drive():
 )
 def test_derivatives_are_those_of_what_is_computed(changes):
     """By parameters and by the amplitude of every effect with a memory, against central differences."""
-    robot = dataclasses.replace(nominal.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
+    robot = dataclasses.replace(robots.nominal(), effects=tuple(BY_NAME[n]() for n in EFFECTS))
     robot = params.strong(params.replace(robot, {k: jnp.asarray(v) for k, v in changes.items()}))
     names = [
         "motor.resistance", "motor.inertia", "motor.inductance", "6T2A.ground.friction.static", "4W2T.radius",
@@ -89,7 +89,7 @@ def test_derivatives_are_those_of_what_is_computed(changes):
 
 
 def test_repeated_instants_change_nothing():
-    robot = nominal.nominal()
+    robot = robots.nominal()
     short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])
     one = jax.tree.map(lambda x: x[0], RUNS)
     first, second = (
@@ -101,5 +101,5 @@ def test_repeated_instants_change_nothing():
 
 
 def test_run_that_cannot_be_followed_is_not_finite():
-    robot = params.replace(nominal.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
+    robot = params.replace(robots.nominal(), {"motor.resistance": jnp.asarray(jnp.nan)})
     assert not np.isfinite(seen(robot)).any()

@@ -13,7 +13,7 @@ from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, noise, observers, priors, problem
 from calibration.inference import optimizers as fit
 from calibration.inference.normal_equations import backward, cholesky, forward
-from mmrjax import nominal
+from mmrjax import robots
 from mmrjax.signals import CONVERGED, SLIDES
 
 solve = eqx.filter_jit(fit.levenberg_marquardt)
@@ -36,7 +36,7 @@ def measured():
 
 @pytest.fixture(scope="module")
 def posed(measured):
-    return pose(measured, nominal.nominal())
+    return pose(measured, robots.nominal())
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_coverage_can_fail(posed, truth):
 
 
 def test_what_only_its_prior_holds_is_said(measured):
-    robot = nominal.nominal()
+    robot = robots.nominal()
     names = (
         *priors.default_names(measured["configuration"], robot),
         "motor.inductance",
@@ -191,7 +191,7 @@ def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
 
 
 def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
-    posed = pose(measured, nominal.nominal(), stated="current=9%,motor_speed=6%,speed=4%")
+    posed = pose(measured, robots.nominal(), stated="current=9%,motor_speed=6%,speed=4%")
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data)
     about = identifiability.analyse(posed, best.z)
     profile = identifiability.profile(posed, best.z, float(best.cost), about)
@@ -208,7 +208,7 @@ def test_blocks_left_out_are_not_seen(posed, measured):
     assert held.labels == ("0.0", "5.0", "10.0", "15.0", "20.0") and held.converged.all()
     # the refit without slope 10, done alone, says the same of those rows
     rows = masks["slope"]["10.0"]
-    alone = pose(measured.where(~rows), nominal.nominal())
+    alone = pose(measured.where(~rows), robots.nominal())
     z = solve(alone, best, alone.data).z
     np.testing.assert_allclose(held.reading[rows], np.asarray(posed.observation(z).reading)[rows], rtol=1e-4)
     # readings of a block do not change what is predicted for it
@@ -224,7 +224,7 @@ def test_blocks_of_what_does_not_vary_are_none(measured):
 
 
 def test_drive_and_steady_agree_on_settled_rows(measured, truth, posed):
-    same = pose(measured, nominal.nominal(), model="drive")
+    same = pose(measured, robots.nominal(), model="drive")
     np.testing.assert_allclose(same.observation(truth).reading, posed.observation(truth).reading, rtol=2e-4)
 
 
@@ -260,7 +260,7 @@ def history_runs(robot, seed=None, noise_share=0.01):
 @pytest.mark.slow
 def test_histories_calibrate_with_drive():
     """A start tells the inductance and the rotor's inertia, which no steady row can."""
-    base = nominal.nominal()
+    base = robots.nominal()
     names = ("motor.inductance", "motor.inertia", "6T2A.track.loss_coulomb", "6T2A.ground.friction.static")
     c = priors.coordinates(base, names)
     truth = jnp.asarray([1.0, -0.8, 1.2, 1.8])
@@ -277,7 +277,7 @@ def test_histories_calibrate_with_drive():
 @pytest.mark.slow
 def test_lbfgs_reaches_the_same_optimum_through_a_rollout():
     """One start-up history of `drive`, one parameter that it tells."""
-    base = nominal.nominal()
+    base = robots.nominal()
     c = priors.coordinates(base, ("motor.inertia",))
     runs = history_runs(c.robot(base, jnp.asarray([1.5])), seed=2)
     runs = runs.where(runs["run_id"] == "a")
@@ -290,9 +290,9 @@ def test_lbfgs_reaches_the_same_optimum_through_a_rollout():
 
 
 def test_histories_pad_runs_of_different_length():
-    runs = history_runs(nominal.nominal())
+    runs = history_runs(robots.nominal())
     kept = (runs["run_id"] != "b") | (runs["time_s"] < 0.3)
-    robot = nominal.nominal()
+    robot = robots.nominal()
     seen, whole = (observers.Histories.of(r, robot)(robot).reading for r in (runs.where(kept), runs))
     np.testing.assert_allclose(seen, whole[kept], rtol=1e-8)
     # against `drive`, which made them: tests/test_histories.py says how close

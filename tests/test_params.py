@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.params import parameter
 
 
@@ -20,9 +20,9 @@ def test_nominal_values_are_those_of_the_reference(robot):
         assert values[name] == pytest.approx(expected, rel=1e-12), name
 
 
-@pytest.mark.parametrize("name", sorted(nominal.ROBOTS))
+@pytest.mark.parametrize("name", sorted(robots.ROBOTS))
 def test_parameters_lie_within_their_bounds(name):
-    for p in params.walk(nominal.ROBOTS[name]()):
+    for p in params.walk(robots.ROBOTS[name]()):
         low, high = p.spec.bounds
         assert low < high and low <= float(p.value) <= high, p.name
 
@@ -84,7 +84,7 @@ def test_spec_is_frozen(robot):
         spec.unit = "kg"
 
 
-@pytest.mark.parametrize(("build", "torque"), [(nominal.sm1, 0.108), (nominal.sm2, 0.300)])
+@pytest.mark.parametrize(("build", "torque"), [(robots.sm1, 0.108), (robots.sm2, 0.300)])
 def test_simplified_robots_are_table_a4(build, torque):
     robot = build()
     assert float(robot.motor.torque_loss(0.0, 1.0)) == float(robot.motor.torque_loss(1200.0, 1.0)) == 4.2e-3

@@ -9,10 +9,10 @@ import pytest
 
 from calibration.data.errors import BadConfiguration
 from calibration.inference import priors
-from mmrjax import nominal, params
+from mmrjax import params, robots
 from mmrjax.effects import ALL
 
-EVERY = [p.name for p in params.walk(dataclasses.replace(nominal.nominal(), effects=tuple(e() for e in ALL)))]
+EVERY = [p.name for p in params.walk(dataclasses.replace(robots.nominal(), effects=tuple(e() for e in ALL)))]
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_coordinates_refuse_stated_priors(robot, names, stated, says):
 def test_coordinates_refuse_a_prior_without_width():
 
     with pytest.raises(BadConfiguration, match=r"motor.friction_viscous: its prior has no width"):
-        priors.coordinates(nominal.sm1(), ["motor.friction_viscous"])
+        priors.coordinates(robots.sm1(), ["motor.friction_viscous"])
 
 
 def test_stated_prior_moves_the_centre(robot):

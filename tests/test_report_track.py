@@ -1,16 +1,20 @@
-"""The report's section on the running gear: Figs. 23-27 out of a run of the track model, there when asked for."""
+"""The running gear in reports: Figs. 23-27 of the paper remade, and a run's own, out of the track model."""
 
 import dataclasses
 import re
 
+import jax
 import numpy as np
 import pytest
 
-from mmrjax import params
+from calibration.data import runs as records
+from mmrjax import fidelities, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.stability import largest_step
 from mmrjax.signals import CONVERGED, FAILED
-from sweeps import figures_track, report
+from sweeps import figures_gear, report_runs
+from sweeps import run as simulation
+from sweeps.paper import report, running_gear
 
 FIGURES = {
     "track_fig23_24_from_standstill",
@@ -21,8 +25,8 @@ FIGURES = {
 SECONDS = 0.9  # of a run; both configurations are under way after 0.5 s
 
 
-def page(folder, robot, model):
-    path = report.write(folder, robot=robot, robot_name="nominal", model=model, runs=None, title="A run")
+def page(folder, robot):
+    path, _ = report.write(folder, robot=robot, robot_name="nominal", model="track", gear=True)
     return path.read_text(encoding="utf-8")
 
 
@@ -32,13 +36,13 @@ def drawn(text):
 
 @pytest.fixture(scope="module")
 def written(robot, tmp_path_factory):
-    """Folder and text of a report with `--model track`, and the run that its figures show."""
-    seen, runs = [], figures_track.runs
+    """Folder and text of the paper remade with the track model, and the run that its figures show."""
+    seen, runs = [], running_gear.runs
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(figures_track, "SECONDS", SECONDS)
-        patch.setattr(figures_track, "runs", lambda robot: seen.append(runs(robot)) or seen[0])
+        patch.setattr(running_gear, "SECONDS", SECONDS)
+        patch.setattr(running_gear, "runs", lambda robot: seen.append(runs(robot)) or seen[0])
         folder = tmp_path_factory.mktemp("report")
-        text = page(folder, robot, "track")
+        text = page(folder, robot)
     return folder, text, seen[0]
 
 
@@ -58,12 +62,6 @@ def test_report_shows_the_running_gear_with_the_track_model(written):
     assert '<h2 id="gear">' in text and 'href="#gear"' in text
 
 
-def test_report_without_the_track_model_has_none_of_it(robot, tmp_path):
-    text = page(tmp_path, robot, "steady")
-    assert drawn(text) == set() and 'id="gear"' not in text and "#gear" not in text
-    assert not list((tmp_path / "figures").glob("track_*"))
-
-
 @pytest.mark.slow
 def test_ripple_table_has_the_period_of_equation_34(written, period):
     cells = re.search(r'id="ripple">.*?<tr><td class="words">6T2A</td>(.*?)</tr>', written[1], re.S).group(1)
@@ -77,19 +75,24 @@ def test_ripple_table_has_the_period_of_equation_34(written, period):
 @pytest.mark.slow
 def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, written):
     from mmrjax.fidelities.steady import steady
-    from mmrjax.signals import command as one
 
     said = re.search(r'id="guide-share">(.*?)</p>', written[1], re.S).group(1)
     here, there = re.search(r"draws ([\d.]+) A here and ([\d.]+) A by the steady model", said).groups()
-    assert float(here) == pytest.approx(written[2].result.reading.total_current[0], abs=0.006)
-    assert float(there) == pytest.approx(float(steady(robot, one(voltage=33.0)).reading.total_current), abs=0.006)
+    assert float(here) == pytest.approx(written[2].result.total_current[0], abs=0.006)
+    assert float(there) == pytest.approx(float(steady(robot, Conditions(voltage=33.0)).total_current), abs=0.006)
     assert float(here) > 1.2 * float(there) and "0.3 for this robot" in said
 
 
-@pytest.mark.slow
-def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(robot, written, period):
+@pytest.fixture(scope="module")
+def gears(robot, written):
     run = written[2]
-    figure, _ = figures_track.ripple_of_current(robot, run)
+    return figures_gear.gears(robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T"))
+
+
+@pytest.mark.slow
+def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(gears, written, period):
+    run = written[2]
+    figure, _ = figures_gear.current_ripple(gears)
     time, current = figure.axes[0].lines[0].get_data()
     np.testing.assert_allclose(current, run.signals.total_current[0, -len(current) :])
     spacing = (time[1] - time[0]) / 1e3
@@ -103,8 +106,8 @@ def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(robot, writte
 
 
 @pytest.mark.slow
-def test_figure_26_marks_a_touchdown_each_pitch(robot, written, period):
-    upper, lower = figures_track.touchdown(robot, written[2]).axes
+def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
+    upper, lower = figures_gear.touchdown(gears[0]).axes
     for axes in (upper, lower):
         marks = sorted(line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == ":")
         assert len(marks) >= 3
@@ -115,8 +118,8 @@ def test_figure_26_marks_a_touchdown_each_pitch(robot, written, period):
 
 
 @pytest.mark.slow
-def test_figure_27_ripples_on_tracks_and_not_on_wheels(written):
-    tracked, wheeled = figures_track.reactions(written[2]).axes
+def test_figure_27_ripples_on_tracks_and_not_on_wheels(gears):
+    tracked, wheeled = figures_gear.reactions(gears).axes
     swing = [np.ptp(axes.lines[0].get_ydata()) / np.mean(axes.lines[0].get_ydata()) for axes in (tracked, wheeled)]
     assert swing[0] > 0.05 and swing[0] > 100 * swing[1]
     half = 6.0 * 9.80665  # roughly what one side bears [N]
@@ -131,19 +134,37 @@ def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written,
         signals=dataclasses.replace(run.signals, total_current=np.full_like(run.signals.total_current, np.nan)),
         result=dataclasses.replace(run.result, status=np.array([FAILED, CONVERGED])),
     )
-    monkeypatch.setattr(figures_track, "runs", lambda robot: broken)
-    text = page(tmp_path, robot, "track")
+    monkeypatch.setattr(running_gear, "runs", lambda robot: broken)
+    text = page(tmp_path, robot)
     assert drawn(text) == set()
     assert re.search(r'id="gear-left-out">.*6T2A: failed, 4W2T: settled', text)
 
 
 def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
     """A sweep of it has been asked for with such a step; the report's own runs must not be refused."""
-    names = [f"{c}.ground.friction.speed_static" for c in ("tracked", "wheeled")]
+    names = [f"{c}.ground.friction.speed_static" for c in ("6T2A", "4W2T")]
     stiff = params.replace(robot, dict.fromkeys(names, np.asarray(5e-3)))
     taken = {}
-    monkeypatch.setattr(figures_track, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords))
-    figures_track.runs(stiff)
-    limit = largest_step(stiff, Conditions(stiff, configuration=np.array(["6T2A", "4W2T"]), voltage=33.0)).min()
+    monkeypatch.setattr(running_gear, "track_batch", lambda robot, conditions, **keywords: taken.update(keywords))
+    running_gear.runs(stiff)
+    limit = largest_step(stiff, Conditions(["6T2A", "4W2T"], 33.0).resolved(stiff)).min()
     assert taken["step"] <= limit < 1e-4
     assert (taken["sample"] / taken["step"]) == pytest.approx(round(taken["sample"] / taken["step"]))
+
+
+def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
+    """0.9 s on wheels; of a run that has not settled long enough no ripple is drawn."""
+    runs = records.Runs("the test", {
+        "configuration": np.array(["4W2T"]), "supply_voltage_V": np.array([33.0]), "payload_kg": np.zeros(1),
+        "slope_deg": np.zeros(1),
+    })  # fmt: skip
+    kept = fidelities.get("track").histories(robot, runs.conditions(robot), {"duration": 0.9, "step": 1e-4})
+    batch = jax.device_get(kept)
+    short = dataclasses.replace(batch, history=jax.tree.map(lambda x: x[:, :100], batch.history))
+    for name, shown, figures in (("whole", batch, {"history", "power", "ripple", "reactions"}),
+                                 ("short", short, {"history", "power"})):  # fmt: skip
+        table = {**simulation.conditions(robot, runs), **simulation.ended(batch)}
+        path = report_runs.write(
+            tmp_path / name, robot=robot, robot_name="nominal", model="track", runs=table, histories=shown
+        )
+        assert set(re.findall(r'<figure id="([^"]+)">', path.read_text())) == figures

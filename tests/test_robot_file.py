@@ -5,14 +5,14 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
-from mmrjax import effects, nominal, params
+from mmrjax import effects, params, robots
 
 
 def values(robot):
     return {p.name: float(p.value) for p in params.walk(robot)}
 
 
-@pytest.mark.parametrize("name", nominal.ROBOTS)
+@pytest.mark.parametrize("name", robots.ROBOTS)
 def test_robot_written_and_read_is_the_same(tmp_path, name):
     robot = robot_file.with_effects(robot_file.load(name), tuple(effects.BY_NAME))
     robot = robot_file.change(robot, {"effects.churning.amplitude": 1e-4}, where="test")
@@ -23,7 +23,7 @@ def test_robot_written_and_read_is_the_same(tmp_path, name):
 def test_file_states_only_what_differs(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('base = "sm1"\n[motor]\nresistance = 0.9\n[effects.series_resistance]\namplitude = 0.3\n')
-    robot, base = values(robot_file.read(path)), values(nominal.sm1())
+    robot, base = values(robot_file.read(path)), values(robots.sm1())
     assert robot.pop("motor.resistance") == 0.9 and robot.pop("effects.series_resistance.amplitude") == 0.3
     assert base.pop("motor.resistance") == 0.611 and robot == base
 
@@ -81,7 +81,7 @@ def test_a_robot_of_another_build_is_written_and_read_the_same(tmp_path, text):
 
 def test_like_starts_from_that_configuration(tmp_path):
     (tmp_path / "mine.toml").write_text(ROVER)
-    robot, base = robot_file.read(tmp_path / "mine.toml"), nominal.nominal()
+    robot, base = robot_file.read(tmp_path / "mine.toml"), robots.nominal()
     assert robot.configurations.names == ("rover", "6T2A") and robot.sides == 4 and robot.battery.cells == 4
     rover, wheeled = robot.configurations["rover"], base.configurations["4W2T"]
     assert float(rover.mass) == 6.0 and float(rover.ground.friction.static) == 0.6

@@ -194,7 +194,7 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
 #: of robot files its import and the names that files formerly had.
 CONFIGURED = {
     "mmrjax/tables.py",
-    "mmrjax/nominal.py",
+    "mmrjax/robots.py",
     "calibration/data/robot_file.py:",
     "calibration/data/robot_file.py:OLD_NAMES",
 }

@@ -13,9 +13,7 @@ from mmrjax.fidelities.track import _batch
 from mmrjax.render import render, scene
 from mmrjax.running_gear import RunningGear
 
-RUNS = Conditions(
-    voltage=jnp.asarray([33.0, 24.0, np.nan]), slope_deg=np.degrees(0.1), configuration=jnp.asarray([0.0, 1.0, 0.0])
-)
+RUNS = Conditions(voltage=jnp.asarray([33.0, 24.0, np.nan]), slope_deg=np.degrees(0.1), configuration=[0, 1, 0])
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from calibration.data.errors import BadConfiguration, choices
-from mmrjax import channels, effects, nominal, params
+from mmrjax import channels, effects, params, robots
 from mmrjax.balances import BALANCES, added, moving
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
@@ -152,7 +152,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
 def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, Signals, Signals]:
     """Of the nominal robot on its battery: what a term may read while it climbs, all signals of that instant, and
     what a term may read at rest."""
-    robot = nominal.nominal()
+    robot = robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
     climbing, rest = (State(*map(jnp.asarray, x)) for x in ((1.5, 800.0, 0.6, 100.0), (0.0, 0.0, 0.0, 0.0)))
     climbs = readable(robot, run, climbing, balance, channel)
@@ -160,7 +160,7 @@ def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, 
 
 
 def _check_term(refuse: Callable[[str], BadConfiguration], effect: type[Effect], size: float) -> None:
-    robot = nominal.nominal()
+    robot = robots.nominal()
     memory = {} if effect.memory_size is None else {effect.name: jnp.asarray(0.3 * effect.memory_size)}
 
     def term(amplitude: jax.Array, signals: Signals) -> jax.Array:

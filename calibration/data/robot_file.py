@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from calibration.data.configuration_tables import configured
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadConfiguration, choices, number
-from mmrjax import effects, nominal, params
+from mmrjax import effects, params, robots
 from mmrjax.robot import Robot
 from mmrjax.tables import TRACKED, WHEELED
 
@@ -41,12 +41,12 @@ def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str]
     Raises:
         BadConfiguration: no such name or file, or what `read` raises.
     """
-    if name_or_path in nominal.ROBOTS:
-        return nominal.ROBOTS[name_or_path]()
+    if name_or_path in robots.ROBOTS:
+        return robots.ROBOTS[name_or_path]()
     path = Path(name_or_path)
     if not path.is_file():
         raise BadConfiguration(
-            f"--robot: got {name_or_path}, no such file and no known robot; {choices(name_or_path, nominal.ROBOTS)}"
+            f"--robot: got {name_or_path}, no such file and no known robot; {choices(name_or_path, robots.ROBOTS)}"
         )
     return read(path, library, notes)
 
@@ -80,9 +80,9 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
     if schema not in SCHEMAS:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
-    if base not in nominal.ROBOTS:
-        raise BadConfiguration(f"{path.name}, base: got {base}; {choices(str(base), nominal.ROBOTS)}")
-    robot = configured(nominal.ROBOTS[base](), content, path.name)
+    if base not in robots.ROBOTS:
+        raise BadConfiguration(f"{path.name}, base: got {base}; {choices(str(base), robots.ROBOTS)}")
+    robot = configured(robots.ROBOTS[base](), content, path.name)
     present = content.get("effects", {})
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
@@ -237,7 +237,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         named = effect.configurations or type(effect)().configurations
         acting = f"configurations = {json.dumps(effect.configurations)}  # on which it acts"
         tables[f"effects.{effect.name}"] = [acting] if named else []
-    start = {p.name: float(p.value) for p in params.walk(nominal.nominal())}
+    start = {p.name: float(p.value) for p in params.walk(robots.nominal())}
     for parameter in params.walk(robot):
         head, _, key = parameter.name.rpartition(".")
         spec, value = parameter.spec, float(parameter.value)

@@ -38,12 +38,13 @@ def ripple(time: Series, values: Series) -> Ripple:
     rest = values - np.polyval(np.polyfit(time, values, 1), time)
     n = len(rest)
     lags = np.arange(n // 2)
-    agreement = np.array([np.corrcoef(rest[: n - k], rest[k:])[0, 1] for k in lags])
+    with np.errstate(invalid="ignore", divide="ignore"):  # of a signal that does not vary
+        agreement = np.array([np.corrcoef(rest[: n - k], rest[k:])[0, 1] for k in lags])
     inner = agreement[1:-1]
     peaks = 1 + np.nonzero((inner > agreement[:-2]) & (inner >= agreement[2:]))[0]
     period = float("nan")
-    if len(peaks):
-        good = peaks[agreement[peaks] >= 0.9 * agreement[peaks].max()]
+    good = peaks[agreement[peaks] >= 0.9 * agreement[peaks].max(initial=0.0)]
+    if len(good):
         first = _vertex(agreement, good[0])
         count = np.round(good / first)
         near = np.abs(good / first - count) < 0.2

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration.data import runs as records
 from calibration.inference import errors as residual
-from mmrjax import channels
+from mmrjax import channels, outputs
 from mmrjax.channels import MM, RPM
 from mmrjax.conditions import Conditions
 from mmrjax.tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
@@ -54,7 +54,6 @@ def operating_points(robot: Robot, asked: Conditions) -> Columns:
     import jax
 
     from mmrjax.fidelities.steady import steady_batch
-    from sweeps import outputs
 
     rows = asked.shape[0]
     parts = []

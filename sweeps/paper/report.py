@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.inference import errors as residual
-from mmrjax.nominal import ROBOTS
+from mmrjax.robots import ROBOTS
 from mmrjax.tables import TRACKED
 from sweeps import figures_history, report
 from sweeps.paper import components, data, runs, tables

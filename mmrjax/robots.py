@@ -103,5 +103,5 @@ def sm2() -> Robot:
     return _simplified(0.300)
 
 
-#: Robots by the name that the conditions line takes.
+#: Robots by the name that the command line takes.
 ROBOTS: dict[str, Callable[[], Robot]] = {"nominal": nominal, "sm1": sm1, "sm2": sm2}

@@ -1,0 +1,92 @@
+"""The table of outputs: what a simulated run adds to a table of runs, one row each. Importable without jax.
+
+Columns of `runs.csv`, of `Results.to_dict` and of printed tables are these.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mmrjax import channels
+
+if TYPE_CHECKING:
+    from mmrjax.signals import Result
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """One number of a result.
+
+    Attributes:
+        name: noun; field of the result, or channel.
+        column: in tables of runs, with the unit in the name.
+        unit: of the column; factor: the SI value of one such unit.
+        label: words of tables and reports.
+        get: the number [SI] out of a result.
+        resolution: digits after the point that a person wants to see [unit].
+    """
+
+    name: str
+    column: str
+    unit: str
+    factor: float
+    label: str
+    get: Callable[[Result], Any]
+    resolution: int = 3
+
+
+#: Beside the channels, which come first.
+FURTHER: tuple[Output, ...] = (
+    Output(
+        "theoretical_speed", "theoretical_speed_mm_s", "mm/s", channels.MM, "theoretical speed",
+        lambda r: r.theoretical_speed, 1,
+    ),
+    Output("slip", "slip", "-", 1.0, "slip", lambda r: r.slip, 4),
+    Output("voltage", "voltage_V", "V", 1.0, "motor voltage", lambda r: r.voltage, 2),
+    Output("adhesion_used", "adhesion_used", "-", 1.0, "adhesion used", lambda r: r.adhesion_used),
+    Output("traction", "traction_N", "N", 1.0, "traction", lambda r: r.traction, 1),
+    Output("power_supply", "power_supply_W", "W", 1.0, "supply power", lambda r: r.power_supply, 1),
+    Output("power_motor", "power_motor_W", "W", 1.0, "motor power", lambda r: r.power_motor, 1),
+    Output("power_gear", "power_gear_W", "W", 1.0, "gearbox power", lambda r: r.power_gear, 1),
+    Output("power_ground", "power_ground_W", "W", 1.0, "ground power", lambda r: r.power_ground, 1),
+    Output("power_lift", "power_lift_W", "W", 1.0, "lifting power", lambda r: r.power_lift, 1),
+    Output("efficiency_motor", "efficiency_motor", "-", 1.0, "motor efficiency", lambda r: r.efficiency_motor),
+    Output("efficiency_gear", "efficiency_gear", "-", 1.0, "gearbox efficiency", lambda r: r.efficiency_gear),
+    Output(
+        "efficiency_chassis", "efficiency_chassis", "-", 1.0, "chassis efficiency",
+        lambda r: r.efficiency_chassis,
+    ),
+    Output(
+        "temperature_winding", "temperature_winding_C", "°C", 1.0, "winding temperature",
+        lambda r: r.temperature_winding, 1,
+    ),
+)  # fmt: skip
+
+
+def table() -> tuple[Output, ...]:
+    """Every output, the channels first, in the order of columns."""
+    shown = tuple(
+        Output(c.name, c.column, c.unit, c.factor, c.label, lambda r, name=c.name: r.reading[name], c.resolution)
+        for c in channels.CHANNELS
+    )
+    return shown + FURTHER
+
+
+def columns(result: Result, further: Mapping[str, Any] | None = None) -> dict[str, np.ndarray]:
+    """Results in the units and words of `runs.csv`.
+
+    Args:
+        further: what a fidelity adds, by column, in the column's unit (`fidelities.base.Run.columns`).
+    """
+    from mmrjax.signals import FLAGS, STATUSES
+
+    found = {output.column: np.asarray(output.get(result)) / output.factor for output in table()}
+    found["status"] = np.array(STATUSES)[np.asarray(result.status)]
+    bits = np.asarray(result.flags)
+    names = [";".join(flag for k, flag in enumerate(FLAGS) if b >> k & 1) for b in bits.ravel()]
+    found["flags"] = np.array(names, dtype=str).reshape(bits.shape)
+    return {**found, **{name: np.asarray(values) for name, values in (further or {}).items()}}

@@ -1,0 +1,135 @@
+"""What `simulate` returns: results with the conditions that they belong to, as a table or as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from mmrjax import outputs
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.base import History
+from mmrjax.params import Scalar
+from mmrjax.signals import STATUSES, Result
+
+#: Columns of a printed table beside conditions and channels.
+_SHOWN = ("slip", "adhesion_used", "power_supply_W", "temperature_winding_C")
+#: Columns of conditions: heading, unit and digits after the point.
+_CONDITIONS = {
+    "configuration": ("configuration", "", 0),
+    "supply_voltage_V": ("supply", "V", 2),
+    "total_mass_kg": ("total mass", "kg", 2),
+    "payload_kg": ("payload", "kg", 2),
+    "slope_deg": ("slope", "deg", 2),
+}
+_WORDS = {"status": ("status", "", 0), "flags": ("flags", "", 0)}
+
+
+class Results(eqx.Module):
+    """Results of one run, or of a batch, of one fidelity; a pytree.
+
+    Every field of `Result`, every channel and every column that the fidelity adds is an attribute:
+    `results.slip`, `results.total_current`, `results.guide_share`. All numbers have the shape of the conditions.
+
+    Attributes:
+        conditions: with configurations as indices.
+        total_mass: of robot and payload [kg], stated or the robot's own.
+        result: in SI units.
+        further: what this fidelity alone knows, by column, in the column's unit.
+        history: runs over time (`time`, `distance`, `signals`, `reading`), their last axis; None where the fidelity
+            has none or none was asked for.
+        configurations: names of the robot's configurations, in the order of their indices.
+        model: the fidelity.
+    """
+
+    conditions: Conditions
+    total_mass: Scalar
+    result: Result
+    further: dict[str, Scalar]
+    history: History | None
+    configurations: tuple[str, ...] = eqx.field(static=True)
+    model: str = eqx.field(static=True)
+
+    def __getattr__(self, name: str) -> Any:
+        result, further = self.__dict__.get("result"), self.__dict__.get("further")
+        if further is not None and name in further:
+            return further[name]
+        if result is not None and not name.startswith("__"):
+            try:
+                return getattr(result, name)
+            except AttributeError:
+                pass
+        raise AttributeError(f"{type(self).__name__} has no {name}")
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the batch; () for one run."""
+        return self.result.status.shape
+
+    @property
+    def configuration(self) -> np.ndarray:
+        """Names of the runs' configurations."""
+        return np.array(self.configurations)[np.asarray(self.conditions.configuration)]
+
+    @property
+    def statuses(self) -> np.ndarray:
+        """How the runs ended, in words of `STATUSES`; `status` holds their codes."""
+        return np.array(STATUSES)[np.asarray(self.result.status)]
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape."""
+        conditions = self.conditions
+        return {
+            "configuration": self.configuration,
+            "supply_voltage_V": np.asarray(conditions.voltage),
+            "total_mass_kg": np.asarray(self.total_mass),
+            "payload_kg": np.asarray(conditions.payload),
+            "slope_deg": np.asarray(conditions.slope_deg),
+            **outputs.columns(self.result, self.further),
+        }
+
+    def table(self, columns: Sequence[str] | None = None, rows: int = 40) -> str:
+        """A table for people, a line a run.
+
+        Args:
+            columns: of `to_dict`; None takes the conditions, what the instruments show and a few more.
+            rows: most that are shown.
+        """
+        content = {name: np.ravel(values) for name, values in self.to_dict().items()}
+        about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in outputs.table()}}
+        if columns is None:
+            shown = [
+                output.column for output in outputs.table() if output.column in _SHOWN or output.name in self.reading
+            ]
+            columns = [
+                "configuration",
+                "supply_voltage_V",
+                "slope_deg",
+                "payload_kg",
+                *shown,
+                *self.further,
+                "status",
+            ]
+        cells = []
+        for name in columns:
+            label, unit, digits = about.get(name, (name.replace("_", " "), "", 3))
+            values = content[name][:rows]
+            words = values.dtype.kind == "U"
+            body = [str(v) if words else f"{v:.{digits}f}" for v in values]
+            column = [label, f"[{unit}]" if unit not in ("", "-") else "", *body]
+            width = max(map(len, column))
+            cells.append([c.ljust(width) if words else c.rjust(width) for c in column])
+        lines = ["  ".join(line).rstrip() for line in zip(*cells, strict=True)]
+        left = len(content["status"]) - rows
+        return "\n".join([*lines, f"... and {left} more"] if left > 0 else lines)
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def __repr__(self) -> str:
+        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(self)):
+            return f"Results of {self.model}, traced"
+        return f"Results of {self.model}, {max(self.result.status.size, 1)} runs\n{self.table()}"

@@ -1,0 +1,343 @@
+"""The public API: five lines, one run or a batch, any fidelity; transformations go through, wrong use is said."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import test_fidelities
+
+import mmrjax as mm
+from mmrjax import channels, fidelities, outputs, params, robots
+from mmrjax.effects import ALL
+from mmrjax.fidelities.drive import drive_batch
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.signals import Result
+
+ROOT = Path(__file__).resolve().parents[1]
+toy = test_fidelities.toy
+
+FIVE_LINES = """\
+import mmrjax as mm
+robot = mm.nominal()
+one = mm.simulate(robot, mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=10.0, payload=3.0))
+many = mm.simulate(robot, mm.Conditions(configuration="4W2T", voltage=[15.0, 24.0], slope_deg=5.0), model="drive")
+print(one.total_current, many.table())
+"""
+
+
+def python(code: str, **environment: str) -> str:
+    clean = {k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"}
+    answer = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=ROOT, env={**clean, **environment}, capture_output=True,
+        text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert answer.returncode == 0, answer.stderr
+    return answer.stdout
+
+
+def test_five_lines():
+    printed = python(FIVE_LINES).splitlines()
+    current, header = printed[0].split(maxsplit=1)
+    assert float(current) == pytest.approx(3.6786702697, rel=1e-9)
+    assert header.startswith("configuration  supply  slope  payload  total current  motor speed   speed")
+    assert [line.split()[0] for line in printed[2:]] == ["4W2T", "4W2T"]
+    assert [line.split()[-1] for line in printed[2:]] == ["converged", "converged"]
+
+
+# --- the package --------------------------------------------------------------------------------------
+
+
+def test_import_loads_no_jax():
+    assert python("import sys, mmrjax; print('jax' in sys.modules, 'numpy' in sys.modules)") == "False False\n"
+
+
+@pytest.mark.parametrize(
+    ("before", "variable", "precision"),
+    [("", {}, "float64"), ("import jax; ", {}, "float64"), ("import jax; ", {"JAX_ENABLE_X64": "0"}, "float32"),
+     ("", {"JAX_ENABLE_X64": "false"}, "float32"), ("", {"JAX_ENABLE_X64": "1"}, "float64")],
+)  # fmt: skip
+def test_import_enables_double_precision_unless_the_variable_says_otherwise(before, variable, precision):
+    code = f"{before}import mmrjax, jax.numpy as jnp; print(jnp.asarray(1.0).dtype, mmrjax.nominal().motor.resistance.dtype)"
+    assert python(code, **variable).split() == [precision, precision]
+
+
+def test_package_states_its_names_version_and_types():
+    assert set(mm.__all__) <= set(dir(mm))
+    for name in mm.__all__:
+        assert getattr(mm, name) is not None
+    with pytest.raises(AttributeError, match="module 'mmrjax' has no attribute 'simulat'"):
+        _ = mm.simulat
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert mm.__version__ == stated["project"]["version"]
+    assert (ROOT / "mmrjax" / "py.typed").exists()
+    assert "py.typed" in stated["tool"]["setuptools"]["package-data"]["mmrjax"]
+
+
+def test_type_checkers_see_every_public_name():
+    text = (ROOT / "mmrjax" / "__init__.py").read_text(encoding="utf-8")
+    block = text[text.index("if TYPE_CHECKING:") : text.index("#: Where")]
+    assert set(re.findall(r"import (\w+) as \1", block)) == set(mm.__all__) - {"__version__"}
+
+
+# --- one run, a batch, any fidelity --------------------------------------------------------------------
+
+
+def test_one_run_has_scalars(robot):
+    one = mm.simulate(robot, mm.Conditions(configuration="4W2T", voltage=15.0))
+    assert one.shape == () and one.total_current.shape == () and one.history is None
+    assert str(one.configuration) == "4W2T" and str(one.statuses) == "converged"
+    assert one.to_dict()["total_current_A"].shape == ()
+    assert len(str(one).splitlines()) == 3 and repr(one).startswith("Results of steady, 1 runs\n")
+
+
+def test_fields_broadcast_configurations_among_them(robot):
+    runs = mm.Conditions(configuration=["6T2A", "4W2T"], voltage=24.0, slope_deg=[[0.0], [5.0], [10.0]])
+    many = mm.simulate(robot, runs)
+    assert many.shape == (3, 2)
+    assert many.configuration.tolist() == [["6T2A", "4W2T"]] * 3
+    for row, slope in enumerate((0.0, 5.0, 10.0)):
+        for column, name in enumerate(("6T2A", "4W2T")):
+            alone = mm.simulate(robot, mm.Conditions(configuration=name, voltage=24.0, slope_deg=slope))
+            np.testing.assert_allclose(many.slip[row, column], alone.slip, rtol=1e-12)
+    by_index = mm.simulate(robot, dataclasses.replace(runs, configuration=jnp.asarray([[0, 1]] * 3)))
+    np.testing.assert_array_equal(by_index.total_current, many.total_current)
+
+
+def test_results_are_those_of_the_fidelities(robot):
+    runs = mm.Conditions(configuration=["6T2A", "4W2T"], voltage=[24.0, 15.0])
+    resolved = runs.resolved(robot)
+    for got, wanted in (
+        (mm.simulate(robot, runs), steady_batch(robot, resolved)),
+        (
+            mm.simulate(robot, runs, model="drive", duration=2.0),
+            drive_batch(robot, resolved, jnp.linspace(0.0, 2.0, 1001)).result,
+        ),
+    ):
+        for a, b in zip(jax.tree.leaves(got.result), jax.tree.leaves(wanted), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_every_result_field_and_channel_is_an_attribute(robot):
+    one = mm.simulate(robot, mm.Conditions())
+    for field in dataclasses.fields(Result):
+        assert getattr(one, field.name) is getattr(one.result, field.name)
+    for name in channels.names():
+        assert getattr(one, name) is one.reading[name]
+    with pytest.raises(AttributeError, match="Results has no torque"):
+        _ = one.torque
+
+
+def test_to_dict_has_the_columns_of_runs_csv(robot):
+    runs = mm.Conditions(configuration=["6T2A", "4W2T"], voltage=24.0, payload=2.0)
+    columns = mm.simulate(robot, runs).to_dict()
+    conditions = ["configuration", "supply_voltage_V", "total_mass_kg", "payload_kg", "slope_deg"]
+    assert list(columns) == [*conditions, *(output.column for output in outputs.table()), "status", "flags"]
+    assert columns["total_mass_kg"].tolist() == [15.1, 13.5]
+    assert columns["status"].tolist() == ["converged", "converged"] and columns["flags"][1] == "gearbox_overspeed"
+    result = steady_batch(robot, runs.resolved(robot))
+    np.testing.assert_allclose(columns["motor_speed_rpm"], result.motor_speed * 30 / np.pi, rtol=1e-12)
+    np.testing.assert_allclose(columns["theoretical_speed_mm_s"], result.theoretical_speed * 1e3, rtol=1e-12)
+    weighed = mm.simulate(robot, dataclasses.replace(runs, total_mass=jnp.asarray([16.0, 17.0])))
+    assert weighed.to_dict()["total_mass_kg"].tolist() == [16.0, 17.0] == weighed.mass.tolist()
+
+
+def test_outputs_name_every_number_of_a_result_once():
+    named = [output.name for output in outputs.table()]
+    fields = [field.name for field in dataclasses.fields(Result)]
+    assert sorted(named) == sorted({*channels.names(), *fields} - {"reading", "mass", "status", "flags"})
+    for output in outputs.table():
+        assert output.column == output.name or output.column.startswith(f"{output.name}_")
+        assert output.label and output.unit
+
+
+def test_table_shows_units_and_as_many_rows_as_wanted(robot):
+    many = mm.simulate(robot, mm.Conditions(voltage=np.linspace(10.0, 30.0, 50)))
+    lines = many.table().splitlines()
+    assert len(lines) == 43 and lines[-1] == "... and 10 more" and "[mm/s]" in lines[1]
+    chosen = many.table(["supply_voltage_V", "efficiency_motor", "status"], rows=2).splitlines()
+    assert chosen[0].split() == ["supply", "motor", "efficiency", "status"] and chosen[1].split() == ["[V]"]
+    assert chosen[2].split()[::2] == ["10.00", "converged"]
+    assert chosen[-1] == "... and 48 more"
+
+
+def test_drive_keeps_histories(robot):
+    one = mm.simulate(robot, mm.Conditions(voltage=24.0), model="drive", duration=1.0)
+    history = one.history
+    assert history.time.shape == history.signals.speed.shape == history.reading["speed"].shape
+    assert history.time.ndim == 1 and len(history.time) > 1000
+    assert float(history.time[-1]) == 1.0 and 0.5 < float(history.distance[-1]) < 0.75
+    np.testing.assert_allclose(history.reading["total_current"][-1], one.total_current, rtol=1e-12)
+    assert mm.simulate(robot, mm.Conditions(voltage=24.0), model="drive", duration=1.0, history=False).history is None
+
+
+def test_track_keeps_histories_with_reactions(robot):
+    runs = mm.Conditions(voltage=[24.0, 15.0])
+    many = mm.simulate(robot, runs, model="track", duration=0.03)
+    assert many.history.time.shape == (2, 30) and many.history.reactions.guided.shape[:2] == (2, 30)
+    assert many.guide_share.shape == (2,) and "guide_share" in many.to_dict() and "guide share" in many.table()
+
+
+def test_large_batches_run_in_chunks(robot, monkeypatch):
+    runs = mm.Conditions(voltage=np.linspace(10.0, 30.0, 10))
+    whole = mm.simulate(robot, runs)
+    sizes = []
+    run = fidelities.get("steady").run
+
+    def counted(robot, conditions, options):
+        sizes.append(conditions.shape)
+        return run(robot, conditions, options)
+
+    monkeypatch.setitem(fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), chunk=4))
+    few = dataclasses.replace(fidelities.get("steady"), run=counted)
+    monkeypatch.setattr("mmrjax.fidelities.steady.FIDELITY", few)
+    np.testing.assert_allclose(mm.simulate(robot, runs).total_current, whole.total_current, rtol=1e-13)
+    assert sizes == [(4,)] * 3
+
+
+def test_new_fidelity_answers_at_once(toy, robot):
+    many = mm.simulate(robot, mm.Conditions(voltage=[15.0, 24.0]), model=toy, patience=5.0)
+    assert many.patience.tolist() == [5.0, 5.0] and "patience" in many.table()
+
+
+# --- transformations ------------------------------------------------------------------------------------
+
+
+def current(resistance, robot, runs, **options):
+    return mm.simulate(mm.replace(robot, {"motor.resistance": resistance}), runs, **options).total_current
+
+
+def test_grad_and_forward_mode_go_through(robot):
+    run = mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=5.0)
+    x, h = jnp.asarray(0.611), 1e-5
+    central = (current(x + h, robot, run) - current(x - h, robot, run)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(current)(x, robot, run), central, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(current)(x, robot, run), central, rtol=1e-6)
+    short = dict(model="drive", duration=0.01, history=False)
+    driven = (current(x + h, robot, run, **short) - current(x - h, robot, run, **short)) / (2 * h)
+    np.testing.assert_allclose(jax.jacfwd(lambda r: current(r, robot, run, **short))(x), driven, rtol=1e-3)
+
+
+def test_vmap_and_jit_go_through(robot):
+    run = mm.Conditions(configuration="4W2T", voltage=24.0, slope_deg=5.0)
+    values = jnp.asarray([0.5, 0.7, 0.9])
+    wanted = [current(r, robot, run) for r in values]
+    np.testing.assert_allclose(jax.vmap(lambda r: current(r, robot, run))(values), wanted, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(lambda r: current(r, robot, run))(values[0]), wanted[0], rtol=1e-12)
+    whole = jax.jit(lambda robot, volt: mm.simulate(robot, mm.Conditions(voltage=volt)))(
+        robot, jnp.asarray([15.0, 24.0])
+    )
+    assert isinstance(whole, mm.Results) and whole.statuses.tolist() == ["converged"] * 2
+    batch = jax.vmap(lambda volt: mm.simulate(robot, mm.Conditions(voltage=volt)))(jnp.asarray([15.0, 24.0]))
+    np.testing.assert_allclose(batch.total_current, whole.total_current, rtol=1e-12)
+    assert len(batch.table().splitlines()) == 4
+
+
+def test_derivative_by_conditions_and_through_bad_values_passes_the_door(robot):
+    slope = jax.grad(lambda angle: mm.simulate(robot, mm.Conditions(slope_deg=angle)).total_current)(5.0)
+    assert np.isfinite(slope) and slope > 0
+    status = jax.jit(lambda volt: mm.simulate(robot, mm.Conditions(voltage=volt)).status)(jnp.nan)
+    assert mm.STATUSES[int(status)] == "failed"
+
+
+# --- wrong use --------------------------------------------------------------------------------------------
+
+
+def test_every_packaged_robot_is_within_its_bounds():
+    for build in robots.ROBOTS.values():
+        mm.simulate(build(), mm.Conditions())
+    mm.simulate(dataclasses.replace(robots.nominal(), effects=tuple(effect() for effect in ALL)), mm.Conditions())
+
+
+def with_value(name, value):
+    return lambda robot: params.replace(robot, {name: value})
+
+
+WRONG = {
+    "slope_deg: got 95; expected -45 to 45 deg": dict(slope_deg=95),
+    "slope_deg[1]: got -50; expected -45 to 45 deg": dict(slope_deg=[0.0, -50.0]),
+    "slope_deg[0, 2]: got 60; expected -45 to 45 deg": dict(slope_deg=[[0.0, 1.0, 60.0]]),
+    "payload: got -1; expected 0 to 300 kg": dict(payload=-1.0),
+    "payload: got 301; expected 0 to 300 kg": dict(payload=301.0),
+    "voltage: got -24; expected 0 to 100 V": dict(voltage=-24.0),
+    "voltage: got nan; expected 0 to 100 V": dict(voltage=np.nan),
+    "voltage[2]: got inf; expected 0 to 100 V": dict(voltage=[1.0, 2.0, np.inf]),
+    "battery: got 2; expected 0 to 1": dict(battery=2.0),
+    "discharge: got -5; expected 0 to 360000 C": dict(discharge=-5.0),
+    "adhesion: got 0; expected 0.001 to 100": dict(adhesion=0.0),
+    "total_mass: got 600; expected 0.1 to 500 kg": dict(total_mass=600.0),
+    "total_mass: got 8 kg; expected more than the payload, 8 kg": dict(total_mass=8.0, payload=8.0),
+    "total_mass[1]: got 8 kg; expected more than the payload, 9 kg": dict(total_mass=8.0, payload=[3.0, 9.0]),
+    "configuration: got 6T2B; did you mean 6T2A? expected one of 6T2A, 4W2T": dict(configuration="6T2B"),
+    "configuration: got legs; expected one of 6T2A, 4W2T": dict(configuration=["6T2A", "legs"]),
+    "configuration: got 2; expected one of 0 (6T2A), 1 (4W2T)": dict(configuration=2),
+    "configuration[1]: got -1; expected one of 0 (6T2A), 1 (4W2T)": dict(configuration=[0, -1]),
+}
+WRONG_ROBOT = {
+    "motor.resistance: got -1; expected 0.01 to 20 ohm (terminal resistance R_rot, eq. (15))": with_value(
+        "motor.resistance", -1.0
+    ),
+    "motor.resistance: got nan; expected 0.01 to 20 ohm (terminal resistance R_rot, eq. (15))": with_value(
+        "motor.resistance", jnp.nan
+    ),
+    "4W2T.mass: got 0; expected 0.5 to 200 kg (mass of the robot without payload)": with_value("4W2T.mass", 0.0),
+    "robot: got function; expected a Robot such as mmrjax.nominal()": lambda robot: mm.nominal,
+}
+WRONG_CALL = {
+    "model: got fast; expected one of steady, drive, track": dict(model="fast"),
+    "model: got stedy; did you mean steady? expected one of steady, drive, track": dict(model="stedy"),
+    "model steady, duration: got 5.0; this fidelity has no such option, its options: none": dict(duration=5.0),
+    "model drive, step: got 0.001; this fidelity has no such option, its options: duration": dict(
+        model="drive", step=1e-3
+    ),
+    "model drive, patience: got 3; this fidelity has no such option, its options: duration": dict(
+        model="drive", patience=3
+    ),
+    "model drive, duration: got -1; expected more than 0, at most 3600 s": dict(model="drive", duration=-1.0),
+    "model track, duration: got 0.0015 s; expected a whole number of samples of 0.001 s": dict(
+        model="track", duration=0.0015
+    ),
+}
+
+
+def refused(robot, conditions, **call) -> str:
+    with pytest.raises(mm.UsageError) as error:
+        mm.simulate(robot, conditions, **call)
+    assert isinstance(error.value, ValueError)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_wrong_conditions_are_said(message, robot):
+    assert refused(robot, mm.Conditions(**WRONG[message])) == message
+
+
+@pytest.mark.parametrize("message", WRONG_ROBOT)
+def test_wrong_robots_are_said(message, robot):
+    assert refused(WRONG_ROBOT[message](robot), mm.Conditions()) == message
+
+
+@pytest.mark.parametrize("message", WRONG_CALL)
+def test_wrong_calls_are_said(message, robot):
+    assert refused(robot, mm.Conditions(), **WRONG_CALL[message]) == message
+
+
+def test_other_wrong_use_is_said(robot):
+    assert refused(robot, {"voltage": 3.0}) == "conditions: got dict; expected mmrjax.Conditions(...)"
+    said = refused(robot, mm.Conditions(voltage=np.full(1001, 24.0)), model="drive")
+    assert said == "history: got 1001 runs; at most 1000 are kept over time; expected history=False"
+    assert re.match(
+        r"model track, step: got 0\.001 s; .* the largest stable step is",
+        refused(robot, mm.Conditions(), model="track", step=1e-3),
+    )
+    with pytest.raises(ValueError, match="shapes do not broadcast"):
+        mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])

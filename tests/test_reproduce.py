@@ -1,0 +1,182 @@
+# ruff: noqa: E402 (double precision is set before anything is imported)
+"""The paper remade by `mmrjax reproduce`: complete, offline, true to the paper's tables and to the model's numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np
+import pytest
+from pages import Tables, drawn, outside
+
+from calibration.data import runs as records
+from calibration.inference import errors as residual
+from mmrjax import outputs, params
+from mmrjax.effects import BY_NAME
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.robots import ROBOTS
+from mmrjax.tables import TRACKED, WHEELED
+from sweeps import cli
+from sweeps.paper import data
+
+FIGURES = {
+    "rows",
+    "fig28_current_over_slope",
+    "fig29_model_errors",
+    "fig23_24_from_standstill",
+    "energy_split",
+    "fig05a_gearbox_efficiency",
+    "fig10_battery",
+    "fig11_motor_friction",
+    "fig18_idle_track",
+}
+
+
+@pytest.fixture(scope="module")
+def reproduced(tmp_path_factory):
+    """A function that runs the command and returns its exit code and folder."""
+
+    def command(*arguments):
+        folder = tmp_path_factory.mktemp("reproduced") / "p"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", ["mmrjax", "reproduce", "--out", str(folder), *map(str, arguments)])
+            with pytest.raises(SystemExit) as end:
+                cli.main()
+        return end.value.code, folder
+
+    return command
+
+
+@pytest.fixture(scope="module")
+def paper(reproduced):
+    """Folder, page and tables of the nominal robot's."""
+    code, folder = reproduced()
+    assert code == 0
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    return folder, page, Tables(page)
+
+
+def test_run_folder_has_the_papers_rows(paper):
+    folder = paper[0]
+    result = json.loads((folder / "result.json").read_text())
+    assert result["schema"] == "mmrjax.reproduce/1" and result["rows"] == 20
+    assert result["errors"]["paper"]["total_current"]["rms_percent"] == pytest.approx(4.0, abs=0.05)
+    rows = (folder / "rows.csv").read_text().splitlines()
+    assert len(rows) == 21 and sum(row.endswith("slides") for row in rows) == 6
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "config.resolved.toml", "figures", "manifest.json", "report.html", "result.json", "robot.toml", "rows.csv",
+    ]  # fmt: skip
+
+
+def test_page_has_every_figure_and_refers_to_nothing_outside(paper):
+    folder, page, _ = paper
+    assert drawn(page) == FIGURES == {p.stem for p in (folder / "figures").glob("*.svg")}
+    assert outside(folder) == []
+    assert 'id="gear"' not in page and "#gear" not in page  # it is not resolved by this fidelity
+    assert (folder / "report.html").stat().st_size < 5e6
+
+
+def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced, tmp_path, capsys):
+    (tmp_path / "crawler.toml").write_text('configurations = ["crawler"]\n[crawler]\nlike = "6T2A"\n')
+    code, folder = reproduced("--robot", tmp_path / "crawler.toml")
+    assert code == 0
+    assert "the paper's runs are of 6T2A, 4W2T; none of them is this robot's" in capsys.readouterr().err
+    page = (folder / "report.html").read_text()
+    assert drawn(page) == FIGURES - {"rows", "fig28_current_over_slope", "fig29_model_errors"}
+    assert "not set against the bench" in page and not (folder / "rows.csv").exists()
+
+
+def test_error_table_equals_equation_35(paper):
+    tables = paper[2]
+    measured, printed = (data.stacked(records.read(n).columns) for n in ("measured", "simulated_by_paper"))
+    points = outputs.columns(
+        steady_batch(ROBOTS["nominal"](), records.read("measured").conditions(ROBOTS["nominal"]()))
+    )
+    ours = residual.relative_error(data.stacked(points), measured)
+    kind = records.read("measured")["configuration"]
+    rows = tables.tables["errors"][2:]
+    for first, errors in ((0, ours), (len(rows) - 3, residual.relative_error(printed, measured))):
+        for row, pick in zip(rows[first : first + 3], (kind != "", kind == "6T2A", kind == "4W2T"), strict=True):
+            there = np.isfinite(errors[pick, 0])
+            assert row[2] == f"{there.sum()} of {pick.sum()}"
+            for k in range(3):
+                values = errors[pick, k][there]
+                assert row[3 + 2 * k] == f"{np.sqrt(np.mean(values**2)):.1f}"
+                assert row[4 + 2 * k] == f"{np.abs(values).max():.1f}"
+
+
+def test_error_table_gives_the_papers_own_errors(paper):
+    tables = paper[2]
+    last = tables.tables["errors"][-3]
+    assert last[0] == "the paper's own simulation"
+    assert [last[k] for k in (3, 5, 7)] == ["4.0", "4.5", "4.6"]
+
+
+def test_row_table_shows_bench_paper_and_own_numbers(paper):
+    tables = paper[2]
+    measured = records.read("measured")
+    points = outputs.columns(steady_batch(ROBOTS["nominal"](), measured.conditions(ROBOTS["nominal"]())))
+    rows = [r for r in tables.tables["rowtable"][2:] if r[0]]
+    assert len(rows) == 20
+    for k, row in enumerate(rows):
+        assert row[:4] == [
+            measured["configuration"][k],
+            f"{measured['supply_voltage_V'][k]:.0f}",
+            f"{measured['total_mass_kg'][k]:.1f}",
+            f"{measured['slope_deg'][k]:.0f}",
+        ]
+        assert row[4] == f"{measured['total_current_A'][k]:.2f}"
+        own = points["total_current_A"][k]
+        assert row[6] == (f"{own:.2f}" if np.isfinite(own) else "slides")
+        assert float(row[10]) == measured["motor_speed_rpm"][k]
+        assert float(row[16]) == measured["speed_mm_s"][k]
+        assert ("A" in row[-1].split()) == (points["status"][k] == "slides")
+    assert [r[1] for r in tables.tables["rowtable"][2:] if not r[0]] == [""] * 10  # 4W2T with Table 7's mass
+
+
+def test_raised_adhesion_makes_every_measured_row_climb():
+    rows = data.rows(ROBOTS["nominal"]())
+    assert (rows.plain["status"] == "slides").sum() == 6
+    assert (rows.raised["status"] == "converged").all()
+    assert rows.ratio["6T2A"] * 0.32 == pytest.approx(0.45) and rows.ratio["4W2T"] * 0.38 == pytest.approx(0.60)
+
+
+def test_raised_adhesion_leaves_a_robot_that_climbs_alone():
+    values = {f"{c}.ground.friction.static": 0.9 for c in (TRACKED, WHEELED)}
+    rows = data.rows(params.replace(ROBOTS["nominal"](), values))
+    assert rows.ratio == {"6T2A": 1.0, "4W2T": 1.0}
+
+
+def test_energy_split_sums_to_the_supply():
+    robot = ROBOTS["nominal"]()
+    effects = (BY_NAME["series_resistance"](amplitude=0.4), BY_NAME["churning"](amplitude=1e-3))
+    for member in (robot, dataclasses.replace(robot, effects=effects)):
+        kind = np.array(["6T2A", "4W2T", "6T2A"])
+        points, split = data.energy_split(
+            member, data.conditions(member, kind, slope_deg=np.array([0.0, 10.0, 10.0]))
+        )
+        assert all((split[item] >= 0).all() for item in data.SPLIT)
+        np.testing.assert_allclose(split["other"] / points["power_supply_W"], 0, atol=1e-9)
+
+
+def test_idle_current_balances_the_losses_by_hand():
+    speed = np.array([5.0, 20.0])
+    motor = speed * 48.0
+    for kind, coulomb, viscous in (("6T2A", 0.350, 0.016), ("4W2T", 0.070, 0.003)):
+        at_motor = (coulomb + viscous * speed) / 48.0 / 0.74 + 0.3e-3 + 1.4e-6 * motor + 2.7e-3 + 5.5e-7 * motor
+        found = data.idle_current(ROBOTS["nominal"](), kind, speed)
+        np.testing.assert_allclose(found, at_motor / 25.9e-3, rtol=1e-9)
+
+
+def test_stages_follow_the_slide():
+    for start in data.starts(ROBOTS["nominal"]()):
+        assert 0 < start.starting < start.slipping < start.time[-1]
+        sliding = start.theoretical - start.speed
+        assert np.all(sliding[start.time > start.slipping] <= 20.0 + 1e-6)  # V_s [mm/s]
+        assert sliding[np.searchsorted(start.time, start.starting)] == sliding.max()
