@@ -247,7 +247,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         origin = f"; {spec.source}" if value == was else origin
         tables.setdefault(head, []).append(f"{key} = {value!r}  # [{spec.unit}] {spec.meaning}{origin}")
     lines = [f"# {line}" for line in note.splitlines()]
-    lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {robot.sides}  # motors driven alike"]
+    lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {int(robot.sides)}  # motors driven alike"]
     lines.append(f"configurations = {json.dumps(list(robot.configurations))}")
     for head, table in tables.items():
         lines += ["", f"[{head}]", *table]

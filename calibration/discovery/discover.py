@@ -104,8 +104,8 @@ def discover_at(
     Args:
         numbers: of the rows, as messages call them; None counts from 1.
     """
-    progress("fitting the base model")
     space = pose(runs, robot, noise.sd, settings, stated, library)
+    progress("fitting the base model")
     fitted = fit_base(space, settings, runs.source)
 
     screened = screen(fitted, lambda base: bases_at(runs, base), settings, runs.source)

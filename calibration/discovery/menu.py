@@ -316,26 +316,26 @@ def readings(robot: Robot) -> tuple[Float[Array, " readings"], Bool[Array, " rea
     for act in (e for e in experiments if isinstance(e, Act)):
         value = act.reading(robot)
         shown[act.name] = value, jnp.ones(value.shape, bool)
-    runs = [e for e in experiments if isinstance(e, Run)]
-    for sides in sorted({r.sides or robot.sides for r in runs}):
-        driven = [r for r in runs if (r.sides or robot.sides) == sides]
-        shown |= _run(dataclasses.replace(robot, sides=sides), driven)
+    shown |= _run(robot, [e for e in experiments if isinstance(e, Run)])
     values, theres = zip(*(shown[e.name] for e in experiments), strict=True)
     return jnp.concatenate(values), jnp.concatenate(theres)
 
 
 def _run(robot: Robot, runs: list[Run]) -> dict[str, tuple[Array, Array]]:
-    """What the robot shows in runs with as many motors, all in one batch."""
+    """What the robot shows in runs, all in one batch."""
     conditions = jax.tree.map(lambda *x: jnp.concatenate(x), *(_conditions(r) for r in runs))
     own = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
     stated = jnp.asarray(conditions.total_mass)
     conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(stated), own, stated))
-    setups = list(dict.fromkeys(r.setup for r in runs))
-    which = np.concatenate([np.full(len(r.voltage), setups.index(r.setup)) for r in runs])
-    robots = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x])[which], *(s(robot) for s in setups))
+    setups = list(dict.fromkeys((r.setup, r.sides) for r in runs))
+    which = np.concatenate([np.full(len(r.voltage), setups.index((r.setup, r.sides))) for r in runs])
+    set_up = [
+        dataclasses.replace(setup(robot), sides=robot.sides if sides is None else sides) for setup, sides in setups
+    ]
+    robots = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x])[which], *set_up)
     result = jax.vmap(lambda r, c: operating_point(r, c)[0])(robots, conditions)
     every = jnp.stack([result.reading[c] for c in channels.names()], -1)
-    held = np.array([s is blocked for s in setups])[which]
+    held = np.array([setup is blocked for setup, _ in setups])[which]
     exists = result.status == jnp.where(jnp.asarray(held), STALLED, CONVERGED)
     shown, first = {}, 0
     for r in runs:
