@@ -94,7 +94,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory, gear: RunningGe
         support=np.asarray(reactions.support),
         traction=np.asarray(signals.traction),
         resistance=np.asarray(signals.resistance),
-        weight=float(np.asarray(signals.mass)[0]) / robot.sides * GRAVITY,
+        weight=float(np.asarray(signals.mass)[0]) / float(robot.sides) * GRAVITY,
     )
 
 

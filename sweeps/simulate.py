@@ -86,7 +86,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
         "distance_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
-        "traction_N": robot.sides * np.ravel(signals.traction),
+        "traction_N": float(robot.sides) * np.ravel(signals.traction),
     }
 
 
