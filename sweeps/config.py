@@ -148,7 +148,7 @@ class GridPart(Part):
     voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] = VOLTAGES_V
     payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
     slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] = SLOPES_DEG
-    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]
+    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
 
 
 class InferencePart(Part):
