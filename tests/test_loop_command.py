@@ -161,7 +161,8 @@ def test_robot_is_accepted_by_the_other_commands(done):
     robot = tomllib.loads((done.folder / "found" / "robot.toml").read_text())
     (name,) = robot["effects"]
     assert name == done.result["effects"][0]["name"]
-    assert robot["effects"][name]["amplitude"] == done.result["effects"][0]["parameters"]["amplitude"]["value"]
+    found = done.result["effects"][0]["parameters"]["amplitude"]["value"]
+    assert robot["effects"][name]["amplitude"] == pytest.approx(found, rel=1e-12)
     run = ["simulate", "--voltage", 33, "--no-report", "--force", "--out", "s"]
     shown = []
     for robot_file in ("nominal", "found/robot.toml"):
