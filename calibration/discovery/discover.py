@@ -22,7 +22,7 @@ from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate, one_curve_suffices
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.outliers import Screening, screen
-from calibration.discovery.result import DiscoveryResult, Remainder, Sensitivity
+from calibration.discovery.result import DiscoveryResult, FoundEffect, Remainder, Sensitivity
 from calibration.discovery.score_tests import bootstrap, diagnosed
 from calibration.discovery.search import Search, search
 from calibration.discovery.settings import Settings, settings_for
@@ -74,16 +74,13 @@ def discover(
     notes += [*distinct.missing(), *checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
     settings = settings_for(kind, replicates, seed)
 
-    def at(sds: Noise, tell: Callable[[str], None]) -> DiscoveryResult:
-        return discover_at(distinct, robot, sds, settings, stated, library, numbers, tell)
-
-    found = at(known, progress)
+    found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)
     sensitivity = []
     if "assumed" in known.source:
         for factor in FACTORS:
             progress(f"the verdict with {factor:g} times the assumed noise")
             sds = noise_room.assumed(distinct, kind.sizes(distinct), noise, factor)
-            sensitivity.append(in_short(factor, at(sds, lambda text: None)))
+            sensitivity.append(in_short(factor, trace(distinct, robot, sds, settings, stated, library)))
         silent = ", ".join(c for c, w in zip(channels.names(), known.source, strict=True) if w == "assumed")
         notes.append(f"no sd is stated for {silent}: {noise_room.default()} is assumed; state yours with --noise")
     return dataclasses.replace(found, notes=(*notes, *found.notes), sensitivity=tuple(sensitivity))
@@ -104,38 +101,88 @@ def discover_at(
     Args:
         numbers: of the rows, as messages call them; None counts from 1.
     """
+    traced = trace(runs, robot, noise, settings, stated, library, progress)
+    return finished(traced, runs, noise, numbers, settings, library, progress)
+
+
+@dataclasses.dataclass(frozen=True)
+class Traced:
+    """What the stages up to a verdict found.
+
+    Attributes:
+        verdict: `none`, `named`, `class` or `unnamed`.
+        screened: the base fit, rows that stand alone set aside; left: what it leaves.
+        searched: what was tried; alike: what cannot be told apart, where a name is given.
+        where: something is missing, or remains; discrepancy: its curve, where no name is given.
+    """
+
+    verdict: str
+    screened: Screening
+    left: Diagnosis
+    searched: Search | None = None
+    alike: Classes | None = None
+    where: Location | None = None
+    discrepancy: Discrepancy | None = None
+
+    @property
+    def members(self) -> tuple[tuple[str, ...], ...]:
+        """Of each effect found, those that these data cannot tell from it, itself first."""
+        return () if self.alike is None else self.alike.members
+
+    @property
+    def best(self) -> Candidate:
+        """The candidate that is proposed: the base, where no effect is named."""
+        if self.alike is None or self.searched is None or self.searched.best is None:
+            return self.screened.base.candidate
+        return self.searched.best
+
+    @property
+    def ends(self) -> Diagnosis:
+        """What that candidate leaves."""
+        if self.alike is None or self.searched is None or self.searched.diagnosis is None:
+            return self.left
+        return self.searched.diagnosis
+
+
+def trace(
+    runs: Runs,
+    robot: Robot,
+    noise: Noise,
+    settings: Settings,
+    stated: Mapping[str, tuple[float, float]] | None = None,
+    library: Library = effects.BY_NAME,
+    progress: Callable[[str], None] = lambda text: None,
+) -> Traced:
+    """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`."""
     space = pose(runs, robot, noise.sd, settings, stated, library)
     progress("fitting the base model")
     fitted = fit_base(space, settings, runs.source)
-
     screened = screen(fitted, lambda base: bases_at(runs, base), settings, runs.source)
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
 
     progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
     left = diagnosis_of_base(screened, settings)
     if not left.test.rejected:
-        return finished("none", runs, noise, numbers, screened, left, settings, library, progress)
+        return Traced("none", screened, left)
 
     progress("something is missing: fitting every effect that could explain it")
     searched = search(space, base, left, bases, settings, progress)
-    if not_to_the_point(space, base, left, searched) or stands_for_a_curve(space, left, searched, bases):
+    best, after = searched.best, searched.diagnosis
+    if (
+        best is None
+        or after is None
+        or not_to_the_point(space, base, best)
+        or stands_for_a_curve(space, left, after, bases)
+    ):
         where = locate(space.bare.observe, left.scores, bases)
-        found = fit_discrepancy(space, base, left.linear, where.balance, where.variable)
-        return finished(
-            "unnamed", runs, noise, numbers, screened, left, settings, library, progress, searched, where=where,
-            discrepancy=found,
-        )  # fmt: skip
+        curve = fit_discrepancy(space, base, left.linear, where.balance, where.variable)
+        return Traced("unnamed", screened, left, searched, where=where, discrepancy=curve)
 
-    assert searched.best is not None and searched.diagnosis is not None
-    progress(f"what else explains as much as {' and '.join(searched.best.effects)}?")
-    alike = classes(space, searched.best, searched.ladder, left.scores, settings)
+    progress(f"what else explains as much as {' and '.join(best.effects)}?")
+    alike = classes(space, best, searched.ladder, left.scores, settings)
     verdict = "named" if all(len(members) == 1 for members in alike.members) else "class"
-    remains = None
-    if searched.diagnosis.test.rejected_with_margin:
-        remains = locate(space.bare.observe, searched.diagnosis.scores, bases)
-    return finished(
-        verdict, runs, noise, numbers, screened, left, settings, library, progress, searched, alike, remains
-    )
+    remains = locate(space.bare.observe, after.scores, bases) if after.test.rejected_with_margin else None
+    return Traced(verdict, screened, left, searched, alike, remains)
 
 
 # --- the stages that are no room of their own -----------------------------------------------------------
@@ -197,19 +244,16 @@ def diagnosis_of_base(screened: Screening, settings: Settings) -> Diagnosis:
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
-def not_to_the_point(space: CandidateSpace, base: Candidate, left: Diagnosis, searched: Search) -> bool:
+def not_to_the_point(space: CandidateSpace, base: Candidate, best: Candidate) -> bool:
     """Whether the effects leave far more than noise, and explain less than half of what was there."""
-    if searched.best is None:
-        return True
     readings = float(np.sum(space.weight > 0))  # what χ² is without anything missing, priors included
-    there, after = (2 * c.cost - readings for c in (base, searched.best))
+    there, after = (2 * c.cost - readings for c in (base, best))
     return bool(after > 2 * np.sqrt(2 * readings) and there - after < 0.5 * there)
 
 
-def stands_for_a_curve(space: CandidateSpace, left: Diagnosis, searched: Search, bases: Bases) -> bool:
+def stands_for_a_curve(space: CandidateSpace, left: Diagnosis, after: Diagnosis, bases: Bases) -> bool:
     """Whether the fit with effects is rejected where one smooth curve would not be."""
-    rejected = searched.diagnosis is None or searched.diagnosis.test.rejected_with_margin
-    return rejected and one_curve_suffices(space.bare.observe, left, bases)
+    return after.test.rejected_with_margin and one_curve_suffices(space.bare.observe, left, bases)
 
 
 def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
@@ -231,68 +275,59 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [said]
 
 
-def in_short(factor: float, found: DiscoveryResult) -> Sensitivity:
+def in_short(factor: float, traced: Traced) -> Sensitivity:
     """What the loop says with another noise."""
-    members = tuple(tuple(e.members) for e in found.effects)
-    return Sensitivity(factor, found.verdict, found.statement, members, found.after.adequate)
+    said = findings.statement(traced.verdict, traced.left.test.p_value, traced.members, traced.where)
+    adequate = not traced.ends.test.rejected_with_margin
+    return Sensitivity(factor, traced.verdict, said, traced.members, adequate)
 
 
 # --- the result -----------------------------------------------------------------------------------------
 
 
 def finished(
-    verdict: str,
+    traced: Traced,
     runs: Runs,
     noise: Noise,
     numbers: np.ndarray | None,
-    screened: Screening,
-    left: Diagnosis,
     settings: Settings,
     library: Library,
     progress: Callable[[str], None],
-    searched: Search | None = None,
-    alike: Classes | None = None,
-    where: Location | None = None,
-    discrepancy: Discrepancy | None = None,
 ) -> DiscoveryResult:
-    """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment.
-
-    Args:
-        screened, left: the base fit, and what it leaves.
-        searched, alike: what was tried, and what cannot be told apart.
-        where: something is missing, or remains; discrepancy: the curve of `unnamed`.
-    """
-    space, base = screened.base.space, screened.base.candidate
+    """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
+    screened, left, where, curve = traced.screened, traced.left, traced.where, traced.discrepancy
+    space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
     included = space.included[:rows]
     before = findings.Fitted(space.equipped, base.z, space.library.indices(empty(settings)))
-    # The candidate that is proposed (the base for `none`, the base with a curve for `unnamed`).
-    best = searched.best if alike is not None and searched is not None and searched.best is not None else base
-    after, ends, robot, z, sd = None, left, findings.proposed_robot(space, best), best.z, best.sd
-    cost, converged, adequate = best.cost, best.converged, not left.test.rejected
-    if discrepancy is not None:
-        after = findings.Fitted(discrepancy.problem, discrepancy.z, None)
-        ends = _diagnosis_beside(space, discrepancy, screened.bases, left)
-        robot, z, sd = discrepancy.robot, discrepancy.z, np.sqrt(np.diag(discrepancy.covariance))
-        cost, converged = discrepancy.chi2[1] / 2, discrepancy.converged
-    elif alike is not None and searched is not None and searched.diagnosis is not None:
+    after, robot, z, sd = None, findings.proposed_robot(space, best), best.z, best.sd
+    cost, converged = best.cost, best.converged
+    if curve is not None:
+        after = findings.Fitted(curve.problem, curve.z, None)
+        ends = _diagnosis_beside(space, curve, screened.bases, left)
+        robot, z, sd = curve.robot, curve.z, np.sqrt(np.diag(curve.covariance))
+        cost, converged = curve.chi2[1] / 2, curve.converged
+    elif best is not base:
         after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
-        ends = searched.diagnosis
-    adequate_after = not ends.test.rejected_with_margin
 
     progress("errors on data held out")
     seen = findings.readings(runs, noise.sd, before, after)
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     progress("the next experiment")
-    members = alike.members if alike is not None else ()
-    ladder = alike.ladder if alike is not None else searched.ladder if searched is not None else ()
+    ladder = traced.alike.ladder if traced.alike is not None else ()
     p = left.test.p_value
     listed = findings.effect_scores(space, left.scores)
     shown = space.library.indices([s.name for s in listed])
+    found: tuple[FoundEffect, ...] = ()
+    remains = None
+    if traced.alike is not None:
+        found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
+        remains = None if where is None else Remainder(where.balance, where.alike, where.variable)
+    unnamed = None if curve is None or where is None else findings.unnamed(curve, where, p, rows)
     result = DiscoveryResult(
-        verdict=verdict,
-        statement=findings.statement(verdict, p, members, where),
+        verdict=traced.verdict,
+        statement=findings.statement(traced.verdict, p, traced.members, where),
         robot=robot,
         converged=converged,
         runs=runs,
@@ -300,16 +335,16 @@ def finished(
         included=included,
         outliers=tuple(int(numbers[k]) for k in screened.outliers),
         unusable=tuple(int(numbers[k]) for k in screened.base.unusable),
-        effects=() if alike is None else findings.found_effects(space, base, best, alike, left.test, settings),
-        unnamed=None if discrepancy is None or where is None else findings.unnamed(discrepancy, where, p, rows),
-        remains=None if alike is None or where is None else Remainder(where.balance, where.alike, where.variable),
-        next_experiment=findings.next_experiment(_proposal(space, best, alike, where, discrepancy, settings)),
+        effects=found,
+        unnamed=unnamed,
+        remains=remains,
+        next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
         cannot_see=findings.invisible(space, left.scores, settings),
         needs_histories=_needs_histories(library, type(observe)),
         alternatives=findings.alternatives(space, best, ladder, settings, plausible=True),
         implausible=findings.alternatives(space, best, ladder, settings, plausible=False),
-        before=findings.evidence(left.test, adequate),
-        after=findings.evidence(ends.test, adequate_after),
+        before=findings.evidence(left.test, adequate=not left.test.rejected),
+        after=findings.evidence(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),
         readings=int(np.sum(space.weight > 0)),
         base_shift=findings.base_shift(space, base.z, z, sd),
@@ -334,17 +369,11 @@ def _diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, l
     return Diagnosis(linear, scores, test)
 
 
-def _proposal(
-    space: CandidateSpace,
-    best: Candidate,
-    alike: Classes | None,
-    where: Location | None,
-    discrepancy: Discrepancy | None,
-    settings: Settings,
-) -> Proposal | None:
-    if discrepancy is not None and where is not None:
-        return denser(space, where, settings)
-    return None if alike is None else separating(space, best, alike, settings)
+def _proposal(space: CandidateSpace, traced: Traced, settings: Settings) -> Proposal | None:
+    """What to do next; None where nothing is left to tell apart."""
+    if traced.discrepancy is not None and traced.where is not None:
+        return denser(space, traced.where, settings)
+    return None if traced.alike is None else separating(space, traced.best, traced.alike, settings)
 
 
 def _needs_histories(library: Library, kind: type[observers.Observer]) -> tuple[str, ...]:

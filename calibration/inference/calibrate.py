@@ -111,7 +111,7 @@ def calibrate(
     about = identifiability.analyse(posed, jnp.asarray(z))
     profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about) if profiles else None
     masks = {kind: holdout.blocks(runs, kind) for kind in kinds}
-    held = holdout.held_out(posed, jnp.asarray(z), masks)
+    held = holdout.held_out(posed, np.asarray(z), masks)
 
     measured, sd = runs.measured(), np.asarray(posed.data.sd)
     seen, seen_before = _reached(posed, status, after.reading), _reached(posed, status_before, before.reading)

@@ -136,7 +136,7 @@ class Profile:
 
 @eqx.filter_jit
 def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> fit.Optimum:
-    return jax.vmap(lambda z, pin: fit.levenberg_marquardt(problem, z, data, pin))(starts, pins)
+    return jax.vmap(lambda z, pin: fit.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
 
 
 def profile(problem: Problem, z: Array, cost: float, about: Identifiability, data: Data | None = None) -> Profile:
@@ -183,11 +183,11 @@ def _redraw(problem: Problem, truth: Array, data: Data, keys: Array, profiles: b
             measured=clean + data.sd * jax.random.normal(one, clean.shape),
             centre=truth + jax.random.normal(two, truth.shape),
         )
-        best = fit.levenberg_marquardt(problem, truth, noisy)
+        best, _ = fit.levenberg_marquardt(problem, truth, noisy)
         if not profiles:
             return best, jnp.zeros_like(truth)
         held = jnp.eye(truth.shape[0], dtype=bool)
-        pinned = jax.vmap(lambda h: fit.levenberg_marquardt(problem, truth, noisy, Pin(h, truth)))(held)
+        pinned = jax.vmap(lambda h: fit.levenberg_marquardt(problem, truth, noisy, Pin(h, truth))[0])(held)
         return best, 2 * (pinned.cost - best.cost)
 
     return jax.vmap(draw)(keys)

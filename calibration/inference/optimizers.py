@@ -106,9 +106,17 @@ def informing(data: Data) -> np.ndarray:
     return np.r_[:readings, readings + rows : readings + rows + data.centre.size]
 
 
-def _finish(function: Callable[[Z], Array], z: Z, data: Data, pin: Pin, steps: Array) -> Optimum:
-    jacobian, r = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
-    return _optimum(jacobian, r, z, data, pin, steps)
+def _finish(problem: Problem, z: Z, data: Data, pin: Pin, steps: Array) -> tuple[Optimum, Observation]:
+    """The optimum at z, and what the model says of every row there: one evaluation serves both."""
+
+    def evaluated(x: Z) -> tuple[Array, tuple[Array, Observation]]:
+        seen = problem.observation(pin.apply(x))
+        prior = jnp.where(pin.held, x - pin.at, x - data.centre)
+        r = jnp.concatenate([problem.whitened(seen, data), prior])
+        return r, (r, seen)
+
+    jacobian, (r, seen) = jax.jacfwd(evaluated, has_aux=True)(z)
+    return _optimum(jacobian, r, z, data, pin, steps), seen
 
 
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
@@ -141,8 +149,9 @@ class Search(optx.LevenbergMarquardt):
 
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
-) -> Optimum:
-    """One search by `optimistix.LevenbergMarquardt`. To be vmapped over starts, data and pins."""
+) -> tuple[Optimum, Observation]:
+    """One search by `optimistix.LevenbergMarquardt`, and what the model says where it ended. To be vmapped over
+    starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
     function = residuals(problem, data, pin)
     tolerance = TOLERANCE_LONG if problem.observe.long else TOLERANCE
@@ -153,7 +162,7 @@ def levenberg_marquardt(
         max_steps=max_steps,
         throw=False,
     )
-    return _finish(function, solution.value, data, pin, solution.stats["num_steps"])
+    return _finish(problem, solution.value, data, pin, solution.stats["num_steps"])
 
 
 @eqx.filter_jit
@@ -338,7 +347,7 @@ def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) 
 
     carry = (start, solver.init(start), jnp.asarray(0), jnp.asarray(jnp.inf))
     z, _, k, _ = jax.lax.while_loop(go_on, step, carry)
-    return _finish(function, z, data, pin, k)
+    return _finish(problem, z, data, pin, k)[0]
 
 
 @eqx.filter_jit
@@ -352,8 +361,8 @@ def searches(
     """
 
     def search(z: Z) -> tuple[Optimum, Array, Array]:
-        found = levenberg_marquardt(problem, z, data)
-        return found, problem.observation(z).status, problem.observation(found.z).status
+        found, seen = levenberg_marquardt(problem, z, data)
+        return found, problem.observation(z).status, seen.status
 
     return jax.vmap(search)(starts)
 

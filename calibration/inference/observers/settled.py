@@ -244,7 +244,7 @@ def _fits(
         here = problem
         if which is not None:
             here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
-        found = levenberg_marquardt(here, z, dataclasses.replace(problem.data, weight=weight), max_steps=steps)
-        return found, here.observation(found.z)
+        data = dataclasses.replace(problem.data, weight=weight)
+        return levenberg_marquardt(here, z, data, max_steps=steps)
 
     return jax.vmap(one)(starts, weights, active)
