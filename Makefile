@@ -6,7 +6,7 @@ READY := $(VENV)/ready
 # A command that ends with 3 is done, with some runs that did not converge; their status says why.
 DONE := || [ $$? -eq 3 ]
 
-.PHONY: demo test slow lint campaign bench clean
+.PHONY: demo test slow lint types campaign bench clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force $(DONE)
@@ -22,6 +22,10 @@ slow: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(MAKE) types
+
+types: $(READY)
+	$(BIN)/python -m mypy
 
 campaign: $(READY)
 	$(BIN)/python benchmarks/loop.py --clean 1000 --library 500 --variants 210 --outside 300 --pairs 330

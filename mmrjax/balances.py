@@ -43,7 +43,7 @@ def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Sc
         e.term(robot, signals) if e.acts_everywhere else e.acts(robot, signals) * e.term(robot, signals)
         for e in entering
     ]
-    return sum(terms) if terms else 0.0  # type: ignore[return-value]
+    return sum(terms) if terms else 0.0
 
 
 def _fill(signals: Signals, **values: Any) -> Signals:

@@ -176,7 +176,7 @@ def tension_along(
     def lower(at: Scalar) -> Scalar:
         return tension.lower + jnp.sum(load * (x - (at < place)))
 
-    def one(at: Scalar) -> Scalar:
+    def one(at: Float[Array, ""]) -> Float[Array, ""]:
         rear = jnp.clip((at - run) / arc, 0.0, 1.0)
         front = jnp.clip((at - 2 * run - arc) / arc, 0.0, 1.0)
         # from the lower run's end over the rear arc to the upper run, and over the front arc down again

@@ -58,6 +58,6 @@ def mass_factor(mass_side: Scalar, radius: Scalar, inertia_rotating: Scalar) -> 
     return inertia_equivalent(mass_side, radius, inertia_rotating) / (mass_side * radius**2)
 
 
-def normal_load(mass: Scalar, slope: Scalar, gravity: float, sides: int) -> Scalar:
+def normal_load(mass: Scalar, slope: Scalar, gravity: float, sides: Scalar) -> Scalar:
     """Normal load of one side m_i g cos α [N], eq. (5)."""
     return mass / sides * gravity * jnp.cos(slope)

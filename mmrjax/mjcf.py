@@ -64,7 +64,10 @@ def masses(robot: Robot, gear: RunningGear, conditions: Conditions, mass: Scalar
     chassis = mass / robot.sides - 2 * pulley
     bare = chassis - payload - 2 * lever
     half = gear.wheelbase / 2
-    parts = [(bare, gear.centre_offset, gear.centre_height), (payload, gear.payload_offset, gear.payload_height)]
+    parts: list[tuple[Scalar, Scalar, Scalar]] = [
+        (bare, gear.centre_offset, gear.centre_height),
+        (payload, gear.payload_offset, gear.payload_height),
+    ]
     for side, angle in ((1.0, gear.lever_front), (-1.0, gear.lever_rear)):
         tip = lever_tip(gear, angle, side)
         parts.append((lever, (side * half + tip[0]) / 2, tip[1] / 2))
@@ -155,7 +158,7 @@ def _template(double: bool) -> tuple[Any, Any]:
 
 def template() -> tuple[Any, Any]:
     """The MJX model and data that all members share in structure."""
-    return _template(bool(jax.config.jax_enable_x64))
+    return _template(jnp.result_type(float) == jnp.float64)
 
 
 def member(model: Any, half: Masses, slope: Scalar, wheelbase: Scalar, step: float) -> Any:

@@ -67,11 +67,14 @@ FURTHER: tuple[Output, ...] = (
 )  # fmt: skip
 
 
+def _reading(channel: str) -> Callable[[Result], Any]:
+    return lambda result: result.reading[channel]
+
+
 def table() -> tuple[Output, ...]:
     """Every output, the channels first, in the order of columns."""
     shown = tuple(
-        Output(c.name, c.column, c.unit, c.factor, c.label, lambda r, name=c.name: r.reading[name], c.resolution)
-        for c in channels.CHANNELS
+        Output(c.name, c.column, c.unit, c.factor, c.label, _reading(c.name), c.resolution) for c in channels.CHANNELS
     )
     return shown + FURTHER
 

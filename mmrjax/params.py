@@ -9,10 +9,13 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 #: A number, or an array of numbers: one of a batch, or a tracer.
 Scalar = Float[Array, "..."] | float
+#: An index, or an array of indices.
+Index = Int[Array, "..."] | np.ndarray | int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,9 +91,9 @@ def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
         elif isinstance(value, eqx.Module):
             yield from walk(value, f"{name}.")
         elif isinstance(value, tuple):
-            for member in value:
-                if isinstance(member, eqx.Module):
-                    yield from walk(member, f"{name}.{member.name}.")  # type: ignore[attr-defined]
+            members: list[Any] = [m for m in value if isinstance(m, eqx.Module)]
+            for member in members:
+                yield from walk(member, f"{name}.{member.name}.")
 
 
 M = TypeVar("M", bound=eqx.Module)

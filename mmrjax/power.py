@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from mmrjax.params import Scalar, parameter
 
@@ -79,9 +80,9 @@ class Battery(eqx.Module):
         cell = self.voltage_no_load(discharge) - self.current(total_current) * self.resistance
         return self.cells * cell
 
-    def empty(self, discharge: Scalar) -> Scalar:
+    def empty(self, discharge: Scalar) -> Bool[Array, "..."]:
         """Whether the charge taken [C] has reached the capacity; the parabola (13) turns up past it."""
-        return discharge >= self.capacity
+        return jnp.asarray(discharge >= self.capacity)
 
 
 def voltage_source(

@@ -94,7 +94,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory, gear: RunningGe
         support=np.asarray(reactions.support),
         traction=np.asarray(signals.traction),
         resistance=np.asarray(signals.resistance),
-        weight=float(np.asarray(signals.mass)[0]) / robot.sides * GRAVITY,
+        weight=float(np.asarray(signals.mass)[0]) / float(robot.sides) * GRAVITY,
     )
 
 
@@ -145,10 +145,10 @@ def draw(axes: Any, view: Scene, k: int) -> None:
     else:
         base = world(_outline(view.path, 0.0, view.place[k]))
         tip = world(_outline(view.path, float(view.path.gear.grouser_height), view.place[k]))
-        axes.add_collection(LineCollection(np.stack([base, tip], axis=1), colors=_BELT, lw=4, zorder=3))
+        axes.add_collection(LineCollection(list(np.stack([base, tip], axis=1)), colors=_BELT, lw=4, zorder=3))
     teeth = (view.place[k][:, None] + np.arange(7) * float(view.path.pitch) / 7).ravel() % float(view.path.length)
     root, inner = (world(_outline(view.path, h, teeth[:TEETH_BELT])) for h in (0.0, -0.0022))
-    axes.add_collection(LineCollection(np.stack([root, inner], axis=1), colors=_BELT, lw=0.9, zorder=3))
+    axes.add_collection(LineCollection(list(np.stack([root, inner], axis=1)), colors=_BELT, lw=0.9, zorder=3))
     for x, phi in ((view.axle, q[3]), (-view.axle, q[4])):
         _disc(axes, Circle, world, x, radius - 0.003, phi, "#d9dee2")
     _forces(axes, view, k, world, ground)

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
 
 from mmrjax.chassis import Chassis
 from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
-from mmrjax.params import Scalar
+from mmrjax.params import Index, Scalar, as_float
 from mmrjax.power import Battery
 from mmrjax.tables import RADIUS_PULLEY
 
@@ -71,7 +70,7 @@ class Robot(eqx.Module):
     Attributes:
         configurations: chassis by name, at least one; given as a mapping.
         effects: terms beyond the paper's model; the empty tuple is the paper's model.
-        sides: motors driven alike; all per-side quantities are of one of them (assumption 3).
+        sides: how many motors are driven alike; all per-side quantities are of one of them (assumption 3).
     """
 
     battery: Battery
@@ -79,9 +78,9 @@ class Robot(eqx.Module):
     gearbox: Gearbox
     configurations: Configurations = eqx.field(converter=_configurations)
     effects: tuple[Effect, ...] = ()
-    sides: int = eqx.field(default=2, static=True)
+    sides: Scalar = eqx.field(default=2.0, converter=as_float)
 
-    def chassis(self, configuration: Int[Array, ""]) -> Chassis:
+    def chassis(self, configuration: Index) -> Chassis:
         """The chassis of the configuration with this index; traceable and batchable."""
         first, *others = self.configurations.members
         chosen = first

@@ -11,7 +11,7 @@ from mmrjax.gearbox import Gearbox
 from mmrjax.ground import Ground
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
-from mmrjax.robot import Robot
+from mmrjax.robot import Configurations, Robot
 from mmrjax.tables import (
     BENCH,
     PAYLOADS_KG,
@@ -69,7 +69,7 @@ def nominal() -> Robot:
         radius=RADIUS_WHEEL,
         inertia=75e-6 + 140e-6 + belt + 2 * 152e-6,
     )
-    return Robot(Battery(), Motor(), Gearbox(), {TRACKED: tracked, WHEELED: wheeled})
+    return Robot(Battery(), Motor(), Gearbox(), Configurations({TRACKED: tracked, WHEELED: wheeled}))
 
 
 def _simplified(track_torque: float) -> Robot:
@@ -90,7 +90,7 @@ def _simplified(track_torque: float) -> Robot:
         "battery.resistance": 0.0,
         "battery.current_other": 0.0,
     }
-    return params.replace(nominal(), constant)  # type: ignore[return-value]
+    return params.replace(nominal(), constant)
 
 
 def sm1() -> Robot:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mmrjax.params import Scalar
+from mmrjax.params import Index, Scalar
 
 GRAVITY = 9.80665  # [m/s²], standard gravity
 
@@ -40,7 +41,7 @@ class State(eqx.Module):
     speed_motor: Scalar
     speed: Scalar
     discharge: Scalar
-    memory: dict[str, Scalar] = eqx.field(default_factory=dict)
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
 
 
 class Signals(eqx.Module):
@@ -50,14 +51,14 @@ class Signals(eqx.Module):
     """
 
     # conditions and state
-    configuration: Int[Array, "..."] = 0  # index
+    configuration: Index = 0  # index
     on_tracks: Scalar = UNSET  # 1 on tracks, 0 on wheels
     slope: Scalar = UNSET
     payload: Scalar = UNSET
     adhesion: Scalar = UNSET
     battery: Scalar = UNSET  # 1 where the on-board battery feeds the motors
     discharge: Scalar = UNSET
-    memory: dict[str, Scalar] = eqx.field(default_factory=dict)  # of effects, by name; empty: settled
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)  # of effects, by name; empty: settled
     current: Scalar = UNSET  # I_d of one motor [A]
     speed_motor: Scalar = UNSET  # [rad/s]
     speed: Scalar = UNSET  # V of the robot [m/s]
@@ -126,7 +127,7 @@ class Result(eqx.Module):
         flags: bit mask over `FLAGS`.
     """
 
-    reading: dict[str, Scalar]
+    reading: Mapping[str, Scalar]
     theoretical_speed: Scalar
     slip: Scalar
     voltage: Scalar

@@ -132,7 +132,7 @@ class Pull(eqx.Module):
 
     force: Float[Array, " contacts"]
     guide: Float[Array, " contacts"]
-    guided: Scalar
+    guided: Float[Array, ""]
     load: Scalar
     generalized: Float[Array, " 4"]
 
@@ -156,7 +156,7 @@ def pull(path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scal
         height: of the axle line over the ground [m].
     """
     sliding = -at.speed_x - signals.speed_slip_terms
-    force = chassis.ground.traction(sliding, at.force, signals.adhesion)
+    force = jnp.asarray(chassis.ground.traction(sliding, at.force, signals.adhesion))
     guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
     # Power of the contact forces per belt speed, then on the pulleys in the shares of that speed.
     along = force * at.rate_x + at.force * at.rate_z - guide
@@ -184,7 +184,7 @@ class Reactions(eqx.Module):
     support: Float[Array, "... 2"]
     place: Float[Array, "... 24"]
     tension: Float[Array, "... 24"]
-    centrifugal: Float[Array, "..."]
+    centrifugal: Scalar
 
     @property
     def guide(self) -> Float[Array, "..."]:

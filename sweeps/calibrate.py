@@ -48,8 +48,8 @@ def print_calibration(found: CalibrationResult) -> None:
     """Parameters, errors and remarks, for a person."""
     shown = Table(title=f"{len(found)} rows, {found.model}", title_justify="left", box=None, pad_edge=False)
     for heading in ("parameter", "value", "95 % interval", "shift [σ]", "held by"):
-        side = "left" if heading in ("parameter", "held by") else "right"
-        shown.add_column(heading, justify=side, no_wrap=True, overflow="ignore")
+        left = heading in ("parameter", "held by")
+        shown.add_column(heading, justify="left" if left else "right", no_wrap=True, overflow="ignore")
     for name, p in found.parameters.items():
         low, high = (f"{v:.3g}" for v in p.interval)
         marks = "> " * p.interval_open[1] + "< " * p.interval_open[0]  # the end lies further out

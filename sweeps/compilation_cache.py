@@ -72,10 +72,14 @@ def enable(path: Path | None = None) -> Path | None:
     # On some processors XLA logs an error for each program that it reads: tuning flags of its own compiler that it
     # takes for features of another machine (openxla/xla issue 44565). What fails is raised, not only logged.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    # Checks inside of diffrax that raise hold a host callback, and such a program is never kept: what they check
+    # (times that increase) is right by construction here, and a wrong one would give NaN.
+    os.environ.setdefault("EQX_ON_ERROR", "nan")
     import jax
 
-    if jax.config.jax_compilation_cache_dir is not None:
-        return Path(jax.config.jax_compilation_cache_dir)
+    own = jax.config.values["jax_compilation_cache_dir"]
+    if own is not None:
+        return Path(own)
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)  # who may write here may run code
         _prune(folder.parent)

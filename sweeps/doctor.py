@@ -69,7 +69,7 @@ def _run() -> str:
     losses = [p.name for p in params.walk(robot) if any(word in p.name for word in words)]
     ideal = params.replace(robot, dict.fromkeys(losses, jnp.asarray(0.0)))
     start = time.perf_counter()
-    answer = steady_batch(ideal, Conditions(voltage=jnp.array([24.0])))  # type: ignore[arg-type]
+    answer = steady_batch(ideal, Conditions(voltage=jnp.array([24.0])))
     found, known = float(answer.motor_speed[0]), 24.0 / float(robot.motor.torque_constant)
     if not math.isclose(found, known, rel_tol=1e-9):
         raise ArithmeticError(f"no-load speed {found} rad/s; known {known} rad/s")
@@ -85,8 +85,8 @@ def _derivative() -> str:
 
     robot, run = robots.nominal(), Conditions()
 
-    def current(friction: jax.Array) -> jax.Array:
-        return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).total_current  # type: ignore[arg-type]
+    def current(friction: params.Scalar) -> jax.Array:
+        return steady(params.replace(robot, {"motor.friction_coulomb": friction}), run).total_current
 
     x, h = robot.motor.friction_coulomb, 1e-6
     exact, central = float(jax.grad(current)(x)), float((current(x + h) - current(x - h)) / (2 * h))

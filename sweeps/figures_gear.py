@@ -79,9 +79,10 @@ def gears(
     answer = []
     for k, name in enumerate(names):
         on_tracks = float(robot.configurations.members[int(which[k])].on_tracks) > 0.5
-        over_time = jax.tree.map(lambda x, k=k: np.asarray(x[k]), (history.time, history.signals, history.reactions))
+        over_time = (history.time, history.signals, history.reactions)
+        time, signals, reactions = jax.tree.map(lambda x, k=k: np.asarray(x[k]), over_time)
         ended, share = STATUSES[int(status[k])], float(guide_share[k])
-        answer.append(Gear(name, on_tracks, ended, float(robot.radius_pulley), *over_time, share))
+        answer.append(Gear(name, on_tracks, ended, float(robot.radius_pulley), time, signals, reactions, share))
     return answer
 
 

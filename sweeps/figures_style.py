@@ -6,15 +6,19 @@ import io
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from mmrjax import channels
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
 
 WIDTH = 10.0  # inches, the width of the page's text
 INK, FAINT = "#222222", "#8a8a8a"
@@ -33,7 +37,7 @@ def axis_label(channel: channels.Channel) -> str:
     return f"{channel.label} [{channel.unit}]"
 
 
-_RC = {
+_RC: dict[RcKeyType, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib
     "font.size": 9.5,
     "axes.titlesize": 10,
@@ -67,9 +71,8 @@ def style() -> Iterator[None]:
 
 def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Figure, np.ndarray]:
     """A figure of the page's width and its axes, shape (rows, columns)."""
-    fig = Figure(figsize=(WIDTH, height), layout="constrained")
+    fig = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
     FigureCanvasAgg(fig)
-    fig.get_layout_engine().set(w_pad=0.08, h_pad=0.06)  # type: ignore[union-attr]
     return fig, fig.subplots(rows, columns, squeeze=False, **keywords)
 
 

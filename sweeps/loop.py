@@ -78,8 +78,8 @@ def print_discovery(found: DiscoveryResult) -> None:
     whens = (0,) if found.verdict == "none" else (0, 1)
     words = ("before", "after")
     lines = {f"{words[k]}, fitted": found.errors[k] for k in whens}
-    for kind, by in found.errors_held_out.items():
-        lines |= {f"{words[k]}, held out by {kind.replace('_', ' and ')}": by[k] for k in whens}
+    for kind, both in found.errors_held_out.items():
+        lines |= {f"{words[k]}, held out by {kind.replace('_', ' and ')}": both[k] for k in whens}
     for text, by in lines.items():
         cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)

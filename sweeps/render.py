@@ -23,8 +23,9 @@ def render(
     force: bool,
 ) -> int:  # fmt: skip
     """Draw one run (of options, by column) from standstill, as a picture or a film; returns the exit code."""
+    options = config.options
     try:
-        pictures.instants(file, begin, end, slow, config.options["duration"])
+        pictures.instants(file, begin, end, slow, options["duration"])
     except ValueError as error:
         raise BadConfiguration(f"render: {error}") from error
     if file.exists() and not force:
@@ -36,7 +37,7 @@ def render(
     run.refuse(robot, conditions, config)
     with progress(1, quiet=False) as advance:
         told = run.shares(advance, 1)
-        trajectory = track_batch(robot, conditions, **config.options, progress=told)
+        trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
         told(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
     aside = file.with_name(f".{file.stem}.writing{file.suffix}")

@@ -86,7 +86,8 @@ def _histories(
     from sweeps import figures_history
 
     which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
-    history, status = histories.history, histories.result.status
+    history, status = histories.history, np.asarray(histories.result.status)
+    assert history is not None  # the fidelity was asked for it
     starts = figures_history.starts(robot, history, status, which, names[:HISTORIES])
     album.add("history", lambda: figures_history.from_standstill(starts))
     known: dict[str, Any] = {"shown": len(starts), "starts": starts}
@@ -94,7 +95,7 @@ def _histories(
         from sweeps import figures_gear
 
         known["averaged"] = 1e3 * float(history.time[0, 1] - history.time[0, 0])
-        share = histories.columns["guide_share"]
+        share = np.asarray(histories.columns["guide_share"])
         gears = figures_gear.gears(robot, history, status, share, which, names[:GEARS])
         # A ripple is of steady travel: the contacts have stopped sliding before the part that is looked at.
         ripples = [g for g, s in zip(gears, starts, strict=False) if s.gets_under_way and g.settled_since(s.slipping)]

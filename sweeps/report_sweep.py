@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +38,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Tabl
     """
     album = Album(folder)
     for channel in channels.CHANNELS:
-        album.add(f"sweep_{channel.name}", lambda c=channel: figures_sweep.sweep(runs, c))
+        album.add(f"sweep_{channel.name}", partial(figures_sweep.sweep, runs, channel))
     return render(
         folder,
         "sweep.html.j2",

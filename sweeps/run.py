@@ -131,7 +131,7 @@ def counts(table: dict[str, np.ndarray]) -> dict[str, int]:
 
 def leave(
     folder: RunFolder,
-    config: FidelityPart,
+    config: configuration.Simulate | configuration.Sweep | configuration.Compare,
     robot: Robot,
     table: dict[str, np.ndarray],
     result: dict[str, Any],

@@ -65,6 +65,7 @@ def _simulated(
         told = run.shares(advance, len(runs))
         batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
         told(1.0)
+    assert batch.history is not None  # the fidelity was asked for it
     folder.write_table("history.csv", history_table(robot, batch.history, runs))
     if batch.history.reactions is not None:
         folder.write_table("reactions.csv", reactions_table(batch.history, runs))
@@ -80,25 +81,26 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
     signals = history.signals
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
-        "time_s": history.time.ravel(),
+        "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in channels.CHANNELS},
-        "theoretical_speed_mm_s": signals.speed_theoretical.ravel() / channels.MM,
-        "distance_m": history.distance.ravel(),
-        "voltage_V": signals.voltage.ravel(),
-        "traction_N": robot.sides * signals.traction.ravel(),
+        "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
+        "distance_m": np.ravel(history.distance),
+        "voltage_V": np.ravel(signals.voltage),
+        "traction_N": float(robot.sides) * np.ravel(signals.traction),
     }
 
 
 def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Loads inside one side's running gear over time [N], a row a sample."""
     loads = history.reactions
+    assert loads is not None  # the fidelity resolves them
     table = {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
-        "time_s": history.time.ravel(),
-        "guide_N": loads.guided.sum(-1).ravel(),
-        "front_N": loads.support[..., 0].ravel(),
-        "rear_N": loads.support[..., 1].ravel(),
-        "centrifugal_tension_N": loads.centrifugal.ravel(),
+        "time_s": np.ravel(history.time),
+        "guide_N": np.ravel(loads.guided.sum(-1)),
+        "front_N": np.ravel(loads.support[..., 0]),
+        "rear_N": np.ravel(loads.support[..., 1]),
+        "centrifugal_tension_N": np.ravel(loads.centrifugal),
     }
     for name in ("grouser", "tension"):
         values = getattr(loads, name)

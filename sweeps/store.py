@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 import hashlib
 import importlib.metadata
 import json
-import math
 import os
 import platform
 import shutil
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.data import writing
 from calibration.data.errors import BadConfiguration, InputError
 from calibration.data.runs import Runs
 from mmrjax import __version__, params
@@ -102,7 +101,7 @@ class RunFolder:
         file = self.partial / "chunks" / f"{name}.npz"
         aside = file.with_suffix(".writing")
         with aside.open("wb") as stream:
-            np.savez(stream, **columns)  # type: ignore[arg-type]
+            np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
 
     def write_text(self, name: str, text: str) -> None:
@@ -111,14 +110,11 @@ class RunFolder:
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file; what is not finite becomes null."""
-        self.write_text(name, json.dumps(_finite(content), indent=2, ensure_ascii=False) + "\n")
+        writing.write_json(self.partial / name, content)
 
     def write_table(self, name: str, columns: dict[str, np.ndarray]) -> None:
         """Write a table as CSV; what is not finite becomes an empty cell."""
-        with (self.partial / name).open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(zip(*(map(_text, column) for column in columns.values()), strict=True))
+        writing.write_table(self.partial / name, columns)
 
     def finish(self, manifest: dict[str, Any], runs: Runs) -> Path:
         """Write the manifest, drop the chunks, and move the folder into place; returns its path.
@@ -175,6 +171,7 @@ def open_folder(
 def provenance() -> dict[str, Any]:
     """Program, versions and devices that made a result."""
     import jax
+    import jax.numpy as jnp
 
     return {
         "schema": "mmrjax.manifest/1",
@@ -183,7 +180,7 @@ def provenance() -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
         "devices": [str(d) for d in jax.devices()],
-        "float": "float64" if jax.config.jax_enable_x64 else "float32",
+        "float": jnp.result_type(float).name,
     }
 
 
@@ -197,21 +194,3 @@ def default_path(command: str) -> Path:
     now = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     path = Path("runs") / f"{command}-{now}"
     return path if not path.exists() else path.with_name(f"{path.name}-{os.getpid()}")
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float | np.floating):
-        return f"{value:.9g}" if math.isfinite(value) else ""
-    return str(value)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

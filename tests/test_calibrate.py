@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -451,5 +452,8 @@ def test_single_precision_is_refused():
         "import calibration\n"
         "calibration.calibrate(calibration.read_runs('measured'), calibration.read_robot('nominal'))"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    single = {**os.environ, "JAX_ENABLE_X64": "false"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=single, capture_output=True, text=True, timeout=60
+    )
     assert 'set jax.config.update("jax_enable_x64", True) first' in done.stderr

@@ -11,7 +11,7 @@ import test_effects as laws
 
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
-from calibration.discovery import bases as curves
+from calibration.inference import bases as curves
 from mmrjax import balances, effects, params, robots
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.fidelities.drive import drive

@@ -45,8 +45,9 @@ def test_parameter_refuses_two_standard_deviations_and_none():
 def test_walk_collects_every_differentiable_leaf(robot_with_effects):
     leaves = jax.tree.leaves(eqx.filter(robot_with_effects, eqx.is_inexact_array))
     found = list(params.walk(robot_with_effects))
-    # what a configuration moves on is a fact of it, no number to be found
+    # what a configuration moves on and how many motors drive are facts, no numbers to be found
     facts = {id(chassis.on_tracks) for chassis in robot_with_effects.configurations.members}
+    facts.add(id(robot_with_effects.sides))
     assert len(found) == len(leaves) - len(facts) == len({p.name for p in found})
     assert {id(p.value) for p in found} == {id(leaf) for leaf in leaves} - facts
 

@@ -154,7 +154,9 @@ def _instants(balance: str, channel: str, configuration: int) -> tuple[Signals, 
     what a term may read at rest."""
     robot = robots.nominal()
     run = Conditions(configuration, slope_deg=6.0, payload=2.0, battery=1.0, discharge=100.0)
-    climbing, rest = (State(*map(jnp.asarray, x)) for x in ((1.5, 800.0, 0.6, 100.0), (0.0, 0.0, 0.0, 0.0)))
+    zero = jnp.zeros(())
+    climbing = State(jnp.asarray(1.5), jnp.asarray(800.0), jnp.asarray(0.6), jnp.asarray(100.0))
+    rest = State(zero, zero, zero, zero)
     climbs = readable(robot, run, climbing, balance, channel)
     return climbs, moving(robot, run, climbing), readable(robot, run, rest, balance, channel)
 

@@ -134,7 +134,8 @@ def current_names(names: Iterable[str], robot: Robot, notes: list[str] | None = 
     Args:
         notes: is given a sentence for each former name of a configuration.
     """
-    found, changed = [], {}
+    found: list[str] = []
+    changed: dict[str, list[str]] = {}
     for name in names:
         head, dot, rest = name.partition(".")
         new = OLD_NAMES.get(head, "")
@@ -246,7 +247,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         origin = f"; {spec.source}" if value == was else origin
         tables.setdefault(head, []).append(f"{key} = {value!r}  # [{spec.unit}] {spec.meaning}{origin}")
     lines = [f"# {line}" for line in note.splitlines()]
-    lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {robot.sides}  # motors driven alike"]
+    lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {int(robot.sides)}  # motors driven alike"]
     lines.append(f"configurations = {json.dumps(list(robot.configurations))}")
     for head, table in tables.items():
         lines += ["", f"[{head}]", *table]

@@ -192,7 +192,7 @@ def candidate_space(
     value, spread, sd = (jnp.asarray([s[k] for s in scales]) for k in range(3))
     coordinates = ActiveSet(
         bare.coordinates,
-        jnp.full(slots, -1, int),  # not a weak type, which `with_effects` would change, and everything compile again
+        jnp.full(slots, -1, int),
         width * jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in effects]),
         (value, spread, sd),
         tuple(e.name for e in effects),

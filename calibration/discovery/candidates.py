@@ -18,7 +18,7 @@ from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_in_batches
 from calibration.inference.linearization import amplitude_of
 from calibration.inference.optimizers import Optimum
-from calibration.inference.problem import Problem
+from calibration.inference.problem import Observation, Problem
 
 #: Fewest rows that a base can be fitted to.
 FEWEST = 4
@@ -115,13 +115,15 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
     while True:
         found, seen = _base_searches(space, settings)
         k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
-        lost = space.bare.observe.unreachable(seen.status[k]) & space.included
+        lost = space.bare.observe.unreachable(np.asarray(seen.status[k])) & space.included
         if not lost.any():
             slots = np.zeros(2 * settings.slots)
             best = jax.tree.map(lambda x: x[k], found)  # noqa: B023
             z, sd = np.concatenate([best.z[: space.free], slots]), np.concatenate([best.sd[: space.free], slots + 1])
             best = dataclasses.replace(best, z=z, sd=sd)
-            return BaseFit(candidate(space, empty(settings), best, settings), seen.reading[k], space, unusable)
+            return BaseFit(
+                candidate(space, empty(settings), best, settings), np.asarray(seen.reading[k]), space, unusable
+            )
         unusable = tuple(sorted({*unusable, *map(int, np.flatnonzero(lost))}))
         space = space.without(lost)
         if space.included.sum() < FEWEST:
@@ -129,7 +131,7 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
             raise BadData(f"{where}: the model reaches too few rows to trace anything (not rows {rows})")
 
 
-def _base_searches(space: CandidateSpace, settings: Settings):
+def _base_searches(space: CandidateSpace, settings: Settings) -> tuple[Optimum, Observation]:
     """Where searches of the base end, from the prior mean and from draws of the prior, and what it says there.
 
     Where rollouts are dear they run without slots, from the best of many draws.

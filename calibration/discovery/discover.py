@@ -104,8 +104,8 @@ def discover_at(
     Args:
         numbers: of the rows, as messages call them; None counts from 1.
     """
-    progress("fitting the base model")
     space = pose(runs, robot, noise.sd, settings, stated, library)
+    progress("fitting the base model")
     fitted = fit_base(space, settings, runs.source)
 
     screened = screen(fitted, lambda base: bases_at(runs, base), settings, runs.source)
@@ -216,7 +216,8 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
     """The runs without exact copies of one another, their row numbers, and what to say of that."""
     columns = [runs[c] for c in observers.kind(runs).identity(runs)]
     seen: set[tuple[str, ...]] = set()
-    keep, copies = [], []
+    keep: list[int] = []
+    copies: list[int] = []
     for k in range(len(runs)):
         row = tuple(str(column[k]) for column in columns)
         (copies if row in seen else keep).append(k)

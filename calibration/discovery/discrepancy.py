@@ -176,7 +176,7 @@ def fit_discrepancy(
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
     found, seen = search_in_batches(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
-    z = found.z[k]
+    z = np.asarray(found.z[k])
     covariance = np.linalg.inv(np.asarray(_curvature(problem, jnp.asarray(z))))
     grid = np.linspace(at_base.low, at_base.high, POINTS)
     shape = at_base.scale * at_base.basis(grid) @ at_base.root
@@ -195,7 +195,7 @@ def fit_discrepancy(
         z=z,
         covariance=covariance,
         problem=problem,
-        reading=seen.reading[k],
+        reading=np.asarray(seen.reading[k]),
         converged=bool(found.converged[k]),
         proposal=propose(linear, balance, included, at_base),
     )
@@ -206,7 +206,7 @@ def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Proble
     problem = space.problem(base.active) if base.effects else space.bare
     # A robot that has this curve from an earlier round keeps one of them: the names are its parameters'.
     kept = tuple(e for e in problem.base.effects if e.name != curve.effect)
-    added = UNNAMED[curve.effect](**{n: jnp.asarray(v) for n, v in curve.values.items()})
+    added = params.replace(UNNAMED[curve.effect](), {n: jnp.asarray(v) for n, v in curve.values.items()})
     robot = dataclasses.replace(problem.base, effects=(*kept, added))
     names = tuple(f"effects.{curve.effect}.{n}" for n in curve.ordinates)
     shaped = Shaped(problem.coordinates, jnp.asarray(curve.root), names)

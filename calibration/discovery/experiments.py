@@ -230,7 +230,7 @@ def prospect(space: CandidateSpace, candidates: Mapping[str, Candidate], setting
     experiments = menu.menu(robot.configurations.names)
     sd = menu.sds(experiments, np.median(np.asarray(space.equipped.data.sd), 0))
     value, half = np.nan_to_num(value), np.nan_to_num(half)
-    return Prospect(tuple(names), experiments, value, half, sd, there.all(0), settings)
+    return Prospect(tuple(names), experiments, value, half, sd, np.all(there, axis=0), settings)
 
 
 # --- the choice -------------------------------------------------------------------------------------

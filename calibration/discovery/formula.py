@@ -93,8 +93,8 @@ def dictionary(ratios: np.ndarray) -> dict[Monomial, np.ndarray]:
             return low[k] > SAFE * high[k]
         return low[k] >= 0 or p == int(p)
 
-    single = [((k, p),) for k in lively for p in POWERS if safe(k, p)]
-    double = [
+    single: list[tuple[tuple[int, float], ...]] = [((k, p),) for k in lively for p in POWERS if safe(k, p)]
+    double: list[tuple[tuple[int, float], ...]] = [
         ((j, p), (k, q))
         for j, k in itertools.combinations(lively, 2)
         for p, q in itertools.product(POWERS_PRODUCT, repeat=2)
@@ -149,7 +149,7 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     if curve.variable == "time":
         return _decay(linear, balance, counts, curve)
     rows = len(counts)
-    ratios = np.stack([r(linear.signals, rows) for r in RATIOS], 1)  # type: ignore[arg-type]
+    ratios = np.stack([r(linear.signals, rows) for r in RATIOS], 1)
     known = dictionary(ratios[counts])
     terms = list(known)
     shapes = np.zeros((rows, len(terms)))

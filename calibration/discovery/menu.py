@@ -31,7 +31,7 @@ BLOCKED, BRAKE = 1e3, 0.06
 # --- how the robot is set up ------------------------------------------------------------------------
 
 
-def _with(robot: Robot, values: Mapping[str, Scalar | float]) -> Robot:
+def _with(robot: Robot, values: Mapping[str, Scalar]) -> Robot:
     return params.replace(robot, {k: jnp.asarray(v, float) for k, v in values.items()})
 
 
@@ -132,9 +132,9 @@ class Run:
 Experiment = Act | Run
 
 
-def _show(robot: Robot, channel: str, **signals: float) -> Array:
+def _show(robot: Robot, channel: str, signals: Signals) -> Array:
     """What the instrument of a channel shows of signals that are known otherwise."""
-    return balances.sensor(robot, Signals(**{k: jnp.asarray(v) for k, v in signals.items()}))[channel]
+    return jnp.asarray(balances.sensor(robot, signals)[channel])
 
 
 #: Payload on the scales [kg].
@@ -151,15 +151,16 @@ def _weighed(robot: Robot) -> Array:
 
 
 def _shunted(*currents: float) -> Callable[[Robot], Array]:
-    return lambda robot: jnp.stack([_show(robot, "total_current", total_current=i) for i in currents])
+    shown = [Signals(total_current=jnp.asarray(i)) for i in currents]
+    return lambda robot: jnp.stack([_show(robot, "total_current", s) for s in shown])
 
 
 def _strobed(robot: Robot) -> Array:
-    return jnp.stack([_show(robot, "motor_speed", speed_motor=w) for w in (300.0, 800.0)])
+    return jnp.stack([_show(robot, "motor_speed", Signals(speed_motor=jnp.asarray(w))) for w in (300.0, 800.0)])
 
 
 def _timed(robot: Robot) -> Array:
-    return jnp.stack([_show(robot, "speed", speed=v) for v in (0.4, 0.9)])
+    return jnp.stack([_show(robot, "speed", Signals(speed=jnp.asarray(v))) for v in (0.4, 0.9)])
 
 
 def acts(configurations: tuple[str, ...]) -> tuple[Act, ...]:
@@ -315,26 +316,26 @@ def readings(robot: Robot) -> tuple[Float[Array, " readings"], Bool[Array, " rea
     for act in (e for e in experiments if isinstance(e, Act)):
         value = act.reading(robot)
         shown[act.name] = value, jnp.ones(value.shape, bool)
-    runs = [e for e in experiments if isinstance(e, Run)]
-    for sides in sorted({r.sides or robot.sides for r in runs}):
-        driven = [r for r in runs if (r.sides or robot.sides) == sides]
-        shown |= _run(dataclasses.replace(robot, sides=sides), driven)
-    value, there = zip(*(shown[e.name] for e in experiments), strict=True)
-    return jnp.concatenate(value), jnp.concatenate(there)
+    shown |= _run(robot, [e for e in experiments if isinstance(e, Run)])
+    values, theres = zip(*(shown[e.name] for e in experiments), strict=True)
+    return jnp.concatenate(values), jnp.concatenate(theres)
 
 
 def _run(robot: Robot, runs: list[Run]) -> dict[str, tuple[Array, Array]]:
-    """What the robot shows in runs with as many motors, all in one batch."""
+    """What the robot shows in runs, all in one batch."""
     conditions = jax.tree.map(lambda *x: jnp.concatenate(x), *(_conditions(r) for r in runs))
     own = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
     stated = jnp.asarray(conditions.total_mass)
     conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(stated), own, stated))
-    setups = list(dict.fromkeys(r.setup for r in runs))
-    which = np.concatenate([np.full(len(r.voltage), setups.index(r.setup)) for r in runs])
-    robots = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x])[which], *(s(robot) for s in setups))
+    setups = list(dict.fromkeys((r.setup, r.sides) for r in runs))
+    which = np.concatenate([np.full(len(r.voltage), setups.index((r.setup, r.sides))) for r in runs])
+    set_up = [
+        dataclasses.replace(setup(robot), sides=robot.sides if sides is None else sides) for setup, sides in setups
+    ]
+    robots = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x])[which], *set_up)
     result = jax.vmap(lambda r, c: operating_point(r, c)[0])(robots, conditions)
     every = jnp.stack([result.reading[c] for c in channels.names()], -1)
-    held = np.array([s is blocked for s in setups])[which]
+    held = np.array([setup is blocked for setup, _ in setups])[which]
     exists = result.status == jnp.where(jnp.asarray(held), STALLED, CONVERGED)
     shown, first = {}, 0
     for r in runs:

@@ -96,7 +96,7 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
         found, seen = search_in_batches(space.equipped, [start] * batch, [robust] * batch, none)
-        far, start = off(seen.reading[0]), found.z[0]
+        far, start = off(np.asarray(seen.reading[0])), np.asarray(found.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outlier_share * included.sum():
         return base, ()

@@ -180,14 +180,14 @@ def beside_curve(linear: Linearization, bases: Bases, chosen: int) -> Statistics
     scores = _score_tests(padded, bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     others = balances != balances[chosen]
-    nothing = np.asarray(-np.inf)
+    nothing = jnp.asarray(-jnp.inf)
     return Statistics(
         single=np.max(np.abs(np.asarray(scores.single))),
         pair=np.max(np.asarray(scores.pair)),
         curve=np.max(np.asarray(scores.curve)[others], initial=-np.inf),
         chi2=nothing,
         white=nothing,
-        settled=np.asarray(True),
+        settled=jnp.asarray(True),
     )
 
 

@@ -65,7 +65,7 @@ class Smooth:
 def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
     if variable in ORDERS:
         return np.stack([np.sin(x), np.cos(x)], 1)
-    return np.asarray(weights(jnp.asarray(x), low, high))  # type: ignore[arg-type]
+    return np.asarray(weights(jnp.asarray(x), low, high))
 
 
 def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:

@@ -64,7 +64,7 @@ def calibrate(
         BadConfiguration: an unknown fidelity or parameter, a prior or noise that is none, rows that no robot near
             the priors reaches; or JAX computes in single precision.
     """
-    if not jax.config.jax_enable_x64:
+    if jnp.result_type(float) != jnp.float64:
         raise BadConfiguration(
             'calibrate: JAX computes in single precision; set jax.config.update("jax_enable_x64", True) first'
         )
@@ -85,7 +85,8 @@ def calibrate(
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     default = priors.default_names(present, robot, computed=facts.computes)
     names = priors.choose(robot, default, free, fix)
-    base, of_product = robot, {}
+    base = robot
+    of_product: dict[str, tuple[float, float]] = {}
     if priors.GUIDE_SHARE in facts.computes:
         base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})

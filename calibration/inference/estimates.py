@@ -89,7 +89,9 @@ def parameters(
             at_bound=_SIDE[int(bound[k])],
             measured_by_data=bool(about.sensitivity[k] > SENSITIVE),
             profile=None if profile is None else ProfileCurve(profile.value[k], profile.rise[k]),
-            with_steady=None if other is None else Beside(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
+            with_steady=None
+            if beside is None or other is None
+            else Beside(float(other[k]), float((z[k] - beside[k]) / about.sd[k])),
         )
     return found
 

@@ -76,7 +76,7 @@ def held_out(
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):
-        lost = problem.observe.unreachable(seen.status[k])[:rows, None]
+        lost = problem.observe.unreachable(np.asarray(seen.status[k]))[:rows, None]
         reading[mask] = np.where(lost, np.nan, seen.reading[k][:rows])[mask]
         status[mask], block[mask] = seen.status[k][:rows][mask], k
-    return HeldOutFits(reading, status, block, found.z, found.converged)
+    return HeldOutFits(reading, status, block, np.asarray(found.z), np.asarray(found.converged))

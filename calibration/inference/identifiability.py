@@ -146,18 +146,18 @@ def profile(problem: Problem, z: Array, cost: float, about: Identifiability, dat
     interval is interpolated on the signed root of the rise, which is straight for a linear model.
     """
     data = problem.data if data is None else data
-    z, size = np.asarray(z), len(about.names)
+    centre, size = np.asarray(z), len(about.names)
     steps = np.concatenate([-np.asarray(PROFILE_STEPS[::-1]), PROFILE_STEPS])
-    at = z[:, None] + about.sd[:, None] * steps  # (parameters, points)
+    at = centre[:, None] + about.sd[:, None] * steps  # (parameters, points)
     along = about.covariance / np.diag(about.covariance)[:, None]  # row k: how all move with k
-    starts = z + along[:, None, :] * (at - z[:, None])[..., None]
+    starts = centre + along[:, None, :] * (at - centre[:, None])[..., None]
     held = np.broadcast_to(np.eye(size, dtype=bool)[:, None, :], starts.shape)
     pins = Pin(jnp.asarray(held.reshape(-1, size)), jnp.asarray(starts.reshape(-1, size)))
     found = _profiles(problem, data, pins.at, pins)
     rise = 2 * (np.asarray(found.cost).reshape(at.shape) - cost)
     root = np.sign(steps) * np.sqrt(np.maximum(rise, 0.0))
     middle = len(PROFILE_STEPS)
-    at_all = np.insert(at, middle, z, axis=1)
+    at_all = np.insert(at, middle, centre, axis=1)
     root_all = np.insert(root, middle, 0.0, axis=1)
     ends = np.array([_ends(a, r) for a, r in zip(at_all, root_all, strict=True)])
     value = np.asarray(jax.vmap(problem.coordinates.value)(jnp.asarray(at_all.T))).T

@@ -61,7 +61,7 @@ def _phase(p: Parameter) -> bool:
     return p.name == "phase"
 
 
-Scales = tuple[Scalar | float, Scalar | float, Scalar | float]
+Scales = tuple[Scalar, Scalar, Scalar]
 
 
 def shape_scales(shape: Parameter | None) -> tuple[float, float, float]:

@@ -145,7 +145,7 @@ def search_one_by_one(
         for k, point in enumerate(points[1:], 2):
             end, status, _ = step(posed, point[None], posed.data)
             ends.append(end)
-            feasibles.append(~unreachable(posed, status).any(1))
+            feasibles.append(~np.any(unreachable(posed, status), axis=1))
             tell(f"start {k} of {len(points)}: objective {end.cost[0]:.4f} after {end.steps[0]} steps, {clock()}")
         found = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
         k = int(np.nanargmin(found.cost))
@@ -220,7 +220,7 @@ def _tighten(
             break
         data = dataclasses.replace(posed.data, stiffness=posed.data.stiffness / 10)
         posed = dataclasses.replace(posed, data=data)
-    return posed, found, ~unreachable(posed, status_start).any(1)
+    return posed, found, ~np.any(unreachable(posed, status_start), axis=1)
 
 
 def _shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:

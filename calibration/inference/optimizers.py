@@ -129,6 +129,9 @@ class Search(optx.LevenbergMarquardt):
     rollout, the integrator's tolerance); `Optimum.converged` says whether that place is an optimum.
     """
 
+    def __init__(self, tolerance: float) -> None:
+        super().__init__(rtol=tolerance, atol=tolerance, linear_solver=Normal())
+
     def terminate(
         self, fn: Any, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
     ) -> tuple[Array, optx.RESULTS]:
@@ -143,9 +146,9 @@ def levenberg_marquardt(
     pin = no_pin(start.shape[0]) if pin is None else pin
     function = residuals(problem, data, pin)
     tolerance = TOLERANCE_LONG if problem.observe.long else TOLERANCE
-    solution = optx.least_squares(
+    solution: optx.Solution = optx.least_squares(
         lambda z, _: function(z),
-        Search(rtol=tolerance, atol=tolerance, linear_solver=Normal()),
+        Search(tolerance),
         pin.apply(start),
         max_steps=max_steps,
         throw=False,
@@ -197,13 +200,15 @@ def search_long(
     Returns:
         Where the search ended, and what the model says where it started and where it ended.
     """
-    pin, solver = no_pin(start.shape[0]), Search(rtol=TOLERANCE_LONG, atol=TOLERANCE_LONG, linear_solver=Normal())
-    y, state, first, best, accepted = start, None, None, None, True
+    pin, solver = no_pin(start.shape[0]), Search(TOLERANCE_LONG)
+    y, state, accepted = start, None, True
+    first: Observation | None = None
+    best: tuple[Optimum, Observation] | None = None
     for steps in range(1, max_steps + 1):
         at = start if state is None else state.y_eval
         # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
         r = None if accepted else evaluated(problem, at, data)
-        if r is None or 0.5 * jnp.sum(r**2) < best[0].cost:
+        if r is None or best is None or 0.5 * jnp.sum(r**2) < best[0].cost:
             r, jacobian, seen = linearised(problem, at, data)
         if state is None:
             shape = jax.eval_shape(lambda: r)  # noqa: B023
@@ -214,9 +219,11 @@ def search_long(
         if accepted:
             best = _optimum(jacobian, r, y, data, pin, jnp.asarray(steps)), seen
             done |= best[0].decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best[0].cost)
+        assert best is not None  # the first step only evaluates the start, and accepts it
         tell(f"step {steps}: objective {float(best[0].cost):.4f}")
         if done:
             break
+    assert best is not None and first is not None
     return best[0], first, best[1]
 
 
@@ -261,7 +268,7 @@ def searches_long(
     Returns:
         Where each search ended, and what the model says there.
     """
-    solver = Search(rtol=TOLERANCE_LONG, atol=TOLERANCE_LONG, linear_solver=Normal())
+    solver = Search(TOLERANCE_LONG)
     starts = jnp.asarray(starts)
     r, jacobian, seen = evaluate(starts)
     y, at, state = starts, starts, _begun(solver, starts, r, jacobian)

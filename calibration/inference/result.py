@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import files
+from calibration.data import writing
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.multistart import Starts
 from mmrjax import channels
@@ -305,7 +305,7 @@ class CalibrationResult:
     def to_json(self) -> dict[str, Any]:
         """As in result.json, docs/schemas/calibrate.schema.json."""
         about, before, main = self.identifiability, _by_name(self.errors_before), self.main_blocks
-        return files.finite(
+        return writing.finite(
             {
                 "schema": SCHEMA,
                 "model": self.model,
@@ -378,8 +378,8 @@ class CalibrationResult:
         folder.mkdir(parents=True, exist_ok=True)
         note = f"calibrated from {robot_name} with {self.source}; the free parameters: {', '.join(self.parameters)}"
         robot_file.write(self.robot, folder / "robot.toml", note=note)
-        files.write_json(folder / "result.json", self.to_json())
-        files.write_table(folder / "rows.csv", self.rows())
+        writing.write_json(folder / "result.json", self.to_json())
+        writing.write_table(folder / "rows.csv", self.rows())
 
 
 def _by_name(values: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -7,7 +7,7 @@ import inspect
 import math
 import re
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -65,7 +65,11 @@ class Effect(eqx.Module):
     memory_size: ClassVar[float | None] = None
     memory_unit: ClassVar[str] = "-"
 
-    amplitude: eqx.AbstractVar[Scalar]
+    if TYPE_CHECKING:
+        # Made without arguments an effect is absent.
+        amplitude: Scalar = eqx.field(default=0.0, kw_only=True)
+    else:
+        amplitude: eqx.AbstractVar[Scalar]
     configurations: tuple[str, ...] = eqx.field(default=(), static=True, kw_only=True)
 
     def __init_subclass__(cls, **keywords: Any) -> None:
@@ -105,7 +109,7 @@ class Effect(eqx.Module):
         """Its memory: of the run so far where one is kept (`drive`, `track`), else settled."""
         return signals.memory[self.name] if self.name in signals.memory else self.settled(robot, signals)
 
-    def step_longest(self, robot: Robot, conditions: Conditions) -> Scalar | float:
+    def step_longest(self, robot: Robot, conditions: Conditions) -> Scalar:
         """Longest integration step that resolves an effect with a memory [s].
 
         An integrator chooses its steps by what happens in the run; for the derivative at amplitude 0 to be

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
 
 from mmrjax import balances
 from mmrjax.conditions import Conditions
+from mmrjax.effects.base import Effect
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals, State
 
 
-@dataclasses.dataclass
-class _Witness:
-    """Stands among a robot's effects, adds nothing, and keeps the signals that its balance hands to a term."""
+def _witness(place: str, of: str, seen: list[Signals]) -> Effect:
+    """An effect that adds nothing, and keeps the signals that its balance hands to a term."""
 
-    balance: str
-    channel: str
-    seen: list[Signals]
-    acts_everywhere: ClassVar[bool] = True
+    class Witness(Effect):
+        balance = place
+        channel = of
+        amplitude: Scalar = 0.0
 
-    def term(self, robot: Robot, signals: Signals) -> Scalar | float:
-        self.seen.append(signals)
-        return 0.0
+        def term(self, robot: Robot, signals: Signals) -> Scalar:
+            seen.append(signals)
+            return 0.0
+
+    return Witness()
 
 
 def readable(
@@ -35,9 +36,9 @@ def readable(
         conditions, state: one run at one instant, scalars; not traced.
         settled: in steady forward travel (`balances.settled`), else in motion (`balances.moving`).
     """
-    witness = _Witness(balance, channel, [])
-    watched = dataclasses.replace(robot, effects=(witness,))
+    seen: list[Signals] = []
+    watched = dataclasses.replace(robot, effects=(_witness(balance, channel, seen),))
     order = balances.settled if settled else balances.moving
     signals = order(watched, conditions, state)
     balances.sensor(watched, signals[0] if isinstance(signals, tuple) else signals)
-    return witness.seen[0]
+    return seen[0]

@@ -6,11 +6,11 @@ from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
-from mmrjax.params import Scalar, parameter
+from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -44,7 +44,7 @@ _EXTENDED[1, :3] = _EXTENDED[-2, :-4:-1] = 3.0, -3.0, 1.0
 _EXTENDED[0, :3] = _EXTENDED[-1, :-4:-1] = 6.0, -8.0, 3.0
 
 
-def _level(u: Scalar) -> Scalar:
+def _level(u: Scalar) -> Float[Array, "..."]:
     """u where it is positive; below, a parabola that is level from u = -LEVEL _LAST on, with slope 1 at 0."""
     width = LEVEL * _LAST
     below = jnp.clip(u, -width, 0.0)
@@ -168,7 +168,7 @@ def _wave(place: str) -> type[Effect]:
         y_sin: Scalar = _ordinate()
         y_cos: Scalar = _ordinate()
 
-        def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
+        def order(self, robot: Robot, configuration: Index) -> Scalar:
             return self.order_shaft / robot.gearbox.ratio
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:

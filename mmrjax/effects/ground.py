@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
 
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
-from mmrjax.params import Scalar, parameter
+from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -185,7 +184,7 @@ class GrouserPolygon(Periodic, GroundEffect):
         source="Section 3.2.4",
     )
 
-    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
         passages = robot.radius_pulley / (self.pitch * robot.gearbox.ratio)
         return 2 * jnp.pi * passages * robot.chassis(configuration).on_tracks
 

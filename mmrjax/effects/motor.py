@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
 
 from mmrjax import contact
 from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
-from mmrjax.params import Scalar, parameter
+from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -170,7 +169,7 @@ class Cogging(Periodic, MotorEffect):
         source="a choice of the model, see above",
     )
 
-    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
         return self.ripples
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

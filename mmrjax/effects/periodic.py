@@ -6,12 +6,11 @@ import abc
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Int
 
 from mmrjax import power
 from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
-from mmrjax.params import Scalar, parameter
+from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -43,7 +42,7 @@ class Periodic(Effect):
     phase: eqx.AbstractVar[Scalar]
 
     @abc.abstractmethod
-    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
         """Radians of the wave per radian of the motor's shaft k [-]."""
 
     def rate(self, robot: Robot, signals: Signals) -> Scalar:

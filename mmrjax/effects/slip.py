@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
 
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
-from mmrjax.params import Scalar
+from mmrjax.params import Index, Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -144,7 +143,7 @@ class PulleyEccentricity(Periodic, SlipEffect):
     )
     phase: Scalar = phase_parameter()
 
-    def order(self, robot: Robot, configuration: Int[Array, ""]) -> Scalar:
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
         return 1.0 / robot.gearbox.ratio
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:

@@ -107,8 +107,8 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
     settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
-    state = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
-    return jnp.where(jnp.all(jnp.isfinite(state)), state, rest)
+    y = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
+    return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 
 
 def drive(
@@ -140,7 +140,7 @@ def drive(
     """
     y0 = start(robot, conditions, rolling)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda _, y, conditions: rates(*conditions, y)),
+        diffrax.ODETerm(lambda _, y, run: rates(run[0], run[1], y)),
         Rodas4(),
         times[0],
         times[-1],

@@ -7,6 +7,7 @@ MJX carries chassis and pulleys (5 degrees of freedom, `mjcf`); grousers or whee
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -41,7 +42,7 @@ class Motion(eqx.Module):
     v: Float[Array, " 5"]
     current: Scalar
     discharge: Scalar
-    memory: dict[str, Scalar] = eqx.field(default_factory=dict)
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
 
 
 class System(eqx.Module):
@@ -68,8 +69,8 @@ class System(eqx.Module):
 
 def system(robot: Robot, conditions: Conditions, gear: RunningGear, step: float) -> System:
     """Constants of one run (scalar fields); robot and gear may hold tracers."""
-    rest = State(*(jnp.zeros_like(conditions.voltage) for _ in range(4)))
-    mass = balances.begin(robot, conditions, rest).mass
+    zero = jnp.zeros_like(conditions.voltage)
+    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
     half = mjcf.masses(robot, gear, conditions, mass)
     model, data = mjcf.template()
     model = mjcf.member(model, half, conditions.slope, gear.wheelbase, step)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from mmrjax import balances, ground
+from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import Result, Signals, quotient
 
@@ -49,7 +50,7 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     )
 
 
-def _efficiency(out: Array, into: Array) -> Array:
+def _efficiency(out: Scalar, into: Scalar) -> Array:
     # What comes back from a slope is no efficiency of the way there.
     forward = (out > 0) & (into >= out)
     return jnp.where(forward, quotient(out, into), 0.0)

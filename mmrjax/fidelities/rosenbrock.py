@@ -37,17 +37,13 @@ _D = (
 )
 
 
-class RodasInterpolation(diffrax.AbstractLocalInterpolation):
+class RodasInterpolation(diffrax.LocalLinearInterpolation):
     """The method's own dense output, of order 3: y0 (1 - s) + s (y1 + (1 - s) (c2 + s c3)).
 
     A Hermite cubic would not do: its slopes are right-hand sides, in which a stiff component multiplies
     the error of its value, so that it swings between the ends of a long step.
     """
 
-    t0: Any
-    t1: Any
-    y0: Any
-    y1: Any
     c2: Any
     c3: Any
 

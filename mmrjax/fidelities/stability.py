@@ -30,11 +30,11 @@ def _slopes(robot: Robot, conditions: Conditions, gear: RunningGear) -> Float[Ar
         def rate(y: Float[Array, " 11"], at: Motion) -> Float[Array, " 11"]:
             motion = Motion(y[:5], y[5:10], y[10], at.discharge, at.memory)
             after, signals, _ = advance(run, motion)
-            current = signals.voltage_left / signals.inductance
+            current = jnp.asarray(signals.voltage_left / signals.inductance)
             return jnp.concatenate([y[5:10], (after.v - motion.v) / _PROBE, current[None]])
 
         def slope(at: Motion) -> Float[Array, "11 11"]:
-            return jax.jacfwd(rate)(jnp.concatenate([at.q, at.v, at.current[None]]), at)
+            return jax.jacfwd(rate)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]), at)
 
         return jax.vmap(slope)(jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run)))
 

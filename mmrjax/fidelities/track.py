@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -102,7 +101,7 @@ def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Ar
     periods = jnp.floor(jax.lax.stop_gradient((end - first) / pitch))
     periods = jnp.where(jnp.isfinite(periods) & (periods >= 2), periods, 0)
 
-    def mean(begin: Array, until: Array, otherwise: Array) -> Any:
+    def mean(begin: Array, until: Scalar, otherwise: Array) -> tuple[Signals, Array]:
         rise = contact.step(middle, end - begin * pitch, 0.0, end - (begin - 1) * pitch, 1.0)
         fall = contact.step(middle, end - (until + 1) * pitch, 1.0, end - until * pitch, 0.0)
         weight = jnp.where(periods > 0, rise * fall, otherwise)
@@ -182,7 +181,7 @@ def _record(run: System, start: Motion, sample: float, samples: int) -> tuple[Mo
     def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
         after, every = jax.lax.scan(small, motion, None, length=round(sample / run.step))
         signals, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
-        _, at, pulled = instant(run, after)
+        at, pulled = instant(run, after)[1:]
         return after, Record(after, signals, guided, undercarriage.reactions(run.path, at, pulled))
 
     return jax.lax.scan(interval, start, None, length=samples)
@@ -322,20 +321,22 @@ def _settled(robot: Robot, conditions: Conditions) -> Result:
 
 
 def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None) -> Run:
-    runs = track_batch(robot, conditions, **options, rolling=True, progress=progress)
+    runs = track_batch(
+        robot, conditions, duration=options["duration"], step=options["step"], rolling=True, progress=progress
+    )
     return Run(runs.result, {"guide_share": runs.steady.guide_share})
 
 
 def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
-    runs = track_batch(robot, conditions, **options, progress=progress)
+    runs = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=progress)
     history = History.of(robot, runs.time, runs.q[..., 0], runs.signals, runs.reactions)
     return Run(runs.result, {"guide_share": runs.steady.guide_share}, history)
 
 
 def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
-    check(robot, conditions, RunningGear(), **options)
+    check(robot, conditions, RunningGear(), duration=options["duration"], step=options["step"])
 
 
 def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:

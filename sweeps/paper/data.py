@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import runs as records
@@ -158,9 +159,9 @@ def errors(simulated: Columns, measured: np.ndarray) -> np.ndarray:
 
 def gear_efficiency(robot: Robot, speed_rpm: float, torque_input: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Output torque [N·m] and efficiency [-], eq. (19), over input torque [N·m] at one motor speed."""
-    gear, speed = robot.gearbox, speed_rpm * RPM
-    transmitted = torque_input - gear.torque_idle(speed, 1.0)
-    return np.asarray(gear.torque_output(transmitted, 1.0)), np.asarray(gear.efficiency(torque_input, speed))
+    gear, speed, torque = robot.gearbox, speed_rpm * RPM, jnp.asarray(torque_input)
+    transmitted = torque - gear.torque_idle(speed, 1.0)
+    return np.asarray(gear.torque_output(transmitted, 1.0)), np.asarray(gear.efficiency(torque, speed))
 
 
 def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.ndarray:
@@ -168,7 +169,7 @@ def cell_voltage(robot: Robot, current: np.ndarray, discharge_mah: float) -> np.
     from mmrjax.power import COULOMB_PER_MAH
 
     battery = robot.battery
-    total = battery.voltage(current - battery.current_other, discharge_mah * COULOMB_PER_MAH)
+    total = battery.voltage(jnp.asarray(current) - battery.current_other, discharge_mah * COULOMB_PER_MAH)
     return np.asarray(total) / battery.cells
 
 
@@ -176,12 +177,13 @@ def cell_no_load(robot: Robot, discharge_mah: np.ndarray) -> np.ndarray:
     """No-load voltage of one cell [V], eq. (13), over discharge [mAh]."""
     from mmrjax.power import COULOMB_PER_MAH
 
-    return np.asarray(robot.battery.voltage_no_load(discharge_mah * COULOMB_PER_MAH)) * np.ones_like(discharge_mah)
+    discharge = jnp.asarray(discharge_mah * COULOMB_PER_MAH)
+    return np.asarray(robot.battery.voltage_no_load(discharge)) * np.ones_like(discharge_mah)
 
 
 def motor_friction(robot: Robot, speed_rpm: np.ndarray) -> np.ndarray:
     """Friction torque of the motor M_df [mN·m], eq. (14), over shaft speed [rpm]."""
-    return 1e3 * np.asarray(robot.motor.torque_loss(speed_rpm * RPM, 1.0)) * np.ones_like(speed_rpm)
+    return 1e3 * np.asarray(robot.motor.torque_loss(jnp.asarray(speed_rpm * RPM), 1.0)) * np.ones_like(speed_rpm)
 
 
 def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> np.ndarray:
@@ -195,10 +197,11 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
 
     asked = conditions(robot, np.full(speed_wheel.shape, configuration))
     chassis = robot.configurations[configuration]
-    zero = np.zeros_like(speed_wheel)
+    wheel = jnp.asarray(speed_wheel)
+    zero = jnp.zeros_like(wheel)
 
     def torque_net(current: float) -> np.ndarray:
-        state = State(zero + current, speed_wheel * robot.gearbox.ratio, chassis.radius * speed_wheel, zero)
+        state = State(zero + current, wheel * robot.gearbox.ratio, chassis.radius * wheel, zero)
         signals = balances.begin(robot, asked, state, direction=zero + 1.0)
         signals = dataclasses.replace(signals, normal=zero, traction=zero)
         signals = balances.motor(robot, balances.electrical(robot, balances.supply(robot, asked, signals)))
@@ -223,7 +226,7 @@ def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[St
     from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    return starts_of(robot, drive_batch(robot, conditions(robot, kinds(robot), voltage=voltage), times))
+    return starts_of(robot, drive_batch(robot, conditions(robot, kinds(robot), voltage=voltage), jnp.asarray(times)))
 
 
 def starts_of(robot: Robot, run: Any) -> list[Start]:
@@ -297,14 +300,14 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
     wheel = points["theoretical_speed_mm_s"] * MM / np.asarray(robot.chassis(asked.configuration).radius)
     current = points["power_supply_W"] / points["voltage_V"] / robot.sides
     state = State(
-        current,
+        jnp.asarray(current),
         wheel * robot.gearbox.ratio,
         points["theoretical_speed_mm_s"] * MM * (1 - points["slip"]),
         asked.discharge,
     )
     at, _ = eqx.filter_jit(balances.settled)(robot, asked, state)
     sides = robot.sides
-    split = {
+    parts = {
         "winding": sides * at.voltage_drop * at.current,
         "motor friction": sides * at.torque_motor_loss * at.speed_motor,
         "gearbox": points["power_motor_W"] - points["power_gear_W"],
@@ -313,7 +316,7 @@ def energy_split(robot: Robot, asked: Conditions) -> tuple[Columns, Columns]:
         "rolling resistance": sides * at.resistance * at.speed,
         "lift": points["power_lift_W"],
     }
-    split = {k: np.asarray(v) for k, v in split.items()}
+    split = {k: np.asarray(v) for k, v in parts.items()}
     split["other"] = points["power_supply_W"] - sum(split.values())
     return points, split
 

@@ -44,7 +44,8 @@ def draw(album: Album, robot: Robot) -> dict[str, Any]:
     """
     run, names = runs(robot), data.kinds(robot)
     which = [robot.configurations.index(c) for c in names]
-    gears = figures_gear.gears(robot, run, run.result.status, run.steady.guide_share, which, names)
+    status, share = np.asarray(run.result.status), np.asarray(run.steady.guide_share)
+    gears = figures_gear.gears(robot, run, status, share, which, names)
     if not all(gear.rolls for gear in gears):
         return {"left_out": ", ".join(f"{g.name}: {words.short(g.status)}" for g in gears)}
     starts = data.starts_of(robot, run)

@@ -72,8 +72,8 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
                 )
         axes.set(xlabel="slope [°]", xticks=[0, 5, 10, 15, 20], xlim=(-0.5, 20.9))
         axes.set_title(kind)
-        table = [r for r in certainty if r["configuration"] == kind]
-        texts = [f"mode {r['mode']}: R² {r['weighed']:.3f} (straight fit {r['straight']:.3f})" for r in table]
+        fits = [r for r in certainty if r["configuration"] == kind]
+        texts = [f"mode {r['mode']}: R² {r['weighed']:.3f} (straight fit {r['straight']:.3f})" for r in fits]
         note(axes, "markers: measured\n" + "\n".join(texts), fontsize=8.5)
     grid[0, 0].set_ylim(0, 1.2 * grid[0, 0].dataLim.y1 if np.isfinite(grid[0, 0].dataLim.y1) else 1.0)
     grid[0, 0].set_ylabel("total current [A]")

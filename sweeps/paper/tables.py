@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import runs as records
@@ -34,7 +35,7 @@ def errors(variants: dict[str, np.ndarray], rows: data.Rows) -> list[dict[str, A
 def implied_resistance(robot: Robot, table: records.Runs) -> np.ndarray:
     """Resistance [Ω] in series with each motor that current and speed of each row imply by (15)."""
     current = table["total_current_A"]
-    back = np.asarray(robot.motor.voltage_back(table["motor_speed_rpm"] * RPM))
+    back = np.asarray(robot.motor.voltage_back(jnp.asarray(table["motor_speed_rpm"] * RPM)))
     return robot.sides * (table["supply_voltage_V"] - back) / current
 
 

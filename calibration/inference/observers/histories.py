@@ -273,7 +273,7 @@ class Histories(Observer):
 
     def angle(self, whole: Signals) -> Float[Array, " rows"]:
         """Angle of the driving shaft at every row, since the start of its run [rad]."""
-        speed = whole.speed_wheel
+        speed = jnp.asarray(whole.speed_wheel)
         turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
         angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
         return angle[self.run, self.instant]
