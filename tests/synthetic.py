@@ -15,11 +15,12 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, fit_base
 from calibration.discovery.outliers import screen
 from calibration.discovery.result import DiscoveryResult
-from calibration.discovery.settings import Settings
+from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
 from calibration.inference.noise import Noise
+from calibration.inference.observers import SettledRuns
 from mmrjax import robots
-from mmrjax.effects import Effect
+from mmrjax.effects import BY_NAME, Effect
 
 #: The analyst's prior on the surface, which Table 5 does not know.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
@@ -68,3 +69,15 @@ class Analyst:
     def discover(self, runs: Runs) -> DiscoveryResult:
         """The whole loop."""
         return discover.discover_at(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
+
+
+#: What tables of settled runs are searched for; the whole library is what the command and the campaign search.
+SEARCHED = (
+    "mass_error", "mass_offset", "supply_sag", "series_resistance", "brush_drop", "winding_heating", "windage",
+    "gear_load_loss", "churning", "stribeck_track", "tension_friction", "speed_rolling", "slope_bias",
+    "rolling_radius", "load_slip", "ammeter_offset", "speed_gain",
+)  # fmt: skip
+#: Of settled runs. Tables of 81 to 96 rows have one padded size, and all files share what is compiled for it.
+SETTLED = Analyst(
+    dataclasses.replace(settings_for(SettledRuns, 192), slots=2), {name: BY_NAME[name] for name in SEARCHED}
+)

@@ -11,13 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from synthetic import Analyst, known, table
+from synthetic import SEARCHED, SETTLED, known, table
 
 from calibration.data.runs import Runs
 from calibration.discovery import discover
 from calibration.discovery.score_tests import bootstrap, diagnosed, score_tests
 from calibration.discovery.search import search
-from calibration.discovery.settings import settings_for
 from calibration.inference import bases
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED, amplitude_of, scored, shape_of
@@ -27,33 +26,21 @@ from calibration.inference.optimizers import observation
 from mmrjax import params
 from mmrjax.effects import BY_NAME
 
-REPLICATES = 192
-#: What these tables are searched for; the whole library is what the command and the campaign search.
-SEARCHED = (
-    "mass_error", "mass_offset", "supply_sag", "series_resistance", "brush_drop", "winding_heating", "windage",
-    "gear_load_loss", "churning", "stribeck_track", "speed_rolling", "slope_bias", "rolling_radius", "load_slip",
-    "ammeter_offset",
-)  # fmt: skip
-#: All tables have 81 to 96 rows, thus one padded size, and share what is compiled.
-ANALYST = Analyst(
-    dataclasses.replace(settings_for(SettledRuns, REPLICATES), slots=2), {n: BY_NAME[n] for n in SEARCHED}
-)
-
 
 @pytest.fixture(scope="module")
 def clean():
     """A table in which nothing is missing: the stages of the loop, and what it finds."""
     runs = table(g.case(seed=2))
-    return SimpleNamespace(**vars(ANALYST.diagnosis(runs)), found=ANALYST.discover(runs))
+    return SimpleNamespace(**vars(SETTLED.diagnosis(runs)), found=SETTLED.discover(runs))
 
 
 @pytest.fixture(scope="module")
 def churning():
     """Ten sigmas of churning: the stages, every candidate of the search, and what the loop finds."""
     case = g.case(["churning"], 10.0, seed=4)
-    at = ANALYST.diagnosis(table(case))
-    searched = search(at.space, at.base, at.left, at.bases, ANALYST.settings, lambda text: None)
-    return SimpleNamespace(**vars(at), searched=searched, found=ANALYST.discover(at.runs), label=case.label)
+    at = SETTLED.diagnosis(table(case))
+    searched = search(at.space, at.base, at.left, at.bases, SETTLED.settings, lambda text: None)
+    return SimpleNamespace(**vars(at), searched=searched, found=SETTLED.discover(at.runs), label=case.label)
 
 
 def classes(found) -> list[set[str]]:
@@ -109,19 +96,19 @@ def test_churning_is_found_with_its_amplitude(churning):
     assert 45 < found.chi2[0] - found.chi2[1] < 180
     c = next(x for x in churning.searched.ladder if x.effects == ("churning",))
     unit = amplitude_of(churning.space.library["churning"]).spec.prior_sd(0.0)
-    sd = ANALYST.settings.width * c.sd[churning.space.free] * unit
+    sd = SETTLED.settings.width * c.sd[churning.space.free] * unit
     truth = churning.label["effects"][0]["amplitude"]
     assert abs(c.amplitude[0] * unit - truth) < 3.5 * sd and sd < 0.3 * truth
 
 
 def test_brush_drop_is_found():
-    found = ANALYST.discover(table(g.case(["brush_drop"], 10.0, seed=1)))
+    found = SETTLED.discover(table(g.case(["brush_drop"], 10.0, seed=1)))
     (members,) = classes(found)
     assert "brush_drop" in members and found.verdict == ("named" if len(members) == 1 else "class")
 
 
 def test_effect_outside_the_library_gets_no_name():
-    found = ANALYST.discover(table(g.case(["supply_hunting"], 12.0, seed=2)))
+    found = SETTLED.discover(table(g.case(["supply_hunting"], 12.0, seed=2)))
     assert found.verdict == "unnamed" and found.effects == ()
     where = found.unnamed
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.balances_alike)
@@ -129,7 +116,7 @@ def test_effect_outside_the_library_gets_no_name():
 
 
 def test_two_effects_are_both_found():
-    found = ANALYST.discover(table(g.case(["series_resistance", "mass_offset"], 12.0, seed=3)))
+    found = SETTLED.discover(table(g.case(["series_resistance", "mass_offset"], 12.0, seed=3)))
     both = classes(found)
     assert len(both) == 2
     resistance = next(c for c in both if "series_resistance" in c)
@@ -142,7 +129,7 @@ def test_two_effects_are_both_found():
 
 
 def test_reading_that_stands_alone_is_an_outlier(clean):
-    found = ANALYST.discover(changed(clean.runs, "speed_mm_s", 17, 15 * clean.runs["speed_sd_mm_s"][17]))
+    found = SETTLED.discover(changed(clean.runs, "speed_mm_s", 17, 15 * clean.runs["speed_sd_mm_s"][17]))
     assert found.outliers == (18,) and found.verdict == "none" and found.unusable == ()
     assert not found.included[17] and found.included.sum() == len(clean.runs) - 1
 
@@ -151,7 +138,7 @@ def test_rows_that_bend_the_fit_are_set_aside(clean):
     wrong = clean.runs.where(np.arange(4))
     wrong.columns["slope_deg"][:2] = 44.0
     wrong.columns["payload_kg"][2:], wrong.columns["total_mass_kg"][2:] = 90.0, 103.0
-    found = ANALYST.discover(joined(clean.runs, wrong))
+    found = SETTLED.discover(joined(clean.runs, wrong))
     assert found.verdict == "none"
     assert {*found.outliers, *found.unusable} == {len(clean.runs) + 1 + k for k in range(4)}
 
@@ -159,7 +146,7 @@ def test_rows_that_bend_the_fit_are_set_aside(clean):
 def test_rows_beyond_the_model_are_kept_out(clean):
     steep = clean.runs.where(np.array([0, 50]))
     steep.columns["slope_deg"][:] = -44.0  # downhill it slides, whatever adhesion is within reach
-    fitted = ANALYST.base(joined(clean.runs, steep))
+    fitted = SETTLED.base(joined(clean.runs, steep))
     assert fitted.unusable == (90, 91) and fitted.space.included[:92].sum() == 90
     p = fitted.space.free
     np.testing.assert_allclose(fitted.candidate.z[:p], clean.base.z[:p], atol=0.1)
@@ -170,7 +157,7 @@ def test_rows_beyond_the_model_are_kept_out(clean):
 
 def test_order_of_rows_does_not_matter(churning):
     runs, before = churning.runs, churning.found
-    found = ANALYST.discover(runs.where(np.random.default_rng(0).permutation(len(runs))))
+    found = SETTLED.discover(runs.where(np.random.default_rng(0).permutation(len(runs))))
     assert found.verdict == before.verdict and classes(found) == classes(before)
     np.testing.assert_allclose(found.chi2[0], before.chi2[0], rtol=1e-5)
     scores, other = ({s.name: np.sign(s.amplitude) * s.score**0.5 for s in f.scores} for f in (before, found))
@@ -180,7 +167,7 @@ def test_order_of_rows_does_not_matter(churning):
 
 
 def test_same_seed_gives_the_same_numbers(clean):
-    same, another = (ANALYST.seeded(seed).diagnosis(clean.runs) for seed in (0, 1))
+    same, another = (SETTLED.seeded(seed).diagnosis(clean.runs) for seed in (0, 1))
     np.testing.assert_array_equal(same.base.z, clean.base.z)
     jax.tree.map(np.testing.assert_array_equal, same.left.test.null, clean.left.test.null)
     assert not np.array_equal(another.left.test.null.single, clean.left.test.null.single)
@@ -194,7 +181,7 @@ def test_held_out_readings_are_those_of_a_refit_without_the_block(clean):
     block = (runs["slope_deg"] == 20) & (runs["supply_voltage_V"] == 15)
     for row in np.flatnonzero(block):  # so far off that whoever has seen the block shows it
         runs = changed(runs, "speed_mm_s", row, 15 * runs["speed_sd_mm_s"][row])
-    fitted, brute = ANALYST.base(runs), ANALYST.base(runs.where(~block))
+    fitted, brute = SETTLED.base(runs), SETTLED.base(runs.where(~block))
     out = held_out(fitted.space.equipped, fitted.candidate.z, [block], (-1, -1))
     seen = observation(fitted.space.bare, jnp.asarray(brute.candidate.z[: brute.space.free]))
     expected = np.asarray(seen.reading)[: len(runs)]

@@ -14,9 +14,11 @@ from synthetic import STATED, Analyst, known, table
 
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
+from calibration.discovery import discover
 from calibration.discovery.adequacy import AdequacyTest
-from calibration.discovery.discrepancy import fit_discrepancy
+from calibration.discovery.discrepancy import fit_discrepancy, locate
 from calibration.discovery.score_tests import diagnosed
+from calibration.discovery.search import search
 from calibration.discovery.settings import settings_for
 from calibration.inference import bases, noise
 from calibration.inference.linearization import PROBED, scored, shape_of
@@ -36,9 +38,11 @@ ANALYST = Analyst(
 )
 
 
-def case(*names, sigmas=10.0, seed=1):
+def case(*names, sigmas=12.0, seed=1):
+    """Four of six starts: both configurations at the least and at the highest voltage."""
     made, label = gs.case(names, sigmas, seed, duration=0.8, every=0.02)
-    return table(made), label
+    runs = table(made)
+    return runs.where(np.isin(runs["run_id"], ["start0", "start2", "start3", "start5"])), label
 
 
 @pytest.fixture(scope="module")
@@ -49,20 +53,29 @@ def clean():
 
 @pytest.fixture(scope="module")
 def oval():
-    """A bent pulley, twice a turn, which the library does not have."""
-    runs, label = case("pulley_ovality", sigmas=12.0, seed=7)
-    return SimpleNamespace(runs=runs, label=label["effects"][0], found=ANALYST.discover(runs))
+    """A bent pulley, twice a turn, which the library does not have: the stages up to the search."""
+    runs, label = case("pulley_ovality", sigmas=15.0, seed=7)
+    at = ANALYST.diagnosis(runs)
+    searched = search(at.space, at.base, at.left, at.bases, ANALYST.settings, lambda text: None)
+    return SimpleNamespace(**vars(at), searched=searched, label=label["effects"][0])
 
 
 # --- verdicts ---------------------------------------------------------------------------------------
 
 
 def test_clean_histories_lack_nothing(clean):
-    found = ANALYST.discover(clean.runs)
-    assert found.verdict == "none" and found.outliers == found.unusable == () and found.before.p_value > 0.05
+    assert not clean.left.test.rejected and clean.left.test.p_value > 0.05
+    assert clean.screened.outliers == clean.screened.base.unusable == ()
     readings = 3 * len(clean.runs)
-    assert abs(found.chi2[0] - readings) < 4 * np.sqrt(2 * readings)
-    assert found.chi2[0] == 2 * clean.base.cost and found.before.p_value == clean.left.test.p_value
+    assert abs(2 * clean.base.cost - readings) < 4 * np.sqrt(2 * readings)
+
+
+@pytest.mark.slow
+def test_result_is_that_of_the_stages(clean):
+    found = ANALYST.discover(clean.runs)
+    assert found.verdict == "none" and found.effects == () and found.outliers == found.unusable == ()
+    assert found.chi2[0] == found.chi2[1] == 2 * clean.base.cost
+    assert found.before.p_value == clean.left.test.p_value
 
 
 def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
@@ -80,20 +93,31 @@ def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
 
 
 def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
-    found = oval.found
-    assert found.verdict == "unnamed" and found.effects == ()
-    where = found.unnamed
-    assert {"track", "gearbox", "motor"} <= {where.balance, *where.balances_alike}
+    space, left, searched = oval.space, oval.left, oval.searched
+    beside = discover.not_to_the_point(space, oval.base, left, searched)
+    assert left.test.rejected and (beside or discover.stands_for_a_curve(space, left, searched, oval.bases))
+    where = locate(space.bare.observe, left.scores, oval.bases)
+    assert {"track", "gearbox", "motor"} <= {where.balance, *where.alike}
     assert where.variable == "order 2 of the driving shaft"
-    strength = {order: s.explained for (order, _), s in found.detail.before.orders.items()}
+    told = space.bare.observe.detail(oval.bases, space.included, left, left).before
+    strength = {order: s.explained for (order, _), s in told.orders.items()}
     assert max(strength, key=strength.get) == where.variable
     assert strength[where.variable] > 2 * strength["order 3 of the driving shaft"]
 
 
 @pytest.mark.slow
+def test_wave_without_a_name_is_in_the_result(oval):
+    found = ANALYST.discover(oval.runs)
+    where = locate(oval.space.bare.observe, oval.left.scores, oval.bases)
+    assert found.verdict == "unnamed" and found.effects == () and found.after.adequate
+    assert (found.unnamed.balance, found.unnamed.variable) == (where.balance, where.variable)
+    assert found.unnamed.defect is None and found.unnamed.score > 0.5 * oval.label["sigmas"] ** 2
+
+
+@pytest.mark.slow
 def test_wave_without_a_name_can_be_added_to_the_robot(oval):
-    at = ANALYST.diagnosis(oval.runs)
-    curve = fit_discrepancy(at.space, at.base, at.left.linear, "track", oval.found.unnamed.variable)
+    variable = "order 2 of the driving shaft"
+    curve = fit_discrepancy(oval.space, oval.base, oval.left.linear, "track", variable)
     assert (
         curve.converged and curve.effect == "wave_track" and isinstance(curve.robot.effects[0], UNNAMED["wave_track"])
     )
@@ -104,9 +128,9 @@ def test_wave_without_a_name_can_be_added_to_the_robot(oval):
     expected = oval.label["amplitude"] * np.exp(1j * oval.label["shapes"]["phase"])
     assert abs(got - expected) < 0.3 * abs(expected) and float(wave.order_shaft) == 2.0
     assert "sin(2 θ_k" in curve.proposal.formula
-    _, _, strongest = diagnosed(curve.problem, jnp.asarray(curve.z), at.space.library.scored, at.bases)
-    after = AdequacyTest(jax.device_get(strongest), at.left.test.null, ANALYST.settings)
-    assert not after.rejected_with_margin and at.left.test.rejected_with_margin
+    _, _, strongest = diagnosed(curve.problem, jnp.asarray(curve.z), oval.space.library.scored, oval.bases)
+    after = AdequacyTest(jax.device_get(strongest), oval.left.test.null, ANALYST.settings)
+    assert not after.rejected_with_margin and oval.left.test.rejected_with_margin
 
 
 @pytest.mark.slow
@@ -209,13 +233,13 @@ def test_memory_tells_noise_from_what_remembers(clean):
     slow = rng.standard_normal((linear.rows, 3))
     for run in rows:
         for a, b in itertools.pairwise(run):
-            slow[b, 1] = 0.7 * slow[a, 1] + 0.71 * slow[b, 1]
+            slow[b, 1] = 0.85 * slow[a, 1] + 0.53 * slow[b, 1]
     assert of(slow) > 2 * np.max(white) > 0
 
 
 def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(clean):
     runs = clean.runs
-    short = runs.where((runs["run_id"] != "start1") | (runs["time_s"] < 0.5))
+    short = runs.where((runs["run_id"] != "start2") | (runs["time_s"] < 0.5))
     mixed = short.where(np.random.default_rng(0).permutation(len(short)))
     observer = Histories.of(mixed, robots.nominal())
     times, names = mixed["time_s"], mixed["run_id"]

@@ -11,27 +11,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import Analyst, table
+from synthetic import SETTLED, table
 
 from calibration.data import robot_file
 from calibration.discovery import discover, formula
 from calibration.discovery.discrepancy import fit_discrepancy
 from calibration.discovery.projection import defect
 from calibration.discovery.score_tests import diagnosed
-from calibration.discovery.settings import settings_for
 from calibration.discovery.smooth import smooth
 from calibration.inference import bases
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED
-from calibration.inference.observers import SettledRuns
 from mmrjax import channels, params
-from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 
 #: An effect that no library holds → balance and variable that it acts through.
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}
-# The library plays no part here; one effect keeps what is compiled small.
-ANALYST = Analyst(dataclasses.replace(settings_for(SettledRuns), slots=1), {"churning": BY_NAME["churning"]})
 
 
 @pytest.fixture(
@@ -41,7 +36,7 @@ def found(request):
     """A case of 12 sigmas, its base fit, and the discrepancy that is fitted to what that leaves."""
     case = g.case([request.param], 12.0, seed=1)
     runs = table(case)
-    fitted = ANALYST.base(runs)
+    fitted = SETTLED.base(runs)
     space, base = fitted.space, fitted.candidate
     bare = space.problem(base.active)
     seen = diagnosed(bare, jnp.asarray(base.z), space.library.scored, discover.bases_at(runs, fitted))
@@ -95,7 +90,7 @@ def test_curve_takes_the_discrepancy_out_of_the_fit(found):
 def test_curve_lowers_the_error_at_slopes_that_were_not_seen(found):
     slopes = found.runs["slope_deg"]
     blocks = [slopes == s for s in np.unique(slopes)]
-    without = held_out(found.space.equipped, found.base.z, blocks, (-1,))
+    without = held_out(found.space.equipped, found.base.z, blocks, (-1, -1))
     with_it = held_out(found.what.problem, found.what.z, blocks)
     assert with_it.converged.all() and np.isfinite(with_it.reading).all()
     before, after = (sigmas(found, out.reading) for out in (without, with_it))

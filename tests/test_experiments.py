@@ -7,15 +7,13 @@ import generator as g
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import Analyst, table
+from synthetic import SETTLED, table
 from test_generator import SHAPES
 
 from calibration.discovery import experiments, menu
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
-from calibration.discovery.settings import settings_for
-from calibration.inference.observers import SettledRuns
 from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
 from mmrjax.tables import CONFIGURATIONS
@@ -28,8 +26,7 @@ PAIRS = {
 }
 MENU = menu.menu(CONFIGURATIONS)
 SPANS = menu.spans(MENU)
-SETTINGS = dataclasses.replace(settings_for(SettledRuns), slots=1)
-ANALYST = Analyst(SETTINGS, {n: BY_NAME[n] for n in sorted({n for pair in PAIRS for n in pair})})
+SETTINGS = SETTLED.settings
 
 
 # --- what the menu foresees -------------------------------------------------------------------------
@@ -99,7 +96,7 @@ def seen():
     answers = {}
     for pair in PAIRS:
         case = g.case([pair[0]], 12.0, seed=3)
-        space = ANALYST.space(table(case))
+        space = SETTLED.space(table(case))
         start = np.zeros(len(space.coordinates))
         fitted = fit_candidates(space, [(filled([name], SETTINGS), start) for name in pair], SETTINGS)
         answers[pair] = case, space, dict(zip(pair, fitted, strict=True))

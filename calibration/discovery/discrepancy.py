@@ -174,7 +174,7 @@ def fit_discrepancy(
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    found, seen = search_in_batches(problem, list(starts), [space.weight] * STARTS, batch=STARTS)
+    found, seen = search_in_batches(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
     z = np.asarray(found.z[k])
     covariance = np.linalg.inv(np.asarray(_curvature(problem, jnp.asarray(z))))
