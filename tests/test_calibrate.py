@@ -220,6 +220,7 @@ def test_unknown_fidelity_lists_the_choices(measured):
         quick(measured, model="trak")
 
 
+@pytest.mark.slow
 def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
     made = quick(measured, free=["default", "motor.inductance", "6T2A.mass"])
     said = " ".join(made.notes)
@@ -230,6 +231,7 @@ def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
     assert entry.variance_ratio == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_infeasible_starts_are_refused_with_the_rows(measured):
     says = r"no start is feasible: measured rows 5, 10 were measured in steady travel, but the model slides there"
     with pytest.raises(BadConfiguration, match=says + r".*6T2A.ground.friction.static = 0.32 .*free it, or raise it"):
@@ -364,6 +366,7 @@ static = 0.6
 """
 
 
+@pytest.mark.slow
 def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(tmp_path):
     (tmp_path / "rover.toml").write_text(ROVER)
     rover = robot_file.read(tmp_path / "rover.toml")
@@ -426,6 +429,7 @@ assert found.to_json()["errors"]["after"]["fitted"]["terminal_voltage"]["rows"] 
 """
 
 
+@pytest.mark.slow
 def test_a_fourth_channel_is_one_row_of_the_table():
     done = subprocess.run(
         [sys.executable, "-c", FOURTH_CHANNEL], cwd=ROOT, capture_output=True, text=True, timeout=600

@@ -241,6 +241,7 @@ def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):
     assert json.loads((tmp_path / "x" / "manifest.json").read_text())["hashes"]["runs.csv"] == known
 
 
+@pytest.mark.slow
 def test_drive_ends_clearly_when_the_battery_is_empty(mmrjax, tmp_path):
     arguments = [
         "simulate",
@@ -270,6 +271,7 @@ def test_simulate_track_writes_every_reaction(mmrjax, tmp_path):
     assert table(tmp_path / "t" / "runs.csv")[0]["guide_share"] != ""
 
 
+@pytest.mark.slow
 def test_sweep_track_has_a_bar_a_status_a_run_and_the_share_of_each(mmrjax, tmp_path):
     """Rolling: on tracks 10° is climbed and 15° slides, on wheels both are climbed."""
     arguments = ("--voltages", "33", "--payloads", "0", "--slopes", "10,15", "--duration", "0.6", "--no-report")
@@ -311,6 +313,7 @@ def test_shares_of_a_batch_add_up_to_its_runs():
     assert sum(told) == pytest.approx(180) and told[1] == pytest.approx(9) and told[-1] == 0
 
 
+@pytest.mark.slow
 def test_track_step_that_is_too_large_is_refused_before_the_run(mmrjax, tmp_path):
     code, out, err = mmrjax("simulate", "--model", "track", "--step", "0.001", "--out", "x")
     assert code == 2 and out == ""
@@ -320,6 +323,7 @@ def test_track_step_that_is_too_large_is_refused_before_the_run(mmrjax, tmp_path
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
     code, _, err = mmrjax("render", "robot.bmp")
     assert code == 2 and "expected a name that ends in .png, .gif, .mp4" in err

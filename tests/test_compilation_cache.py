@@ -82,6 +82,7 @@ def test_count_of_compilations_can_fail(first):
     assert not any(name.startswith("jit_asking") for name in names)
 
 
+@pytest.mark.slow
 def test_broken_entries_are_compiled_again(tmp_path):
     began = process(tmp_path)
     entries = sorted(Path(began["folder"]).iterdir())
@@ -106,6 +107,7 @@ def test_process_with_cache_switched_off_keeps_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_unwritable_place_switches_the_cache_off(tmp_path):
     (tmp_path / "file").write_text("")
     done = process(tmp_path / "file")
@@ -125,6 +127,7 @@ def test_place_is_the_users_by_default(monkeypatch, tmp_path):
     assert f"-{jaxlib.__version__}-" in compilation_cache.location().name
 
 
+@pytest.mark.slow
 def test_cache_that_jax_was_given_stays(tmp_path):
     done = process(tmp_path / "ours", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "theirs"))
     assert done["folder"] == str(tmp_path / "theirs") and not (tmp_path / "ours").exists()

@@ -75,6 +75,7 @@ def test_curve_obeys(effect, law):
     law(effect)
 
 
+@pytest.mark.slow
 def test_curves_at_zero_change_nothing_in_steady_and_none_is_dead():
     both = jax.jit(lambda a: jax.jacfwd(lambda a: (_steady(robot(a)),) * 2, has_aux=True)(a))
     slopes, with_them = both(jnp.zeros(len(CURVES)))

@@ -107,6 +107,7 @@ def test_brush_drop_is_found():
     assert "brush_drop" in members and found.verdict == ("named" if len(members) == 1 else "class")
 
 
+@pytest.mark.slow
 def test_effect_outside_the_library_gets_no_name():
     found = SETTLED.discover(table(g.case(["supply_hunting"], 12.0, seed=2)))
     assert found.verdict == "unnamed" and found.effects == ()

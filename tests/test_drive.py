@@ -203,6 +203,7 @@ def test_drive_that_starts_rolling_stays_at_the_operating_point(robot):
     np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_drive_that_starts_rolling_remembers_as_if_it_had_long_been(robot):
     warm = dataclasses.replace(robot, effects=(ThermalDrift(amplitude=jnp.asarray(1.0)),))
     run = Conditions(voltage=24.0, slope_deg=np.degrees(0.1))

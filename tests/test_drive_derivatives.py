@@ -9,6 +9,8 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive
 from mmrjax.signals import STATUSES
 
+pytestmark = pytest.mark.slow  # compiles for a minute
+
 RUNS = {
     "tracked_24V": dict(voltage=24.0, slope_deg=np.degrees(0.03), payload=2.0),
     "wheeled_33V_spinning": dict(voltage=33.0, slope_deg=15.0, configuration=1),

@@ -581,6 +581,7 @@ for name in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_every_file_of_effects_can_be_imported_first():
     first = ["mmrjax.robot", "mmrjax.balances", "mmrjax.effects", *MODULES]
     done = subprocess.run([sys.executable, "-c", FIRST, *first], capture_output=True, text=True)
@@ -675,6 +676,7 @@ def drive_readings():
     return run
 
 
+@pytest.mark.slow
 def test_drive_without_amplitudes_is_drive_without_effects(drive_readings):
     bare = robots.nominal()
     plain = jax.jit(jax.vmap(lambda c: drive(bare, c, jnp.asarray(DRIVEN), tolerance=1e-11)))(CONDITIONS)

@@ -87,7 +87,9 @@ CONTRACT = (knows_itself, settles_traceably, runs_batches, keeps_histories, chec
 
 
 @pytest.mark.parametrize("law", CONTRACT, ids=lambda law: law.__name__)
-@pytest.mark.parametrize("name", fidelities.NAMES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if fidelities.facts(n).slow else n for n in fidelities.NAMES]
+)
 def test_fidelity_keeps_the_contract(name, law, robot):
     fidelity = fidelities.get(name)
     assert fidelity.name == name
@@ -122,12 +124,14 @@ def test_contract_can_be_broken(law, of, change, robot):
         law(dataclasses.replace(fidelities.get(of), **change), robot)
 
 
+@pytest.mark.slow
 def test_settled_fidelities_agree_where_the_robot_drives(robot):
     steady, drive = (fidelities.get(name).settled(robot, RUNS) for name in ("steady", "drive"))
     for name in channels.names():
         np.testing.assert_allclose(drive.reading[name], steady.reading[name], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_settled_gives_numbers_where_the_robot_slides(robot):
     runs = Conditions(voltage=24.0, slope_deg=[20.0])
     for name in ("steady", "drive"):

@@ -11,6 +11,8 @@ from mmrjax.running_gear import RunningGear
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 import free_chain
 
+pytestmark = pytest.mark.slow  # compiles for a minute
+
 DURATION = 0.3  # [s], of which 5 grouser periods are averaged
 
 

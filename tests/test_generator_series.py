@@ -51,7 +51,7 @@ def test_series_generator_holds_every_effect_that_only_a_series_shows():
     assert sum(not f.cls for f in gs.FORMS.values()) >= 4
 
 
-@pytest.mark.parametrize("battery", [0.0, 1.0])
+@pytest.mark.parametrize("battery", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_clean_histories_agree_with_drive(package, battery):
     _, y = gs.histories(RUNS, DURATION, EVERY, battery=np.full(6, battery))
     assert apart(package(battery), y) < ERROR
@@ -62,7 +62,7 @@ def test_comparison_with_drive_can_fail(package):
     assert apart(package(0.0), y) > 5 * ERROR
 
 
-@pytest.mark.parametrize("name", PASSING)
+@pytest.mark.parametrize("name", [PASSING[0], *(pytest.param(n, marks=pytest.mark.slow) for n in PASSING[1:])])
 def test_effect_of_a_series_agrees_with_drive(package, name):
     form, battery = gs.FORMS[name], float(name == "battery_sag")
     size = {"cogging": 10.0, "stick_slip": 3.0, "thermal_drift": 5.0}.get(name, 1.0) * form.size

@@ -58,7 +58,9 @@ def test_histories_follow_drive():
     "changes",
     [
         pytest.param({}, marks=pytest.mark.slow),
-        {"effects.cogging.amplitude": 3e-4, "effects.pulley_eccentricity.amplitude": 0.02},
+        pytest.param(
+            {"effects.cogging.amplitude": 3e-4, "effects.pulley_eccentricity.amplitude": 0.02}, marks=pytest.mark.slow
+        ),
     ],
     ids=["bare", "waves"],
 )
@@ -88,6 +90,7 @@ def test_derivatives_are_those_of_what_is_computed(changes):
         assert (error <= 2e-3 * scale + 1e-9 * np.abs(up[k]).max((0, 1)) / float(step[k])).all(), name
 
 
+@pytest.mark.slow
 def test_repeated_instants_change_nothing():
     robot = robots.nominal()
     short, long = GRID[:120], np.concatenate([GRID[:120], np.repeat(GRID[119], 7)])

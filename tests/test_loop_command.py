@@ -203,6 +203,7 @@ def test_users_effect_is_scored_and_named(quick, tmp_path):
     assert "[effects.payload_binding]" in (tmp_path / "x" / "robot.toml").read_text()
 
 
+@pytest.mark.slow
 def test_one_voltage_gives_a_verdict(quick, tmp_path):
     table = g.case(seed=1).table
     written(tmp_path / "runs.csv", {k: v[table["supply_voltage_V"] == 24] for k, v in table.items()})

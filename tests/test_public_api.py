@@ -113,6 +113,7 @@ def test_fields_broadcast_configurations_among_them(robot):
     np.testing.assert_array_equal(by_index.total_current, many.total_current)
 
 
+@pytest.mark.slow
 def test_results_are_those_of_the_fidelities(robot):
     runs = mm.Conditions(configuration=["6T2A", "4W2T"], voltage=[24.0, 15.0])
     resolved = runs.resolved(robot)
@@ -170,6 +171,7 @@ def test_table_shows_units_and_as_many_rows_as_wanted(robot):
     assert chosen[-1] == "... and 48 more"
 
 
+@pytest.mark.slow
 def test_drive_keeps_histories(robot):
     one = mm.simulate(robot, mm.Conditions(voltage=24.0), model="drive", duration=1.0)
     history = one.history
@@ -180,6 +182,7 @@ def test_drive_keeps_histories(robot):
     assert mm.simulate(robot, mm.Conditions(voltage=24.0), model="drive", duration=1.0, history=False).history is None
 
 
+@pytest.mark.slow
 def test_track_keeps_histories_with_reactions(robot):
     runs = mm.Conditions(voltage=[24.0, 15.0])
     many = mm.simulate(robot, runs, model="track", duration=0.03)

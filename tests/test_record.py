@@ -56,7 +56,7 @@ def _source(name: str) -> str:
 
 
 SLOW = pytest.mark.slow
-TABLES = ["library", *(pytest.param(n, marks=SLOW) for n in RESULTS["loop"] if n != "library")]
+TABLES = [pytest.param(n, marks=SLOW) for n in RESULTS["loop"]]
 
 
 @pytest.mark.parametrize("name", TABLES)

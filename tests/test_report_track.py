@@ -140,6 +140,7 @@ def test_robot_that_does_not_get_under_way_is_said_and_not_drawn(robot, written,
     assert re.search(r'id="gear-left-out">.*6T2A: failed, 4W2T: settled', text)
 
 
+@pytest.mark.slow
 def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
     """A sweep of it has been asked for with such a step; the report's own runs must not be refused."""
     names = [f"{c}.ground.friction.speed_static" for c in ("6T2A", "4W2T")]
@@ -152,6 +153,7 @@ def test_stiff_robot_is_run_with_a_step_that_it_bears(robot, monkeypatch):
     assert (taken["sample"] / taken["step"]) == pytest.approx(round(taken["sample"] / taken["step"]))
 
 
+@pytest.mark.slow
 def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
     """0.9 s on wheels; of a run that has not settled long enough no ripple is drawn."""
     runs = records.Runs("the test", {

@@ -73,6 +73,7 @@ def test_steady_derivatives_at_zero_slip_are_finite(theta, steady_numbers, free)
     assert np.isfinite(values).all() and np.isfinite(jacobian).all()
 
 
+@pytest.mark.slow
 def test_steady_second_derivatives_are_central_differences(rebuild, theta, free, scales):
     """Of the speed by three parameters, through the implicit derivative twice."""
     from mmrjax.fidelities.steady import steady

@@ -111,6 +111,7 @@ def test_standing_robot_is_in_balance(robot):
         assert float(at.normal) == pytest.approx(float(weight), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_member_that_blows_up_fails_alone(robot):
     """A step ten times too long, on the door's inner side: its status says so, its neighbour runs on."""
     gear = RunningGear()

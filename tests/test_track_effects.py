@@ -13,6 +13,8 @@ from mmrjax.effects import ALL
 from mmrjax.fidelities.steady import steady
 from mmrjax.fidelities.track import track
 
+pytestmark = pytest.mark.slow  # compiles for a minute
+
 SETTLED = tuple(e for e in ALL if not e.transient)
 TRANSIENT = tuple(e for e in ALL if e.transient)
 OUTPUTS = ("total_current", "motor_speed", "speed")

@@ -118,6 +118,7 @@ def test_averages_do_not_depend_on_the_step(averages):
     np.testing.assert_allclose(averages(gear, 5e-5), averages(gear, 1e-4), rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_averages_hardly_depend_on_the_contact_stiffness(averages):
     """Doubled: less than 0.3 %."""
     gear = RunningGear()

@@ -49,6 +49,7 @@ def tail(runs, k, name):
     return ripple(runs.time[k, TAIL], series(runs, k, name)[TAIL])
 
 
+@pytest.mark.slow
 def test_statuses_are_each_member_s_own(runs):
     names = [STATUSES[s] for s in runs.result.status]
     assert names == ["converged"] * 7 + ["slides", "tips", "failed", "stalled"]
@@ -198,6 +199,7 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     assert float(jnp.max(jnp.abs(ours.result.reading["total_current"] / theirs.reading["total_current"] - 1))) < 0.005
 
 
+@pytest.mark.slow
 def test_batch_is_its_members(robot):
     """vmap = loop: a run does not depend on who runs beside it."""
     from mmrjax.fidelities.track import _batch
