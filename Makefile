@@ -6,15 +6,19 @@ READY := $(VENV)/ready
 # A command that ends with 3 is done, with some runs that did not converge; their status says why.
 DONE := || [ $$? -eq 3 ]
 
-.PHONY: demo test slow lint types campaign bench clean
+.PHONY: demo test test-all slow lint campaign bench clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force $(DONE)
 	$(BIN)/mmrjax sweep --robot runs/demo/loop/robot.toml --out runs/demo/table8 --force $(DONE)
 	@echo "open runs/demo/loop/report.html, then runs/demo/table8/report.html"
 
-test: $(READY)
+test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+# Everything: the tests that compile or run for long too, an hour on two cores.
+test-all: lint
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 slow: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
@@ -22,9 +26,6 @@ slow: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(MAKE) types
-
-types: $(READY)
 	$(BIN)/python -m mypy
 
 campaign: $(READY)
