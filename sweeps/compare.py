@@ -42,8 +42,8 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
                 folder.partial, robot=robot, robot_name=config.robot, model=config.model, data_name=runs.source,
                 table=comparison, summary=summary, notes=notes,
             )  # fmt: skip
-        result = {"schema": "mmrjax.compare/1", "errors": summary, "notes": notes}
-        return run.leave(folder, config, robot, table, result, runs)
+        further = {"errors": summary, "notes": notes}
+        return run.leave(folder, config, run.SimulationResult("compare", config.model, robot, runs, table, further))
 
 
 def compared(measured: records.Runs, simulated: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Summary]:

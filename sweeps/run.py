@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +23,45 @@ from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress as bar
 from sweeps.console import say
 from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationResult:
+    """What a simulating command found: typed, by name; what is written is read off it.
+
+    Attributes:
+        command: that simulated; model: fidelity; robot: that was simulated.
+        runs: what was simulated; table: their conditions and outcomes, a column each as in `runs.csv`.
+        further: what the command adds to `result.json`.
+    """
+
+    command: str
+    model: str
+    robot: Robot
+    runs: Runs
+    table: dict[str, np.ndarray]
+    further: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def statuses(self) -> dict[str, int]:
+        """How many runs ended in each status; every status is named."""
+        return counts(self.table)
+
+    @property
+    def flags(self) -> dict[str, int]:
+        """How many runs exceed each limit."""
+        return {name: int(np.sum(np.char.find(self.table["flags"], name) >= 0)) for name in FLAGS}
+
+    def to_json(self) -> dict[str, Any]:
+        """`result.json`."""
+        return {
+            "schema": f"mmrjax.{self.command}/1",
+            **self.further,
+            "model": self.model,
+            "runs": len(self.table["status"]),
+            "statuses": self.statuses,
+            "flags": self.flags,
+        }
 
 
 def simulate(
@@ -132,24 +172,17 @@ def counts(table: dict[str, np.ndarray]) -> dict[str, int]:
 def leave(
     folder: RunFolder,
     config: configuration.Simulate | configuration.Sweep | configuration.Compare,
-    robot: Robot,
-    table: dict[str, np.ndarray],
-    result: dict[str, Any],
-    runs: Runs,
+    result: SimulationResult,
 ) -> int:
     """Write what every simulating command leaves, and move the folder into place; returns the exit code.
 
     Args:
         folder: of the command; config: its configuration, with the robot's name.
-        table: of `evaluate`; result: what `result.json` holds beside the counts; runs: what was simulated.
     """
-    folder.write_table("runs.csv", table)
+    folder.write_table("runs.csv", result.table)
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
-    robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
-    ended = counts(table)
-    flags = {name: int(np.sum(np.char.find(table["flags"], name) >= 0)) for name in FLAGS}
-    content = {**result, "model": config.model, "runs": len(table["status"]), "statuses": ended, "flags": flags}
-    folder.write_json("result.json", content)
-    path = folder.finish({"seed": None, "statuses": ended}, runs)
+    robot_file.write(result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
+    folder.write_json("result.json", result.to_json())
+    path = folder.finish({"seed": None, "statuses": result.statuses}, result.runs)
     say(str(path))
-    return DONE if ended["converged"] == len(table["status"]) else SOME_NOT_CONVERGED
+    return DONE if result.statuses["converged"] == len(result.table["status"]) else SOME_NOT_CONVERGED

@@ -49,7 +49,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
                 folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
                 histories=histories,
             )  # fmt: skip
-        return run.leave(folder, config, robot, table, {"schema": "mmrjax.simulate/1"}, runs)
+        return run.leave(folder, config, run.SimulationResult("simulate", config.model, robot, runs, table))
 
 
 def _simulated(

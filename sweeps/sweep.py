@@ -27,7 +27,7 @@ def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
             from sweeps import report_sweep
 
             report_sweep.write(folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table)
-        return run.leave(folder, config, robot, table, {"schema": "mmrjax.sweep/1"}, runs)
+        return run.leave(folder, config, run.SimulationResult("sweep", config.model, robot, runs, table))
 
 
 def print_counts(table: dict[str, np.ndarray]) -> None:
