@@ -104,7 +104,7 @@ def oracle(case: g.Case) -> list[dict]:
 def one(robot, kind: str, seed: int, replicates: int) -> dict:
     """A case made, looped over and scored against its label."""
     from calibration.data import runs as records
-    from calibration.discovery.discover import discover_at
+    from calibration.discovery.discover import trace
     from calibration.discovery.settings import settings_for
     from calibration.inference import noise, observers
 
@@ -118,14 +118,18 @@ def one(robot, kind: str, seed: int, replicates: int) -> dict:
     began = time.perf_counter()
     observer = observers.kind(runs)
     settings = settings_for(observer, replicates, seed)
-    found = discover_at(runs, robot, noise.of(runs, observer.sizes(runs)), settings, STATED)
-    return {"kind": kind, "seed": seed, "seconds": time.perf_counter() - began, **judged(case, found, robot)}
+    found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings, STATED)
+    seconds = time.perf_counter() - began
+    return {"kind": kind, "seed": seed, "seconds": seconds, **judged(case, runs, found, settings)}
 
 
-def judged(case: g.Case, found, robot) -> dict:
-    """Verdict and label side by side."""
-    named = found.verdict in ("named", "class")
-    fitted = Again(found, robot) if named else None
+def judged(case: g.Case, runs, found, settings) -> dict:
+    """Verdict and label side by side.
+
+    Args:
+        found: what the stages of the loop found, a `Traced`.
+    """
+    base = found.screened.base.candidate
     return {
         "truth": [
             {**{k: e[k] for k in ("name", "class", "balance", "sigmas", "sizes")}, **o}
@@ -133,82 +137,48 @@ def judged(case: g.Case, found, robot) -> dict:
         ],
         "sigmas_together": case.label["sigmas_together"],
         "verdict": found.verdict,
-        "classes": [list(e.members) for e in found.effects],
+        "classes": [list(members) for members in found.members],
         "unnamed": located(found),
-        "p_value": found.before.p_value,
-        "outliers": [int(k) - 1 for k in found.outliers],
-        "chi2": list(found.chi2),
-        "experiments": carried_out(case, fitted) if found.verdict == "class" else [],
-        **(after(case, found, fitted) if named else {}),
+        "p_value": found.left.test.p_value,
+        "outliers": list(found.screened.outliers),
+        "chi2": [2 * base.cost, 2 * found.best.cost],
+        "experiments": carried_out(case, found, settings) if found.verdict == "class" else [],
+        **(after(case, runs, found) if found.verdict in ("named", "class") else {}),
     }
 
 
 def located(found) -> tuple | None:
     """(balance, variable, balances that act alike) of what has no name, or remains."""
-    if found.unnamed is not None:
-        return found.unnamed.balance, found.unnamed.variable, found.unnamed.balances_alike
-    if found.remains is not None:
-        return found.remains.balance, found.remains.variable, found.remains.balances_alike
-    return None
+    return None if found.where is None else (found.where.balance, found.where.variable, found.where.alike)
 
 
-class Again:
-    """The fits of a finished loop, made again by its stages for what its result does not hold.
-
-    Attributes:
-        space: the rows that count; base: the fit without effects, a `Candidate`.
-        candidates: the proposed one first, then those that are indistinguishable from it, by the names of their
-            effects.
-    """
-
-    def __init__(self, found, robot) -> None:
-        import jax
-        import jax.numpy as jnp
-
-        from calibration.discovery import discover
-        from calibration.discovery.candidates import filled, fit_base, fit_candidates, start
-        from calibration.discovery.score_tests import diagnosed
-
-        self.settings = settings = found.settings
-        space = discover.pose(found.runs, robot, found.readings_of_rows.sd, settings, STATED)
-        included = np.zeros(len(space.included), bool)
-        included[: len(found.runs)] = found.included
-        fitted = fit_base(space.without(~included), settings, found.runs.source)
-        self.space = space = fitted.space
-        self.base = base = fitted.candidate
-        bare = space.problem(base.active)
-        bases = discover.bases_at(found.runs, fitted)
-        scores = jax.device_get(diagnosed(bare, jnp.asarray(base.z), space.library.scored, bases))[1]
-        best = [e.name for e in found.effects]
-        sets = [best]
-        for k, effect in enumerate(found.effects):
-            sets += [[*best[:k], name, *best[k + 1 :]] for name in list(effect.members)[1:]]
-        wanted = [filled(names, settings) for names in sets]
-        starts = [(w, start(space, base, w, settings, scores)) for w in wanted]
-        self.candidates = {" + ".join(c.effects): c for c in fit_candidates(space, starts, settings)}
-
-
-def after(case: g.Case, found, fitted: Again) -> dict:
+def after(case: g.Case, runs, found) -> dict:
     """Errors held out by slope before and after, over the noise's sd, and the bias of the base parameters."""
-    seen = found.readings_of_rows
+    from calibration.inference import blocks
+    from calibration.inference.held_out import held_out
 
-    def rms(readings: np.ndarray) -> float:
-        error = (readings - seen.measured) / seen.sd
-        return float(np.sqrt(np.nanmean(error[found.included] ** 2)))
+    masks, rows = list(blocks.blocks(runs, "slope").values()), len(runs)
+    space, both = found.screened.base.space, (found.screened.base.candidate, found.best)
+    included, sd = space.included[:rows], np.asarray(space.bare.data.sd)[:rows]
 
-    c = fitted.space.coordinates.base
+    def rms(candidate) -> float:
+        indices = space.library.indices(candidate.active)
+        seen = held_out(space.equipped, candidate.z, masks, indices).reading
+        return float(np.sqrt(np.nanmean((((seen - runs.measured()) / sd)[included]) ** 2)))
+
+    c = space.coordinates.base
     value = np.array([case.constants[n] for n in c.names])
     truth = (np.where(c.scale, np.log(value), value) - np.asarray(c.location)) / np.asarray(c.spread)
-    both = fitted.base, next(iter(fitted.candidates.values()))
     bias = [((x.z[: len(c)] - truth) / x.sd[: len(c)]).tolist() for x in both]
-    return {"held_out": [rms(r) for r in seen.held_out["slope"]], "bias": bias}
+    return {"held_out": [rms(x) for x in both], "bias": bias}
 
 
-def carried_out(case: g.Case, fitted: Again) -> list[dict]:
+def carried_out(case: g.Case, found, settings) -> list[dict]:
     """Experiments proposed and carried out one after the other, until one alternative or nothing to do is left."""
     from calibration.discovery import experiments
 
-    seen = whole = experiments.prospect(fitted.space, fitted.candidates, fitted.settings)
+    left = experiments.alternatives(found.best, found.alike)
+    seen = whole = experiments.prospect(found.screened.base.space, left, settings)
     done: dict[str, dict] = {}
     said: list[dict] = []
     while len(seen.names) > 1 and len(said) < EXPERIMENTS:

@@ -63,36 +63,38 @@ def work(task: tuple) -> dict:
 def judged(robot, table: dict, label: dict, seed: int, replicates: int) -> dict:
     """The loop over a case, verdict and label side by side."""
     from calibration.data.runs import Runs
-    from calibration.discovery.discover import discover_at
-    from calibration.discovery.findings import size_of
+    from calibration.discovery.discover import trace
+    from calibration.discovery.findings import effect_scores, size_of
     from calibration.discovery.settings import settings_for
     from calibration.inference import noise, observers
-    from mmrjax.effects import BY_NAME
 
     runs = Runs("synthetic", dict(table))
     began = time.perf_counter()
     observer = observers.kind(runs)
     settings = settings_for(observer, replicates, seed)
-    found = discover_at(runs, robot, noise.of(runs, observer.sizes(runs)), settings, STATED)
+    found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings, STATED)
     seconds = time.perf_counter() - began
-    left = {s.name: s.sigmas_per_prior_sd for s in found.scores}
+    space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
+    left = {s.name: s.sigmas_per_prior_sd for s in effect_scores(space, found.left.scores)}
+    sd = {e.name: size_of(e) for e in space.library.effects}
     truth = [
         {
             **{k: e[k] for k in ("name", "class", "balance", "amplitude", "sigmas")},
             # what the loop's own base, which frees more than the generator's, leaves of it
-            "sigmas_left": left[e["class"]] * abs(e["amplitude"]) / size_of(BY_NAME[e["class"]]())
-            if e["class"]
-            else None,
+            "sigmas_left": left[e["class"]] * abs(e["amplitude"]) / sd[e["class"]] if e["class"] else None,
         }
         for e in label["effects"]
     ]
-    amplitudes = {e.name: next(iter(e.parameters.values())) for e in found.effects}
+    spread = settings.width * best.sd[space.free :]
     return {
         "seconds": seconds, "truth": truth, "verdict": found.verdict,
-        "classes": [list(e.members) for e in found.effects], "unnamed": located(found),
-        "p_value": found.before.p_value, "outliers": len(found.outliers),
-        "chi2": list(found.chi2), "readings": found.readings,
-        "amplitudes": {name: [a.value, a.sd] for name, a in amplitudes.items()},
+        "classes": [list(members) for members in found.members], "unnamed": located(found),
+        "p_value": found.left.test.p_value, "outliers": len(found.screened.outliers),
+        "chi2": [2 * base.cost, 2 * best.cost], "readings": int(np.sum(space.weight > 0)),
+        "amplitudes": {
+            name: [float(best.amplitude[slot] * sd[name]), float(spread[slot] * sd[name])]
+            for slot, name in enumerate(best.active) if name
+        },
     }  # fmt: skip
 
 

@@ -13,7 +13,8 @@ from calibration.data.runs import Runs
 from calibration.discovery import discover
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, fit_base
-from calibration.discovery.outliers import screen
+from calibration.discovery.discover import Traced
+from calibration.discovery.outliers import Screening, screen
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
@@ -56,19 +57,25 @@ class Analyst:
         """The base fitted to a table."""
         return fit_base(self.space(runs), self.settings, runs.source)
 
-    def diagnosis(self, runs: Runs) -> SimpleNamespace:
-        """The stages up to the test whether anything is missing: `screened`, `left`, and what is in them."""
-        fitted = self.base(runs)
-        screened = screen(fitted, lambda base: discover.bases_at(runs, base), self.settings, runs.source)
-        left = discover.diagnosis_of_base(screened, self.settings)
-        base = screened.base
-        return SimpleNamespace(
-            runs=runs, screened=screened, left=left, space=base.space, base=base.candidate, bases=screened.bases
-        )
+    def screened(self, runs: Runs) -> Screening:
+        """The base fitted to a table, rows that stand alone set aside."""
+        return screen(self.base(runs), lambda base: discover.bases_at(runs, base), self.settings, runs.source)
+
+    def trace(self, runs: Runs) -> Traced:
+        """The stages of the loop up to its verdict."""
+        return discover.trace(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
 
     def discover(self, runs: Runs) -> DiscoveryResult:
         """The whole loop."""
         return discover.discover_at(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
+
+
+def parts(runs: Runs, traced: Traced) -> SimpleNamespace:
+    """What tests of the stages ask for, under short names."""
+    base = traced.screened.base
+    return SimpleNamespace(
+        runs=runs, traced=traced, left=traced.left, space=base.space, base=base.candidate, bases=traced.screened.bases
+    )
 
 
 #: What tables of settled runs are searched for; the whole library is what the command and the campaign search.

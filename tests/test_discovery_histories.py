@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from synthetic import STATED, Analyst, known, table
+from synthetic import STATED, Analyst, known, parts, table
 
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -47,39 +47,35 @@ def case(*names, sigmas=12.0, seed=1):
 
 @pytest.fixture(scope="module")
 def clean():
-    """Histories in which nothing is missing: the stages of the loop."""
-    return ANALYST.diagnosis(case(seed=1)[0])
+    """Histories in which nothing is missing, through the stages of the loop."""
+    runs = case(seed=1)[0]
+    return parts(runs, ANALYST.trace(runs))
 
 
 @pytest.fixture(scope="module")
 def oval():
     """A bent pulley, twice a turn, which the library does not have: the stages up to the search."""
     runs, label = case("pulley_ovality", sigmas=15.0, seed=7)
-    at = ANALYST.diagnosis(runs)
-    searched = search(at.space, at.base, at.left, at.bases, ANALYST.settings, lambda text: None)
-    return SimpleNamespace(**vars(at), searched=searched, label=label["effects"][0])
+    screened = ANALYST.screened(runs)
+    space, base, bases_ = screened.base.space, screened.base.candidate, screened.bases
+    left = discover.diagnosis_of_base(screened, ANALYST.settings)
+    searched = search(space, base, left, bases_, ANALYST.settings, lambda text: None)
+    return SimpleNamespace(
+        runs=runs, space=space, base=base, bases=bases_, left=left, searched=searched, label=label["effects"][0]
+    )
 
 
 # --- verdicts ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_clean_histories_lack_nothing(clean):
-    assert not clean.left.test.rejected and clean.left.test.p_value > 0.05
-    assert clean.screened.outliers == clean.screened.base.unusable == ()
+    found = clean.traced
+    assert found.verdict == "none" and found.screened.outliers == found.screened.base.unusable == ()
+    assert clean.left.test.p_value > 0.05
     readings = 3 * len(clean.runs)
     assert abs(2 * clean.base.cost - readings) < 4 * np.sqrt(2 * readings)
 
 
-@pytest.mark.slow
-def test_result_is_that_of_the_stages(clean):
-    found = ANALYST.discover(clean.runs)
-    assert found.verdict == "none" and found.effects == () and found.outliers == found.unusable == ()
-    assert found.chi2[0] == found.chi2[1] == 2 * clean.base.cost
-    assert found.before.p_value == clean.left.test.p_value
-
-
-@pytest.mark.slow
 def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
     runs, label = case("pulley_eccentricity", seed=2)
     found = ANALYST.discover(runs)
@@ -94,12 +90,14 @@ def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
     assert [e.name for e in found.robot.effects] == ["pulley_eccentricity"]
 
 
-@pytest.mark.slow
 def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
+    """As `trace` decides it, without the curve."""
     space, left, searched = oval.space, oval.left, oval.searched
     best, after = searched.best, searched.diagnosis
-    beside = best is None or discover.not_to_the_point(space, oval.base, best)
-    assert left.test.rejected and (beside or discover.stands_for_a_curve(space, left, after, oval.bases))
+    assert left.test.rejected
+    assert discover.not_to_the_point(space, oval.base, best) or discover.stands_for_a_curve(
+        space, left, after, oval.bases
+    )
     where = locate(space.bare.observe, left.scores, oval.bases)
     assert {"track", "gearbox", "motor"} <= {where.balance, *where.alike}
     assert where.variable == "order 2 of the driving shaft"
