@@ -310,7 +310,7 @@ def beside(gears: list[RunningGear]) -> list[dict]:
     for gear in gears:
         answer = _batch(nominal(), runs, gear, 0.8, 1e-4, 1e-3, True)
         normal, fast = np.asarray(answer.signals.normal[0, -300:]), float(answer.v[0, -300:, 3].mean())
-        period = period_pitch(35e-3, fast, float(nominal().tracked.radius))
+        period = period_pitch(35e-3, fast, float(nominal().radius_pulley))
         periods = int(0.3 / period)
         found.append(
             {

@@ -71,7 +71,7 @@ def discover(
             "needed"
         )
     known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
-    notes += [*distinct.missing(), *checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
+    notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
     settings = settings_for(kind, replicates, seed)
 
     found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)
