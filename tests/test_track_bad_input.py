@@ -137,10 +137,10 @@ def test_member_that_blows_up_fails_alone(robot):
 
 @pytest.mark.slow
 def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
-    options = {"model": "track", "step_s": 1.3e-4, "chunk": 2, "slopes_deg": (0.0,)}
+    options = {"model": "track", "step_s": 1.25e-4, "chunk": 2, "slopes_deg": (0.0,)}
     config = configuration.resolve(configuration.Sweep, None, options)
-    runs, told = grid(config), []
-    limits = largest_step(robot, runs.command())
+    runs, told = grid(config, robot), []
+    limits = largest_step(robot, run.commanded(robot, runs, config))
     worst = int(np.argmin(limits))
     assert limits[:2].min() > config.step_s > limits[worst]  # the first chunk could bear it
     with pytest.raises(BadConfiguration, match=rf"run {worst + 1} of {len(runs)}"):
