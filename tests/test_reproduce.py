@@ -62,7 +62,6 @@ def paper(reproduced):
     return folder, page, Tables(page)
 
 
-@pytest.mark.slow
 def test_run_folder_has_the_papers_rows(paper):
     folder = paper[0]
     result = json.loads((folder / "result.json").read_text())
