@@ -32,6 +32,7 @@ class Channel:
         read: what of the signals an ideal instrument shows [SI].
         sd_share: sd that is assumed where none is known, as a share of the reading [-].
         resolution: digits after the point that a person wants to see [unit].
+        zero_at_rest: whether it shows 0 until the robot moves.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Channel:
     read: Callable[[Robot, Signals], Any]
     sd_share: float
     resolution: int = 1
+    zero_at_rest: bool = False
 
 
 #: In the order of columns, arrays and reports. Read through the module (`channels.CHANNELS`), so that a row more
@@ -77,6 +79,7 @@ CHANNELS: tuple[Channel, ...] = (
         sd_largest=10_000.0,
         read=lambda robot, signals: signals.speed_motor,
         sd_share=0.005,
+        zero_at_rest=True,
     ),
     Channel(
         name="speed",
@@ -90,6 +93,7 @@ CHANNELS: tuple[Channel, ...] = (
         sd_largest=5_000.0,
         read=lambda robot, signals: signals.speed,
         sd_share=0.01,
+        zero_at_rest=True,
     ),
 )
 

@@ -33,7 +33,7 @@ from mmrjax.signals import STATUSES
 
 # %% [markdown]
 # ## One operating point
-# The robot is a tree of parameters, each with its unit and source. Conditions are a `command`, in SI units.
+# The robot is a tree of parameters, each with its unit and source. Conditions say what is set from outside.
 
 # %%
 robot = robots.nominal()
@@ -41,9 +41,9 @@ one = Conditions(voltage=jnp.array([15.0]), slope_deg=jnp.array([5.0]), total_ma
 answer = steady_batch(robot, one)
 
 print(f"status       {STATUSES[int(answer.status[0])]}")
-print(f"current      {float(answer.reading.total_current[0]):.2f} A    (measured: 2.75 A)")
-print(f"motor speed  {float(answer.reading.motor_speed[0]) * 30 / np.pi:.0f} rpm (measured: 4800 rpm)")
-print(f"speed        {float(answer.reading.speed[0]) * 1e3:.0f} mm/s  (measured: 400 mm/s)")
+print(f"current      {float(answer.total_current[0]):.2f} A    (measured: 2.75 A)")
+print(f"motor speed  {float(answer.motor_speed[0]) * 30 / np.pi:.0f} rpm (measured: 4800 rpm)")
+print(f"speed        {float(answer.speed[0]) * 1e3:.0f} mm/s  (measured: 400 mm/s)")
 
 # %% [markdown]
 # ## Every slope at once, and a status for each
@@ -74,9 +74,9 @@ def show(figure):
 
 figure = Figure(figsize=(8, 3), layout="constrained")
 left, right = figure.subplots(1, 2)
-left.plot(slopes, climbs.reading.total_current)
+left.plot(slopes, climbs.total_current)
 left.set(xlabel="slope [deg]", ylabel="total current [A]")
-right.plot(slopes, 1e3 * climbs.reading.speed)
+right.plot(slopes, 1e3 * climbs.speed)
 right.set(xlabel="slope [deg]", ylabel="speed [mm/s]")
 show(figure)
 
@@ -92,7 +92,7 @@ name = "6T2A.ground.rolling_resistance"
 
 def current(resistance):
     """Total current [A] at 5 degrees as a function of the rolling resistance coefficient."""
-    return steady_batch(params.replace(robot, {name: resistance}), one).reading.total_current[0]
+    return steady_batch(params.replace(robot, {name: resistance}), one).total_current[0]
 
 
 slope_of_current = float(jax.grad(current)(0.06))
@@ -101,6 +101,6 @@ print(f"dI/df = {slope_of_current:.4f} A (twice run: {twice:.4f}), so 0.01 more 
 
 # %%
 assert STATUSES[int(answer.status[0])] == "converged"
-assert abs(float(answer.reading.total_current[0]) - 2.75) / 2.75 < 0.10  # the paper's model, nothing fitted
+assert abs(float(answer.total_current[0]) - 2.75) / 2.75 < 0.10  # the paper's model, nothing fitted
 assert 12 < slopes[slides].min() < 18
 assert abs(slope_of_current - twice) < 1e-6 * abs(twice)

@@ -106,19 +106,19 @@ def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[d
         axes.annotate("", (start, level), (start + 1e3 * expected, level), arrowprops=arrow)
         axes.text(start, level + 0.05 * span, f"{1e3 * expected:.1f} ms, eq. (34)", fontsize=8.5, va="bottom")
         axes.set_title(title.format(gear.name))
-        found = {
-            name: ripple.ripple(gear.time[tail], getattr(gear.signals, name)[tail])
-            for name in ("total_current", "speed", "normal")
-        }
+        of = gear.signals
+        drawn, travel, reaction = (
+            ripple.ripple(gear.time[tail], x[tail]) for x in (of.total_current, of.speed, of.normal)
+        )
         facts.append(
             {
                 "configuration": gear.name,
                 "pitch": "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm",
-                "period_ms": 1e3 * found["total_current"].period,
+                "period_ms": 1e3 * drawn.period,
                 "equation_ms": 1e3 * expected,
-                "current_percent": 100 * found["total_current"].amplitude,
-                "speed_percent": 100 * found["speed"].amplitude,
-                "reaction_percent": 100 * found["normal"].amplitude,
+                "current_percent": 100 * drawn.amplitude,
+                "speed_percent": 100 * travel.amplitude,
+                "reaction_percent": 100 * reaction.amplitude,
                 "guide_percent": 100 * gear.guide_share if gear.on_tracks else None,
             }
         )

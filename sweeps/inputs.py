@@ -6,7 +6,7 @@ from typing import Any
 
 from calibration.data import effect_file, robot_file
 from calibration.data import runs as records
-from calibration.data.errors import BadConfiguration, BadData, choices
+from calibration.data.errors import BadConfiguration, choices
 from mmrjax.robot import Robot
 from sweeps.config import RobotPart
 from sweeps.console import tell
@@ -54,10 +54,10 @@ def read_runs(source: str, robot: Robot, *, measured: bool, series: bool = False
             robot does not have.
     """
     runs = records.read(source, measured=measured)
-    if runs.has("time_s") and not series:
-        raise BadData(
-            f"{runs.source}: column time_s: time histories are for calibrate and loop; expected one row a run"
-        )
+    if not series:
+        from calibration.inference import observers
+
+        observers.kind(runs).check_settled(runs)
     runs.configurations(robot)
     if runs.unknown:
         tell(f"{runs.source}: not used: {', '.join(runs.unknown)}")

@@ -25,7 +25,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
     album = Album(folder)
     album.add("parameters", lambda: figures_calibration.parameters(found))
     album.add("before_after", lambda: figures_calibration.before_after(found))
-    if "time_s" in table:
+    if found.axis:
         album.add("histories", lambda: figures_calibration.histories(table))
     album.add("parity", lambda: figures_comparison.parity(table))
     album.add("residuals", lambda: figures_comparison.errors_over(table))

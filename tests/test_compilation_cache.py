@@ -68,6 +68,7 @@ def test_second_process_compiles_nothing_and_answers_the_same(first):
     assert str(described.path) == began["folder"] and f"{described.entries} programs" in str(described)
 
 
+@pytest.mark.slow
 def test_count_of_compilations_can_fail(first):
     """Another program is compiled and kept; one with a host callback never is."""
     cache, began = first

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import REPRESENTATIVE
 
 import mmrjax
 from mmrjax import balances, channels, effects, params, robots
@@ -684,7 +685,11 @@ def test_drive_without_amplitudes_is_drive_without_effects(drive_readings):
     np.testing.assert_allclose(drive_readings(jnp.zeros(len(ALL))), expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("k", range(len(ALL)), ids=[e.name for e in ALL])
+@pytest.mark.parametrize(
+    "k",
+    [k if e.name in REPRESENTATIVE else pytest.param(k, marks=pytest.mark.slow) for k, e in enumerate(ALL)],
+    ids=[e.name for e in ALL],
+)
 def test_drive_and_steady_both_feel(k, drive_readings):
     """At a tenth of the prior's standard deviation a reading moves by more than 1e-5, in both fidelities.
 

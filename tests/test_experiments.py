@@ -103,6 +103,7 @@ def seen():
     return {p: (c, space, f, experiments.prospect(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_is_what_an_engineer_would_do(pair, seen):
     proposal = experiments.choose(seen[pair][3])
@@ -111,6 +112,7 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
     assert len(proposal.table) == len(MENU) and proposal.table[0].experiments == proposal.experiments
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS)
 def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
@@ -198,6 +200,7 @@ def test_a_second_experiment_that_adds_nothing_is_not():
     )
 
 
+@pytest.mark.slow
 def test_alternatives_that_agree_give_none(seen):
     _, space, fitted, _ = seen["series_resistance", "supply_sag"]
     same = next(iter(fitted.values()))
@@ -206,6 +209,7 @@ def test_alternatives_that_agree_give_none(seen):
     assert proposal.expected_sigma == 0 and proposal.separates == ()
 
 
+@pytest.mark.slow
 def test_unaffected_experiment_separates_nothing(seen):
     foreseen = seen["series_resistance", "supply_sag"][3]
     assert foreseen.apart(0, 1, "weigh") == 0 and foreseen.apart(0, 1, "zero current") == 0
@@ -232,12 +236,14 @@ def test_alternatives_of_two_classes_differ_in_one_effect():
     assert list(left) == ["a + b", "c + b", "d + a"]
 
 
+@pytest.mark.slow
 def test_nothing_is_proposed_where_one_name_is_left(seen):
     space = seen["mass_error", "tension_friction"][1]
     (best,) = candidates("mass_error")
     assert experiments.separating(space, best, Classes((("mass_error",),), (best,)), SETTINGS) is None
 
 
+@pytest.mark.slow
 def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
     space = seen["mass_error", "tension_friction"][1]
     runs = int(space.included.sum())

@@ -105,6 +105,7 @@ def test_a_penalty_that_holds_nothing_moves_nothing(clean, truth):
     np.testing.assert_allclose(found.z, again.z, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_truth_is_recovered_from_clean_readings(clean, truth):
     found, _, _ = fit.searches(clean, starts(len(truth), 16), clean.data)
     assert np.all(found.converged)

@@ -188,6 +188,7 @@ def test_steady_stalls_exactly_below_the_voltage_that_breaks_away(robot):
     assert STATUSES[int(below.status)] == "stalled"
 
 
+@pytest.mark.slow
 def test_steady_stands_until_shafts_and_robot_are_faster_than_rest(robot):
     """A tenth of V_s = 2 mm/s: below, the fidelities resolve friction at rest differently, so both say `stalled`."""
     voltages = np.linspace(0.64, 1.2, 113)

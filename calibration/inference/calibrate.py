@@ -125,6 +125,7 @@ def calibrate(
         tied=estimates.tied(posed),
         noise=estimates.noise(posed, known, found.shares, measured),
         percent_of=observe.percent_of,
+        axis=observe.axis,
         errors_before=estimates.errors(observe, seen_before, measured, sd),
         errors_after=estimates.errors(observe, seen, measured, sd),
         held_out={kind: estimates.held_out(posed, h, measured, sd) for kind, h in held.items()},

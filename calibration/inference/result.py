@@ -247,7 +247,7 @@ class CalibrationResult:
         source: of the runs; model: the fidelity; seed: of the starts.
         parameters: the free ones, by name; tied: those that follow them, by name.
         noise: by channel.
-        percent_of: what errors in percent are of.
+        percent_of: what errors in percent are of; axis: column along which the rows of a run follow one another.
         errors_before, errors_after: of the robot as given and as calibrated, by channel.
         held_out: by kind of block, in the order in which they tell most.
         conditions: columns of the runs, as in their table; readings: by channel.
@@ -268,6 +268,7 @@ class CalibrationResult:
     tied: dict[str, Tie]
     noise: dict[str, ChannelNoise]
     percent_of: str
+    axis: str
     errors_before: Errors
     errors_after: Errors
     held_out: dict[str, HeldOut]

@@ -52,6 +52,7 @@ class Observer(eqx.Module):
         conditions: of each run, shape (runs,).
         word: what a row is; fewest: rows in which a missing effect can be told from noise.
         axes: columns of a table over which readings vary.
+        axis: of those, the one along which the rows of a run follow one another; empty where a run is one row.
         pad: rows are padded to a multiple of this, so that tables of about one size share what is compiled.
         blocks: kinds of blocks to hold out, the most telling first.
         percent_of: what errors in percent are of.
@@ -68,6 +69,7 @@ class Observer(eqx.Module):
     word: ClassVar[str]
     fewest: ClassVar[int]
     axes: ClassVar[tuple[str, ...]]
+    axis: ClassVar[str] = ""
     pad: ClassVar[int]
     blocks: ClassVar[tuple[str, ...]]
     percent_of: ClassVar[str]
@@ -110,6 +112,15 @@ class Observer(eqx.Module):
 
         Raises:
             BadData: a run that does not begin as the model does.
+        """
+
+    @classmethod
+    @abc.abstractmethod
+    def check_settled(cls, runs: Runs) -> None:
+        """Refuse runs that are not one settled row each.
+
+        Raises:
+            BadData: time histories.
         """
 
     @classmethod

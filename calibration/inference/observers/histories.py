@@ -107,6 +107,7 @@ class Histories(Observer):
     word: ClassVar[str] = "samples"
     fewest: ClassVar[int] = 24
     axes: ClassVar[tuple[str, ...]] = (*CONDITIONS, "time_s")
+    axis: ClassVar[str] = "time_s"
     pad: ClassVar[int] = 1
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
     percent_of: ClassVar[str] = "channel's root mean square"
@@ -171,7 +172,7 @@ class Histories(Observer):
         """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
         names, measured = _names(runs), runs.measured()
         # Current rises within a millisecond; what moves does not.
-        moving = [k for k, c in enumerate(channels.CHANNELS) if c.word in ("motor_speed", "speed")]
+        moving = [k for k, c in enumerate(channels.CHANNELS) if c.zero_at_rest]
         for name in np.unique(names):
             mine = np.flatnonzero(names == name)
             first = mine[np.argmin(runs["time_s"][mine])]
@@ -199,6 +200,12 @@ class Histories(Observer):
             f"runs of {runs['time_s'].max():.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft "
             "faster than some ten steps are not resolved; cut the runs to look for them"
         ]
+
+    @classmethod
+    def check_settled(cls, runs: Runs) -> None:
+        raise BadData(
+            f"{runs.source}: column time_s: time histories are for calibrate and loop; expected one row a run"
+        )
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:

@@ -116,6 +116,10 @@ class SettledRuns(Observer):
         return []
 
     @classmethod
+    def check_settled(cls, runs: Runs) -> None:
+        return
+
+    @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
         return tuple(c for c in runs.columns if c != "run_id")
 
