@@ -89,6 +89,6 @@ def test_loop_is_as_recorded(name):
 def test_calibration_is_as_recorded():
     was = RESULTS["calibrate"]["measured"]
     found = calibrate(tables.read("measured"), nominal(), noise=was["noise"])
-    assert found.cost == pytest.approx(was["objective"], rel=1e-3)
+    assert found.objective == pytest.approx(was["objective"], rel=1e-3)
     for name, (value, sd) in was["parameters"].items():
         assert abs(found.parameters[name].value - value) < 0.05 * sd, name
