@@ -16,7 +16,7 @@ demo: $(READY)
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
-# Everything: the tests that compile or run for long too, an hour on two cores.
+# Everything: the tests that compile or run for long too, about an hour on two cores.
 test-all: lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
