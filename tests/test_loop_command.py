@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -13,6 +14,7 @@ from types import SimpleNamespace
 
 import generator as g
 import generator_series as gs
+import jsonschema
 import numpy as np
 import pytest
 
@@ -117,6 +119,10 @@ def test_command_ends_well_and_says_what_it_found(done):
 
 def test_result_has_the_schema_of_the_issue(done):
     r = done.result
+    schema = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text())
+    jsonschema.validate(r, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**r, "verdict": "perhaps"}, schema)
     assert r["schema"] == "mmrjax.loop/1" and r["verdict"] in ("named", "class")
     (effect,) = r["effects"]
     assert {"name", "class", "balance", "equation", "parameters", "p_value", "score"} <= set(effect)
@@ -358,3 +364,41 @@ def test_report_of_histories_shows_what_only_they_tell(started):
     assert "What each equation lacks" not in page and "Settled runs show nothing" not in page
     figures = {p.stem for p in (started.folder / "found" / "figures").iterdir()}
     assert "series" in figures and "defects" not in figures
+
+
+# --- a channel more ----------------------------------------------------------------------------------
+
+FOURTH = """
+import csv, sys
+from mmrjax import channels
+channels.CHANNELS += (channels.Channel(
+    name="terminal_voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V", factor=1.0,
+    label="terminal voltage", word="voltage", range=(-200.0, 200.0), sd_largest=50.0,
+    read=lambda robot, signals: signals.voltage, sd_share=0.01,
+),)
+source, target, out, *priors = sys.argv[1:]
+rows = list(csv.DictReader(open(source)))
+for row in rows:
+    row |= {"terminal_voltage_V": row["supply_voltage_V"], "terminal_voltage_sd_V": "0.05"}
+with open(target, "w") as file:
+    table = csv.DictWriter(file, rows[0])
+    table.writeheader()
+    table.writerows(rows)
+sys.argv = ["mmrjax", "loop", target, "--out", out, "--replicates", "250", "--no-report", *priors]
+from sweeps.cli import main
+main()
+"""
+
+
+@pytest.mark.slow
+def test_fourth_channel_goes_through_the_loop_by_one_row(tmp_path):
+    source = Path(__file__).parent / "record" / "library.csv"
+    command = [sys.executable, "-c", FOURTH, source, tmp_path / "runs.csv", tmp_path / "found", *PRIORS]
+    done = subprocess.run(
+        list(map(str, command)), cwd=source.parents[2], capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "found" / "result.json").read_text())
+    assert "churning" in found["effects"][0]["class"] and "terminal_voltage" in found["noise"]
+    assert found["chi2"]["readings"] == 4 * found["rows"]
+    assert found["errors"]["after"]["fitted"]["terminal_voltage"]["rows"] == found["rows"]
