@@ -287,6 +287,7 @@ WRONG = {
     "contract": (["--effects", "mine.py"], "mine.py, PayloadBinding, balance: got trakc; did you mean track?"),
     "few replicates": (["--replicates", "10"], "option replicates: got 10"),
     "prior twice": (["--prior", "motor.resistance=1±0.1"] * 2, "--prior motor.resistance: given twice"),
+    "prior of a former name": (["--prior", "tracked.mu=1±0.1"], "6T2A.mu"),
     "prior of nothing": (["--prior", "motor.resistence=1±0.1"], "motor.resistance"),
 }
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.data import robot_file
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -64,6 +65,8 @@ def discover(
         BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be.
     """
     distinct, numbers, notes = without_copies(runs)
+    stated = dict(stated or {})
+    stated = dict(zip(robot_file.current_names(stated, robot, notes), stated.values(), strict=True))
     kind = observers.kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
