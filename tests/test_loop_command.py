@@ -288,6 +288,10 @@ WRONG = {
     "few replicates": (["--replicates", "10"], "option replicates: got 10"),
     "prior twice": (["--prior", "motor.resistance=1±0.1"] * 2, "--prior motor.resistance: given twice"),
     "prior of a former name": (["--prior", "tracked.mu=1±0.1"], "6T2A.mu"),
+    "prior by both names": (
+        ["--prior", "tracked.ground.friction.static=1±0.1", "--prior", "6T2A.ground.friction.static=1±0.1"],
+        "--prior, tracked.ground.friction.static: its new name 6T2A.ground.friction.static is stated too",
+    ),
     "prior of nothing": (["--prior", "motor.resistence=1±0.1"], "motor.resistance"),
 }
 

@@ -9,7 +9,7 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 
@@ -19,6 +19,8 @@ from calibration.data.errors import BadConfiguration, choices, number
 from mmrjax import effects, params, robots
 from mmrjax.robot import Robot
 from mmrjax.tables import TRACKED, WHEELED
+
+T = TypeVar("T")
 
 SCHEMA = "mmrjax.robot/2"
 #: Schemas that are read; in the first, configurations had the names of OLD_NAMES.
@@ -150,6 +152,22 @@ def current_names(names: Iterable[str], robot: Robot, notes: list[str] | None = 
     return found
 
 
+def current_values(values: Mapping[str, T], robot: Robot, where: str, notes: list[str] | None = None) -> dict[str, T]:
+    """What is stated of parameters, by their names as `current_names` brings them up to date.
+
+    Args:
+        where: opens the message of an error; notes: as for `current_names`.
+
+    Raises:
+        BadConfiguration: a parameter is stated by its former and its new name.
+    """
+    names = current_names(values, robot, notes)
+    for old, name in zip(values, names, strict=True):
+        if names.count(name) > 1:
+            raise BadConfiguration(f"{where}, {old}: its new name {name} is stated too; state it once")
+    return dict(zip(names, values.values(), strict=True))
+
+
 def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
     """The robot with parameters replaced, each checked against its field; `sides` and `battery.cells` too.
 
@@ -159,11 +177,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     Raises:
         BadConfiguration: as `read`.
     """
-    names = current_names(values, robot, notes)
-    for old, name in zip(values, names, strict=True):
-        if names.count(name) > 1:
-            raise BadConfiguration(f"{where}, {old}: its new name {name} is stated too; state it once")
-    stated = dict(zip(names, values.values(), strict=True))
+    stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     known = {p.name: p for p in params.walk(robot)}
     for name, value in stated.items():

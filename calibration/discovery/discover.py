@@ -65,8 +65,7 @@ def discover(
         BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be.
     """
     distinct, numbers, notes = without_copies(runs)
-    stated = dict(stated or {})
-    stated = dict(zip(robot_file.current_names(stated, robot, notes), stated.values(), strict=True))
+    stated = robot_file.current_values(stated or {}, robot, "--prior", notes)
     kind = observers.kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(

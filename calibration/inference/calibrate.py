@@ -78,8 +78,7 @@ def calibrate(
 
     former: list[str] = []
     free, fix = (robot_file.current_names(names, robot, former) for names in (free, fix))
-    stated = dict(stated or {})
-    stated = dict(zip(robot_file.current_names(stated, robot, former), stated.values(), strict=True))
+    stated = robot_file.current_values(stated or {}, robot, "--prior", former)
     for sentence in former:
         tell(sentence)
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
