@@ -23,7 +23,7 @@ from calibration.discovery.settings import settings_for
 from calibration.inference import bases, noise
 from calibration.inference.linearization import PROBED, scored, shape_of
 from calibration.inference.observers import Histories
-from calibration.inference.optimizers import gauss_newton
+from calibration.inference.optimizers import levenberg_marquardt
 from mmrjax import params, robots
 from mmrjax.effects import BY_NAME, UNNAMED
 from mmrjax.effects.curve import weights
@@ -207,7 +207,7 @@ def test_linear_bootstrap_is_that_of_refits(clean):
 
     def chi2(noise_):
         data = dataclasses.replace(problem.data, measured=clean_reading + problem.data.sd * noise_, centre=z)
-        back = gauss_newton(problem, z, data, 3)
+        back = levenberg_marquardt(problem, z, data, max_steps=6)[0].z
         return jnp.sum(problem.misfit(back, data) ** 2) + jnp.sum((back - z) ** 2), jnp.sum(noise_**2)
 
     after, before = jax.jit(lambda d: jax.lax.map(chi2, d))(draw)

@@ -14,7 +14,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import Normal, backward, cholesky, forward
+from calibration.inference.normal_equations import Normal, cholesky, forward
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.robot import Robot
 
@@ -306,20 +306,6 @@ def searches_long(
 @jax.jit
 def _where(which: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
-
-
-def gauss_newton(problem: Problem, z: Z, data: Data, steps: int) -> Z:
-    """A few Gauss-Newton steps: the refit of a bootstrap's replicate, whose truth is the start."""
-    function = residuals(problem, data, no_pin(z.shape[0]))
-
-    def step(_: Any, z: Z) -> Z:
-        jacobian, r = jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(z)
-        lower = cholesky(jacobian.T @ jacobian)
-        move = backward(lower, forward(lower, jacobian.T @ r))
-        move = jnp.where(jnp.all(jnp.isfinite(move)), move, 0.0)
-        return z - move * jnp.minimum(1.0, 3.0 / jnp.maximum(jnp.linalg.norm(move), 1e-9))
-
-    return jax.lax.fori_loop(0, steps, step, z)
 
 
 def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) -> Optimum:

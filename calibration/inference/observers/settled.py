@@ -20,7 +20,7 @@ from calibration.inference.details import EquationDefects
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Observer, SearchPolicy
-from calibration.inference.optimizers import Optimum, gauss_newton, levenberg_marquardt
+from calibration.inference.optimizers import Optimum, levenberg_marquardt
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities
 from mmrjax.conditions import Conditions
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 CONTRADICTION = 6.0
 #: The same for replicates whose sd is not known, as a share of their mean.
 CONTRADICTION_SHARE = 0.25
-#: Gauss-Newton steps of a replicate's refit.
-STEPS = 4
 #: Balances to which the defect of a row is attributed, one for each equation that the channels close.
 EQUATIONS = ("electrical", "track", "slip")
 
@@ -206,7 +204,7 @@ class SettledRuns(Observer):
         key: Array,
     ) -> Linearization:
         """As the protocol says. Readings are drawn with their sds, and the bench values too: a prior is a
-        measurement made beforehand."""
+        measurement made beforehand. The refit is the search that found the fit, from the truth."""
         one, two = jax.random.split(key)
         clean = problem.observation(z).reading
         noisy = dataclasses.replace(
@@ -214,7 +212,8 @@ class SettledRuns(Observer):
             measured=clean + data.sd * jax.random.normal(one, clean.shape),
             centre=z + jax.random.normal(two, z.shape),
         )
-        return self.linearise(problem, gauss_newton(problem, z, noisy, STEPS), noisy, effects)
+        refit, _ = levenberg_marquardt(problem, z, noisy, max_steps=self.policy.steps)
+        return self.linearise(problem, refit.z, noisy, effects)
 
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
