@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from calibration.data.errors import BadData
 from calibration.discovery.active_set import CandidateSpace
@@ -18,7 +16,7 @@ from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_in_batches
 from calibration.inference.linearization import amplitude_of
 from calibration.inference.optimizers import Optimum
-from calibration.inference.problem import Observation, Problem
+from calibration.inference.problem import Observation
 
 #: Fewest rows that a base can be fitted to.
 FEWEST = 4
@@ -132,31 +130,19 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
 
 
 def _base_searches(space: CandidateSpace, settings: Settings) -> tuple[Optimum, Observation]:
-    """Where searches of the base end, from the prior mean and from draws of the prior, and what it says there.
+    """Where searches of the base end, from the starts that its data propose, and what it says there.
 
-    Where rollouts are dear they run without slots, from the best of many draws.
+    Where rollouts are slow they run without slots.
     """
-    policy, p = space.bare.observe.policy, space.free
-    random = np.random.default_rng(settings.seed)
-    if policy.draws:
-        draws = random.standard_normal((policy.draws, p))
-        order = np.argsort(np.asarray(_costs(space.bare, jnp.asarray(draws))))
-        starts = np.concatenate([np.zeros((1, p)), draws[order[: policy.searches - 1]]])
-        weights = jnp.repeat(space.bare.data.weight[None], policy.searches, 0)
-        return jax.device_get(space.bare.observe.search(space.bare, jnp.asarray(starts), weights, rivals=True))
-    starts = np.zeros((policy.searches, len(space.coordinates)))
-    starts[1:, :p] = random.standard_normal((policy.searches - 1, p))
-    none = [space.library.indices(empty(settings))] * policy.searches
-    return search_in_batches(space.equipped, list(starts), [space.weight] * policy.searches, none)
-
-
-@eqx.filter_jit
-def _costs(problem: Problem, zs: Array) -> Array:
-    def one(z: Array) -> Array:
-        cost = jnp.sum(problem.misfit(z, problem.data) ** 2) + jnp.sum(z**2)
-        return jnp.where(jnp.isfinite(cost), cost, jnp.inf)
-
-    return jax.lax.map(one, zs, batch_size=16)
+    observe, p = space.bare.observe, space.free
+    starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
+    if observe.long:
+        weights = jnp.repeat(space.bare.data.weight[None], len(starts), 0)
+        return jax.device_get(observe.search(space.bare, jnp.asarray(starts), weights, rivals=True))
+    wide = np.zeros((len(starts), len(space.coordinates)))
+    wide[:, :p] = starts
+    none = [space.library.indices(empty(settings))] * len(starts)
+    return search_in_batches(space.equipped, list(wide), [space.weight] * len(starts), none)
 
 
 Proposal = tuple[tuple[str, ...], np.ndarray]

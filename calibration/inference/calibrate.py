@@ -71,7 +71,7 @@ def calibrate(
     observe = observers.kind(runs)
     facts = observers.facts(model)
     effort = facts.effort
-    starts = (observe.starts or effort.starts) if starts is None else starts
+    starts = (observe.searches or effort.starts) if starts is None else starts
     profiles = effort.profiles if profiles is None else profiles
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
@@ -169,7 +169,7 @@ def _searched(
 ) -> tuple[Found, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
-    points = np.concatenate([np.zeros((1, size)), rng.standard_normal((max(starts, 1) - 1, size))])
+    points = posed.observe.starts(posed, rng, starts)
     if not posed.observe.long:
         return multistart.search(posed, known, points), None
     if not posed.observe.eased:

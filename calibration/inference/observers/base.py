@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from calibration.data.runs import Runs
 from calibration.inference.bases import Bases
@@ -33,14 +33,12 @@ class SearchPolicy:
     Attributes:
         batch: fits in one batch.
         steps: most steps of one.
-        draws: of the prior, of which the best begin a search of the base.
         searches: of the base.
         one_by_one: whether outliers are set aside one at a time, with a fit after each.
     """
 
     batch: int = 16
     steps: int = 60
-    draws: int = 0
     searches: int = 16
     one_by_one: bool = True
 
@@ -61,7 +59,7 @@ class Observer(eqx.Module):
             different numbers of terms (waves have two a run) how improbable that is, `curve`.
         rows_tell: whether a single row shows a defect by itself.
         evidence: kinds of evidence that something is missing.
-        starts: searches of a calibration; None takes the fidelity's.
+        searches: of a calibration; None takes the fidelity's.
     """
 
     conditions: eqx.AbstractVar[Conditions]
@@ -77,7 +75,7 @@ class Observer(eqx.Module):
     compares: ClassVar[str]
     rows_tell: ClassVar[bool]
     evidence: ClassVar[tuple[str, ...]]
-    starts: ClassVar[int | None] = None
+    searches: ClassVar[int | None] = None
 
     # --- of a table, before anything is simulated
 
@@ -194,6 +192,15 @@ class Observer(eqx.Module):
             linear: the same fit, linearised.
             key: random.
         """
+
+    def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
+        """Coordinates at which at most `count` searches of a base begin: the prior mean, and draws of the prior.
+
+        Args:
+            problem: without effects in its coordinates.
+        """
+        size = len(problem.coordinates)
+        return np.concatenate([np.zeros((1, size)), random.standard_normal((max(count, 1) - 1, size))])
 
     @abc.abstractmethod
     def search(

@@ -20,6 +20,7 @@ from calibration.inference.details import Memory, Strongest, TimeSide, TimeStati
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import backward, cholesky, forward
+from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Optimum, linearised, searches_long
 from calibration.inference.problem import Data, Observation, Problem
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 KNOTS, KNOT_STEPS = 256, 1e7
 #: Lags of a run's residual that are looked at, at most a quarter of its samples.
 LAGS = 12
+#: Of a chassis' friction law what only sliding shows.
+SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 
@@ -111,13 +114,11 @@ class Histories(Observer):
     pad: ClassVar[int] = 1
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
     percent_of: ClassVar[str] = "channel's root mean square"
-    #: Draws of the prior among which the starts are chosen: far off, a start slides where the measured one grips,
-    #: and a search from there stays.
-    policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, draws=128, searches=16, one_by_one=False)
+    policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
     compares: ClassVar[str] = "curve"
     rows_tell: ClassVar[bool] = False
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
-    starts: ClassVar[int | None] = 8
+    searches: ClassVar[int | None] = 8
 
     conditions: Conditions
     times: Float[Array, "runs instants"]
@@ -218,7 +219,7 @@ class Histories(Observer):
 
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return ("motor.inductance", "motor.inertia"), ("inertia", "ground.friction.dynamic")
+        return ("motor.inductance", "motor.inertia"), ("inertia", *SLIDING)
 
     @classmethod
     def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
@@ -365,6 +366,17 @@ class Histories(Observer):
         counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
         noise = counts * jax.random.normal(key, counts.shape)
         return linear.with_residual(noise - jacobian @ backward(lower, forward(lower, jacobian.T @ noise)))
+
+    def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
+        """As the protocol says; see `settled_ends`."""
+
+        def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
+            weights = jnp.repeat(blunt.data.weight[None], len(starts), 0)
+            evaluate = lambda z: _evaluate(blunt, z, weights, None)  # noqa: E731
+            return searches_long(evaluate, jnp.asarray(starts), blunt.data, weights, steps)[0]
+
+        draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
+        return settled_ends.starts(problem, draws, search)[:count]
 
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False

@@ -1,0 +1,233 @@
+"""Where fits of histories begin: at what their settled ends say, for any adhesion of the ground.
+
+The misfit of a start has valleys: a run that grips where the measured one slides, or the other way round, stays so
+all the way down. How a run ends depends on that by its creep alone, so the base is fitted to the settled ends first,
+by `steady`, once for each adhesion of a grid. Histories are then fitted from there and from draws of the prior with
+blunt instruments, which lets no inrush outweigh all the rest; and since configurations share the drive alone, the
+best of each is put together with the best of the others.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import stats
+
+from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.optimizers import Optimum, Pin, levenberg_marquardt
+from calibration.inference.priors import TIED
+from calibration.inference.problem import Problem, data_of
+from mmrjax import channels
+
+if TYPE_CHECKING:
+    from calibration.inference.observers.histories import Histories
+
+#: Adhesions that are tried [-].
+ADHESIONS = (0.15, 0.2, 0.27, 0.36, 0.48, 0.64, 0.85, 1.1)
+#: Adhesion [-] and V_s [m/s] of the surfaces that are drawn.
+SURFACES = {"ground.friction.static": (0.15, 1.2), "ground.friction.speed_static": (0.002, 0.08)}
+#: Share of a run that is its end, and change of a channel between the halves of an end that is settled: as a share of
+#: the reading, and in sds of the difference.
+END, CHANGE, CHANGE_SD = 0.2, 0.02, 4.0
+#: Slip of the movers beyond which a run slides: it tells nothing of settled travel [-].
+SLIDES = 0.4
+#: Least relative sd of an end's mean: what is not quite settled is no better known [-].
+FLOOR = 0.01
+#: Shares of the V_s at the settled ends that are tried: creep at the noise's size does not tell it.
+FINER = (1.0, 0.25)
+#: Steps of a fit to settled ends; of one with blunt instruments, and how many of those there are.
+STEPS, STEPS_BLUNT, SEARCHES = 40, 20, 16
+#: Sd of a blunt instrument, over its channel's root mean square [-].
+BLUNT = 0.03
+#: Draws of the prior, beside the settled ends.
+DRAWS = 96
+STATIC, CREEP = "ground.friction.static", "ground.friction.speed_static"
+
+
+@dataclasses.dataclass(frozen=True)
+class Ends:
+    """Means over the settled ends of runs.
+
+    Attributes:
+        mean, sd: [SI], NaN where a channel is not read or not settled, shape (runs, channels).
+    """
+
+    mean: np.ndarray
+    sd: np.ndarray
+
+
+def settled_ends(problem: Problem) -> Ends:
+    """What the runs of a problem show at their ends, as far as they are settled."""
+    observe, data = problem.observe, problem.data
+    measured, sd, weight = (np.asarray(x) for x in (data.measured, data.sd, data.weight))
+    rows_of, time = np.asarray(observe.rows_of), np.asarray(observe.time)  # type: ignore[attr-defined]
+    mean, error = (np.full((len(rows_of), measured.shape[1]), np.nan) for _ in range(2))
+    for k, mine in enumerate(rows_of):
+        rows = mine[mine >= 0]
+        end = rows[time[rows] >= (1 - END) * time[rows[-1]]]
+        for c in range(measured.shape[1]):
+            these = end[weight[end, c] > 0]
+            if len(these) < 4:
+                continue
+            halves = np.array_split(measured[these, c], 2)
+            change = abs(halves[1].mean() - halves[0].mean())
+            noise = 2 * np.median(sd[these, c]) / np.sqrt(len(these))
+            size = abs(measured[these, c].mean())
+            if change < max(CHANGE * size, CHANGE_SD * noise):
+                mean[k, c] = measured[these, c].mean()
+                error[k, c] = max(noise / 2, FLOOR * size)
+    return Ends(mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan))
+
+
+def starts(
+    problem: Problem, draws: Float[np.ndarray, "draws parameters"], search: Callable[..., Optimum]
+) -> Float[np.ndarray, "starts parameters"]:
+    """Coordinates at which searches of a base may begin, the most promising first.
+
+    Args:
+        problem: of histories, without effects in its coordinates.
+        draws: of the prior, tried beside the settled ends.
+        search: (problem, starts, most steps) → where a batch of searches of its ends.
+    """
+    ends = _at_ends(problem)
+    friction = np.array(["ground.friction." in n for n in problem.coordinates.names])
+    points = np.concatenate([ends, np.where(friction, _spread(problem, draws), ends[0]), 0 * ends[:1], draws])
+    blunt = _blunt(problem)
+    found = search(blunt, _recombined(blunt, points)[:SEARCHES], STEPS_BLUNT)
+    ended = np.asarray(found.z)[np.argsort(np.asarray(found.cost))]
+    return np.concatenate([_recombined(blunt, ended)[:1], ended])
+
+
+def _recombined(problem: Problem, points: np.ndarray) -> np.ndarray:
+    """Points with the parameters of each configuration exchanged, so that the k-th has what fits its runs k-th best;
+    what is shared is that of the point that fits all runs best."""
+    by_run = _misfit_of_runs(problem, points)
+    mixed = np.tile(points[int(np.argmin(by_run.sum(1)))], (len(points), 1))
+    which = np.asarray(problem.observe.conditions.configuration)
+    for k, name in enumerate(problem.base.configurations):
+        own = [j for j, n in enumerate(problem.coordinates.names) if n.startswith(f"{name}.")]
+        if own and (which == k).any():
+            order = np.argsort(by_run[:, which == k].sum(1), kind="stable")
+            mixed[:, own] = points[order][:, own]
+    return mixed
+
+
+def _spread(problem: Problem, draws: np.ndarray) -> np.ndarray:
+    """Draws with adhesion and V_s spread evenly (in logarithms) over what surfaces show, dynamic values in their
+    nominal ratio to static ones."""
+    out = []
+    for z in draws:
+        z = z.copy()
+        for k, name in enumerate(problem.coordinates.names):
+            for suffix, (low, high) in SURFACES.items():
+                if name.endswith(suffix):
+                    share = stats.norm.cdf(z[k])
+                    z[k] = _coordinate(problem, k, low * (high / low) ** share)
+        out.append(_with_sliding(problem, z, 1.0))
+    return np.stack(out)
+
+
+def _coordinate(problem: Problem, k: int, value: float) -> float:
+    """The coordinate at which a parameter has a value [SI]."""
+    c = problem.coordinates
+    return float(((np.log(value) if c.scale[k] else value) - c.location[k]) / c.spread[k])
+
+
+def _blunt(problem: Problem) -> Problem:
+    """The problem as it would be with blunt instruments."""
+    data = problem.data
+    count = np.maximum(np.sum(np.asarray(data.weight) > 0, 0), 1)
+    rms = np.sqrt(np.sum(np.asarray(data.weight > 0) * np.asarray(data.measured) ** 2, 0) / count)
+    return dataclasses.replace(problem, data=dataclasses.replace(data, sd=jnp.hypot(data.sd, BLUNT * rms)))
+
+
+def _at_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
+    """Fits to the settled ends: with each adhesion of the grid, and with a free one."""
+    names = problem.coordinates.names
+    statics = [k for k, n in enumerate(names) if n.endswith(STATIC)]
+    ends = settled_ends(problem)
+    mean = np.where(_sliding(problem, ends)[:, None], np.nan, ends.mean)
+    observe = SettledRuns(problem.observe.conditions, "steady")
+    here = Problem(problem.base, problem.coordinates, observe, data_of(mean, ends.sd, len(names)))
+    pinned = np.stack([_with_adhesion(problem, np.zeros(len(names)), a) for a in ADHESIONS])
+    held = np.zeros(pinned.shape, bool)
+    held[:, statics] = True
+    fitted = jax.device_get(_pinned(here, jnp.asarray(pinned), jnp.asarray(held)))
+    free = jax.device_get(_pinned(here, jnp.asarray(fitted.z), jnp.zeros(held.shape, bool)))
+    best = free.z[int(np.argmin(np.where(np.isfinite(free.cost), free.cost, np.inf)))]
+    wanted = [z for z in (best, *fitted.z) if np.all(np.isfinite(z))]
+    return np.stack([_with_sliding(problem, z, share) for z in wanted for share in FINER])
+
+
+def _sliding(problem: Problem, ends: Ends) -> np.ndarray:
+    """Whether a run's movers spin at its end, shape (runs,)."""
+    if not {"motor_speed", "speed"} <= set(channels.names()):
+        return np.zeros(len(ends.mean), bool)
+    turning, travelling = (ends.mean[:, channels.index(c)] for c in ("motor_speed", "speed"))
+    robot = problem.base
+    radius = np.array([float(c.radius) for c in robot.configurations.members])
+    circumference = radius[np.asarray(problem.observe.conditions.configuration)] * turning
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slip = 1 - travelling / (circumference / float(robot.gearbox.ratio))
+    return np.nan_to_num(slip) > SLIDES
+
+
+def _with_adhesion(problem: Problem, z: np.ndarray, adhesion: float) -> np.ndarray:
+    """z with this adhesion in every configuration."""
+    z, c = z.copy(), problem.coordinates
+    for k, name in enumerate(c.names):
+        if name.endswith(STATIC):
+            z[k] = _coordinate(problem, k, adhesion)
+    return z
+
+
+def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
+    """z with a share of its V_s, and what settled ends do not show in the nominal ratio to what they do."""
+    c = problem.coordinates
+    value = np.array(c.value(jnp.asarray(z)))
+    nominal = np.asarray(c.value(jnp.zeros(len(c))))
+    for k, name in enumerate(c.names):
+        if name.endswith(CREEP):
+            value[k] *= share
+    for k, name in enumerate(c.names):
+        for follower, leader in TIED:
+            if name.endswith(follower) and (own := name.removesuffix(follower) + leader) in c.names:
+                j = c.names.index(own)
+                value[k] = nominal[k] * value[j] / nominal[j]
+    inside = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
+    changed = value != np.asarray(c.value(jnp.asarray(z)))
+    return np.where(changed, (inside - np.asarray(c.location)) / np.asarray(c.spread), z)
+
+
+@eqx.filter_jit
+def _pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
+    def one(z: Array, held: Array) -> Optimum:
+        return levenberg_marquardt(problem, z, problem.data, Pin(held, z), max_steps=STEPS)[0]
+
+    return jax.vmap(one)(starts, held)
+
+
+def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
+    """Sum of squares of the readings of each run at each point [σ²], infinite where one cannot be followed; shape
+    (points, runs)."""
+    observe: Histories = problem.observe  # type: ignore[assignment]
+    by_row = np.sum(np.asarray(_misfits(problem, jnp.asarray(points))) ** 2, 2)
+    by_run = np.zeros((len(points), len(observe.rows_of)))
+    np.add.at(by_run.T, np.asarray(observe.run), by_row.T)
+    return np.where(np.isfinite(by_run), by_run, np.inf)
+
+
+@eqx.filter_jit
+def _misfits(problem: Problem, zs: Array) -> Array:
+    """Whitened residuals of the readings at each point, shape (points, rows, channels)."""
+    shape = problem.data.measured.shape
+    return jax.lax.map(
+        lambda z: problem.misfit(z, problem.data)[: problem.data.measured.size].reshape(shape), zs, batch_size=16
+    )
