@@ -64,6 +64,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
         adhesion=conditions.adhesion,
         battery=conditions.battery,
         discharge=state.discharge,
+        order=conditions.order,
         memory=state.memory,
         current=state.current,
         speed_motor=state.speed_motor,

@@ -31,6 +31,7 @@ class Conditions(eqx.Module):
         discharge: charge C_b already taken from the battery [C].
         adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
         total_mass: mass of robot and payload as weighed [kg]; None takes the robot's own mass and the payload.
+        order: place in the sequence of runs; what drifts from run to run depends on it [-].
     """
 
     configuration: Int[Array, "..."] | np.ndarray
@@ -41,6 +42,7 @@ class Conditions(eqx.Module):
     discharge: Float[Array, "..."]
     adhesion: Float[Array, "..."]
     total_mass: Float[Array, "..."] | None
+    order: Float[Array, "..."]
 
     def __init__(
         self,
@@ -52,21 +54,24 @@ class Conditions(eqx.Module):
         discharge: Number = 0.0,
         adhesion: Number = 1.0,
         total_mass: Number | None = None,
+        order: Number = 0.0,
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
             which = jnp.asarray(which).astype(int)
-        numbers = [jnp.asarray(v, float) for v in (voltage, slope_deg, payload, battery, discharge, adhesion)]
+        given = (voltage, slope_deg, payload, battery, discharge, adhesion, order)
+        numbers = [jnp.asarray(v, float) for v in given]
         mass = None if total_mass is None else jnp.asarray(total_mass, float)
         shapes = [x.shape for x in (which, *numbers, *([] if mass is None else [mass]))]
         try:
             shape = jnp.broadcast_shapes(*shapes)
         except ValueError:
-            of = dict(zip([f.name for f in dataclasses.fields(type(self))], shapes, strict=False))
+            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in ("total_mass", "order")]
+            of = dict(zip([*names, "order", "total_mass"], shapes, strict=False))
             said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
         self.configuration = (np if which.dtype.kind == "U" else jnp).broadcast_to(which, shape)
-        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = (
+        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion, self.order = (
             jnp.broadcast_to(x, shape) for x in numbers
         )
         self.total_mass = None if mass is None else jnp.broadcast_to(mass, shape)

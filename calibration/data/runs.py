@@ -30,6 +30,8 @@ CONDITIONS: dict[str, tuple[float, float]] = {
     "slope_deg": (-45.0, 45.0),
 }
 TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
+#: Place of a row in the sequence in which runs were made; without it that of the row in the file.
+ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
 WORDS = ("configuration", "surface", "run_id")
 #: Columns that every table has to have, and those that a table without measurements may lack.
 REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
@@ -45,14 +47,14 @@ def measured_columns() -> tuple[str, ...]:
 def known_columns() -> tuple[str, ...]:
     """Every column that means something in a table of runs."""
     deviations = tuple(c.sd_column for c in channels.CHANNELS)
-    return (*REQUIRED, *measured_columns(), *deviations, "surface", "run_id", "time_s")
+    return (*REQUIRED, *measured_columns(), *deviations, "surface", "run_id", "time_s", *ORDER)
 
 
 def _ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
     readings = {c.column: c.range for c in channels.CHANNELS}
     deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.CHANNELS}
-    return {**CONDITIONS, **readings, **deviations, **TIME}
+    return {**CONDITIONS, **readings, **deviations, **TIME, **ORDER}
 
 
 #: Tables that come with the package.
@@ -162,6 +164,7 @@ class Runs:
             discharge=discharge,
             adhesion=adhesion,
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
+            order=self["order"] if self.has("order") else 0.0,
         )
 
 
@@ -212,6 +215,8 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
             columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
     _check_mass(name, columns)
     _check_deviations(name, columns)
+    if "order" not in columns and "time_s" not in columns:
+        columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c in header if c not in known_columns())
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest())
 

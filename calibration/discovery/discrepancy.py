@@ -68,11 +68,15 @@ def locate(observe: Observer, scores: ScoreTable, bases: Bases) -> Location:
     """Balance and variable of the curve that explains most, and the balances in which one explains as much."""
     names = bases_room.names(bases)
     deviate, by = np.asarray(scores.curve), np.asarray(getattr(scores, observe.compares))
-    k = int(deviate.argmax())
+    happens = np.array([bases_room.window(n[1]) is not None for n in names])
+    # A smooth curve shows something of what happens for a while, and the other way round.
+    for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
+    those = [j for j in range(len(names)) if happens[j] == for_a_while]
+    k = max(those, key=lambda j: deviate[j])
     balance = names[k][0]
-    over = [j for j, n in enumerate(names) if n[0] == balance and n[1] != bases_room.CONDITIONS]
-    j = max(over, key=lambda j: by[j])
-    best = {b: max(deviate[i] for i, n in enumerate(names) if n[0] == b) for b in bases_room.BALANCES}
+    over = [j for j in those if names[j][0] == balance and names[j][1] != bases_room.CONDITIONS]
+    j = k if for_a_while else max(over, key=lambda j: by[j])
+    best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in bases_room.BALANCES}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     explained = np.asarray(scores.explained)
     return Location(balance, names[j][1], tuple(itertools.chain(*alike)), float(explained[j]), float(explained[k]))
@@ -165,7 +169,7 @@ def fit_discrepancy(
 
     Args:
         base: the fit that leaves it; linear: the same, linearised.
-        balance: one of `bases.BALANCES`; variable: one of `bases.VARIABLES`, or of `bases.ORDERS`.
+        balance: one of `bases.BALANCES`; variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
     included = space.included
     at_base = smooth(linear, balance, variable, included)

@@ -317,8 +317,7 @@ def statement(verdict: str, p: float, classes: Sequence[Sequence[str]], where: L
         others = [b for b in where.alike if b != where.balance]
         also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
         return (
-            f"Something is missing in the balance {where.balance}{also}, best shown over "
-            f"{where.variable.replace('_', ' ')}, and no effect of the library explains it "
+            f"Something is missing in the balance {where.balance}{also}, {shown_over(where.variable)}, and no effect of the library explains it "
             f"(family-wise p {said_p(p)})."
         )
     names = []
@@ -327,6 +326,16 @@ def statement(verdict: str, p: float, classes: Sequence[Sequence[str]], where: L
         names.append(words[0] if len(words) == 1 else unsure)
     left = "" if where is None else f" Something remains in the balance {where.balance}."
     return f"Missing: {'; '.join(names)} (family-wise p {said_p(p)}).{left}"
+
+
+def shown_over(variable: str) -> str:
+    """Where a discrepancy shows, in words."""
+    happens = bases_room.window(variable)
+    if happens is None:
+        return f"best shown over {variable.replace('_', ' ')}" if variable != "order" else "drifting from run to run"
+    if happens.axis == "time":
+        return f"from {happens.low:.3g} to {happens.high:.3g} s after the start of the runs"
+    return f"in runs {happens.low:.0f} to {happens.high:.0f}"
 
 
 def said_p(p: float) -> str:

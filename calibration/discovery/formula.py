@@ -16,6 +16,8 @@ from mmrjax.signals import Signals
 
 #: What a formula is called, in the symbols of the paper.
 SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV"}
+#: Variables over which things fade: symbol, and unit of its constant.
+FADING = {"time": ("t", " s"), "order": ("k", "")}
 #: Exponents of a factor alone, and in a product of two.
 POWERS, POWERS_PRODUCT = (-1.0, 0.5, 1.0, 2.0, 3.0), (-1.0, 0.5, 1.0, 2.0)
 #: Second terms that are tried beside each first one.
@@ -146,7 +148,9 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     """
     if curve.wave:
         return _harmonic(balance, curve)
-    if curve.variable == "time":
+    if curve.happening:
+        return _while(balance, curve)
+    if curve.variable in FADING:
         return _decay(linear, balance, counts, curve)
     rows = len(counts)
     ratios = np.stack([r(linear.signals, rows) for r in RATIOS], 1)
@@ -211,10 +215,19 @@ def _harmonic(balance: str, curve: Smooth) -> Proposal:
     return Proposal(formula, (), (size,), (float("nan"),), ("angle of the driving shaft",), curve.explained, 0.0, 1)
 
 
+def _while(balance: str, curve: Smooth) -> Proposal:
+    """What happens for a while: its mean over that."""
+    level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
+    formula = f"{SYMBOL[balance]} = {level:.2g} {BALANCES[balance][0]} while {curve.variable}"
+    axis = curve.variable.split()[0]
+    return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
+
+
 def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
-    """What fades with the time since the start: an exponential, its time constant from a grid over the length of the
-    runs. A level beside it is left to the base."""
-    t = linear.variable("time")
+    """What fades with the time since the start or from run to run: an exponential, its constant from a grid over the
+    length of the runs or of the table. A level beside it is left to the base."""
+    t = linear.variable(curve.variable)
+    symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())
     project, cost = Projection(linear), np.log(3 * counts.sum())
@@ -225,8 +238,8 @@ def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoot
     if not best[1]:
         return Proposal("none: no term shows in these data", (), (), (), (), 0.0, 0.0, len(constants))
     tau, value, sd = best[1]
-    formula = f"{SYMBOL[balance]} = {value:.2g} {BALANCES[balance][0]} exp(-t / {tau:.2g} s)"
+    formula = f"{SYMBOL[balance]} = {value:.2g} {BALANCES[balance][0]} exp(-{symbol} / {tau:.2g}{unit})"
     gain = float(curve.freedom * cost - curve.explained - best[0])
     return Proposal(
-        formula, (), (float(value),), (float(sd),), ("time",), float(2 * cost - best[0]), gain, len(constants)
+        formula, (), (float(value),), (float(sd),), (curve.variable,), float(2 * cost - best[0]), gain, len(constants)
     )

@@ -119,7 +119,7 @@ def _curve_score(linear: Linearization, columns: Array) -> tuple[Array, Array]:
     freedom = jnp.maximum(freedom, 1e-3)
     spread = 2 / (9 * freedom)
     deviate = ((explained / freedom) ** (1 / 3) - (1 - spread)) / jnp.sqrt(spread)
-    return deviate, explained
+    return jnp.where(jnp.any(seen), deviate, -1.0 / ABSORBED), explained
 
 
 class Statistics(eqx.Module):

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.discovery.projection import Projection, columns_of
-from calibration.inference.bases import ORDERS
+from calibration.inference.bases import ORDERS, window
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import ORDINATES, weights
 
 #: Priors that are tried for the ordinates: correlation lengths [spacings], sizes [σ that an ordinate makes].
 LENGTHS, SIZES = (1.0, 1.5, 2.5, 4.0), tuple(np.geomspace(0.3, 300.0, 25))
+#: Room beside what happens for a while for it to begin and end, as a share of how long it lasts.
+BESIDE = 0.3
 #: Prior sd of a curve's level and trend, over that of its shape.
 WIDE = 3.0
 
@@ -44,6 +46,11 @@ class Smooth:
     def wave(self) -> bool:
         """Whether it repeats with the angle of a shaft."""
         return self.variable in ORDERS
+
+    @property
+    def happening(self) -> bool:
+        """Whether it stands for what happens for a while."""
+        return window(self.variable) is not None
 
     @property
     def ordinates(self) -> tuple[str, ...]:
@@ -78,14 +85,19 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     Args:
         counts: whether a row counts, shape (rows,).
     """
-    x = linear.variable(variable)
+    happens = window(variable)
+    axis = variable if happens is None else happens.axis
+    x = linear.variable(axis)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
+    if happens is not None:
+        beside = BESIDE * max(happens.high - happens.low, 1e-6 * (high - low))
+        low, high = happens.low - beside, happens.high + beside
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # the variable stands still: an offset is all that can be seen
     basis = _basis(variable, x, low, high)
     a, b = Projection(linear)(columns_of(linear, balance, basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
-    roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length) for length in LENGTHS]
+    roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length, happens is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
     for root, sigmas in itertools.product(roots, SIZES):
         scale = sigmas * size
@@ -96,13 +108,19 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
         if evidence > best[0]:
             explained = 2 * pull @ z - z @ inner @ z
             best = evidence, (scale, root, z, float(explained), float(np.trace(np.linalg.solve(there, inner))))
-    name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{variable}"
+    name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
     return Smooth(name, variable, low, high, *best[1])
 
 
-def _smoothness(length: float) -> np.ndarray:
-    """L of the prior covariance of the ordinates at a correlation length [spacings]."""
+def _smoothness(length: float, happening: bool = False) -> np.ndarray:
+    """L of the prior covariance of the ordinates at a correlation length [spacings]; what happens for a while begins
+    and ends at nothing."""
     distance = np.subtract.outer(np.arange(len(ORDINATES)), np.arange(len(ORDINATES)))
     across = np.linspace(-1.0, 1.0, len(ORDINATES))
+    if happening:
+        covariance = np.exp(-0.5 * (distance / length) ** 2) + 1e-6 * np.eye(len(ORDINATES))
+        root = np.linalg.cholesky(covariance)
+        root[[0, -1]] = 0.0
+        return root
     broad = WIDE**2 * (1 + np.outer(across, across)) + 1e-6 * np.eye(len(ORDINATES))
     return np.linalg.cholesky(np.exp(-0.5 * (distance / length) ** 2) + broad)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import re
 from collections.abc import Mapping
 
 import equinox as eqx
@@ -17,7 +19,8 @@ from calibration.inference.linearization import PROBED
 #: also loads the contact; and those for which they stand, as what these lack has the same shape in them.
 BALANCES = ("electrical", "track", "ground", "slip")
 STANDS_FOR = {"electrical": ("supply",), "track": ("gearbox", "motor")}
-#: Variables of a curve, fields of `Signals` (and the time of histories), with the column that measures each.
+#: Variables of a curve, fields of `Signals` (and the time of histories and the order of runs), with the column that
+#: measures each.
 VARIABLES = {
     "voltage": "supply_voltage_V",
     "current": "total_current_A",
@@ -26,10 +29,16 @@ VARIABLES = {
     "payload": "payload_kg",
     "speed": "speed_mm_s",
     "time": "time_s",
+    "order": "order",
 }
 #: Terms of a curve of one variable (Legendre polynomials), and degree of the polynomial in all conditions.
 TERMS, DEGREE = 5, 2
 CONDITIONS = "conditions"
+#: Axes along which something may happen for a while, the first that a table has; shares of the range that its windows
+#: have, each of which starts in the middle of the one before; fewest rows in one.
+AXES, WINDOWS, FEWEST = ("time", "order"), (1 / 4, 1 / 8, 1 / 16), 3
+#: Share of the variance of the order that conditions explain from which drift cannot be told from them.
+COLLINEAR = 0.9
 #: Waves of histories: per turn of the driving pulley or wheel, and whether of the belt (168 teeth, 24 grousers
 #: around a pulley of 48 teeth).
 ORDERS: dict[str, tuple[float, bool]] = {
@@ -79,7 +88,7 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
     """
     names, bases = [], []
     for variable, column in VARIABLES.items():
-        if column not in columns:
+        if column not in columns or (variable == "order" and collinearity(columns, weight) > COLLINEAR):
             continue
         basis = legendre.legvander(scaled(columns[column], weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
         for balance in BALANCES:
@@ -97,6 +106,75 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
     return tuple(
         Basis(jnp.asarray(np.stack(b)), tuple(PROBED.index(n[0]) for n in ns), tuple(ns)) for ns, b in groups if ns
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """A stretch of an axis, `time` [s] or `order` [-], in which something happens."""
+
+    axis: str
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.axis} {self.low:.5g} to {self.high:.5g}"
+
+
+def window(variable: str) -> Window | None:
+    """The window that a variable's name stands for, None for another variable."""
+    found = re.fullmatch(rf"({'|'.join(AXES)}) (\S+) to (\S+)", variable)
+    return None if found is None else Window(found[1], float(found[2]), float(found[3]))
+
+
+def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
+    """Windows in time (at the same instants of all runs) or in the order of runs, in every balance.
+
+    Args:
+        columns: of the table; weight: 0 for rows that do not count, shape (rows,).
+    """
+    axis = next((a for a in AXES if VARIABLES[a] in columns), None)
+    if axis is None:
+        return ()
+    x, counts = np.asarray(columns[VARIABLES[axis]], float), weight > 0
+    low, high = x[counts].min(), x[counts].max()
+    shapes: list[tuple[np.ndarray, str]] = []
+    tried = 0
+    for share in WINDOWS:
+        size = share * (high - low)
+        for k in range(round(2 / share) - 1):
+            tried += 1
+            first = low + k * size / 2
+            inside = counts & (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
+            if FEWEST <= inside.sum() <= 0.5 * counts.sum():
+                name = str(Window(axis, float(x[inside].min()), float(x[inside].max())))
+                shapes.append((inside.astype(float), name))
+    if not shapes:
+        return ()
+    # The first again for those that hold too few or too many rows: tables of one size share what is compiled.
+    shapes += shapes[:1] * (tried - len(shapes))
+    every = [(b, name) for b in BALANCES for _, name in shapes]
+    whole = jnp.asarray(np.stack([s for s, _ in shapes] * len(BALANCES))[:, :, None])
+    return (Basis(whole, tuple(PROBED.index(b) for b, _ in every), tuple(every)),)
+
+
+def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> float:
+    """Share of the variance of the order of runs that their conditions explain (R²): at 1 a drift from run to run
+    cannot be told from what the conditions do.
+
+    Conditions are a level for each configuration and polynomials of voltage, slope and payload.
+    """
+    there = weight > 0
+    x = np.asarray(columns["order"], float)[there]
+    if len(x) < 4 or np.ptp(x) == 0:
+        return 1.0
+    terms = [columns["configuration"][there] == name for name in np.unique(columns["configuration"][there])]
+    for column in ("supply_voltage_V", "slope_deg", "payload_kg"):
+        terms += list(legendre.legvander(scaled(columns[column], weight)[there], DEGREE)[:, 1:].T)
+    matrix = np.stack(terms, 1).astype(float)
+    left = x - matrix @ np.linalg.lstsq(matrix, x, rcond=None)[0]
+    rank = int(np.linalg.matrix_rank(matrix))
+    freedom = (len(x) - 1) / max(len(x) - rank, 1)
+    return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
 
 
 def waves(on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.ndarray) -> Bases:

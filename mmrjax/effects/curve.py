@@ -21,8 +21,8 @@ BALANCES = {
     "ground": ("N", 4.0, "direction_travel"),
     "slip": ("m/s", 0.05, "direction"),
 }
-#: Variables of a curve, signals that every one of these balances knows, and the time since the start of the run:
-#: unit and ordinary range.
+#: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the
+#: place of a run in the sequence: unit and ordinary range.
 VARIABLES = {
     "voltage": ("V", 10.0, 35.0),
     "current": ("A", 0.0, 6.0),
@@ -31,6 +31,7 @@ VARIABLES = {
     "payload": ("kg", 0.0, 8.0),
     "speed": ("m/s", 0.1, 1.0),
     "time": ("s", 0.0, 2.0),
+    "order": ("-", 0.0, 100.0),
 }
 ORDINATES = tuple(f"y{k}" for k in range(6))
 #: Share of the range over which a curve levels out beyond each of its ends.
@@ -123,7 +124,7 @@ def _curve(place: str, over: str) -> type[Effect]:
             if over == "time":
                 x = self.recall(robot, signals)
             else:
-                x = signals.payload if over == "payload" else getattr(signals, over) * way
+                x = getattr(signals, over) if over in ("payload", "order") else getattr(signals, over) * way
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
             return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
 

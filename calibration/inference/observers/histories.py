@@ -392,11 +392,12 @@ class Histories(Observer):
         )
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
-        """Curves as of settled runs, over time too, and waves in the angle of a shaft."""
+        """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft."""
         angle = np.nan_to_num(np.asarray(_angle(self, robot)))
         on_tracks = np.asarray(jax.vmap(robot.chassis)(self.conditions.configuration).on_tracks > 0.5)
         waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots))
-        return (*bases_room.families(columns, included.astype(float)), *waves)
+        weight = included.astype(float)
+        return (*bases_room.families(columns, weight), *bases_room.windows(columns, weight), *waves)
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
         names = bases_room.names(bases)

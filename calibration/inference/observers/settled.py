@@ -119,7 +119,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
-        return tuple(c for c in runs.columns if c != "run_id")
+        return tuple(c for c in runs.columns if c not in ("run_id", "order"))
 
     @classmethod
     def shows(cls, effect: type[Effect]) -> bool:
@@ -221,7 +221,8 @@ class SettledRuns(Observer):
         return _fits(problem, starts, weights, active, self.policy.steps)
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
-        return bases_room.families(columns, included.astype(float))
+        weight = included.astype(float)
+        return (*bases_room.families(columns, weight), *bases_room.windows(columns, weight))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """As the protocol says: a row's residual (simulated less measured) is split among the defects of the
