@@ -30,7 +30,8 @@ class Candidate:
         active: name of the effect in each slot, "" where empty.
         z: coordinates, see `ActiveSet`; sd: their posterior sds; cost: the objective [½σ²].
         amplitude: in prior sds of each slot's effect (0 where empty).
-        plausible: whether every amplitude is within its bounds, four prior sds, and the sign of a loss.
+        size: of each slot over the largest plausible amplitude in its direction; 0 where empty.
+        plausible: whether every amplitude is of a plausible size, off its bounds, and of a sign that physics allows.
         converged: whether the fit is an optimum.
     """
 
@@ -39,6 +40,7 @@ class Candidate:
     sd: np.ndarray
     cost: float
     amplitude: np.ndarray
+    size: np.ndarray
     plausible: bool
     converged: bool
 
@@ -68,19 +70,21 @@ def candidate(space: CandidateSpace, active: tuple[str, ...], best: Optimum, set
     amplitude = settings.width * np.asarray(space.coordinates.parts(best.z)[1])
     spread = settings.width * np.asarray(space.coordinates.parts(best.sd)[1])
     amplitude = np.where([bool(name) for name in active], amplitude, 0.0)
-    sizes = zip(active, amplitude, spread, strict=True)
-    ok = all(_plausible(space, name, a, s, settings) for name, a, s in sizes if name)
+    size = np.array([_size(space, n, a, settings) if n else 0.0 for n, a in zip(active, amplitude, strict=True)])
+    near = np.array([_size(space, n, s, settings) if n else 0.0 for n, s in zip(active, spread, strict=True)])
+    signs = [not (n and space.library[n].dissipative and a <= 0) for n, a in zip(active, amplitude, strict=True)]
+    # What lies within an sd of a bound is held by it, unless its sd is as large as all that is plausible.
+    ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and all(signs)
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
-    return Candidate(active, np.asarray(best.z), np.asarray(best.sd), cost, amplitude, ok, bool(best.converged))
+    return Candidate(active, np.asarray(best.z), np.asarray(best.sd), cost, amplitude, size, ok, bool(best.converged))
 
 
-def _plausible(space: CandidateSpace, name: str, amplitude: float, sd: float, settings: Settings) -> bool:
-    effect = space.library[name]
-    spec = amplitude_of(effect).spec
-    value = amplitude * spec.prior_sd(0.0)
-    if not (spec.bounds[0] < value < spec.bounds[1] and abs(amplitude) < settings.plausible):
-        return False
-    return not (effect.dissipative and amplitude < -2 * sd)
+def _size(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:
+    """An amplitude [prior sds] over the largest that is plausible in its direction."""
+    spec = amplitude_of(space.library[name]).spec
+    unit = spec.prior_sd(0.0)
+    bound = max(spec.bounds[1] if amplitude > 0 else -spec.bounds[0], 0.0) / unit
+    return abs(amplitude) / max(min(settings.plausible, bound), 1e-9)
 
 
 @dataclasses.dataclass(frozen=True)

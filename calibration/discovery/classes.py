@@ -1,4 +1,4 @@
-"""Classes: for each effect found, those that the same data cannot tell from it."""
+"""Classes: for each effect found, the effects and stated values that the same data cannot tell from it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ import dataclasses
 import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import Diagnosis
 from calibration.discovery.candidates import Candidate, fit_candidates, start
 from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.search import without_each
 from calibration.discovery.settings import Settings
+from calibration.discovery.stated_values import Shift, shifts
 
 #: Effects that are tried in the place of each one.
 TRIED = 16
+#: Share of what an effect explains that the score of a shifted prior has to promise for it to be fitted.
+SURE = 0.7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,11 +26,20 @@ class Classes:
 
     Attributes:
         members: of each effect of the best candidate, effects indistinguishable from it, itself first.
+        stated: of each, base parameters whose stated value may be wrong instead.
+        families: of each, the families of its members, the leader's first.
         ladder: every candidate that was fitted, those of the search among them.
     """
 
     members: tuple[tuple[str, ...], ...]
+    stated: tuple[tuple[Shift, ...], ...]
+    families: tuple[tuple[str, ...], ...]
     ladder: tuple[Candidate, ...]
+
+    @property
+    def single(self) -> bool:
+        """Whether each effect has one name."""
+        return all(len(m) + len(s) == 1 for m, s in zip(self.members, self.stated, strict=True))
 
 
 def cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
@@ -37,14 +51,24 @@ def cosines(space: CandidateSpace, scores: ScoreTable) -> np.ndarray:
 
 
 def classes(
-    space: CandidateSpace, best: Candidate, ladder: tuple[Candidate, ...], scores: ScoreTable, settings: Settings
+    space: CandidateSpace,
+    base: Candidate,
+    best: Candidate,
+    ladder: tuple[Candidate, ...],
+    left: Diagnosis,
+    settings: Settings,
 ) -> Classes:
-    """For each effect of the best fit, the effects that explain the data as well in its place.
+    """For each effect of the best fit, the effects and the stated values that explain the data as well in its place.
+
+    The forms of nature are not those of a library: an effect explains as well what it explains but for a share
+    `settings.form` of the sigmas.
 
     Args:
-        scores: of the base fit.
+        left: what the base leaves.
     """
-    cosine, names = cosines(space, scores), space.library.names
+    cosine, names = cosines(space, left.scores), space.library.names
+    fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings)
+    gains = [2 * (c.cost - best.cost) for c in fewer]
     wanted: list[tuple[int, str, tuple[str, ...]]] = []
     for slot, name in enumerate(best.effects):
         k = names.index(name)
@@ -54,16 +78,20 @@ def classes(
                 wanted.append((slot, names[j], active))
     known = {c.key: c for c in ladder}
     new = [active for _, _, active in wanted if frozenset(n for n in active if n) not in known]
-    fitted = fit_candidates(space, [(w, start(space, best, w, settings, scores)) for w in new], settings)
+    fitted = fit_candidates(space, [(w, start(space, best, w, settings, left.scores)) for w in new], settings)
     known |= {c.key: c for c in fitted}
-    members = []
-    for slot, name in enumerate(best.effects):
+    members, stated = [], []
+    for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
+        within = max(settings.same, settings.form**2 * gain)
         for s, other, active in wanted:
             rival = known[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
-            limit = settings.same_parallel if parallel else settings.same
+            limit = max(within, settings.same_parallel) if parallel else within
             if s == slot and rival.plausible and 2 * (rival.cost - best.cost) <= limit:
                 same.append(other)
         members.append(tuple(same))
-    return Classes(tuple(members), (*ladder, *fitted))
+        found = shifts(space, fewer[slot], SURE * gain, settings)
+        stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within))
+    families = tuple(tuple(dict.fromkeys(space.library[m].family() for m in same)) for same in members)
+    return Classes(tuple(members), tuple(stated), families, (*ladder, *fitted))

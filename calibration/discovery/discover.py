@@ -20,13 +20,14 @@ from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
 from calibration.discovery.classes import Classes, classes, cosines
-from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate, one_curve_suffices
+from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.outliers import Screening, screen
 from calibration.discovery.result import DiscoveryResult, FoundEffect, Remainder, Sensitivity
 from calibration.discovery.score_tests import bootstrap, diagnosed
 from calibration.discovery.search import Search, search
 from calibration.discovery.settings import Settings, settings_for
+from calibration.discovery.standing import Standing, standing
 from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference.bases import Bases
@@ -37,6 +38,8 @@ from mmrjax.robot import Robot
 
 #: Factors on an assumed noise at which the verdict is looked at too.
 FACTORS = (0.5, 2.0)
+#: Share of rows set aside beyond which that is said first.
+MANY = 0.03
 
 
 def discover(
@@ -116,6 +119,7 @@ class Traced:
         screened: the base fit, rows that stand alone set aside; left: what it leaves.
         searched: what was tried; alike: what cannot be told apart, where a name is given.
         where: something is missing, or remains; discrepancy: its curve, where no name is given.
+        standing: why names that were looked at do not stand, or what was put beside them.
     """
 
     verdict: str
@@ -125,6 +129,7 @@ class Traced:
     alike: Classes | None = None
     where: Location | None = None
     discrepancy: Discrepancy | None = None
+    standing: Standing | None = None
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
@@ -159,32 +164,28 @@ def trace(
     space = pose(runs, robot, noise.sd, settings, stated, library)
     progress("fitting the base model")
     fitted = fit_base(space, settings, runs.source)
-    screened = screen(fitted, lambda base: bases_at(runs, base), settings, runs.source)
+    screened = screen(fitted, lambda base: bases_at(runs, base), runs, settings)
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
 
     progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
     left = diagnosis_of_base(screened, settings)
-    if not left.test.rejected:
+    if not left.test.rejected and screened.cluster is None:
         return Traced("none", screened, left)
 
     progress("something is missing: fitting every effect that could explain it")
     searched = search(space, base, left, bases, settings, progress)
     best, after = searched.best, searched.diagnosis
-    if (
-        best is None
-        or after is None
-        or not_to_the_point(space, base, best)
-        or stands_for_a_curve(space, left, after, bases)
-    ):
+    stood = standing(space, base, searched, left, bases, settings)
+    if best is None or after is None or not stood.stands:
         where = locate(space.bare.observe, left.scores, bases)
         curve = fit_discrepancy(space, base, left.linear, where.balance, where.variable)
-        return Traced("unnamed", screened, left, searched, where=where, discrepancy=curve)
+        return Traced("unnamed", screened, left, searched, where=where, discrepancy=curve, standing=stood)
 
     progress(f"what else explains as much as {' and '.join(best.effects)}?")
-    alike = classes(space, best, searched.ladder, left.scores, settings)
-    verdict = "named" if all(len(members) == 1 for members in alike.members) else "class"
+    alike = classes(space, base, best, searched.ladder, left, settings)
+    verdict = "named" if alike.single else "class"
     remains = locate(space.bare.observe, after.scores, bases) if after.test.rejected_with_margin else None
-    return Traced(verdict, screened, left, searched, alike, remains)
+    return Traced(verdict, screened, left, searched, alike, remains, standing=stood)
 
 
 # --- the stages that are no room of their own -----------------------------------------------------------
@@ -246,18 +247,6 @@ def diagnosis_of_base(screened: Screening, settings: Settings) -> Diagnosis:
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
-def not_to_the_point(space: CandidateSpace, base: Candidate, best: Candidate) -> bool:
-    """Whether the effects leave far more than noise, and explain less than half of what was there."""
-    readings = float(np.sum(space.weight > 0))  # what χ² is without anything missing, priors included
-    there, after = (2 * c.cost - readings for c in (base, best))
-    return bool(after > 2 * np.sqrt(2 * readings) and there - after < 0.5 * there)
-
-
-def stands_for_a_curve(space: CandidateSpace, left: Diagnosis, after: Diagnosis, bases: Bases) -> bool:
-    """Whether the fit with effects is rejected where one smooth curve would not be."""
-    return after.test.rejected_with_margin and one_curve_suffices(space.bare.observe, left, bases)
-
-
 def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
     """The runs without exact copies of one another, their row numbers, and what to say of that."""
     columns = [runs[c] for c in observers.kind(runs).identity(runs)]
@@ -279,9 +268,25 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
 
 def in_short(factor: float, traced: Traced) -> Sensitivity:
     """What the loop says with another noise."""
-    said = findings.statement(traced.verdict, traced.left.test.p_value, traced.members, traced.where)
+    said = _statement(traced)
     adequate = not traced.ends.test.rejected_with_margin
     return Sensitivity(factor, traced.verdict, said, traced.members, adequate)
+
+
+def _statement(traced: Traced) -> str:
+    space, alike, p = traced.screened.base.space, traced.alike, traced.left.test.p_value
+    if alike is None:
+        said = findings.statement(traced.verdict, p, traced.where)
+    else:
+        stated = [findings.stated_in_words(space, shifts) for shifts in alike.stated]
+        said = findings.statement(traced.verdict, p, traced.where, alike.members, stated, alike.families)
+    aside, counting = len(traced.screened.outliers), int(space.included.sum())
+    if aside > MANY * (aside + counting):
+        share = 100 * aside / (aside + counting)
+        said = f"{aside} of {aside + counting} rows ({share:.0f} %) lie off alone and are set aside. {said}"
+    if traced.screened.cluster is not None:
+        said = f"{said} {str(traced.screened.cluster).capitalize()}: that is a finding, and none is set aside."
+    return said
 
 
 # --- the result -----------------------------------------------------------------------------------------
@@ -317,9 +322,12 @@ def finished(
     seen = findings.readings(runs, noise.sd, before, after)
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     progress("the next experiment")
-    ladder = traced.alike.ladder if traced.alike is not None else ()
+    ladder = traced.searched.ladder if traced.searched is not None else ()
+    near, too_large = findings.alternatives(
+        space, best, cost, traced.alike.ladder if traced.alike is not None else ladder, settings
+    )
     p = left.test.p_value
-    listed = findings.effect_scores(space, left.scores)
+    listed = findings.effect_scores(space, left.scores, settings)
     shown = space.library.indices([s.name for s in listed])
     found: tuple[FoundEffect, ...] = ()
     remains = None
@@ -329,7 +337,7 @@ def finished(
     unnamed = None if curve is None or where is None else findings.unnamed(curve, where, p, rows)
     result = DiscoveryResult(
         verdict=traced.verdict,
-        statement=findings.statement(traced.verdict, p, traced.members, where),
+        statement=_statement(traced),
         robot=robot,
         converged=converged,
         runs=runs,
@@ -343,8 +351,9 @@ def finished(
         next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
         cannot_see=findings.invisible(space, left.scores, settings),
         needs_histories=_needs_histories(library, type(observe)),
-        alternatives=findings.alternatives(space, best, ladder, settings, plausible=True),
-        implausible=findings.alternatives(space, best, ladder, settings, plausible=False),
+        alternatives=near,
+        implausible=too_large,
+        standing="" if traced.standing is None else traced.standing.reason,
         before=findings.evidence(left.test, adequate=not left.test.rejected),
         after=findings.evidence(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),

@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
-from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose
 from calibration.discovery.projection import Defect, defect
-from calibration.discovery.score_tests import ScoreTable, beside_curve
+from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.smooth import Smooth, smooth
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
@@ -80,13 +79,6 @@ def locate(observe: Observer, scores: ScoreTable, bases: Bases) -> Location:
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     explained = np.asarray(scores.explained)
     return Location(balance, names[j][1], tuple(itertools.chain(*alike)), float(explained[j]), float(explained[k]))
-
-
-def one_curve_suffices(observe: Observer, base: Diagnosis, bases: Bases) -> bool:
-    """Whether one smooth curve in one balance would leave nothing that is beyond doubt."""
-    k = int(np.argmax(np.asarray(getattr(base.scores, observe.compares))))
-    left = AdequacyTest(beside_curve(base.linear, bases, k), base.test.null, base.test.settings)
-    return not left.rejected_with_margin
 
 
 # --- the curve ------------------------------------------------------------------------------------------

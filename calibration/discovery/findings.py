@@ -14,7 +14,7 @@ import numpy as np
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest
-from calibration.discovery.candidates import Candidate, fit_candidates, start
+from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Discrepancy, Location
 from calibration.discovery.experiments import Proposal
@@ -32,10 +32,13 @@ from calibration.discovery.result import (
     NextExperiment,
     RankedExperiment,
     ReadingsOfRows,
+    StatedValue,
     UnnamedDiscrepancy,
 )
 from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.search import own_p, without_each
 from calibration.discovery.settings import Settings
+from calibration.discovery.stated_values import Shift
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import priors
@@ -73,7 +76,7 @@ def found_effects(
         test: of the base fit, whose bootstrap gives the p-values.
     """
     gains = _without_each(space, base, best, settings)
-    null = np.asarray(test.null.single) ** 2
+    null = np.asarray(test.null.single)
     listed = []
     for slot, members in enumerate(found.members):
         effect = space.library[members[0]]
@@ -82,12 +85,14 @@ def found_effects(
             FoundEffect(
                 name=effect.name,
                 members={name: _member(space, best, found, slot, name) for name in members},
+                stated={s.name: _stated(space, best, s) for s in found.stated[slot]},
+                families=found.families[slot],
                 balance=effect.balance,
                 unit=BALANCES[effect.balance][0],
                 equation=words,
                 source=source,
                 parameters=_parameters(space, best, slot, settings),
-                p_value=(1 + int(np.sum(null >= gains[slot]))) / (1 + len(null)),
+                p_value=own_p(gains[slot], null),
                 score=float(gains[slot]),
             )
         )
@@ -115,13 +120,18 @@ def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, n
     return Member(float(amplitude), float(2 * (other.cost - best.cost)))
 
 
+def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
+    coordinates, p, k = space.coordinates.base, space.free, shift.index
+    value = [float(coordinates.value(jnp.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
+    rise = float(2 * (shift.fit.cost - best.cost))
+    return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
+
+
 def _without_each(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> list[float]:
     """What each effect explains that the others cannot: the rise of χ² when it is taken away and all is refitted."""
     if len(best.effects) == 1:
         return [2 * (base.cost - best.cost)]
-    fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
-    fitted = fit_candidates(space, [(w, start(space, best, w, settings)) for w in fewer], settings)
-    return [2 * (c.cost - best.cost) for c in fitted]
+    return [2 * (c.cost - best.cost) for c in without_each(space, best, settings)]
 
 
 def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> UnnamedDiscrepancy:
@@ -146,19 +156,39 @@ def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> U
 
 
 def alternatives(
-    space: CandidateSpace, best: Candidate | None, ladder: Sequence[Candidate], settings: Settings, *, plausible: bool
-) -> tuple[Alternative, ...]:
-    """Candidates that explain the data nearly as well as the one proposed, or would but for their size."""
-    if best is None or not best.effects:
-        return ()
-    listed = []
+    space: CandidateSpace, best: Candidate, cost: float, ladder: Sequence[Candidate], settings: Settings
+) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
+    """Candidates that explain the data nearly as well as what is proposed; and those that would but for their size.
+
+    Args:
+        cost: of what is proposed [½σ²]; best: the same, where it is a candidate.
+    """
+    near: tuple[list[Alternative], list[Alternative]] = ([], [])
+    seen = {best.key}
     for c in sorted(ladder, key=lambda x: x.cost):
-        rise = 2 * (c.cost - best.cost)
-        if c.key != best.key and c.plausible == plausible and rise <= settings.alternative:
-            sds = {name: float(a) for name, a in zip(c.active, c.amplitude, strict=True) if name}
-            sizes = {name: a * size_of(space.library[name]) for name, a in sds.items()}
-            listed.append(Alternative(sizes, sds, float(rise)))
-    return tuple(listed)
+        rise = 2 * (c.cost - cost)
+        if c.key in seen or not c.effects or rise > settings.alternative:
+            continue
+        seen.add(c.key)
+        near[0 if c.plausible else 1].append(_alternative(space, c, rise))
+    return tuple(near[0]), tuple(near[1])
+
+
+def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> Alternative:
+    sds, sizes, why = {}, {}, []
+    for name, amplitude, size in zip(c.active, c.amplitude, c.size, strict=True):
+        if not name:
+            continue
+        sds[name], sizes[name] = float(amplitude), float(size)
+        if space.library[name].dissipative and amplitude <= 0:
+            why.append(f"{name} would put power in")
+        elif size >= 1:
+            rests = " and ".join(space.library[name].rests_on) or amplitude_of(space.library[name]).spec.meaning
+            why.append(f"{name} at {size:.2g} times its largest plausible size; check {rests}")
+        elif not c.plausible:
+            why.append(f"{name} is within an sd of the largest plausible size")
+    amplitudes = {name: a * size_of(space.library[name]) for name, a in sds.items()}
+    return Alternative(amplitudes, sds, sizes, float(rise), "; ".join(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
@@ -222,28 +252,43 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     }
 
 
-def effect_scores(space: CandidateSpace, scores: ScoreTable) -> tuple[EffectScore, ...]:
-    """Every effect at its best shape, strongest first."""
+def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
+    """Every effect at its best shape and plausible size, strongest first."""
     listed = []
     for effect in space.library.effects:
+        amplitude, explained = _plausible_score(space, effect, scores, settings)
         m = space.library.best_instance(effect.name, np.asarray(scores.single))
         listed.append(
             EffectScore(
                 name=effect.name,
                 balance=effect.balance,
-                score=float(scores.single[m] ** 2),
-                amplitude=float(scores.amplitude[m] * size_of(effect)),
+                score=explained,
+                amplitude=amplitude * size_of(effect),
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
         )
     return tuple(sorted(listed, key=lambda s: -s.score))
 
 
+def _plausible_score(
+    space: CandidateSpace, effect: Effect, scores: ScoreTable, settings: Settings
+) -> tuple[float, float]:
+    """Amplitude [prior sds] and what it explains [σ²], no larger than plausible and of a sign that physics allows."""
+    m = space.library.best_instance(effect.name, np.asarray(scores.single))
+    wanted, left = float(scores.amplitude[m]), float(scores.left[m])
+    low = 0.0 if effect.dissipative else -settings.plausible
+    amplitude = min(max(wanted, low), settings.plausible)
+    return amplitude, float(scores.single[m] ** 2 - ((wanted - amplitude) * left) ** 2)
+
+
 def invisible(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[str, ...]:
-    """Effects of which the largest plausible amplitude leaves too few sigmas."""
+    """Effects of which the largest plausible amplitude leaves too few sigmas, and that explain no more than that."""
     left = space.library.largest(np.asarray(scores.left))
     return tuple(
-        n for n, x in zip(space.library.names, left, strict=True) if settings.plausible * x < settings.visible
+        e.name
+        for e, x in zip(space.library.effects, left, strict=True)
+        if settings.plausible * x < settings.visible
+        and _plausible_score(space, e, scores, settings)[1] < settings.visible**2
     )
 
 
@@ -309,23 +354,49 @@ def errors(
 # --- words ----------------------------------------------------------------------------------------------
 
 
-def statement(verdict: str, p: float, classes: Sequence[Sequence[str]], where: Location | None) -> str:
-    """The verdict in one sentence; `where` something is missing, or remains."""
+def statement(
+    verdict: str,
+    p: float,
+    where: Location | None,
+    classes: Sequence[Sequence[str]] = (),
+    stated: Sequence[Sequence[str]] = (),
+    families: Sequence[Sequence[str]] = (),
+) -> str:
+    """The verdict in one sentence.
+
+    Args:
+        where: something is missing, or remains.
+        classes: names of each effect found; stated: values that may be wrong instead, in words; families: of each.
+    """
     if verdict == "none":
         return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
     if verdict == "unnamed" and where is not None:
         others = [b for b in where.alike if b != where.balance]
         also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
         return (
-            f"Something is missing in the balance {where.balance}{also}, {shown_over(where.variable)}, and no effect of the library explains it "
-            f"(family-wise p {said_p(p)})."
+            f"Something is missing in the balance {where.balance}{also}, {shown_over(where.variable)}, and no effect "
+            f"of the library explains it (family-wise p {said_p(p)})."
         )
     names = []
-    for words in classes:
-        unsure = f"one of {', '.join(words)} (these data cannot tell which)"
-        names.append(words[0] if len(words) == 1 else unsure)
+    for k, words in enumerate(classes):
+        values = list(stated[k]) if k < len(stated) else []
+        said = words[0]
+        if len(words) + len(values) > 1:
+            family = f"{families[k][0]}, " if k < len(families) and len(families[k]) == 1 else ""
+            listed = ", ".join(words) if len(words) == 1 else f"one of {', '.join(words)}"
+            said = f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
+        names.append(said)
     left = "" if where is None else f" Something remains in the balance {where.balance}."
     return f"Missing: {'; '.join(names)} (family-wise p {said_p(p)}).{left}"
+
+
+def stated_in_words(space: CandidateSpace, shifts: Sequence[Shift]) -> list[str]:
+    """`motor.resistance is 1.94 ohm`, for each."""
+    c, p = space.coordinates.base, space.free
+    return [
+        f"{s.name} is {float(c.value(jnp.asarray(s.fit.z[:p]))[s.index]):.3g} {c.units[s.index]}".strip()
+        for s in shifts
+    ]
 
 
 def shown_over(variable: str) -> str:

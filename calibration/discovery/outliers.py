@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from calibration.data.runs import Runs
 from calibration.discovery.candidates import BaseFit, empty, fit_base
+from calibration.discovery.clusters import LEVELS, Cluster, cluster
 from calibration.discovery.score_tests import Diagnosed, diagnosed
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
@@ -26,21 +28,49 @@ class Screening:
         base: the fit; outliers: indices of the rows set aside, in the order in which they were.
         bases: of the curves that a discrepancy is looked for with, at that fit.
         diagnosed: the fit linearised, and what effects and curves could explain of its residual.
+        cluster: what rows that lie off have in common, so that they were not set aside; None for nothing.
     """
 
     base: BaseFit
     outliers: tuple[int, ...]
     bases: Bases
     diagnosed: Diagnosed
+    cluster: Cluster | None = None
 
 
-def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings, where: str) -> Screening:
+def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
     """Set aside rows with a reading that stands alone: its own shift explains more than any effect or curve.
 
+    Rows that stand together are none: they stay, and `cluster` says where.
+
     Args:
-        bases_at: bases of curves at a fit of the base.
-        where: opens messages.
+        bases_at: bases of curves at a fit of the base; runs: the table.
     """
+    where = runs.source
+    found = _screened(base, bases_at, settings, where)
+    mine = np.zeros(len(base.space.included), bool)
+    mine[list(found.outliers)] = True
+    together = _together(found, mine, runs, settings)
+    if together is None:
+        return found
+    bases, seen = _look(base, bases_at, settings)
+    return Screening(base, (), bases, seen, together)
+
+
+def _together(found: Screening, outliers: np.ndarray, runs: Runs, settings: Settings) -> Cluster | None:
+    """What outliers have in common."""
+    rows = len(runs)
+    axes = {a: runs[c] for a, c in (("time", "time_s"), ("order", "order")) if runs.has(c)}
+    turned = found.diagnosed[0].turned()
+    if turned is not None:
+        axes["angle of the driving shaft"] = turned[:rows] % (2 * np.pi)
+    levels = {c: runs[c] for c in LEVELS if runs.has(c)}
+    included = found.base.space.included
+    return cluster(outliers[:rows], included[:rows], axes, levels, settings.outlier_error, settings.seed)
+
+
+def _screened(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings, where: str) -> Screening:
+    """Rows whose own shift explains more than any effect or curve, set aside."""
     allowed = int(settings.outlier_share * base.space.included.sum())
     base, outliers = _set_gross_aside(base, settings, where)
     included = base.space.included

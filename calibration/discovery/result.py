@@ -37,17 +37,38 @@ class Member:
 
 
 @dataclasses.dataclass(frozen=True)
+class StatedValue:
+    """A base parameter whose stated value may be wrong in the place of an effect.
+
+    Attributes:
+        value: that explains as much; stated: its prior mean; both in `unit`.
+        prior_sds: how far from its prior that is; rise_chi2: what the data say against it [σ²].
+    """
+
+    value: float
+    stated: float
+    unit: str
+    prior_sds: float
+    rise_chi2: float
+
+
+@dataclasses.dataclass(frozen=True)
 class FoundEffect:
     """An effect of the verdict.
 
     Attributes:
         name: of the leader of its class; members: effects that these data cannot tell from it, itself first.
+        stated: base parameters that may be wrong instead, by name.
+        families: of the members, the leader's first: one family says what is missing even where no name is sure.
         balance, unit: that it enters; equation, source: from its docstring.
-        parameters: its amplitude and shape; p_value: family-wise; score: rise of χ² without it, refitted [σ²].
+        parameters: its amplitude and shape; p_value: its own, against the strongest of all effects in each bootstrap
+            table; score: rise of χ² without it, all else fitted again [σ²].
     """
 
     name: str
     members: dict[str, Member]
+    stated: dict[str, StatedValue]
+    families: tuple[str, ...]
     balance: str
     unit: str
     equation: str
@@ -110,11 +131,19 @@ class Remainder:
 
 @dataclasses.dataclass(frozen=True)
 class Alternative:
-    """Effects that explain the data nearly as well: amplitudes, the same in prior sds, and the rise of χ² [σ²]."""
+    """Effects that were fitted and are not proposed.
+
+    Attributes:
+        effects: amplitudes; prior_sds: the same in prior sds; sizes: over the largest plausible ones.
+        rise_chi2: over the proposed fit [σ²], negative where they explain more.
+        why: why they are not proposed, in words.
+    """
 
     effects: dict[str, float]
     prior_sds: dict[str, float]
+    sizes: dict[str, float]
     rise_chi2: float
+    why: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,7 +247,8 @@ class DiscoveryResult:
         effects: found; unnamed: the discrepancy of that verdict; remains: what the effects leave.
         next_experiment: what would tell more; None where nothing is left to tell apart.
         cannot_see: effects that the data cannot show; needs_histories: that only histories can.
-        alternatives, implausible: candidates nearly as good; such that would be but for their size.
+        alternatives, implausible: candidates nearly as good; such that would be but for their size or sign.
+        standing: why names do not stand, or beside what they do; "" where there is nothing to say.
         before, after: evidence in what base and proposed robot leave.
         chi2: twice the objective before and after [σ²]; readings: that count.
         base_shift: of every base parameter; scores: of the library at the base fit, strongest first.
@@ -250,6 +280,7 @@ class DiscoveryResult:
     needs_histories: tuple[str, ...]
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
+    standing: str
     before: Evidence
     after: Evidence
     chi2: tuple[float, float]
@@ -294,6 +325,7 @@ class DiscoveryResult:
             **self.detail.to_json(),
             "alternatives": [dataclasses.asdict(a) for a in self.alternatives],
             "implausible": [dataclasses.asdict(a) for a in self.implausible],
+            "standing": self.standing,
             "errors": {w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(whens)},
             "errors_percent_of": self.percent_of,
             "held_out_by": held,
@@ -365,7 +397,8 @@ class Sensitivity:
 def _effect(e: FoundEffect) -> dict[str, Any]:
     return {
         "name": e.name,
-        "class": list(e.members),
+        "class": [*e.members, *e.stated],
+        "families": list(e.families),
         "balance": e.balance,
         "unit": e.unit,
         "equation": e.equation,
@@ -374,6 +407,7 @@ def _effect(e: FoundEffect) -> dict[str, Any]:
         "p_value": e.p_value,
         "score": e.score,
         "members": {name: dataclasses.asdict(m) for name, m in e.members.items()},
+        "stated_values": {name: dataclasses.asdict(s) for name, s in e.stated.items()},
     }
 
 

@@ -9,6 +9,7 @@ with one degree of freedom where nothing is missing (Rao 1948).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -27,6 +28,8 @@ ABSORBED = 1e-3
 UNSETTLED = 0.05
 #: Prior sd of a curve's columns where they are fitted with the free parameters [σ]: wide, and keeps their rank.
 WIDE = 30.0
+#: Further columns are filled up to a multiple of this.
+FILLED = 12
 #: Replicates in one batch of the bootstrap.
 CHUNK = 64
 
@@ -159,36 +162,54 @@ def diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bas
     return linear, scores, strongest(scores, linear)
 
 
-def beside_curve(linear: Linearization, bases: Bases, chosen: int) -> Statistics:
-    """The strongest statistics that are left once the curves of one family are fitted with the free parameters.
+def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarray:
+    """Signatures of one family's columns, each of a wide prior sd, shape (readings, terms).
 
     Args:
         chosen: index of the family, in the order of `ScoreTable.curve`.
     """
     linear = jax.tree.map(jnp.asarray, linear)
-    extra = [np.asarray(c) for basis in bases for c in basis_columns(linear, basis)][chosen]
-    norm = np.linalg.norm(extra, axis=0)
-    extra = extra[:, norm > 0] / norm[norm > 0] * WIDE
+    for basis in bases:
+        if chosen < len(basis.names):
+            columns = np.asarray(linear.columns(basis.balance[chosen], basis.columns[chosen]))
+            norm = np.linalg.norm(columns, axis=0)
+            return columns[:, norm > 0] / norm[norm > 0] * WIDE
+        chosen -= len(basis.names)
+    raise IndexError(chosen)
+
+
+def beside_columns(
+    linear: Linearization, bases: Bases, extra: np.ndarray, of: Sequence[str]
+) -> tuple[Statistics, np.ndarray]:
+    """The strongest statistics that are left once further columns are fitted with the free parameters, and the normal
+    deviate of every family of curves, -inf for those of the columns' own balances.
+
+    Args:
+        extra: columns over the readings, shape (readings, columns); of: their balances.
+    """
+    linear = jax.tree.map(jnp.asarray, linear)
     jacobian = np.asarray(linear.jacobian)
-    readings, total, wide = extra.shape[0], jacobian.shape[0], extra.shape[1]
+    readings, total = extra.shape[0], jacobian.shape[0]
+    wide = -(-extra.shape[1] // FILLED) * FILLED  # to few sizes: each is compiled
     whole = np.zeros((total + wide, jacobian.shape[1] + wide))
     whole[:total, : jacobian.shape[1]] = jacobian
-    whole[:readings, jacobian.shape[1] :] = extra
+    whole[:readings, jacobian.shape[1] : jacobian.shape[1] + extra.shape[1]] = extra
     whole[total:, jacobian.shape[1] :] = np.eye(wide)
     residual = jnp.concatenate([linear.residual, jnp.zeros(wide)])
     padded = dataclasses.replace(linear, jacobian=jnp.asarray(whole), residual=residual)
     scores = _score_tests(padded, bases)
     balances = np.array([n[0] for b in bases for n in b.names])
-    others = balances != balances[chosen]
+    deviate = np.where(np.isin(balances, list(of)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
-    return Statistics(
+    found = Statistics(
         single=np.max(np.abs(np.asarray(scores.single))),
         pair=np.max(np.asarray(scores.pair)),
-        curve=np.max(np.asarray(scores.curve)[others], initial=-np.inf),
+        curve=np.max(deviate, initial=-np.inf),
         chi2=nothing,
         white=nothing,
         settled=jnp.asarray(True),
     )
+    return found, deviate
 
 
 _score_tests = eqx.filter_jit(score_tests)

@@ -58,7 +58,10 @@ def search(
         base: the fit without effects; left: what it leaves.
     """
     ladder = _singles(space, base, left.scores, settings)
+    null = np.asarray(left.test.null.single)
     best, diagnosis, seen = _best(ladder), None, None
+    if best is not None and own_p(2 * (base.cost - best.cost), null) > settings.family_wise_error:
+        best = None
     while best is not None:
         seen = best
         diagnosis = diagnose(space, best, bases, left.test.null, settings)
@@ -68,7 +71,29 @@ def search(
         more = _extend(space, best, diagnosis.scores, base, left.scores, settings)
         best = _accepted(_best(more), ladder, settings)
         ladder += more
+        if best is not None:
+            fewer = without_each(space, best, settings)
+            ladder += fewer
+            gains = [2 * (c.cost - best.cost) for c in fewer]
+            if any(own_p(gain, null) > settings.family_wise_error for gain in gains):
+                best = None
     return Search(tuple(ladder), seen, diagnosis)
+
+
+def own_p(gain: float, null: np.ndarray) -> float:
+    """Share of bootstrap tables in which the strongest single effect explains as much [σ²], never below
+    1 / (replicates + 1).
+
+    Args:
+        null: root of what it explains in each [σ].
+    """
+    return (1 + int(np.sum(null**2 >= gain))) / (1 + len(null))
+
+
+def without_each(space: CandidateSpace, best: Candidate, settings: Settings) -> list[Candidate]:
+    """The candidate without each of its effects in turn, all else fitted again."""
+    fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
+    return fit_candidates(space, [(w, start(space, best, w, settings)) for w in fewer], settings)
 
 
 def _most(space: CandidateSpace, settings: Settings) -> int:

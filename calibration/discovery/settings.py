@@ -30,8 +30,10 @@ class Settings:
         visible: sigmas that the largest plausible amplitude has to leave for an effect to be visible [σ].
         same, same_parallel: rise of the objective up to which another effect explains the data as well, and up to
             which it does where |cos| of the signatures is above `parallel` [σ²].
+        form: share of an effect's sigmas by which another may explain less and still be the same but for its form.
         alike: |cos| above which an effect is tried in the place of another one.
         needed: what each of two effects has to explain, given the other, for both to be named [σ].
+        preferred: evidence by which a smooth curve has to be the better explanation for names not to stand [σ²].
         alternative: rise of the objective up to which a candidate is listed [σ²].
         outlier_share: largest share of rows set aside; outlier_error: family-wise error of that.
         gross: how many times further off than the median row no row can be that was measured as it is stated [σ].
@@ -54,8 +56,10 @@ class Settings:
     same: float = 4.0
     same_parallel: float = 9.0
     parallel: float = 0.95
+    form: float = 0.25
     alike: float = 0.5
     needed: float = 5.0
+    preferred: float = 6.0
     alternative: float = 9.0
     outlier_share: float = 0.1
     outlier_error: float = 0.01

@@ -7,14 +7,17 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.polynomial import legendre
 
 from calibration.discovery.projection import Projection, columns_of
-from calibration.inference.bases import ORDERS, window
+from calibration.inference.bases import ORDERS, scaled, window
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import ORDINATES, weights
 
 #: Priors that are tried for the ordinates: correlation lengths [spacings], sizes [σ that an ordinate makes].
 LENGTHS, SIZES = (1.0, 1.5, 2.5, 4.0), tuple(np.geomspace(0.3, 300.0, 25))
+#: Terms of each variable of a surface, and the fall of their prior sd with the degree (in logarithms).
+PRODUCT, FALL = 4, 0.35
 #: Room beside what happens for a while for it to begin and end, as a share of how long it lasts.
 BESIDE = 0.3
 #: Prior sd of a curve's level and trend, over that of its shape.
@@ -29,7 +32,8 @@ class Smooth:
         effect, variable: name of the curve, and what it is over; low, high: ends of its range; scale: its amplitude.
         root: L of the prior covariance L Lᵀ of the ordinates, shape (ordinates, ordinates).
         start: ordinates in prior coordinates, y = L z, shape (ordinates,).
-        explained: fall of χ²; freedom: how many parameters that took.
+        explained: fall of χ²; freedom: how many parameters that took; evidence: twice the log of the marginal
+            likelihood over that without a curve [σ²].
     """
 
     effect: str
@@ -41,6 +45,7 @@ class Smooth:
     start: np.ndarray
     explained: float
     freedom: float
+    evidence: float
 
     @property
     def wave(self) -> bool:
@@ -107,7 +112,8 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
         evidence = 0.5 * pull @ z - 0.5 * np.linalg.slogdet(there)[1]
         if evidence > best[0]:
             explained = 2 * pull @ z - z @ inner @ z
-            best = evidence, (scale, root, z, float(explained), float(np.trace(np.linalg.solve(there, inner))))
+            taken = float(np.trace(np.linalg.solve(there, inner)))
+            best = evidence, (scale, root, z, float(explained), taken, 2 * float(evidence))
     name = f"wave_{balance}" if variable in ORDERS else f"curve_{balance}_{axis}"
     return Smooth(name, variable, low, high, *best[1])
 
@@ -124,3 +130,46 @@ def _smoothness(length: float, happening: bool = False) -> np.ndarray:
         return root
     broad = WIDE**2 * (1 + np.outer(across, across)) + 1e-6 * np.eye(len(ORDINATES))
     return np.linalg.cholesky(np.exp(-0.5 * (distance / length) ** 2) + broad)
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """A smooth discrepancy over two variables in a balance, linear at a fit.
+
+    Attributes:
+        columns: its signatures, scaled to the prior that the data find most likely, shape (readings, terms).
+        explained: fall of χ² [σ²]; evidence: as of `Smooth`.
+    """
+
+    columns: np.ndarray
+    explained: float
+    evidence: float
+
+
+def surface(
+    linear: Linearization, balance: str, variables: tuple[str, str], counts: np.ndarray, project: Projection
+) -> Surface:
+    """The discrepancy over two variables: products of Legendre polynomials, each term's prior sd the smaller the
+    higher its degree, of the size of the greatest evidence.
+
+    Args:
+        counts: whether a row counts, shape (rows,).
+    """
+    weight = counts.astype(float)
+    sides = [
+        legendre.legvander(scaled(linear.variable(v), weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
+        for v in variables
+    ]
+    shapes = (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.rows, -1)
+    columns = columns_of(linear, balance, shapes)
+    a, b = project(columns)
+    size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
+    best = (-np.inf, 0.0, 0.0)
+    for sigmas in SIZES:
+        scale = sigmas * size
+        there = np.eye(len(b)) + scale**2 * a
+        z = np.linalg.solve(there, scale * b)
+        evidence = scale * b @ z - np.linalg.slogdet(there)[1]
+        if evidence > best[0]:
+            best = float(evidence), scale, float(2 * scale * b @ z - scale**2 * z @ a @ z)
+    return Surface(best[1] * columns, best[2], best[0])

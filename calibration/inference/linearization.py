@@ -178,6 +178,10 @@ class Linearization(eqx.Module):
         """What a curve may be over, by row [SI]: a signal, or what else the observer knows."""
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
+    def turned(self) -> np.ndarray | None:
+        """Angle of the driving shaft at every row since the start of its run [rad]; None where no run is followed."""
+        return None
+
     def series(self) -> Float[Array, "runs samples channels"]:
         """Whitened residuals of the readings of each run in the order of time; of settled rows each its own."""
         return self.by_row()[:, None]

@@ -17,6 +17,18 @@ from mmrjax.params import Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
+#: What the balances of one equation add up to, in words: those of a line act alike on the readings.
+EQUATION = {
+    **dict.fromkeys(("supply", "electrical"), "voltage drop"),
+    **dict.fromkeys(("motor", "gearbox", "track"), "loss torque"),
+    "ground": "resistance to travel",
+    "slip": "slip",
+    "mass": "mass",
+    "inertia": "inertia",
+    "inductance": "inductance",
+    "sensor": "reading",
+}
+
 
 def amplitude(*, unit: str, meaning: str, bounds: tuple[float, float], sd: float, source: str) -> Any:
     """Declare the amplitude of an effect, 0 (absent) by default; see `params.Spec` for the arguments."""
@@ -35,6 +47,11 @@ class Effect(eqx.Module):
         balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has; has no default. A
             positive term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
             `inertia` and `inductance` it adds, and in `sensor` it adds to the reading of `channel`.
+        driver: what its term changes with, besides the direction: `speed`, `current`, `load`, ... Effects of one
+            equation with one driver are a family: the forms of a law that data may not tell apart. Empty where it
+            is the same share everywhere.
+        rests_on: dotted names of parameters of the robot in proportion to which its term is, for whoever finds its
+            amplitude too large.
         dissipative: whether a positive amplitude may only take power out.
         channel: for `sensor` alone: the channel that it changes, one of `channels.names()`.
         transient: whether settled travel shows nothing of it, so that only histories can.
@@ -55,6 +72,8 @@ class Effect(eqx.Module):
 
     name: ClassVar[str]
     balance: ClassVar[str]
+    driver: ClassVar[str] = ""
+    rests_on: ClassVar[tuple[str, ...]] = ()
     dissipative: ClassVar[bool] = False
     channel: ClassVar[str] = ""
     transient: ClassVar[bool] = False
@@ -80,6 +99,12 @@ class Effect(eqx.Module):
         if isinstance(stated := vars(cls).get("configurations"), tuple):
             cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": tuple[str, ...]}
             cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
+
+    @classmethod
+    def family(cls) -> str:
+        """Its equation and its driver, in words: `loss torque that changes with speed`."""
+        what = f"reading of {cls.channel}".replace("_", " ") if cls.channel else EQUATION[cls.balance]
+        return f"{what} that changes with {cls.driver}" if cls.driver else f"{what} that is the same share everywhere"
 
     @property
     def acts_everywhere(self) -> bool:

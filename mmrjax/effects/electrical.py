@@ -26,6 +26,7 @@ class SeriesResistance(ElectricalEffect):
     Source: Fig. 20 of the paper (leads and ammeter of the bench); Ohm (1827).
     """
 
+    driver = "current"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -50,6 +51,7 @@ class BrushDrop(ElectricalEffect):
     contact is ohmic.
     """
 
+    driver = "current"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -83,6 +85,8 @@ class WindingHeating(ElectricalEffect):
     that the inrush of a start, which lasts milliseconds, is not taken for a settled current of 50 A.
     """
 
+    driver = "current"
+    rests_on = ("motor.resistance_thermal",)
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -110,6 +114,7 @@ class ThermalDrift(ElectricalEffect):
     The memory is T [K]; where none is kept it is settled.
     """
 
+    driver = "current"
     dissipative = True
     settles_to = "winding_heating"
     memory_size = 10.0

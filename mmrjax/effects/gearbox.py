@@ -30,6 +30,7 @@ class GearLoadLoss(GearboxEffect):
     eq. (19)'s η_rm in another form: look-alike of a change of η_rm by -a η_rm.
     """
 
+    driver = "load"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -55,6 +56,7 @@ class GearQuadraticLoss(GearboxEffect):
     whose planets tilt.
     """
 
+    driver = "load"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -79,6 +81,7 @@ class StribeckGear(GearboxEffect):
     Winter, 2003). With the same ω_s it is `stribeck_motor` times i η_rm.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(

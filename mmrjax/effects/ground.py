@@ -26,6 +26,7 @@ class SpeedRolling(GroundEffect):
     for light tracks.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -50,6 +51,7 @@ class AdhesiveDrag(GroundEffect):
     Here rounded off at rest, so that its derivative is finite there.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -83,6 +85,7 @@ class WeightTransfer(GroundEffect):
     pressure above 1), so the first-order part cancels and a ~ f (h/L)².
     """
 
+    driver = "slope"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -107,6 +110,7 @@ class Sinkage(GroundEffect):
     coefficient.
     """
 
+    driver = "load"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -141,6 +145,7 @@ class SlopeBias(GroundEffect):
     apart.
     """
 
+    driver = "weight"
     odd_in_travel = True
 
     amplitude: Scalar = amplitude(
@@ -165,6 +170,7 @@ class GrouserPolygon(Periodic, GroundEffect):
     comes down again, so it takes no power out over a passage.
     """
 
+    driver = "angle"
     movers = "tracks"
 
     amplitude: Scalar = amplitude(

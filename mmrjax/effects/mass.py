@@ -47,6 +47,7 @@ class MassOffset(MassEffect):
     guide load and inertia all follow from the mass, so it enters there and nowhere else.
     """
 
+    driver = "configuration"
     movers = "wheels"
 
     amplitude: Scalar = amplitude(

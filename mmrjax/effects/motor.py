@@ -30,6 +30,7 @@ class Windage(MotorEffect):
     cube of speed at a constant skin friction coefficient.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -55,6 +56,7 @@ class StribeckMotor(MotorEffect):
     (1994), with exponent 1.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -87,6 +89,7 @@ class IronLoss(MotorEffect):
     is its dry one: what can be told from them is the bend towards ω_c.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -121,6 +124,8 @@ class TorqueConstantSaturation(MotorEffect):
     So it is not a loss of power by itself.
     """
 
+    driver = "load"
+
     amplitude: Scalar = amplitude(
         unit="1/A^2",
         meaning="relative loss of torque constant over squared current",
@@ -143,6 +148,8 @@ class Cogging(Periodic, MotorEffect):
     rotor's inertia leaves no more than a / (J_d ω_f) of speed, 0.03 rad/s at the prior's size, so the ripple
     is faded out instead of being integrated at 5 kHz: it acts at a crawl and at the start.
     """
+
+    driver = "angle"
 
     amplitude: Scalar = amplitude(
         unit="N·m",

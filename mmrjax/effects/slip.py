@@ -48,6 +48,8 @@ class BeltCreep(SlipEffect):
     steady travel; where the two differ in sign it is no loss.
     """
 
+    driver = "demand"
+
     amplitude: Scalar = amplitude(
         unit="1/N",
         meaning="creep over traction of a side, 1/(E A)",
@@ -69,6 +71,8 @@ class NonlinearSlip(SlipEffect):
     inverse. u is held within 2, beyond which the robot slides anyway. A loss where demand and traction agree
     in sign.
     """
+
+    driver = "demand"
 
     amplitude: Scalar = amplitude(
         unit="-",
@@ -92,6 +96,8 @@ class SpeedSlip(SlipEffect):
     is kinematic: on a descent it does not take power out.
     """
 
+    driver = "speed"
+
     amplitude: Scalar = amplitude(
         unit="s/m",
         meaning="slip over speed",
@@ -113,6 +119,8 @@ class LoadSlip(SlipEffect):
     2012, ch. 1). Kinematic, so not dissipative by itself.
     """
 
+    driver = "load"
+
     amplitude: Scalar = amplitude(
         unit="1/N",
         meaning="relative loss of rolling radius over load of a side",
@@ -133,6 +141,8 @@ class PulleyEccentricity(Periodic, SlipEffect):
     Source: order 1 of the driving wheel's angle; total run-out by ISO 1101. The lever arm of the traction
     changes alike, which is left out: an effect enters one balance.
     """
+
+    driver = "angle"
 
     amplitude: Scalar = amplitude(
         unit="-",

@@ -24,6 +24,7 @@ class SupplySag(SupplyEffect):
     them apart.
     """
 
+    driver = "current"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -49,6 +50,7 @@ class BatterySag(SupplyEffect):
     stored, so it is not a pure loss. On an external supply it is absent.
     """
 
+    driver = "current"
     needs_battery = True
     memory_size = 10.0
     memory_unit = "A"

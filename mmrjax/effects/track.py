@@ -25,6 +25,7 @@ class Churning(TrackEffect):
     speed, at a rate that grows as the speed (Merritt, The Evolution of a Tank Transmission, 1946).
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -48,6 +49,7 @@ class StribeckTrack(TrackEffect):
     Source: Tustin (1947), the exponential law; Armstrong-Hélouvry, Dupont and Canudas de Wit (1994).
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -80,6 +82,7 @@ class TensionFriction(TrackEffect):
     tractive effort.
     """
 
+    driver = "load"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -106,6 +109,7 @@ class CentrifugalTension(TrackEffect):
     the pulley, which drives the belt in both.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -132,6 +136,7 @@ class BendingLoss(TrackEffect):
     Far from ω_r it is like eq. (24)'s terms.
     """
 
+    driver = "speed"
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -167,6 +172,7 @@ class StickSlip(TrackEffect):
     Bent bristles give energy back, so it is not a pure loss.
     """
 
+    driver = "speed"
     transient = True
     memory_size = 1.0
     memory_unit = "-"

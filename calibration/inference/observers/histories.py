@@ -74,6 +74,9 @@ class HistoriesLinearization(Linearization):
             return bases_room.ORDERS[name][0] * np.asarray(self.angle)
         return np.asarray(self.time) if name == "time" else super().variable(name)
 
+    def turned(self) -> np.ndarray | None:
+        return np.asarray(self.angle)
+
     def series(self) -> Float[Array, "runs samples channels"]:
         """Whitened residuals of the readings of each run in the order of time, 0 beyond its last."""
         return jnp.where(self.rows_of[:, :, None] < 0, 0.0, self.by_row()[self.rows_of])

@@ -1,0 +1,209 @@
+"""Whether names may stand: what smooth curves would explain in their place, or take away from them.
+
+A name is a claim about a cause; a curve claims only a place and a shape. Effects that were searched for among many
+can together imitate a law that the library lacks. So names are compared with curves by evidence that counts what was
+searched (MacKay, Information Theory, Inference, and Learning Algorithms, 2003, ch. 28), and where a fit with effects
+is not adequate each has to keep its significance with the best curves beside it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.adequacy import AdequacyTest, Diagnosis
+from calibration.discovery.candidates import Candidate
+from calibration.discovery.projection import Projection
+from calibration.discovery.score_tests import beside_columns, family_columns
+from calibration.discovery.search import Search
+from calibration.discovery.settings import Settings
+from calibration.discovery.smooth import smooth, surface
+from calibration.inference import bases as bases_room
+from calibration.inference.bases import Bases
+from calibration.inference.linearization import Linearization
+
+#: Curves that are put beside effects, one after the other.
+CURVES = 3
+#: Balances whose curves stand for effects of a balance: those of one equation.
+EQUATION = {
+    **dict.fromkeys(("supply", "electrical"), "electrical"),
+    **dict.fromkeys(("motor", "gearbox", "track"), "track"),
+    **dict.fromkeys(("ground", "mass"), "ground"),
+    "slip": "slip",
+}
+#: Pairs of variables over which a surface is tried.
+VARIABLES = ("voltage", "current", "speed_motor", "slope", "payload")
+
+
+@dataclasses.dataclass(frozen=True)
+class Standing:
+    """Whether the names of a candidate stand.
+
+    Attributes:
+        stands: whether they do; reason: in a sentence, why not, or what was put beside them.
+    """
+
+    stands: bool
+    reason: str = ""
+
+
+def standing(
+    space: CandidateSpace, base: Candidate, searched: Search, left: Diagnosis, bases: Bases, settings: Settings
+) -> Standing:
+    """Whether the effects of the best candidate of a search may be named.
+
+    Args:
+        left: what the base leaves.
+    """
+    best, after = searched.best, searched.diagnosis
+    if best is None or after is None:
+        return Standing(False, "no effect of the library that explains it is of a plausible size")
+    other = _ruled_out(space, base, best, searched.ladder, settings)
+    if other is not None:
+        return Standing(False, f"{' and '.join(other.effects)} would explain more, but not at a plausible size")
+    if after.test.rejected_with_margin:
+        return _beside_curves(space, best, after, bases, settings)
+    return _against_curves(space, base, best, left.linear, bases, settings)
+
+
+def _ruled_out(
+    space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
+) -> Candidate | None:
+    """A candidate that is the better explanation by its evidence and is ruled out by its size alone."""
+    names = evidence_of_names(space, base, best, settings)
+    ruled_out = [c for c in ladder if not c.plausible and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
+    better = [c for c in ruled_out if evidence_of_names(space, base, c, settings) > names + settings.preferred]
+    return min(better, key=lambda c: c.cost, default=None)
+
+
+# --- an adequate fit: is a curve the better explanation? ---------------------------------------------------
+
+
+def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> float:
+    """Twice the log of the evidence of a set of effects over none [σ²]: the fall of χ², less what their amplitudes
+    and shapes were free to take and the number of sets of its size."""
+    p, count = space.free, len(best.effects)
+    sds = np.asarray(best.sd)[[k for k, name in enumerate(best.active) if name] + np.array(p)]
+    shapes = np.asarray(best.sd)[[k for k, name in enumerate(best.active) if name] + np.array(p + settings.slots)]
+    taken = -2 * np.sum(np.log(np.clip(np.concatenate([sds, shapes]), 1e-6, 1.0)))
+    return float(2 * (base.cost - best.cost) - taken - 2 * math.log(math.comb(len(space.library), count)))
+
+
+def _against_curves(
+    space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
+) -> Standing:
+    """Names against one smooth curve of one variable, or of two, in the balance of several of them or anywhere."""
+    names = evidence_of_names(space, base, best, settings)
+    equations = [EQUATION.get(space.library[e].balance, "") for e in best.effects]
+    crowded = {e for e in equations if e and equations.count(e) > 1}
+    tried = _curves(space, linear, bases, crowded)
+    if not tried:
+        return Standing(True)
+    curve, word = max(tried)
+    curve -= 2 * math.log(len(tried))
+    # What is linear at the base falls short of a fit: compared with what the names would explain there.
+    shortfall = 2 * (base.cost - best.cost) - _linearly(space, best, linear, settings)
+    if curve + max(shortfall, 0.0) > names + settings.preferred:
+        return Standing(False, f"one smooth {word} explains as much as {' and '.join(best.effects)}")
+    return Standing(True)
+
+
+def _curves(space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]) -> list[tuple[float, str]]:
+    """(evidence, words) of every smooth curve: of one variable in any balance, of two in the crowded ones."""
+    included, offered = space.included, {n[1] for n in bases_room.names(bases)}
+    known = [v for v in bases_room.VARIABLES if v in offered and _varies(linear, v, included)]
+    tried = []
+    for balance in bases_room.BALANCES:
+        for variable in known:
+            found = smooth(linear, balance, variable, included)
+            tried.append((found.evidence, f"curve in {balance} over {variable.replace('_', ' ')}"))
+    project = Projection(linear)
+    for balance in sorted(crowded):
+        for pair in itertools.combinations([v for v in VARIABLES if v in known], 2):
+            over = surface(linear, balance, pair, included, project)
+            words = " and ".join(v.replace("_", " ") for v in pair)
+            tried.append((over.evidence, f"surface in {balance} over {words}"))
+    return tried
+
+
+def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
+    x = linear.variable(variable)[included]
+    return bool(np.all(np.isfinite(x)) and np.ptp(x) > 1e-9 * max(np.max(np.abs(x)), 1e-9))
+
+
+def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, settings: Settings) -> float:
+    """What the effects of a candidate explain at the base fit, at their nearest shapes [σ²]."""
+    p, s = space.free, settings.slots
+    chosen = []
+    for slot, name in enumerate(best.active):
+        if name:
+            mine = np.flatnonzero(space.library.of == space.library.names.index(name))
+            chosen.append(int(mine[np.argmin(np.abs(space.library.at[mine] - best.z[p + s + slot]))]))
+    a, b = Projection(linear)(np.asarray(linear.signatures)[:, chosen])
+    return float(b @ np.linalg.lstsq(a, b, rcond=1e-9)[0])
+
+
+# --- a fit that is not adequate: do the names keep their significance? -------------------------------------
+
+
+def _beside_curves(
+    space: CandidateSpace, best: Candidate, after: Diagnosis, bases: Bases, settings: Settings
+) -> Standing:
+    """Names beside the best smooth curves, as many as leave nothing: each has to keep its significance, and what is
+    left with both has to be noise."""
+    linear, chosen = after.linear, list[int]()
+    names = bases_room.names(bases)
+    columns = np.zeros((linear.readings, 0))
+    deviate = np.array(after.scores.curve)
+    test = after.test
+    for _ in range(CURVES):
+        chosen.append(int(np.argmax(deviate)))
+        columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
+        found, deviate = beside_columns(linear, bases, columns, [names[k][0] for k in chosen])
+        test = AdequacyTest(found, after.test.null, settings)
+        if not test.rejected_with_margin:
+            break
+    if test.rejected_with_margin:
+        return Standing(False, f"the fit with {' and '.join(best.effects)} is not adequate")
+    for e in best.effects:
+        columns = np.concatenate([columns, _strongest_surface(space, linear, space.library[e].balance)], 1)
+    significance = _significance(space, best, linear, columns)
+    needed = after.test.threshold("single")
+    lost = [e for e, t in zip(best.effects, significance, strict=True) if abs(t) < needed]
+    words = ", ".join(f"{names[k][0]} over {names[k][1].replace('_', ' ')}" for k in chosen)
+    if lost:
+        return Standing(False, f"beside smooth curves ({words}) {' and '.join(lost)} would explain nothing")
+    return Standing(True, f"beside smooth curves ({words})")
+
+
+def _strongest_surface(space: CandidateSpace, linear: Linearization, balance: str) -> np.ndarray:
+    """Columns of the surface of most evidence in an effect's equation, none where it has no curves."""
+    equation = EQUATION.get(balance)
+    included = space.included
+    known = [v for v in VARIABLES if _varies(linear, v, included)]
+    if equation is None or len(known) < 2:
+        return np.zeros((linear.readings, 0))
+    project = Projection(linear)
+    tried = [surface(linear, equation, pair, included, project) for pair in itertools.combinations(known, 2)]
+    return max(tried, key=lambda s: s.evidence).columns
+
+
+def _significance(space: CandidateSpace, best: Candidate, linear: Linearization, columns: np.ndarray) -> list[float]:
+    """Amplitude of each effect over its sd, with columns fitted beside (of prior sd 1 each)."""
+    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
+    width = columns.shape[1]
+    whole = np.zeros((len(jacobian) + width, jacobian.shape[1] + width))
+    whole[: len(jacobian), : jacobian.shape[1]] = jacobian
+    whole[: linear.readings, jacobian.shape[1] :] = columns
+    whole[len(jacobian) :, jacobian.shape[1] :] = np.eye(width)
+    long = np.concatenate([residual, np.zeros(width)])
+    normal = whole.T @ whole
+    step = -np.linalg.solve(normal, whole.T @ long)
+    sd = np.sqrt(np.diag(np.linalg.inv(normal)))
+    at = [space.free + slot for slot, name in enumerate(best.active) if name]
+    return [float((best.z[k] + step[k]) / sd[k]) for k in at]

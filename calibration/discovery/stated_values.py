@@ -1,0 +1,100 @@
+"""Stated values that may be the wrong ones: base parameters whose shift explains the data as well as an effect.
+
+A prior is a measurement made beforehand, and may be off like any reading. The score of a shift of one prior's mean is
+that of a column that is 1 in its residual; where it is large, the fit is made again with that prior left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.candidates import Candidate, candidate
+from calibration.discovery.settings import Settings
+from calibration.inference.held_out import search_in_batches
+from calibration.inference.optimizers import linearised
+
+#: Refits with a prior's mean where the last one ended, until it pulls no longer [prior sds].
+ROUNDS, PULL = 3, 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Shift:
+    """A base parameter freed of its prior, in the place of an effect.
+
+    Attributes:
+        name: dotted, of the parameter; index: of its coordinate.
+        fit: all else fitted again; cost of its prior left out.
+    """
+
+    name: str
+    index: int
+    fit: Candidate
+
+
+def scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a shift of the mean of each coordinate's prior would explain [σ²], and where the data alone would have the
+    coordinate, as far as a line tells [prior sds].
+
+    Args:
+        jacobian, residual: of a fit, the priors' residuals last.
+    """
+    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    at = np.arange(len(residual) - jacobian.shape[1], len(residual))
+    leverage = np.sum(half[:, at] ** 2, 0)
+    left = residual[at] - half[:, at].T @ (half @ residual)
+    free = np.maximum(1 - leverage, 1e-9)
+    seen = leverage < 1 - 1e-6
+    return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[at] / free, 0.0)
+
+
+def shifts(space: CandidateSpace, at: Candidate, needed: float, settings: Settings) -> list[Shift]:
+    """Base parameters that, freed of their prior, would explain at least `needed` σ² of what a fit leaves.
+
+    Args:
+        at: the fit; its effects stay.
+    """
+    problem = space.problem(at.active)
+    residual, jacobian, _ = linearised(problem, jnp.asarray(at.z), problem.data)
+    explained, values = scores(np.asarray(jacobian), np.asarray(residual))
+    found = []
+    for k in np.argsort(-explained[: space.free]):
+        if explained[k] < needed:
+            break
+        fit = _without_prior(space, at, int(k), float(values[k]), settings)
+        if fit is not None:
+            found.append(Shift(space.coordinates.base.names[k], int(k), fit))
+    return found
+
+
+def _without_prior(
+    space: CandidateSpace, at: Candidate, k: int, value: float, settings: Settings
+) -> Candidate | None:
+    """The fit with the prior of coordinate k left out: with its mean where the data have it.
+
+    None where that is beyond the parameter's bounds, or no optimum.
+    """
+    p, mean, start = space.free, value, np.array(at.z)
+    batch = space.bare.observe.policy.batch
+    indices = [space.library.indices(at.active)] * batch
+    for _ in range(ROUNDS):
+        centre = np.zeros(len(start))
+        centre[k] = mean
+        start[k] = mean
+        data = dataclasses.replace(space.equipped.data, centre=jnp.asarray(centre))
+        problem = dataclasses.replace(space.equipped, data=data)
+        found, _ = search_in_batches(problem, [start] * batch, [space.weight] * batch, indices)
+        best = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
+        z = np.asarray(found.z[best])
+        if not np.isfinite(found.cost[best]):
+            return None
+        if abs(z[k] - mean) < PULL:
+            break
+        mean, start = float(z[k]), z.copy()
+    if space.coordinates.base.beyond(z[:p])[k]:
+        return None
+    return candidate(space, at.active, jax.tree.map(lambda x: x[best], found), settings)
