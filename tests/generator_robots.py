@@ -136,7 +136,9 @@ def _drawn(rng: np.random.Generator, roles: Sequence[str]) -> tuple[dict[str, fl
         "gearbox.friction_viscous": dry * rng.uniform(0.4, 0.9) / no_load,
     }
     p = {n: _typed(v) if n.startswith(("motor.", "gearbox.")) else v for n, v in p.items()}
-    whole = 0.02 < R < 15 and CURRENT[0] < SIDES * demand / C < CURRENT[1] and p["motor.inertia"] < 8e-4 and dry < 0.08
+    whole = (
+        0.02 < R < 15 and CURRENT[0] < SIDES * demand / C < CURRENT[1] and p["motor.inertia"] < 8e-4 and dry < 0.08
+    )
     return (p, supply, payload) if whole else None
 
 

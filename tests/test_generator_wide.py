@@ -93,7 +93,7 @@ def test_robots_constants_fit_together(machines):
         assert sound.all() and y[0].min() > 0.05 and y[0].max() < 120
         no_load = m.supply / p["motor.torque_constant"]
         assert 250 < no_load < 1300 and (y[1] < no_load).all()
-        assert y[2].min() > 0.02 and y[2].max() < 3.0
+        assert y[2].min() > 0.02 and y[2].max() < 4.5
         dry = p["motor.friction_coulomb"] + p["gearbox.friction_coulomb"]
         assert dry / p["motor.torque_constant"] < 0.12 * np.median(y[0])  # current at no load
 
