@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pysindy
-from loop import MIMIC, STATED, campaign, interval, make, oracle, robot_of
+from campaign import Task, campaign, robot_of
+from loop import STATED, make, oracle
+from loop_scores import MIMIC, interval
 
 KINDS = ("clean", "library", "outside", "pairs")
 #: Effects that are refitted beside a fit: the loop's own number.
@@ -287,10 +289,9 @@ def summary(lines: list[dict]) -> list[str]:
     return out
 
 
-def work(task: tuple) -> dict:
+def work(task: Task) -> dict:
     """One case in a worker."""
-    kind, seed, _, robot = task
-    return one(robot_of(robot), kind, seed)
+    return one(robot_of(task.robot), task.kind, task.seed)
 
 
 if __name__ == "__main__":

@@ -69,20 +69,27 @@ def perturbed(rng: np.random.Generator, names: Sequence[str] = tuple(TOLERANCES)
 
 @dataclasses.dataclass(frozen=True)
 class Conditions:
-    """One array a column, shape (rows,): wheeled 0/1, U [V], slope [rad], payload [kg], stated mass [kg]."""
+    """One array a column, shape (rows,): wheeled 0/1, U [V], slope [rad], payload [kg], stated mass [kg], and the
+    position in which the row was measured, from 0 on."""
 
     wheeled: np.ndarray
     U: np.ndarray
     slope: np.ndarray
     payload: np.ndarray
     mass: np.ndarray
+    row: np.ndarray
+
+    def at(self, rows: np.ndarray) -> Conditions:
+        """These rows, measured in this order."""
+        kept = [getattr(self, f.name)[rows] for f in dataclasses.fields(self)[:-1]]
+        return Conditions(*kept, np.arange(len(rows), dtype=float))
 
 
 def conditions(wheeled, U, slope_deg, payload, p: Mapping[str, float] = CLIMBING) -> Conditions:
     """Conditions with the mass as weighed, to 10 g."""
     w, u, s, m = (np.asarray(x, float) for x in np.broadcast_arrays(wheeled, U, slope_deg, payload))
     own = np.where(w > 0.5, p["4W2T.mass"], p["6T2A.mass"])
-    return Conditions(w, u, np.radians(s), m, np.round(own + m, 2))
+    return Conditions(w, u, np.radians(s), m, np.round(own + m, 2), np.arange(w.size, dtype=float).reshape(w.shape))
 
 
 def table8(
@@ -219,25 +226,26 @@ CHANNELS = ("total_current", "motor_speed", "speed")
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """One form with its amplitude and shape parameters."""
+    """One form with its amplitude and shape parameters; `law` is a form that FORMS does not hold under that name."""
 
     name: str
     amplitude: float
     shapes: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    law: Form | None = None
 
     @property
     def form(self) -> Form:
-        return FORMS[self.name]
+        return FORMS[self.name] if self.law is None else self.law
 
     def of(self, s: SimpleNamespace) -> np.ndarray:
         return self.amplitude * self.form.of(s, self.shapes)
 
 
-def draw(name: str, rng: np.random.Generator) -> Term:
+def draw(name: str, rng: np.random.Generator, law: Form | None = None) -> Term:
     """A term of unit amplitude (of its ordinary sign) with its shape parameters drawn."""
-    form = FORMS[name]
+    form = FORMS[name] if law is None else law
     sign = rng.choice((-1.0, 1.0)) if form.either else 1.0
-    return Term(name, sign, {k: float(rng.uniform(*b)) for k, b in form.shapes.items()})
+    return Term(name, sign, {k: float(rng.uniform(*b)) for k, b in form.shapes.items()}, law)
 
 
 # --- the balances -----------------------------------------------------------------------------------
@@ -255,6 +263,7 @@ def _instant(x: np.ndarray, c: Conditions, p: Mapping[str, float], terms: Sequen
         return sum((t.of(s) for t in terms if t.form.balance == balance), 0.0)
 
     s = SimpleNamespace(I=x[0], w=x[1], V=x[2], wheeled=c.wheeled, slope=c.slope, payload=c.payload, U=c.U)
+    s.row, s.order = c.row, c.row / max(float(np.max(c.row, initial=0.0)), 1.0)  # order: 0 to 1
     s.R, s.C = p["motor.resistance"], p["motor.torque_constant"]
     s.r, s.M_t0, s.M_own, s.r_pulley = both("radius"), both("track.loss_coulomb"), both("mass"), p["6T2A.radius"]
     s.w_k = s.w / p["gearbox.ratio"]
@@ -346,17 +355,20 @@ class Instruments:
 _SHOWN = np.array([1.0, 30 / np.pi, 1000.0])[:, None]  # A, rad/s, m/s → A, rpm, mm/s
 
 
-def base_slopes(c, p, instruments: Instruments, names: Sequence[str] = tuple(TOLERANCES)) -> np.ndarray:
-    """Whitened change of the readings for one tolerance of each constant, shape (3 rows, names)."""
+def base_slopes(
+    c, p, instruments: Instruments, names: Sequence[str] = tuple(TOLERANCES), sds: Mapping[str, float] | None = None
+) -> np.ndarray:
+    """Whitened change of the readings for one sd of each constant, shape (3 rows, names); `sds`: else tolerances."""
     x, _ = solve(c, p)
     f0 = _left(x, c, p, ())
     inverse = np.linalg.inv(_slope(x, c, p, (), f0))
     columns = []
     for name in names:
-        h = 1e-6 * p[name]
+        sd = TOLERANCES[name] * CLIMBING[name] if sds is None else sds[name]
+        h = 1e-6 * max(p[name], sd)
         df = (_left(x, c, dict(p) | {name: p[name] + h}, ()) - f0) / h
         dx = -np.einsum("nij,jn->in", inverse, df)
-        dy = dx * np.array([SIDES, 1.0, 1.0])[:, None] * TOLERANCES[name] * CLIMBING[name]
+        dy = dx * np.array([SIDES, 1.0, 1.0])[:, None] * sd
         columns.append((dy * _SHOWN / instruments.stated[:, None]).ravel())
     return np.stack(columns, 1)
 
@@ -455,7 +467,7 @@ def _free(how: str, U: np.ndarray, wheeled: int, motors: int, p: Mapping[str, fl
         s = SimpleNamespace(
             I=i, w=w, w_k=w / p["gearbox.ratio"], U=U, R=R, C=C, r=p[chassis + "radius"], r_pulley=p["6T2A.radius"],
             M_t0=p[chassis + "track.loss_coulomb"], M=zero, N=zero, D=zero, P=zero, payload=zero, slope=zero,
-            wheeled=zero + wheeled, V=zero,
+            wheeled=zero + wheeled, V=zero, row=zero, order=zero,
         )  # fmt: skip
         # terms of the common line are written for the current of all motors, SIDES I
         line = SimpleNamespace(**vars(s) | {"I": i * motors / SIDES})

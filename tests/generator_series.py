@@ -52,6 +52,13 @@ FORMS: dict[str, Moving] = {
     "stick_slip": Moving("track", lambda s, q: s.z, 0.1, {}, "stick_slip"),
     "series_resistance": Moving("electrical", lambda s, q: s.I, 0.4, {}, "series_resistance"),
     "churning": Moving("track", lambda s, q: s.w_k**2 * s.sign, 5e-4, {}, "churning"),
+    "supply_sag": Moving("supply", lambda s, q: SIDES * s.I, 0.2, {}, "supply_sag"),
+    "brush_drop": Moving("electrical", lambda s, q: s.I / np.hypot(s.I, q["knee"]), 0.5, {"knee": (0.05, 0.2)}, "brush_drop"),
+    "windage": Moving("motor", lambda s, q: s.w**2 * s.sign, 5e-10, {}, "windage"),
+    "stribeck_track": Moving("track", lambda s, q: np.exp(-abs(s.w_k) / q["fade"]) * s.sign, 0.1, {"fade": (5.0, 16.0)}, "stribeck_track"),
+    "rolling_radius": Moving("slip", lambda s, q: -s.V_teor, 0.03, {}, "rolling_radius"),
+    "speed_slip": Moving("slip", lambda s, q: s.V_teor**2 * s.sign, 0.02, {}, "speed_slip"),
+    "load_slip": Moving("slip", lambda s, q: s.N * s.V_teor, 1e-4, {}, "load_slip"),
     # outside the library: a bent shaft (order 2 of the pulley), a belt splice (once a turn of the belt),
     # a supply that recovers after its inrush, oil that warms with the way travelled
     "pulley_ovality": Moving("track", lambda s, q: np.sin(2 * s.theta / s.i + q["phase"]), 0.05, _PHASE),
@@ -91,7 +98,7 @@ def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str,
     s.V_teor = s.r * s.w_k
     s.sign, sign_V = _soft_sign(s.V_teor, 0.1 * V_s), _soft_sign(s.V, 0.1 * V_s)
     m = c.mass / SIDES
-    N = m * G * np.cos(c.slope)
+    N = s.N = m * G * np.cos(c.slope)
     cell = p["battery.curvature"] * s.C_b**2 + p["battery.slope"] * s.C_b + p["battery.voltage_full"]
     I_b = SIDES * s.I + p["battery.current_other"]  # (10)
     U = np.where(battery > 0.5, CELLS * (cell - I_b * p["battery.resistance"]), c.U) - extra("supply")

@@ -205,3 +205,21 @@ def test_more_runs_come_from_the_same_robot():
 def test_without_effects_sigmas_are_none():
     assert g.case(seed=1).label["sigmas_together"] == 0.0
     assert g.case(seed=1).label["kind"] == "clean" and g.case(seed=1).label["effects"] == []
+
+
+def test_a_term_may_bring_its_own_law_and_see_when_a_row_was_measured():
+    law = g.Form("", "track", lambda s, q: s.order, 0.1)
+    rows = g.table8().at(np.arange(89, -1, -1))
+    term = g.Term("drift", 0.1, law=law)
+    y, sound = g.readings(rows, g.CLIMBING, [term])
+    change = (y / g.readings(rows, g.CLIMBING)[0] - 1)[0]
+    assert sound.all() and change[0] == pytest.approx(0, abs=1e-9) and change[-1] > 5 * change[9] > 0
+    assert (rows.slope == g.table8().slope[::-1]).all()
+
+
+def test_slopes_take_the_sds_that_they_are_given():
+    p, show = dict(g.CLIMBING), g.Instruments()
+    name = "4W2T.ground.friction.speed_static"
+    usual = g.base_slopes(GRID, p, show, (name,))
+    wide = g.base_slopes(GRID, p, show, (name,), {name: p[name]})
+    np.testing.assert_allclose(wide, usual / 0.3, rtol=1e-6)

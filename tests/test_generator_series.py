@@ -17,6 +17,8 @@ from mmrjax.fidelities.drive import drive_batch
 RUNS = gs.starts(g.CLIMBING)
 DURATION, EVERY = 0.6, 0.01
 PASSING = tuple(n for n, f in gs.FORMS.items() if f.cls)
+#: What the library calls a shape parameter.
+SHAPES = {"knee": "current_ohmic", "fade": "speed_fade"}
 #: Of each channel's largest value in the run; 4e-6 at worst (a battery run whose movers spin), else below 2e-6.
 ERROR = 1e-5
 
@@ -66,9 +68,11 @@ def test_comparison_with_drive_can_fail(package):
 def test_effect_of_a_series_agrees_with_drive(package, name):
     form, battery = gs.FORMS[name], float(name == "battery_sag")
     size = {"cogging": 10.0, "stick_slip": 3.0, "thermal_drift": 5.0}.get(name, 1.0) * form.size
-    shapes = {k: 0.5 for k in form.shapes}
+    shapes = {k: 0.5 if k == "phase" else float(np.mean(b)) for k, b in form.shapes.items()}
     _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING, [(form, size, shapes)], np.full(6, battery))
-    values = {f"effects.{name}.amplitude": size} | {f"effects.{name}.{k}": v for k, v in shapes.items()}
+    values = {f"effects.{name}.amplitude": size} | {
+        f"effects.{name}.{SHAPES.get(k, k)}": v for k, v in shapes.items()
+    }
     there = package(battery, values)
     assert apart(there, y) < ERROR
     assert apart(there, package(battery)) > 3e-5

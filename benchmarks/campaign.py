@@ -1,0 +1,161 @@
+"""The command of a campaign: so many cases of each kind, one line of a file each, on many processes, resumable."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import gc
+import json
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [p for p in (str(ROOT), str(ROOT / "tests")) if p not in sys.path]
+
+#: A worker is one thread: as many workers as cores share a machine without waiting for one another.
+ALONE = {
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+#: Memory mappings of a worker beyond which its compiled programs are dropped; Linux allows 65530.
+MAPPINGS = 30_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One case: its kind and seed, and how it is judged."""
+
+    kind: str
+    seed: int
+    replicates: int = 500
+    robot: str = "nominal"
+    narrow: bool = False
+
+
+@functools.cache
+def robot_of(name: str) -> Any:
+    """A robot by its name or from its file; what its loops compile is kept on disk for the other workers."""
+    import jax
+
+    from sweeps import compilation_cache
+
+    compilation_cache.enable()
+    jax.config.update("jax_enable_x64", True)
+    from calibration.data import robot_file
+
+    return robot_file.load(name)
+
+
+def plain(x: Any) -> Any:
+    """Anything that a result holds, as JSON can."""
+    if dataclasses.is_dataclass(x) and not isinstance(x, type):
+        return {f.name: plain(getattr(x, f.name)) for f in dataclasses.fields(x)}
+    if isinstance(x, Mapping):
+        return {str(k): plain(v) for k, v in x.items()}
+    if isinstance(x, list | tuple | set | frozenset):
+        return [plain(v) for v in x]
+    if isinstance(x, np.ndarray) or hasattr(x, "__array__"):
+        return np.asarray(x).tolist()
+    return x if isinstance(x, str | int | float | bool | type(None)) else str(x)
+
+
+def guarded(work: Callable[[Task], dict], task: Task) -> dict:
+    """What came of a case, or the error that it ended with."""
+    try:
+        return {"kind": task.kind, "seed": task.seed, **work(task)}
+    except Exception as error:
+        return {"kind": task.kind, "seed": task.seed, "error": f"{type(error).__name__}: {error}"}
+    finally:
+        _make_room()
+
+
+def _make_room() -> None:
+    mapped = Path("/proc/self/maps")
+    if "jax" in sys.modules and mapped.exists() and mapped.read_bytes().count(b"\n") > MAPPINGS:
+        sys.modules["jax"].clear_caches()
+        gc.collect()
+
+
+def known(path: Path) -> list[dict]:
+    """Lines of a file; the last may have been cut off."""
+    lines = []
+    for text in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            continue
+    return lines
+
+
+def campaign(
+    doc: str | None, kinds: tuple[str, ...], work: Callable[[Task], dict], summary: Callable[..., list[str]], out: str
+) -> None:
+    """Read the command line, make and judge cases in processes of their own, and print the figures.
+
+    Args:
+        work: a function of a module; summary: of all lines.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for kind in kinds:
+        parser.add_argument(f"--{kind.replace('_', '-')}", type=int, default=0, help="cases")
+    parser.add_argument("--replicates", type=int, default=500)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--robot", default="nominal", help="of the paper's robot's cases")
+    parser.add_argument("--narrow", action="store_true", help="one surface, its adhesion stated, as before")
+    parser.add_argument("--out", type=Path, default=Path(out))
+    parser.add_argument("--cache", type=Path, help="folder of compiled programs that the workers share")
+    parser.add_argument("--limit", type=float, default=np.inf, help="seconds after which the campaign stops")
+    parser.add_argument("--only-summary", action="store_true", help="figures of --out as it is")
+    given = parser.parse_args()
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    lines = [x for x in known(given.out) if "error" not in x]  # errors are tried again
+    if given.only_summary:
+        print("\n".join(summary(known(given.out))))
+        return
+    done = {(x["kind"], x["seed"]) for x in lines}
+    wanted = {kind: getattr(given, kind) for kind in kinds}
+    tasks = [
+        Task(kind, seed, given.replicates, given.robot, given.narrow)
+        for kind, count in wanted.items()
+        for seed in range(given.first, given.first + count)
+        if (kind, seed) not in done
+    ]
+    tasks.sort(key=lambda t: (t.seed - given.first) / wanted[t.kind])  # kinds go on side by side
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if given.jobs > 1:
+        os.environ.update({k: v for k, v in ALONE.items() if k not in os.environ})
+    if given.cache is not None:
+        os.environ["MMRJAX_CACHE"] = str(given.cache.resolve())
+    began = time.monotonic()
+    made = 0
+    cut = given.out.exists() and given.out.read_bytes()[-1:] not in (b"", b"\n")  # killed while writing
+    with multiprocessing.get_context("spawn").Pool(given.jobs) as pool, given.out.open("a", encoding="utf-8") as file:
+        file.write("\n" if cut else "")
+        results = pool.imap_unordered(functools.partial(guarded, work), tasks)
+        while made < len(tasks):
+            left = given.limit - (time.monotonic() - began)
+            try:
+                line = results.next(timeout=max(min(left, 1e6), 0.01))
+            except multiprocessing.TimeoutError:
+                print("the limit is reached", flush=True)
+                pool.terminate()
+                break
+            made += 1
+            lines.append(line)
+            file.write(json.dumps(plain(line)) + "\n")
+            file.flush()
+            if made % 50 == 0:
+                print(f"{made}/{len(tasks)} cases, {time.monotonic() - began:.0f} s", flush=True)
+    print("\n".join(summary(lines)))
+    print(f"{made} of {len(tasks)} cases in {time.monotonic() - began:.0f} s with {given.jobs} processes")

@@ -1,0 +1,357 @@
+"""What a campaign's lines say: shares with their intervals, of tables and of histories alike.
+
+A line holds the verdict (`verdict`, `classes`, `where`, `families`, `events`) beside the truth of its case.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+#: Balances that act on the same of the three equations that current, motor speed and speed close.
+EQUATION = {
+    **dict.fromkeys(("supply", "electrical", "inductance"), "electrical"),
+    **dict.fromkeys(("motor", "gearbox", "track", "ground", "mass", "inertia"), "torque"),
+    "slip": "slip",
+    "sensor": "sensor",
+}
+#: Sigmas that the best library effect has to leave of a foreign one for it not to be a mimic.
+MIMIC = 5.0
+#: Least number of cases of a stratum that is judged; most of the false findings.
+STRATUM, FALSE = 60, 5.0
+#: What drives each effect that has another form among the variants: variables that a curve could have.
+SPEEDS = ("speed_motor", "speed", "voltage")
+LOADS = ("slope", "payload", "current")
+DRIVEN: dict[str, tuple[str, ...]] = {
+    "supply_sag": ("current",), "brush_drop": ("current",), "winding_heating": ("current",),
+    "torque_constant_saturation": ("current",), "windage": SPEEDS, "stribeck_motor": SPEEDS, "iron_loss": SPEEDS,
+    "gear_quadratic_loss": LOADS, "stribeck_gear": SPEEDS, "churning": SPEEDS, "stribeck_track": SPEEDS,
+    "tension_friction": LOADS, "bending_loss": SPEEDS, "speed_rolling": SPEEDS, "adhesive_drag": SPEEDS,
+    "weight_transfer": ("slope",), "sinkage": ("payload",), "belt_creep": LOADS, "nonlinear_slip": LOADS,
+    "speed_slip": SPEEDS, "load_slip": LOADS,
+}  # fmt: skip
+#: Properties by which clean cases are looked at again: name, edges of the bins.
+BINS: tuple[tuple[str, tuple[float, ...]], ...] = (
+    ("adhesion", (0.2, 0.35, 0.5, 0.75, 1.0)),
+    ("V_s", (0.002, 0.006, 0.02, 0.06)),
+    ("mass", (2, 8, 20, 60)),
+    ("ratio", (10, 30, 60, 120)),
+    ("radius", (0.02, 0.045, 0.08, 0.15)),
+    ("supply", (6, 12, 24, 48)),
+    ("rows", (15, 33, 49, 91, 129, 201)),
+)
+
+
+def wilson(hits: int, n: int) -> tuple[float, float]:
+    """95 % interval of a share [%] (Wilson 1927)."""
+    z, p = 1.96, hits / n
+    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / (1 + z * z / n)
+    return 100 * max(middle - half, 0.0), 100 * min(middle + half, 1.0)
+
+
+def interval(hits: int, n: int) -> str:
+    """A share with its 95 % interval."""
+    if n == 0:
+        return "none"
+    low, high = wilson(hits, n)
+    return f"{100 * hits / n:5.1f} %  [{low:.1f}, {high:.1f}]  of {n}"
+
+
+# --- of one line ------------------------------------------------------------------------------------
+
+
+def single(x: dict) -> bool:
+    """Whether one effect is named."""
+    return x["verdict"] == "named" and len(x["classes"]) == 1
+
+
+def contains(x: dict) -> bool:
+    """Whether one effect is found, and its class holds the truth."""
+    return len(x["classes"]) == 1 and x["truth"][0]["class"] in x["classes"][0]
+
+
+def everything(x: dict) -> bool:
+    """Whether there is a class for each truth, and no other."""
+
+    def matched(truths: Sequence[str], classes: Sequence[Sequence[str]]) -> bool:
+        if not truths:
+            return not classes
+        return any(
+            truths[0] in members and matched(truths[1:], [*classes[:k], *classes[k + 1 :]])
+            for k, members in enumerate(classes)
+        )
+
+    return matched([t["class"] for t in x["truth"]], x["classes"])
+
+
+def placed(x: dict) -> bool:
+    """Whether what has no name is in the truth's equation."""
+    return x["verdict"] == "unnamed" and _equation(x) == EQUATION[x["truth"][0]["balance"]]
+
+
+def _equation(x: dict) -> str:
+    return EQUATION.get(x["where"][0], x["where"][0]) if x.get("where") else ""
+
+
+def false_finding(x: dict) -> bool:
+    """Whether something is said to be missing somewhere: a name, or a place."""
+    return x["verdict"] != "none"
+
+
+def located(x: dict) -> bool:
+    """Whether a finding has a name or a place; that the noise is not as stated has neither."""
+    return x["verdict"] in ("named", "class") or (x["verdict"] == "unnamed" and bool(x.get("where")))
+
+
+def family_right(x: dict) -> bool:
+    """Whether the verdict names the truth or its family: the equation it enters and what drives it."""
+    if contains(x):
+        return True
+    truth = x["truth"][0]
+    drives = DRIVEN.get(truth["class"], ())
+    there = [str(f) for f in _flat(x.get("families") or ())]
+    if truth["class"] in there:
+        return True
+    if any(w in there for w in (truth["balance"], _equation_of(truth))) and any(d in there for d in drives):
+        return True
+    return placed(x) and x["where"][1] in drives
+
+
+def _equation_of(truth: dict) -> str:
+    return EQUATION[truth["balance"]]
+
+
+def _flat(x: object) -> Iterable[object]:
+    if isinstance(x, dict):
+        for v in x.values():
+            yield from _flat(v)
+    elif isinstance(x, list | tuple):
+        for v in x:
+            yield from _flat(v)
+    else:
+        yield x
+
+
+def in_place(x: dict) -> bool:
+    """Whether a drift, a cluster or an event is placed: over the right variable in the right equation, or by an event
+    that shares half of its rows or of its time with the truth."""
+    truth = x["truth"][0]
+    where = truth["where"]
+    right = truth["balance"] == "sensor" or _equation(x) == _equation_of(truth)
+    over = {"order": ("order", "row"), "time": ("time",)}.get(where.get("variable", ""), (where.get("variable"),))
+    if x["verdict"] == "unnamed" and right and x["where"] and x["where"][1] in over:
+        return True
+    for event in x.get("events") or ():
+        if not isinstance(event, dict):
+            continue
+        if {"rows", "samples"} & set(event) and where.get("rows"):
+            found, true = set(event.get("rows", event.get("samples"))), set(where["rows"])
+            if len(found & true) >= 0.5 * len(found | true):
+                return True
+        ends = event.get("window") or event.get("time") or (event.get("start"), event.get("stop"))
+        if where.get("window") and isinstance(ends, list | tuple) and len(ends) == 2 and None not in ends:
+            (a, b), (c, d) = ends, where["window"]
+            if min(b, d) - max(a, c) >= 0.5 * (max(b, d) - min(a, c)):
+                return True
+    return False
+
+
+def sigmas(truth: dict) -> float:
+    """What is left of an effect after the base is refitted: by the loop's own base where that is known."""
+    left = truth.get("sigmas_left")
+    return truth["sigmas"] if left is None else left
+
+
+# --- of all lines -----------------------------------------------------------------------------------
+
+
+class Figures:
+    """Lines of text, one a figure."""
+
+    def __init__(self, lines: list[dict]) -> None:
+        self.lines, self.out = lines, []
+
+    def of(self, *kinds: str) -> list[dict]:
+        """Judged cases of these kinds."""
+        return [x for x in self.lines if x["kind"] in kinds and "verdict" in x]
+
+    def say(self, what: str, those: Sequence[dict], hit: Callable[[dict], object]) -> None:
+        """One share, where there is any case."""
+        if those:
+            self.out.append(f"{what:76s} {interval(sum(bool(hit(x)) for x in those), len(those))}")
+
+    def note(self, text: str) -> None:
+        """One line more."""
+        self.out.append(text)
+
+
+def clean(f: Figures, kinds: Sequence[str]) -> None:
+    """False findings, per stratum and per property; a stratum that is too high is marked."""
+    for kind in kinds:
+        f.say(f"{kind}: a false finding (goal <= 5 %)", f.of(kind), false_finding)
+    wide = f.of("clean_wide")
+    for stratum in dict.fromkeys(sorted(x.get("stratum", "") for x in wide)):
+        _stratum(f, f"stratum {stratum}", [x for x in wide if x.get("stratum") == stratum])
+    for name, edges in BINS:
+        for low, high in itertools.pairwise(edges):
+            inside = [x for x in wide if any(low <= v < high or v == high == edges[-1] for v in values(x, name))]
+            _stratum(f, f"{name} {low:g} to {high:g}", inside)
+
+
+def values(x: dict, name: str) -> list[float]:
+    """A property of a case; one of a surface has a value for each configuration."""
+    made = x.get("made", {})
+    if name in ("adhesion", "V_s"):
+        return [s[name] for s in made.get("surface", {}).values()]
+    if name == "rows":
+        return [made["rows"]] if "rows" in made else []
+    return [made["robot"][name]] if name in made.get("robot", {}) else []
+
+
+def _stratum(f: Figures, what: str, those: list[dict]) -> None:
+    if not those:
+        return
+    hits = sum(map(false_finding, those))
+    mark = "  ABOVE 5 %" if wilson(hits, len(those))[0] > FALSE else ""
+    few = "  (few)" if len(those) < STRATUM else ""
+    f.note(f"  {what:74s} {interval(hits, len(those))}{mark}{few}")
+
+
+def noise(f: Figures) -> None:
+    """Noise that is not as stated."""
+    those = f.of("noise")
+    f.say("noise half or twice: a located finding (goal <= 5 %)", those, located)
+    told = [x for x in those if x.get("noise_factor") is not None]
+    f.say("  a factor is told", those, lambda x: x in told)
+    f.say("  and is right within 20 %", told, lambda x: abs(x["noise_factor"] / x["made"]["noise"] - 1) < 0.2)
+
+
+def library(f: Figures, kind: str = "library") -> None:
+    """Effects of the library, by the sigmas that a refit of the base leaves."""
+    those = f.of(kind)
+    for low, high, goal in ((5, 6, "92"), (6, 7, ""), (7, 99, "98")):
+        some = [x for x in those if low <= sigmas(x["truth"][0]) < high]
+        span = f"{low} to {high}" if high < 99 else f">= {low}"
+        f.say(f"{kind}, {span} sigma left: class right" + (f" (goal >= {goal} %)" if goal else ""), some, contains)
+        f.say("  something found", some, false_finding)
+    strong = [x for x in those if sigmas(x["truth"][0]) >= 5]
+    f.say(
+        f"{kind}, >= 5 sigma left: a single name that is given is right (goal >= 97 %)",
+        [x for x in strong if single(x)],
+        contains,
+    )
+    alone = [x for x in strong if len(x["truth"][0].get("class_oracle", ())) == 1]
+    f.say("  single name right, where noise-free data leave one", alone, lambda x: contains(x) and single(x))
+    f.say("  unnamed", strong, lambda x: x["verdict"] == "unnamed")
+    f.say("  two or more effects named", strong, lambda x: len(x["classes"]) > 1)
+    weak = [x for x in those if sigmas(x["truth"][0]) < 5]
+    f.say(f"{kind}, weaker: a wrong name or class", weak, lambda x: x["classes"] and not contains(x))
+    held = [x for x in strong if contains(x)]
+    if held:
+        ideal = [len(x["truth"][0].get("class_oracle", ())) for x in held]
+        mean = np.mean([len(x["classes"][0]) for x in held])
+        f.note(f"  members of the class: mean {mean:.2f} (noise-free {np.mean(ideal):.2f})")
+
+
+def variants(f: Figures) -> None:
+    """Other forms of a library effect."""
+    those = [x for x in f.of("variants") if x["truth"][0]["sigmas"] >= 5]
+    f.say("another form: a wrong single name (goal <= 5 %)", those, lambda x: single(x) and not contains(x))
+    f.say("  the cause's family is named (goal >= 85 %)", those, family_right)
+    f.say("  the class holds the cause", those, contains)
+    f.say("  or unnamed in the right equation", those, lambda x: contains(x) or placed(x))
+    f.say("  nothing found", those, lambda x: x["verdict"] == "none")
+
+
+def outside(f: Figures, kind: str) -> None:
+    """Effects that the library does not hold."""
+    those = [x for x in f.of(kind) if x["truth"][0]["sigmas"] >= 7.5]
+    free = [x for x in those if x["truth"][0].get("best_other", np.inf) >= MIMIC]
+    mimics = [x for x in those if x["truth"][0].get("best_other", np.inf) < MIMIC]
+    f.say(f"{kind} >= 8 sigma, no mimic: wrong single name (goal <= 3 %)", free, single)
+    f.say("  any library name (goal <= 6 %)", free, lambda x: x["classes"])
+    f.say("  unnamed in the right equation (goal >= 95 %)", free, placed)
+    f.say("  nothing found", free, lambda x: x["verdict"] == "none")
+    f.say(
+        "  unnamed in the very balance",
+        free,
+        lambda x: x["verdict"] == "unnamed" and x["where"] and x["where"][0] == x["truth"][0]["balance"],
+    )
+    f.say(
+        "  the very balance among those said to act alike",
+        free,
+        lambda x: x["verdict"] == "unnamed" and x["where"] and x["truth"][0]["balance"] in x["where"][2],
+    )
+    f.say(f"{kind}, with a mimic: a library name", mimics, lambda x: x["classes"])
+    f.say("  unnamed in the right equation", mimics, placed)
+    for name in dict.fromkeys(sorted(x["truth"][0]["name"] for x in free)):
+        some = [x for x in free if x["truth"][0]["name"] == name]
+        wrong = Counter(str(x["classes"]) if x["classes"] else x["verdict"] for x in some if not placed(x))
+        if wrong:
+            f.note(f"    {name}: right {sum(map(placed, some))} of {len(some)}; {dict(wrong)}")
+
+
+def several(f: Figures) -> None:
+    """Two and three effects at once."""
+    for kind, goal in (("pairs", "goal >= 92 %"), ("triples", "goal >= 75 %"), ("compensating", "")):
+        those = f.of(kind)
+        if kind != "compensating":
+            those = [x for x in those if all(t["sigmas"] >= 7.2 for t in x["truth"])]
+        f.say(f"{kind} >= 8 sigma each beside the others: all classes ({goal})", those, everything)
+        f.say("  something found", those, false_finding)
+        f.say("  more effects than there are", those, lambda x: len(x["classes"]) > len(x["truth"]))
+        f.say("  a class that holds none of them", those, lambda x: any(
+            not {t["class"] for t in x["truth"]} & set(c) for c in x["classes"]))  # fmt: skip
+
+
+def placed_kinds(f: Figures, kinds: Sequence[str]) -> None:
+    """Drifts, clusters, events."""
+    for kind in kinds:
+        those = [x for x in f.of(kind) if x["truth"][0]["sigmas"] >= 7.5]
+        f.say(f"{kind} >= 8 sigma: found and placed (goal >= 90 %)", those, in_place)
+        f.say("  something found", those, false_finding)
+        f.say("  a library name", those, lambda x: x["classes"])
+        f.say("  none, and rows or samples set aside", those, lambda x: x["verdict"] == "none" and x["outliers"])
+
+
+def coverage(f: Figures) -> None:
+    """How often 95 % intervals hold the truth: base parameters each, amplitudes apart."""
+    those = [x for x in f.of("coverage") if "deviates" in x]
+    names = dict.fromkeys(n for x in those for n in x["deviates"])
+    whole = [d for x in those for d in x["deviates"].values()]
+    f.say(
+        "coverage: the truth is in the class, or nothing is missing and none said",
+        f.of("coverage"),
+        lambda x: "deviates" in x,
+    )
+    if whole:
+        f.note(f"{'coverage of 95 % intervals, all base parameters (goal 92 to 98 %)':76s} {_covered(whole)}")
+    for name in names:
+        some = [x["deviates"][name] for x in those if name in x["deviates"]]
+        f.note(f"  {name:74s} {_covered(some)}  mean {np.mean(some):+.2f}, sd {np.std(some):.2f}")
+    some = [x["amplitude_deviate"] for x in those if x.get("amplitude_deviate") is not None]
+    if some:
+        what = "coverage of 95 % intervals, amplitudes (goal 92 to 98 %)"
+        f.note(f"{what:76s} {_covered(some)}  mean {np.mean(some):+.2f}")
+
+
+def _covered(deviates: Sequence[float]) -> str:
+    return interval(int(np.sum(np.abs(deviates) <= 1.96)), len(deviates))
+
+
+def ends(f: Figures) -> None:
+    """What was skipped and why, errors, time, outliers."""
+    skipped = Counter((x["kind"], str(x["skipped"])) for x in f.lines if x.get("skipped"))
+    for (kind, why), count in sorted(skipped.items()):
+        f.note(f"skipped: {kind}: {why}: {count}")
+    errors = Counter((x["kind"], x["error"][:110]) for x in f.lines if "error" in x)
+    for (kind, why), count in sorted(errors.items()):
+        f.note(f"error: {kind}: {why}: {count}")
+    judged = [x for x in f.lines if "verdict" in x]
+    if judged:
+        seconds = [x["seconds"] for x in judged]
+        f.note(f"{len(judged)} cases; seconds a case: median {np.median(seconds):.2f}, mean {np.mean(seconds):.2f}")
