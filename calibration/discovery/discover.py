@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import own_mass, robot_file
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -54,7 +54,7 @@ def discover(
 
     Args:
         runs: settled runs, or time histories from rest.
-        robot: its values are the prior means.
+        robot: its values are the prior means; a mass that the table states takes the place of its own.
         noise: sds as `noise.parse`; None takes the file's columns, else a usual one is assumed, halved and doubled.
         stated: parameter → (mean, sd) [SI], priors in place of the fields'.
         library: effects to look for.
@@ -74,6 +74,7 @@ def discover(
         )
     known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
     notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
+    notes += own_mass.remarks(robot, distinct)
     settings = settings_for(kind, replicates, seed)
 
     found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)
@@ -201,8 +202,9 @@ def pose(
     """The base problem of a table, and room for the effects that its data can show.
 
     Rows are padded to a multiple, so that tables of about one size share what is compiled; what is padded counts
-    for nothing.
+    for nothing. A mass that the table states takes the place of the robot's own.
     """
+    robot = own_mass.weighed(robot, runs)
     kind = observers.kind(runs)
     index, real = padded(len(runs), kind.pad)
     names = priors.free_names(robot, runs["configuration"], *kind.free())
