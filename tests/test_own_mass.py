@@ -18,6 +18,7 @@ from calibration.data.errors import BadConfiguration, BadData
 from calibration.discovery import discover, findings
 from calibration.discovery.candidates import Candidate, filled
 from calibration.inference.calibrate import calibrate
+from calibration.inference.linearization import shape_of, shape_scales, shaped
 from calibration.inference.observers import SettledRuns
 from calibration.inference.optimizers import read
 from mmrjax import channels, params, robots
@@ -87,7 +88,8 @@ def fits(tmp_path_factory):
     space = discover.pose(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
     z = np.zeros(len(space.coordinates))
     z[: space.free] = np.random.default_rng(3).normal(0.0, 0.5, space.free)
-    z[space.free], z[space.free + SETTLED.settings.slots] = 0.3 / SETTLED.settings.width, 0.4
+    # The exponent of sinkage is then beyond its bounds, which a file could not state.
+    z[space.free], z[space.free + SETTLED.settings.slots] = 0.3 / SETTLED.settings.width, 3.0
     written = Written(runs, tmp_path_factory.mktemp("written"), ALL)
 
     def of(name):
@@ -116,6 +118,19 @@ def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
     np.testing.assert_array_equal(status_again, status)
     assert np.isfinite(reading).all()
     np.testing.assert_allclose(again, reading, rtol=1e-9)
+
+
+@pytest.mark.parametrize("effect", [e for e in ALL if shape_of(e()) is not None], ids=lambda e: e.name)
+def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
+    shape = shape_of(effect())
+    z = np.linspace(-6.0, 6.0, 61)
+    value = np.asarray(shaped(shape_scales(shape), jnp.asarray(z)))
+    low, high = shape.spec.bounds
+    assert low <= value.min() and value.max() <= high
+    if shape.name == "phase":
+        np.testing.assert_allclose(np.exp(1j * value), np.exp(1j * shape.spec.prior_sd(0.0) * z), atol=1e-12)
+    else:
+        assert np.all(np.diff(value) >= 0) and value[30] == pytest.approx(float(shape.value))
 
 
 def test_comparison_can_fail(tmp_path):
