@@ -120,9 +120,19 @@ def _order(table: Sequence[HeldOutAlternative]) -> list[int]:
 
     Of those within `TOLD` of the smallest the best fit comes first: between these held-out data decide nothing.
     """
-    able = [k for k, a in enumerate(table) if a.lost <= table[0].lost]
-    least = min(table[k].rms_sigma for k in able)
-    return sorted(able, key=lambda k: (k != 0 or table[0].rms_sigma > (1 + TOLD) * least, table[k].rms_sigma))
+    able = _able(table)
+    least = min((table[k] for k in able), key=lambda a: a.rms_sigma)
+    return sorted(able, key=lambda k: (k != 0 or not _draw(table[0], least), table[k].rms_sigma))
+
+
+def _able(table: Sequence[HeldOutAlternative]) -> list[int]:
+    """Those that predict no fewer readings than the first."""
+    return [k for k, a in enumerate(table) if a.lost <= table[0].lost]
+
+
+def _draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
+    """Whether held-out data decide nothing between two."""
+    return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
 
 
 def by_held_out(
@@ -178,7 +188,10 @@ def remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[str]:
     closest = min(range(len(table)), key=lambda k: table[k].rise_chi2)
     wins = _order(table)[0]
     each = ", ".join(f"{n} {a.rms_sigma:.2f} σ" for n, a in zip(names, table, strict=True))
+    alike = any(_draw(table[k], table[0]) for k in _able(table)[1:])
     by = "errors held out" if prefer == HELD_OUT else "the fit to all rows"
+    if prefer == HELD_OUT and leader == wins == 0 and alike:
+        by = f"the fit to all rows, as errors held out are within {TOLD:.0%}"
     said = f"{names[leader]} comes first in its class by {by}; errors held out: {each}"
     if prefer == HELD_OUT and leader != closest:
         said += f"; by the fit to all rows {names[closest]} would, by Δχ² {table[leader].rise_chi2:.1f}"
