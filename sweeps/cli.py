@@ -372,6 +372,13 @@ def loop(
         list[str] | None,
         typer.Option(help="A prior in SI units, repeatable, e.g. motor.resistance=0.9±0.1."),
     ] = None,
+    prefer: Annotated[
+        str | None,
+        typer.Option(
+            help="By what one of several effects that these data cannot tell apart comes first: fit, or held-out "
+            "(errors of blocks that a fit has not seen).  \\[default: fit]"
+        ),
+    ] = None,
     replicates: Annotated[int | None, typer.Option(help="Tables of the bootstrap.  \\[default: 500]")] = None,
     seed: Annotated[int | None, typer.Option(help="Of everything random.  \\[default: 0]")] = None,
     robot: _Robot = None,
@@ -391,6 +398,7 @@ def loop(
 
     options = _options(robot=robot, set=set_, effects=effects, report=report) | {
         "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
+        "prefer": prefer,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Loop, None, options), no_cache)
     from sweeps import loop as room

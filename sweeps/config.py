@@ -228,9 +228,11 @@ class Loop(RobotPart, InferencePart, OutputPart):
 
     Attributes:
         replicates: of the bootstrap.
+        prefer: whether the fit to all rows or errors held out choose the leader of a class.
     """
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
+    prefer: Literal["fit", "held-out"] = "fit"
 
 
 C = TypeVar("C", bound=Part)

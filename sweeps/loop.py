@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.table import Table
 
 from calibration.data import effect_file, robot_file
+from calibration.discovery import preference
 from calibration.discovery.discover import discover
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import priors
@@ -34,7 +35,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
     with open_folder("loop", config, robot, out, force, runs) as folder:
         found = discover(
             runs, robot, noise=config.noise or None, stated=stated, library=effect_file.library(config.effects),
-            replicates=config.replicates, seed=config.seed, progress=progress,
+            replicates=config.replicates, seed=config.seed, prefer=config.prefer, progress=progress,
         )  # fmt: skip
         folder.write_json("result.json", found.to_json())
         folder.write_table("rows.csv", found.rows_table())
@@ -55,6 +56,9 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person."""
     say(f"{found.verdict}: {found.statement}")
+    rise = preference.said_worse(found.held_out_worse, found.errors_held_out)
+    if rise:
+        say(rise)
     if found.effects:
         shown = Table(box=None, pad_edge=False)
         for heading in ("effect", "balance", "amplitude", "Δχ²", "indistinguishable from"):
@@ -77,7 +81,8 @@ def print_discovery(found: DiscoveryResult) -> None:
         errors.add_column(heading, justify="right" if heading else "left")
     whens = (0,) if found.verdict == "none" else (0, 1)
     words = ("before", "after")
-    lines = {f"{words[k]}, fitted": found.errors[k] for k in whens}
+    lines = {"as stated, nothing fitted": found.errors_as_stated}
+    lines |= {f"{words[k]}, fitted": found.errors[k] for k in whens}
     for kind, both in found.errors_held_out.items():
         lines |= {f"{words[k]}, held out by {kind.replace('_', ' and ')}": both[k] for k in whens}
     for text, by in lines.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from calibration.discovery import preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
 from sweeps import figures_loop
@@ -56,6 +57,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         album,
         title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
         document=found.to_json(),
+        worse=preference.said_worse(found.held_out_worse, found.errors_held_out),
         rows=first_rows(found.rows_table()),
         columns=columns(),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",

@@ -43,7 +43,7 @@ class ActiveSet(eqx.Module):
     base: Coordinates
     active: Int[Array, " slots"]
     sd: Float[Array, " effects"]
-    scales: tuple[Array, Array, Array]
+    scales: tuple[Array, Array, Array, Array, Array]
     names: tuple[str, ...] = eqx.field(static=True)
     shapes: tuple[str, ...] = eqx.field(static=True)
 
@@ -189,12 +189,12 @@ def candidate_space(
     """The space of the base problem and these effects of a library, with so many slots (see `Settings`)."""
     shapes = [shape_of(e) for e in effects]
     scales = [shape_scales(s) for s in shapes]
-    value, spread, sd = (jnp.asarray([s[k] for s in scales]) for k in range(3))
+    value, spread, sd, low, high = (jnp.asarray([s[k] for s in scales]) for k in range(5))
     coordinates = ActiveSet(
         bare.coordinates,
         jnp.full(slots, -1, int),
         width * jnp.asarray([amplitude_of(e).spec.prior_sd(0.0) for e in effects]),
-        (value, spread, sd),
+        (value, spread, sd, low, high),
         tuple(e.name for e in effects),
         tuple("" if s is None else s.name for s in shapes),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -93,5 +94,11 @@ def classes(
         members.append(tuple(same))
         found = shifts(space, fewer[slot], SURE * gain, settings)
         stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within))
-    families = tuple(tuple(dict.fromkeys(space.library[m].family() for m in same)) for same in members)
-    return Classes(tuple(members), tuple(stated), families, (*ladder, *fitted))
+    return Classes(
+        tuple(members), tuple(stated), tuple(families(space, same) for same in members), (*ladder, *fitted)
+    )
+
+
+def families(space: CandidateSpace, members: Sequence[str]) -> tuple[str, ...]:
+    """Families of the members of a class, the leader's first."""
+    return tuple(dict.fromkeys(space.library[m].family() for m in members))

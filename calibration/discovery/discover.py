@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import own_mass, robot_file
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import findings
+from calibration.discovery import findings, preference
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
@@ -23,10 +23,10 @@ from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.outliers import Screening, screen
-from calibration.discovery.result import DiscoveryResult, FoundEffect, Remainder, Sensitivity
+from calibration.discovery.result import DiscoveryResult, FoundEffect, HeldOutAlternative, Remainder, Sensitivity
 from calibration.discovery.score_tests import bootstrap, diagnosed
 from calibration.discovery.search import Search, search
-from calibration.discovery.settings import Settings, settings_for
+from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import Standing, standing
 from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
@@ -51,17 +51,19 @@ def discover(
     library: Library = effects.BY_NAME,
     replicates: int = 500,
     seed: int = 0,
+    prefer: str = FIT,
     progress: Callable[[str], None] = lambda text: None,
 ) -> DiscoveryResult:
     """Find what a robot's model lacks against measured runs.
 
     Args:
         runs: settled runs, or time histories from rest.
-        robot: its values are the prior means.
+        robot: its values are the prior means; a mass that the table states takes the place of its own.
         noise: sds as `noise.parse`; None takes the file's columns, else a usual one is assumed, halved and doubled.
         stated: parameter → (mean, sd) [SI], priors in place of the fields'.
         library: effects to look for.
         replicates: of the bootstrap; seed: random seed.
+        prefer: by what the leader of a class is chosen, `fit` or `held-out`.
         progress: called with a sentence as the work goes on.
 
     Raises:
@@ -77,7 +79,8 @@ def discover(
         )
     known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
     notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
-    settings = settings_for(kind, replicates, seed)
+    notes += own_mass.remarks(robot, distinct)
+    settings = settings_for(kind, replicates, seed, prefer)
 
     found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)
     sensitivity = []
@@ -120,6 +123,7 @@ class Traced:
         searched: what was tried; alike: what cannot be told apart, where a name is given.
         where: something is missing, or remains; discrepancy: its curve, where no name is given.
         standing: why names that were looked at do not stand, or what was put beside them.
+        held_out: the alternatives compared by data held out, where these chose the leader.
     """
 
     verdict: str
@@ -130,6 +134,7 @@ class Traced:
     where: Location | None = None
     discrepancy: Discrepancy | None = None
     standing: Standing | None = None
+    held_out: tuple[HeldOutAlternative, ...] = ()
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
@@ -183,9 +188,14 @@ def trace(
 
     progress(f"what else explains as much as {' and '.join(best.effects)}?")
     alike = classes(space, base, best, searched.ladder, left, settings)
+    compared: tuple[HeldOutAlternative, ...] = ()
+    if settings.prefer == HELD_OUT:
+        progress("which of those predicts best what a fit has not seen?")
+        searched, alike, compared = preference.by_held_out(space, runs, searched, alike, bases, settings)
+        after = searched.diagnosis or after
     verdict = "named" if alike.single else "class"
     remains = locate(space.bare.observe, after.scores, bases) if after.test.rejected_with_margin else None
-    return Traced(verdict, screened, left, searched, alike, remains, standing=stood)
+    return Traced(verdict, screened, left, searched, alike, remains, standing=stood, held_out=compared)
 
 
 # --- the stages that are no room of their own -----------------------------------------------------------
@@ -202,8 +212,9 @@ def pose(
     """The base problem of a table, and room for the effects that its data can show.
 
     Rows are padded to a multiple, so that tables of about one size share what is compiled; what is padded counts
-    for nothing.
+    for nothing. A mass that the table states takes the place of the robot's own.
     """
+    robot = own_mass.weighed(robot, runs)
     kind = observers.kind(runs)
     index, real = padded(len(runs), kind.pad)
     names = priors.free_names(robot, runs["configuration"], *kind.free())
@@ -321,6 +332,9 @@ def finished(
     progress("errors on data held out")
     seen = findings.readings(runs, noise.sd, before, after)
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
+    compared = traced.held_out
+    if traced.alike is not None and not compared and not observe.long:
+        compared = preference.compared(space, runs, best, traced.alike)
     progress("the next experiment")
     ladder = traced.searched.ladder if traced.searched is not None else ()
     near, too_large = findings.alternatives(
@@ -363,8 +377,11 @@ def finished(
         cosine=cosines(space, left.scores)[np.ix_(shown, shown)],
         detail=observe.detail(screened.bases, included, left, ends),
         readings_of_rows=seen,
+        errors_as_stated=error(seen.as_stated),
         errors=(error(seen.before), error(seen.after)),
         errors_held_out={k: (error(a), error(b)) for k, (a, b) in seen.held_out.items()},
+        held_out_worse=preference.worse(seen.held_out, error),
+        alternatives_held_out=compared,
         percent_of=observe.percent_of,
         noise=_noise(runs, noise, type(observe)),
         settings=settings,
@@ -426,6 +443,7 @@ def remarks(found: DiscoveryResult) -> tuple[str, ...]:
         said.append(
             f"what was found does not explain everything: {found.remains.balance} still lacks something over {over}"
         )
+    said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:
         said.append(f"only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs")

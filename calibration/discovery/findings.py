@@ -314,26 +314,14 @@ def readings(runs: Runs, sd: np.ndarray, before: Fitted, after: Fitted | None) -
         return np.where(lost, np.nan, np.asarray(found.reading)[:rows])
 
     held, labels = {}, {}
-    for kind, by in _blocks(runs, before.problem.observe.blocks).items():
+    for kind, by in blocks_room.distinct(runs, before.problem.observe.blocks).items():
         masks = list(by.values())
         first = held_out(before.problem, before.z, masks, before.active).reading
         later = first if after is None else held_out(after.problem, after.z, masks, after.active).reading
         held[kind], labels[kind] = (first, later), tuple(by)
-    fitted = seen(before)
-    return ReadingsOfRows(runs.measured(), sd[:rows], fitted, fitted if after is None else seen(after), held, labels)
-
-
-def _blocks(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
-    """Kinds of blocks that the data have, less those that divide the rows as an earlier one does."""
-    blocks: dict[str, dict[str, np.ndarray]] = {}
-    divided = []
-    for kind in kinds:
-        by = blocks_room.blocks(runs, kind)
-        parts = {m.tobytes() for m in by.values()}
-        if parts not in divided:
-            divided.append(parts)
-            blocks[kind] = by
-    return {kind: by for kind, by in blocks.items() if by}
+    stated, fitted = seen(dataclasses.replace(before, z=np.zeros_like(before.z))), seen(before)
+    later = fitted if after is None else seen(after)
+    return ReadingsOfRows(runs.measured(), sd[:rows], stated, fitted, later, held, labels)
 
 
 def errors(

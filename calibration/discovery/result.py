@@ -219,13 +219,15 @@ class ReadingsOfRows:
     """Readings of every row [SI], shape (rows, channels), NaN where there is none.
 
     Attributes:
-        measured, sd: of the table; before, after: by the base and by the proposed robot, fitted to all rows.
+        measured, sd: of the table; as_stated: by the robot before any fit, at the means of its priors.
+        before, after: by the base and by the proposed robot, fitted to all rows.
         held_out: kind of block → (before, after), each row by fits that have not seen its block.
         blocks: kind of block → labels.
     """
 
     measured: np.ndarray
     sd: np.ndarray
+    as_stated: np.ndarray
     before: np.ndarray
     after: np.ndarray
     held_out: dict[str, tuple[np.ndarray, np.ndarray]]
@@ -233,6 +235,41 @@ class ReadingsOfRows:
 
 
 Errors = dict[str, dict[str, float | int]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Worse:
+    """A channel that is predicted worse with what was found than without it.
+
+    Attributes:
+        kind: of the blocks held out; channel: its name.
+        rows: that both fits predict; before, after: rms error over these [%].
+    """
+
+    kind: str
+    channel: str
+    rows: int
+    before: float
+    after: float
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOutAlternative:
+    """An alternative of a class, fitted anew without each block.
+
+    Attributes:
+        effects: its names; leads: whether it is the one proposed.
+        rise_chi2: of the fit to all rows, above the best one [σ²].
+        rms_sigma: over the readings of all kinds of blocks that every alternative predicts [σ]; by_kind: of each.
+        lost: readings of blocks that it does not predict, because its robot slides or fails there.
+    """
+
+    effects: tuple[str, ...]
+    leads: bool
+    rise_chi2: float
+    rms_sigma: float
+    by_kind: dict[str, float]
+    lost: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,7 +292,11 @@ class DiscoveryResult:
         cosine: |cos| between what the base leaves of two effects' signatures; shape (scores, scores), their order.
         detail: what this kind of data tells beside: equations run by run, or memory, orders and drift.
         readings_of_rows: measured and simulated.
+        errors_as_stated: rms by channel, of the robot before any fit.
         errors, errors_held_out: rms by channel, before and after; by kind of block.
+        held_out_worse: where the latter rise.
+        alternatives_held_out: of a class, compared by data held out; empty where there is one, or where that takes
+            long and was not asked for.
         percent_of: what errors in percent are of.
         noise: channel → source and median sd [%].
         settings: the statistical constants; replicates: of the bootstrap, that settled.
@@ -290,8 +331,11 @@ class DiscoveryResult:
     cosine: np.ndarray
     detail: Detail
     readings_of_rows: ReadingsOfRows
+    errors_as_stated: Errors
     errors: tuple[Errors, Errors]
     errors_held_out: dict[str, tuple[Errors, Errors]]
+    held_out_worse: tuple[Worse, ...]
+    alternatives_held_out: tuple[HeldOutAlternative, ...]
     percent_of: str
     noise: dict[str, dict[str, Any]]
     settings: Settings
@@ -326,9 +370,15 @@ class DiscoveryResult:
             "alternatives": [dataclasses.asdict(a) for a in self.alternatives],
             "implausible": [dataclasses.asdict(a) for a in self.implausible],
             "standing": self.standing,
-            "errors": {w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(whens)},
+            "errors": {
+                # nothing is fitted as stated, so both are the same
+                "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
+                **{w: {"fitted": self.errors[k], "held_out": main[k]} for k, w in enumerate(whens)},
+            },
             "errors_percent_of": self.percent_of,
             "held_out_by": held,
+            "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
+            "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],
             "adequate": {"before": self.before.adequate, "after": self.after.adequate},
             "evidence": {"before": _evidence(self.before), "after": _evidence(self.after)},
             "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from calibration.data.errors import BadConfiguration, choices
 from calibration.inference.observers import Observer
 
 #: Family-wise error of «something is missing», shared out among the kinds of evidence: single effects, curves, pairs,
@@ -12,6 +13,8 @@ SHARES = {
     ("single", "curve", "pair", "chi2"): (0.03, 0.01, 0.004, 0.006),
     ("single", "curve", "pair", "chi2", "white"): (0.03, 0.01, 0.004, 0.003, 0.003),
 }
+#: By what the leader of a class is chosen among its members.
+PREFERENCES = FIT, HELD_OUT = ("fit", "held-out")
 #: How far beyond its threshold a statistic has to be for a fit with effects to be rejected: two sigmas of a
 #: leftover that lies right on it would flip the verdict, at a family-wise error of some 1 %.
 MARGINS = {"single": 0.5, "curve": 0.7, "pair": 6.0, "chi2": 10.0, "white": 1.0}
@@ -42,6 +45,7 @@ class Settings:
         enough, gain: chance beyond which telling a pair apart better is no gain; what a second experiment has to
             add to the number of pairs that are expected to be told apart.
         refuted: rise of χ² by which an alternative is refuted [σ²].
+        prefer: one of `PREFERENCES`.
     """
 
     shares: dict[str, float]
@@ -71,6 +75,7 @@ class Settings:
     enough: float = 0.95
     gain: float = 0.2
     refuted: float = 4.0
+    prefer: str = FIT
 
     @property
     def family_wise_error(self) -> float:
@@ -78,7 +83,13 @@ class Settings:
         return sum(self.shares.values())
 
 
-def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0) -> Settings:
-    """The settings for data of a kind."""
+def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, prefer: str = FIT) -> Settings:
+    """The settings for data of a kind.
+
+    Raises:
+        BadConfiguration: `prefer` is none of `PREFERENCES`.
+    """
+    if prefer not in PREFERENCES:
+        raise BadConfiguration(f"--prefer: got {prefer}; {choices(prefer, PREFERENCES)}")
     shares = dict(zip(kind.evidence, SHARES[kind.evidence], strict=True))
-    return Settings(shares, replicates=replicates, seed=seed)
+    return Settings(shares, replicates=replicates, seed=seed, prefer=prefer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,6 +30,19 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
     labels = np.array([" ".join(str(runs[c][k]) for c in columns) for k in range(len(runs))])
     names = list(dict.fromkeys(labels))
     return {name: labels == name for name in names} if len(names) > 1 else {}
+
+
+def distinct(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+    """Kind → blocks, of the kinds that the data have, less those that divide the rows as an earlier one does."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    divided = []
+    for kind in kinds:
+        by = blocks(runs, kind)
+        parts = {m.tobytes() for m in by.values()}
+        if parts not in divided:
+            divided.append(parts)
+            found[kind] = by
+    return {kind: by for kind, by in found.items() if by}
 
 
 @dataclasses.dataclass(frozen=True)

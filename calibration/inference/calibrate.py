@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import own_mass, robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
@@ -48,7 +48,7 @@ def calibrate(
 
     Args:
         runs: rows of settled runs, or of time histories.
-        robot: its values are the prior means.
+        robot: its values are the prior means; a mass that the table states takes the place of its own.
         free, fix: parameter names, see `priors.choose`; stated: priors in place of the fields', (mean, sd) [SI].
         noise: as `noise.parse`; None takes the file's sd columns, or estimates.
         model: name of a fidelity.
@@ -61,8 +61,8 @@ def calibrate(
 
     Raises:
         BadData: data that cannot be fitted, see `checks.check`.
-        BadConfiguration: an unknown fidelity or parameter, a prior or noise that is none, rows that no robot near
-            the priors reaches; or JAX computes in single precision.
+        BadConfiguration: an unknown fidelity or parameter, a prior or noise that is none, or of a mass that the
+            table states, rows that no robot near the priors reaches; or JAX computes in single precision.
     """
     if jnp.result_type(float) != jnp.float64:
         raise BadConfiguration(
@@ -81,6 +81,9 @@ def calibrate(
     stated = robot_file.current_values(stated or {}, robot, "--prior", former)
     for sentence in former:
         tell(sentence)
+    own_mass.check_priors(stated, robot, runs)
+    weights = own_mass.remarks(robot, runs)
+    robot = own_mass.weighed(robot, runs)
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     default = priors.default_names(present, robot, computed=facts.computes)
     names = priors.choose(robot, default, free, fix)
@@ -91,7 +94,7 @@ def calibrate(
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
     coordinates = dataclasses.replace(coordinates, stated=tuple(stated))
     known = noise_room.of(runs, observe.sizes(runs), noise)
-    notes = [*checks.check(runs, robot, names, known), *_of_product(of_product)]
+    notes = [*checks.check(runs, robot, names, known), *weights, *_of_product(of_product)]
     posed = observers.pose(runs, base, coordinates, known.sd, model)
 
     found, beside = _searched(runs, base, posed, known, starts, seed, tell)

@@ -61,23 +61,27 @@ def _phase(p: Parameter) -> bool:
     return p.name == "phase"
 
 
-Scales = tuple[Scalar, Scalar, Scalar]
+Scales = tuple[Scalar, Scalar, Scalar, Scalar, Scalar]
 
 
-def shape_scales(shape: Parameter | None) -> tuple[float, float, float]:
-    """(value, spread, sd) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z: a phase is
-    shifted, a scale multiplied."""
+def shape_scales(shape: Parameter | None) -> tuple[float, float, float, float, float]:
+    """(value, spread, sd, low, high) of a shape parameter, value · exp(spread · z) + sd · z at coordinate z: a phase
+    is shifted, a scale multiplied; see `shaped` for the bounds."""
     if shape is None:
-        return 1.0, 0.0, 0.0
+        return 1.0, 0.0, 0.0, -math.inf, math.inf
+    low, high = shape.spec.bounds
     if _phase(shape):
-        return float(shape.value), 0.0, shape.spec.prior_sd(0.0)
-    return float(shape.value), math.sqrt(math.log1p((shape.spec.relative_sd or 0.0) ** 2)), 0.0
+        return float(shape.value), 0.0, shape.spec.prior_sd(0.0), low, high
+    return float(shape.value), math.sqrt(math.log1p((shape.spec.relative_sd or 0.0) ** 2)), 0.0, low, high
 
 
 def shaped(scales: Scales, z: Array) -> Array:
-    """A shape parameter at coordinate z, `scales` as by `shape_scales`."""
-    value, spread, sd = scales
-    return value * jnp.exp(spread * z) + sd * z
+    """A shape parameter at coordinate z, `scales` as by `shape_scales`, within the bounds that a robot file allows:
+    a phase by whole turns, a scale by a cut."""
+    value, spread, sd, low, high = scales
+    moved = value * jnp.exp(spread * z) + sd * z
+    turned = jnp.remainder(moved + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return jnp.where(jnp.asarray(sd) > 0, turned, jnp.clip(moved, low, high))
 
 
 #: Where on the prior of a shape parameter the library is scored, in its sds.
@@ -119,7 +123,7 @@ def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     if shape is None:
         return ScoredEffect(unit, "", (0.0,), ())
     grid = TURN if _phase(shape) else grid
-    values = np.clip(np.asarray(shaped(shape_scales(shape), jnp.asarray(grid))), *shape.spec.bounds)
+    values = np.asarray(shaped(shape_scales(shape), jnp.asarray(grid)))
     return ScoredEffect(unit, shape.name, tuple(grid), tuple(map(float, values)))
 
 

@@ -1,0 +1,129 @@
+"""The mass of a robot without payload: what its file states, and what a table of runs states in its place.
+
+A table that states `total_mass_kg` is simulated with that mass, whatever the robot's own. A robot that is fitted to
+it has to have the same mass, or an effect that adds to the mass would be found against the table's and written beside
+the file's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.errors import BadConfiguration, BadData, number
+from calibration.data.runs import Runs
+from mmrjax import params
+from mmrjax.robot import Robot
+from mmrjax.tables import BENCH
+
+#: Masses that differ by less are the same: the rounding of a sum [kg].
+ROUNDING = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class StatedMass:
+    """Mass of one configuration without payload, `total_mass_kg` less `payload_kg`.
+
+    Attributes:
+        median, low, high: over the rows of the configuration [kg].
+        unladen: whether it varies although `total_mass_kg` does not, as where that leaves the payload out.
+    """
+
+    median: float
+    low: float
+    high: float
+    unladen: bool
+
+    @property
+    def varies(self) -> bool:
+        """Whether no single mass is right for every row."""
+        return self.high - self.low > ROUNDING
+
+
+def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
+    """What a table states of each configuration that it has; empty where it has no `total_mass_kg`.
+
+    Raises:
+        BadData: a mass beyond the bounds of the robot's, or a configuration that the robot does not have.
+    """
+    if not runs.has("total_mass_kg"):
+        return {}
+    which = runs.configurations(robot)
+    own = runs["total_mass_kg"] - runs["payload_kg"]
+    low, high = next(p for p in params.walk(robot.configurations.members[0]) if p.name == "mass").spec.bounds
+    wrong = np.flatnonzero((own < low) | (own > high))
+    if wrong.size:
+        row = int(wrong[0])
+        raise BadData(
+            f"{runs.source} row {row + 1}, total_mass_kg: got {number(runs['total_mass_kg'][row])} with a payload of "
+            f"{number(runs['payload_kg'][row])} kg; expected a robot of {number(low)} to {number(high)} kg without it"
+        )
+    found = {}
+    for index in np.unique(which):
+        mine = which == index
+        m = own[mine]
+        constant = bool(np.ptp(runs["total_mass_kg"][mine]) <= ROUNDING)
+        median = round(float(np.median(m)), 6)
+        found[robot.configurations.names[index]] = StatedMass(median, float(m.min()), float(m.max()), constant)
+    return found
+
+
+def weighed(robot: Robot, runs: Runs) -> Robot:
+    """`robot` with the own mass that a table states for each configuration, the median over its rows.
+
+    Raises:
+        BadData: as `stated_masses`.
+    """
+    own = {name: float(chassis.mass) for name, chassis in robot.configurations.items()}
+    masses = {n: s.median for n, s in stated_masses(robot, runs).items() if abs(s.median - own[n]) > ROUNDING}
+    return params.replace(robot, {f"{name}.mass": jnp.asarray(mass, float) for name, mass in masses.items()})
+
+
+def remarks(robot: Robot, runs: Runs) -> list[str]:
+    """What the table states otherwise than the robot, and what follows for the robot that is written.
+
+    Args:
+        robot: as given, before `weighed`.
+    """
+    said = []
+    for name, stated in stated_masses(robot, runs).items():
+        own = float(robot.configurations[name].mass)
+        if stated.varies:
+            why = "; does total_mass_kg leave the payload out?" if stated.unladen else ""
+            said.append(
+                f"{name}: total_mass_kg less payload_kg varies from {stated.low:.4g} to {stated.high:.4g} kg: the "
+                f"fit used the table's, row by row; {stated.median:.4g} kg, their median, is written, and with it "
+                f"rows of another mass are not as fitted{why}"
+            )
+        elif abs(stated.median - own) > ROUNDING:
+            said.append(
+                f"{name}: the table states {stated.median:.6g} kg without payload, the robot's file {own:.6g} kg; "
+                f"{stated.median:.6g} kg is fitted with and written"
+            )
+    others = [s for s in np.unique(runs["surface"]) if s != BENCH] if runs.has("surface") else []
+    if others:
+        said.append(
+            f"the table has runs on {', '.join(others)}: the friction that is written is that of {BENCH}; simulate "
+            f"with --surface {others[0]} to meet what was fitted"
+        )
+    return said
+
+
+def check_priors(stated: Iterable[str], robot: Robot, runs: Runs) -> None:
+    """Refuse a prior of a mass that the table states: it would be written, and was not fitted with.
+
+    Args:
+        stated: names of parameters.
+
+    Raises:
+        BadConfiguration: one of them is such a mass.
+    """
+    for name in stated_masses(robot, runs):
+        if f"{name}.mass" in stated:
+            raise BadConfiguration(
+                f"--prior {name}.mass: {runs.source} states total_mass_kg, which its runs are simulated with; remove "
+                "that column to fit the mass, or the prior"
+            )

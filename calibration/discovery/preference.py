@@ -1,0 +1,210 @@
+"""What data held out say: which errors rise with what was found, and which alternative of a class predicts best."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from calibration.data.runs import Runs
+from calibration.discovery import experiments
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.candidates import Candidate, fit_candidates, start
+from calibration.discovery.classes import Classes, families
+from calibration.discovery.result import Errors, HeldOutAlternative, Worse
+from calibration.discovery.search import Search, diagnose
+from calibration.discovery.settings import HELD_OUT, Settings
+from calibration.inference import blocks as blocks_room
+from calibration.inference.bases import Bases
+from calibration.inference.held_out import held_out
+from mmrjax import channels
+
+#: Share of itself by which held-out errors have to differ to be told apart; less is not seen in two digits.
+TOLD = 0.01
+
+
+# --- before and after -----------------------------------------------------------------------------------
+
+
+def worse(
+    readings: Mapping[str, tuple[np.ndarray, np.ndarray]], errors: Callable[[np.ndarray], Errors]
+) -> tuple[Worse, ...]:
+    """Every kind of block and channel in which the error of data held out rises, over the rows that both predict.
+
+    Args:
+        readings: kind of block → readings before and after [SI], NaN where a fit predicts none.
+        errors: of readings, by channel.
+    """
+    found = []
+    for kind, (before, after) in readings.items():
+        both = np.isfinite(before) & np.isfinite(after)
+        was, now = (errors(np.where(both, x, np.nan)) for x in (before, after))
+        for channel, e in now.items():
+            old, new = float(was[channel]["rms_percent"]), float(e["rms_percent"])
+            if new > (1 + TOLD) * old:
+                found.append(Worse(kind, channel, int(e["rows"]), old, new))
+    return tuple(found)
+
+
+def said_worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]]) -> str:
+    """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
+
+    Args:
+        held_out: kind of block → errors before and after, each over the rows that it predicts.
+    """
+    labels = {c.name: c.label for c in channels.CHANNELS}
+    parts = []
+    for kind, (before, after) in held_out.items():
+        mine = [w for w in found if w.kind == kind]
+        changes = [f"{labels[w.channel]} {_change(w.before, w.after)} %" for w in mine]
+        predicted = {n: (int(before[n]["rows"]), int(after[n]["rows"])) for n in after}
+        if any(w.rows < max(predicted[w.channel]) for w in mine):
+            changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
+        lost = max(was - now for was, now in predicted.values())
+        if lost > 0:
+            changes.append(f"{lost} row{'s' * (lost > 1)} fewer predicted")
+        if changes:
+            parts.append(f"by {kind.replace('_', ' and ')} {', '.join(changes)}")
+    return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
+
+
+def _change(before: float, after: float) -> str:
+    """Two numbers with as many digits as tell them apart."""
+    texts = [(f"{before:.{k}f}", f"{after:.{k}f}") for k in range(1, 6)]
+    return " → ".join(next((pair for pair in texts if pair[0] != pair[1]), texts[-1]))
+
+
+# --- among alternatives ---------------------------------------------------------------------------------
+
+
+def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes) -> tuple[HeldOutAlternative, ...]:
+    """Held-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
+
+    Empty where there is but one, or no block to hold out.
+    """
+    others = list(experiments.alternatives(best, alike).values())
+    data, rows = space.equipped.data, len(runs)
+    measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
+    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
+    if len(others) < 2 or not kinds:
+        return ()
+
+    def sigma(c: Candidate, masks: list[np.ndarray]) -> np.ndarray:
+        reading = held_out(space.equipped, c.z, masks, space.library.indices(c.active)).reading
+        return np.where(counts, (reading - measured) / sd, np.nan)
+
+    errors = [{kind: sigma(c, list(by.values())) for kind, by in kinds.items()} for c in others]
+    held = {kind: counts & np.any(list(by.values()), 0)[:, None] for kind, by in kinds.items()}
+    common = {kind: np.all([np.isfinite(e[kind]) for e in errors], 0) for kind in kinds}
+
+    def rms(e: Mapping[str, np.ndarray], of: Sequence[str]) -> float:
+        squares = np.concatenate([e[kind][common[kind]] ** 2 for kind in of])
+        return float(np.sqrt(squares.mean())) if squares.size else float("nan")
+
+    return tuple(
+        HeldOutAlternative(
+            effects=c.effects,
+            leads=c is best,
+            rise_chi2=float(2 * (c.cost - min(x.cost for x in others))),
+            rms_sigma=rms(e, list(kinds)),
+            by_kind={kind: rms(e, [kind]) for kind in kinds},
+            lost=int(sum(np.sum(held[kind] & ~np.isfinite(e[kind])) for kind in kinds)),
+        )
+        for c, e in zip(others, errors, strict=True)
+    )
+
+
+def _order(table: Sequence[HeldOutAlternative]) -> list[int]:
+    """Alternatives that predict no fewer readings than the best fit, which is the first, by their held-out error.
+
+    Of those within `TOLD` of the smallest the best fit comes first: between these held-out data decide nothing.
+    """
+    able = _able(table)
+    least = min((table[k] for k in able), key=lambda a: a.rms_sigma)
+    return sorted(able, key=lambda k: (k != 0 or not _draw(table[0], least), table[k].rms_sigma))
+
+
+def _able(table: Sequence[HeldOutAlternative]) -> list[int]:
+    """Those that predict no fewer readings than the first."""
+    return [k for k, a in enumerate(table) if a.lost <= table[0].lost]
+
+
+def _draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
+    """Whether held-out data decide nothing between two."""
+    return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
+
+
+def by_held_out(
+    space: CandidateSpace, runs: Runs, searched: Search, alike: Classes, bases: Bases, settings: Settings
+) -> tuple[Search, Classes, tuple[HeldOutAlternative, ...]]:
+    """The search and its classes, led by the alternative that predicts data held out best, see `_order`.
+
+    One that is not adequate where the best fit is does not lead.
+    """
+    best, before = searched.best, searched.diagnosis
+    if best is None or before is None:
+        return searched, alike, ()
+    table = compared(space, runs, best, alike)
+    if not table:
+        return searched, alike, ()
+    fitted = {c.key: c for c in experiments.alternatives(best, alike).values()}
+    for k in _order(table):
+        leader = fitted[frozenset(table[k].effects)]
+        if leader is best:
+            break
+        diagnosis = diagnose(space, leader, bases, before.test.null, settings)
+        sound = before.test.rejected_with_margin or not diagnosis.test.rejected_with_margin
+        if sound:
+            led = tuple(dataclasses.replace(a, leads=j == k) for j, a in enumerate(table))
+            searched = dataclasses.replace(searched, best=leader, diagnosis=diagnosis)
+            return searched, _led(space, best, leader, alike, settings), led
+    return searched, alike, table
+
+
+def _led(space: CandidateSpace, best: Candidate, leader: Candidate, alike: Classes, settings: Settings) -> Classes:
+    """The classes of another leader: its effect comes first in its class; what is missing of them is fitted."""
+    members = dict(zip(best.effects, alike.members, strict=True))
+    (new,), (old,) = leader.key - best.key, best.key - leader.key
+    members[new] = (new, *(n for n in members.pop(old) if n != new))
+    stated = dict(zip(best.effects, alike.stated, strict=True))
+    stated[new] = stated.pop(old)
+    known = {best.key, *(c.key for c in alike.ladder)}
+    wanted = [
+        tuple(other if n == name else n for n in leader.active)
+        for name in leader.effects
+        for other in members[name][1:]
+    ]
+    missing = [w for w in wanted if frozenset(n for n in w if n) not in known]
+    fitted = fit_candidates(space, [(w, start(space, leader, w, settings)) for w in missing], settings)
+    return Classes(
+        tuple(members[name] for name in leader.effects),
+        tuple(stated[name] for name in leader.effects),
+        tuple(families(space, members[name]) for name in leader.effects),
+        (best, *alike.ladder, *fitted),
+    )
+
+
+def remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[str]:
+    """By what the leader was chosen among the alternatives, and whether the other way would have chosen another."""
+    if not table:
+        return []
+    shared = set.intersection(*(set(a.effects) for a in table))
+    names = [" and ".join(n for n in a.effects if n not in shared) for a in table]
+    leader = next(k for k, a in enumerate(table) if a.leads)
+    closest = min(range(len(table)), key=lambda k: table[k].rise_chi2)
+    wins = _order(table)[0]
+    each = ", ".join(f"{n} {a.rms_sigma:.2f} σ" for n, a in zip(names, table, strict=True))
+    alike = any(_draw(table[k], table[0]) for k in _able(table)[1:])
+    by = "errors held out" if prefer == HELD_OUT else "the fit to all rows"
+    if prefer == HELD_OUT and leader == wins == 0 and alike:
+        by = f"the fit to all rows, as errors held out are within {TOLD:.0%}"
+    said = f"{names[leader]} comes first in its class by {by}; errors held out: {each}"
+    if prefer == HELD_OUT and leader != closest:
+        said += f"; by the fit to all rows {names[closest]} would, by Δχ² {table[leader].rise_chi2:.1f}"
+    if leader != wins:
+        why = (
+            "is not as adequate" if prefer == HELD_OUT else f"would come first by --prefer {HELD_OUT}, where adequate"
+        )
+        said += f"; {names[wins]} {why}"
+    return [said]

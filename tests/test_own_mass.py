@@ -1,0 +1,285 @@
+"""What the loop and `calibrate` write, simulated under the conditions of their table, is what they fitted."""
+
+import csv
+import dataclasses
+import tomllib
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import SETTLED, STATED
+from test_loop_command import mmrjax
+
+from calibration.data import own_mass, robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.discovery import discover, findings
+from calibration.discovery.candidates import Candidate, filled
+from calibration.inference.calibrate import calibrate
+from calibration.inference.linearization import shape_of, shape_scales, shaped
+from calibration.inference.observers import SettledRuns
+from calibration.inference.optimizers import read
+from mmrjax import channels, params, robots
+from mmrjax.effects import ALL, BY_NAME, UNNAMED
+from mmrjax.fidelities.steady import steady_batch
+from sweeps import loop as room
+
+#: Mass without payload that the tables here state [kg]; the nominal robot has 13.1 and 11.5 kg.
+MASSES = {"6T2A": 14.2, "4W2T": 13.1}
+
+
+def table(masses=MASSES, surface=None) -> records.Runs:
+    """Twelve runs, six of each configuration, with stated masses."""
+    names = np.repeat(list(masses), 6)
+    payload = np.tile([0.0, 3.0, 8.0], 4)
+    columns = {
+        "configuration": names,
+        "supply_voltage_V": np.tile([15.0, 24.0, 33.0, 15.0], 3),
+        "total_mass_kg": np.array([masses[n] for n in names]) + payload,
+        "payload_kg": payload,
+        "slope_deg": np.tile([0.0, 5.0, 12.0], 4)[::-1],
+    } | {c.column: np.linspace(1.0, 2.0, 12) for c in channels.CHANNELS}
+    return records.Runs("runs.csv", columns | ({} if surface is None else {"surface": np.full(12, surface)}))
+
+
+def unweighed(runs: records.Runs) -> records.Runs:
+    """The same conditions with the robot's own mass and the payload."""
+    return dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
+
+
+@eqx.filter_jit
+def _swept(robot, conditions):
+    result = steady_batch(robot, conditions)
+    return jnp.stack([result.reading[c] for c in channels.names()], -1), result.status
+
+
+class Written:
+    """Robots through robot.toml, then simulated with their own mass: one program for all effects of a set."""
+
+    def __init__(self, runs, path, effects):
+        self.path, self.effects = path / "robot.toml", tuple(e() for e in effects)
+        self.runs = unweighed(runs)
+
+    def __call__(self, robot):
+        robot_file.write(robot, self.path)
+        back = robot_file.read(self.path)
+        have = {e.name: e for e in back.effects}
+        assert set(have) == {e.name for e in robot.effects}
+        whole = dataclasses.replace(back, effects=tuple(have.get(e.name, e) for e in self.effects))
+        return jax.device_get(_swept(params.strong(whole), self.runs.conditions(back)))
+
+
+# --- every effect ---------------------------------------------------------------------------------------
+
+#: Effects that settled runs on an external supply do not show; a robot may have them all the same.
+UNSEEN = tuple(e.name for e in ALL if not SettledRuns.shows(e))
+
+
+@pytest.fixture(scope="module")
+def fits(tmp_path_factory):
+    """The loop's fits to a table, by effect, and the robot of each through its file."""
+    runs = table()
+    stated = {n: (m, 0.2) for n, (m, _) in STATED.items()}
+    robot = robot_file.with_effects(robots.nominal(), UNSEEN)
+    robot = params.replace(robot, {f"effects.{n}.amplitude": 0.3 * _sd(BY_NAME[n]) for n in UNSEEN})
+    sd = 0.02 * np.abs(runs.measured())
+    space = discover.pose(runs, robot, sd, SETTLED.settings, stated, BY_NAME)
+    z = np.zeros(len(space.coordinates))
+    z[: space.free] = np.random.default_rng(3).normal(0.0, 0.5, space.free)
+    # The exponent of sinkage is then beyond its bounds, which a file could not state.
+    z[space.free], z[space.free + SETTLED.settings.slots] = 0.3 / SETTLED.settings.width, 3.0
+    written = Written(runs, tmp_path_factory.mktemp("written"), ALL)
+
+    def of(name):
+        active = filled([name] if name else [], SETTLED.settings)
+        problem = space.problem(active)
+        seen = jax.device_get(read(problem, problem.robot(jnp.asarray(z))))
+        candidate = Candidate(active, z, z, 0.0, z, True, True)
+        again, status = written(findings.proposed_robot(space, candidate))
+        return seen.reading[: len(runs)], seen.status[: len(runs)], again, status
+
+    return of
+
+
+def _sd(effect) -> float:
+    return next(p for p in params.walk(effect()) if p.spec.amplitude).spec.prior_sd(0.0)
+
+
+def shown(name):
+    """A test of many effects: one compiles, the rest only run."""
+    return pytest.param(name, marks=[] if name in ("", "mass_offset", "sinkage") else pytest.mark.slow)
+
+
+@pytest.mark.parametrize("name", [shown(n) for n in ("", *(e.name for e in ALL if SettledRuns.shows(e)))])
+def test_robot_that_the_loop_writes_is_the_one_that_it_fitted(name, fits):
+    reading, status, again, status_again = fits(name)
+    np.testing.assert_array_equal(status_again, status)
+    assert np.isfinite(reading).all()
+    np.testing.assert_allclose(again, reading, rtol=1e-9)
+
+
+@pytest.mark.parametrize("effect", [e for e in ALL if shape_of(e()) is not None], ids=lambda e: e.name)
+def test_shape_that_a_fit_reaches_is_one_that_a_file_may_state(effect):
+    shape = shape_of(effect())
+    z = np.linspace(-6.0, 6.0, 61)
+    value = np.asarray(shaped(shape_scales(shape), jnp.asarray(z)))
+    low, high = shape.spec.bounds
+    assert low <= value.min() and value.max() <= high
+    if shape.name == "phase":
+        np.testing.assert_allclose(np.exp(1j * value), np.exp(1j * shape.spec.prior_sd(0.0) * z), atol=1e-12)
+    else:
+        assert np.all(np.diff(value) >= 0) and value[30] == pytest.approx(float(shape.value))
+
+
+def test_comparison_can_fail(tmp_path):
+    """What was wrong: the mass of the table was fitted with, the robot's own was written."""
+    runs, robot = table(), robots.nominal()
+    written = Written(runs, tmp_path, ())
+    conditions = runs.conditions(robot)
+    before, _ = jax.device_get(_swept(params.strong(robot), conditions))
+    assert np.abs(written(robot)[0] / before - 1).max() > 0.02
+    np.testing.assert_allclose(written(own_mass.weighed(robot, runs))[0], before, rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(UNNAMED))
+def test_robot_with_a_curve_is_written_as_it_was_fitted(name, curves):
+    reading, again = curves(name)
+    np.testing.assert_allclose(again, reading, rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def curves(tmp_path_factory):
+    """Readings of the nominal robot with a discrepancy without a name, and of the same through its file."""
+    runs = table()
+    robot = own_mass.weighed(robots.nominal(), runs)
+    every = tuple(UNNAMED.values())
+    written = Written(runs, tmp_path_factory.mktemp("curves"), every)
+
+    def of(name):
+        with_it = robot_file.with_effects(robot, [name])
+        values = {f"effects.{name}.amplitude": 0.2 * _sd(UNNAMED[name])}
+        values |= {f"effects.{name}.y{k}": 0.3 * k for k in range(6) if name.startswith("curve")}
+        with_it = params.replace(with_it, values)
+        (present,) = with_it.effects
+        whole = tuple(present if e.name == name else e() for e in every)
+        fitted = dataclasses.replace(with_it, effects=whole)
+        reading, _ = jax.device_get(_swept(params.strong(fitted), runs.conditions(fitted)))
+        return reading, written(with_it)[0]
+
+    return of
+
+
+# --- what is said ---------------------------------------------------------------------------------------
+
+
+def test_mass_of_the_table_is_taken_and_said(robot):
+    runs = table({"6T2A": 13.1, "4W2T": 13.1})
+    assert own_mass.remarks(robot, runs) == [
+        "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg; 13.1 kg is fitted with and written"
+    ]
+    taken = own_mass.weighed(robot, runs)
+    assert float(taken.configurations["4W2T"].mass) == 13.1 and float(taken.configurations["6T2A"].mass) == 13.1
+    # Of a sum of floats the rounding is neither written nor said, and what is taken is not taken again.
+    assert own_mass.remarks(taken, runs) == []
+
+
+def test_a_table_without_masses_leaves_the_robots(robot):
+    runs = unweighed(table())
+    assert own_mass.weighed(robot, runs) is robot or own_mass.stated_masses(robot, runs) == {}
+    assert own_mass.remarks(robot, runs) == []
+
+
+def test_a_mass_that_varies_is_said_and_its_median_written(robot):
+    runs = table()
+    runs.columns["total_mass_kg"][:6] += [0.0, 0.0, 0.1, 0.2, 0.3, 0.4]
+    (said, _) = own_mass.remarks(robot, runs)
+    assert said == (
+        "6T2A: total_mass_kg less payload_kg varies from 14.2 to 14.6 kg: the fit used the table's, row by row; "
+        "14.35 kg, their median, is written, and with it rows of another mass are not as fitted"
+    )
+    assert float(own_mass.weighed(robot, runs).configurations["6T2A"].mass) == 14.35
+
+
+def test_a_total_without_its_payload_is_suspected(robot):
+    runs = table()
+    runs.columns["total_mass_kg"][:] = 13.1
+    said = own_mass.remarks(robot, runs)
+    assert len(said) == 2 and all(s.endswith("; does total_mass_kg leave the payload out?") for s in said)
+
+
+def test_a_surface_other_than_the_robots_is_said(robot):
+    said = own_mass.remarks(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="asphalt"))
+    assert said == [
+        "the table has runs on asphalt: the friction that is written is that of lacquered_wood; simulate with "
+        "--surface asphalt to meet what was fitted"
+    ]
+    assert own_mass.remarks(robot, table({"6T2A": 13.1, "4W2T": 11.5}, surface="lacquered_wood")) == []
+
+
+def test_a_mass_that_no_robot_has_is_refused(robot):
+    runs = table({"6T2A": 0.3, "4W2T": 13.1})
+    says = (
+        r"runs\.csv row 1, total_mass_kg: got 0\.3 with a payload of 0 kg; expected a robot of 0\.5 to 200 kg without"
+    )
+    with pytest.raises(BadData, match=says):
+        own_mass.weighed(robot, runs)
+
+
+def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
+    says = r"--prior 4W2T\.mass: runs\.csv states total_mass_kg, .* remove that column to fit the mass, or the prior"
+    with pytest.raises(BadConfiguration, match=says):
+        calibrate(table(), robot, free=["default", "4W2T.mass"], stated={"4W2T.mass": (12.0, 0.1)})
+    own_mass.check_priors(["4W2T.mass"], robot, unweighed(table()))
+
+
+# --- the commands ---------------------------------------------------------------------------------------
+
+
+def rows(path):
+    with path.open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture(scope="module")
+def looped(tmp_path_factory):
+    """`loop` on the measured runs, with a library of a few effects."""
+    folder = tmp_path_factory.mktemp("looped")
+    some = {n: BY_NAME[n] for n in ("series_resistance", "brush_drop", "mass_offset", "nonlinear_slip")}
+    options = ("--noise", "current=2%,motor_speed=0.5%,speed=1%", "--replicates", 250, "--no-report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(room.effect_file, "library", lambda paths: some)
+        done = mmrjax(folder, "loop", "measured", *options, "--out", "found")
+    assert done.code == 0, done.err
+    return folder, done
+
+
+@pytest.mark.slow
+def test_sweep_of_the_loops_robot_is_its_fit(looped):
+    folder, done = looped
+    assert "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg" in done.out
+    written = tomllib.loads((folder / "found" / "robot.toml").read_text(encoding="utf-8"))
+    assert written["4W2T"]["mass"] == 13.1 and "mass_offset" in written["effects"]
+    axes = ("--voltages", "15,33", "--payloads", "0,8")
+    mmrjax(folder, "sweep", "--robot", "found/robot.toml", *axes, "--no-report", "--out", "swept")
+    keys = ("configuration", "supply_voltage_V", "payload_kg", "slope_deg")
+    swept = {tuple(r[k] for k in keys): r for r in rows(folder / "swept" / "runs.csv")}
+    for row in rows(folder / "found" / "rows.csv"):
+        same = swept[tuple(row[k] for k in keys)]
+        for c in channels.CHANNELS:
+            assert float(same[c.column]) == pytest.approx(float(row[f"after_{c.column}"]), rel=1e-7), (row["row"], c)
+
+
+@pytest.mark.slow
+def test_calibrated_robot_is_its_fit(tmp_path):
+    runs = records.read("measured")
+    found = calibrate(runs, robots.nominal(), noise="current=2%,motor_speed=1%,speed=1%", starts=4, profiles=False,
+                      blocks=())  # fmt: skip
+    assert any(n.startswith("4W2T: the table states 13.1 kg without payload") for n in found.notes)
+    found.save(tmp_path)
+    again = robot_file.read(tmp_path / "robot.toml")
+    shown = steady_batch(again, unweighed(runs).conditions(again))
+    for name, reading in found.readings.items():
+        np.testing.assert_allclose(np.asarray(shown.reading[name]), reading.after, rtol=1e-8)

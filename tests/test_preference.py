@@ -1,0 +1,206 @@
+"""What held-out data say: errors that rise are told first, and they may choose the leader of a class."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import generator as g
+import jsonschema
+import numpy as np
+import pytest
+from pages import Tables
+from synthetic import SETTLED, known, table
+
+from calibration.data.errors import BadConfiguration
+from calibration.data.writing import finite
+from calibration.discovery import discover, preference
+from calibration.discovery.result import HeldOutAlternative, Worse
+from calibration.discovery.settings import HELD_OUT, settings_for
+from calibration.inference.observers import SettledRuns
+from mmrjax import channels, robots
+from sweeps import loop as room
+from sweeps import report_loop
+
+NAMES = channels.names()
+
+
+def errors(sigma):
+    """As by the loop: an rms of each channel over the rows that are there."""
+    there = np.isfinite(sigma)
+    return {
+        n: {"rows": int(there[:, k].sum()), "rms_percent": float(np.sqrt(np.nanmean(sigma[:, k] ** 2)))}
+        for k, n in enumerate(NAMES)
+    }
+
+
+def held_out(before, after, kind="voltage"):
+    """Ten rows with these errors in every channel, and their errors by kind of block."""
+    readings = {kind: tuple(np.full((10, len(NAMES)), x) for x in (before, after))}
+    return readings, {k: tuple(map(errors, v)) for k, v in readings.items()}
+
+
+def test_an_error_that_rises_is_listed_and_said():
+    readings, by = held_out(4.3, 4.3)
+    readings["voltage"][1][:, 1] = 4.72
+    found = preference.worse(readings, errors)
+    assert found == (Worse("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
+    assert preference.said_worse(found, by) == (
+        "Held out, what was found predicts worse: by voltage motor speed 4.3 → 4.7 %."
+    )
+
+
+def test_an_error_that_falls_or_stays_is_not_said():
+    readings, by = held_out(4.3, 4.3)
+    readings["voltage"][1][:, 1], readings["voltage"][1][:, 2] = 4.0, 4.3 * 1.005
+    assert preference.worse(readings, errors) == () and preference.said_worse((), by) == ""
+
+
+def test_errors_are_of_the_rows_that_both_predict():
+    """A fit that predicts two hard rows more is not worse for them; one that predicts fewer is said to."""
+    readings, _ = held_out(4.0, 4.0)
+    before, after = readings["voltage"]
+    before[:2], after[:2] = np.nan, 40.0
+    assert preference.worse(readings, errors) == ()
+    after[2:, 0] = 5.0
+    by = {"voltage": (errors(before), errors(after))}
+    found = preference.worse(readings, errors)
+    assert [(w.rows, w.before, w.after) for w in found] == [(8, 4.0, 5.0)]
+    assert preference.said_worse(found, by).endswith(
+        "by voltage total current 4.0 → 5.0 % (of the 8 rows that both predict)."
+    )
+    swapped = {"slope": (by["voltage"][1], by["voltage"][0])}
+    assert preference.said_worse((), swapped) == (
+        "Held out, what was found predicts worse: by slope 2 rows fewer predicted."
+    )
+
+
+def test_numbers_that_differ_are_shown_to_differ():
+    readings, by = held_out(0.141, 0.149)
+    assert "0.14 → 0.15 %" in preference.said_worse(preference.worse(readings, errors), by)
+
+
+# --- among alternatives ---------------------------------------------------------------------------------
+
+
+def alternative(name, rms, *, leads=False, rise=0.0, lost=0):
+    return HeldOutAlternative((name, "brush_drop"), leads, rise, rms, {"slope": rms}, lost)
+
+
+@pytest.mark.parametrize(
+    ("rms", "lost", "first"),
+    [((3.0, 2.0, 2.5), (0, 0, 0), 1), ((2.01, 2.0, 2.5), (0, 0, 0), 0), ((3.0, 2.0, 2.5), (0, 3, 0), 2)],
+    ids=["smallest", "a draw goes to the fit", "predicts fewer"],
+)
+def test_order_of_alternatives(rms, lost, first):
+    rows = [alternative(n, r, lost=m) for n, r, m in zip("abc", rms, lost, strict=True)]
+    assert preference._order(rows)[0] == first
+
+
+def test_it_is_said_by_what_the_leader_was_chosen():
+    best, other = alternative("series_resistance", 3.0, leads=True), alternative("supply_sag", 2.0, rise=1.4)
+    (said,) = preference.remarks((best, other), "fit")
+    assert said == (
+        "series_resistance comes first in its class by the fit to all rows; errors held out: series_resistance 3.00 σ, "
+        "supply_sag 2.00 σ; supply_sag would come first by --prefer held-out, where adequate"
+    )
+    led = (dataclasses.replace(best, leads=False), dataclasses.replace(other, leads=True))
+    (said,) = preference.remarks(led, HELD_OUT)
+    assert said == (
+        "supply_sag comes first in its class by errors held out; errors held out: series_resistance 3.00 σ, "
+        "supply_sag 2.00 σ; by the fit to all rows series_resistance would, by Δχ² 1.4"
+    )
+    (said,) = preference.remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
+    assert said.startswith(
+        "series_resistance comes first in its class by the fit to all rows, as errors held out are"
+    )
+    (said,) = preference.remarks((best, other), HELD_OUT)
+    assert said.endswith("supply_sag 2.00 σ; supply_sag is not as adequate")
+    assert preference.remarks((), "fit") == []
+
+
+def test_another_preference_lists_the_choices():
+    with pytest.raises(
+        BadConfiguration, match=r"--prefer: got heldout; did you mean held-out\? allowed: fit, held-out"
+    ):
+        settings_for(SettledRuns, prefer="heldout")
+
+
+RUNS = table(g.case(["series_resistance", "tension_friction"], 12.0, seed=3))
+SETTINGS = dataclasses.replace(SETTLED.settings, prefer=HELD_OUT)
+
+
+def trace():
+    """The stages of a table whose effects have look-alikes, held-out data choosing."""
+    return discover.trace(RUNS, robots.nominal(), known(RUNS), SETTINGS, SETTLED.stated, SETTLED.library)
+
+
+def finished(traced):
+    return discover.finished(traced, RUNS, known(RUNS), None, SETTINGS, SETTLED.library, lambda text: None)
+
+
+@pytest.fixture(scope="module")
+def traced():
+    return trace()
+
+
+@pytest.mark.slow
+def test_held_out_data_choose_the_leader(traced):
+    by_fit = SETTLED.trace(RUNS)
+    assert by_fit.verdict == "class" and by_fit.held_out == ()
+    rows = traced.held_out
+    assert len(rows) > 1 and rows[0].effects == by_fit.best.effects
+    assert all(np.isfinite(a.rms_sigma) and a.by_kind for a in rows)
+    (leader,) = (a for a in rows if a.leads)
+    least = min(a.rms_sigma for a in rows)
+    assert leader.rms_sigma <= (1 + preference.TOLD) * least and leader.effects == traced.best.effects
+
+
+@pytest.mark.slow
+def test_what_follows_is_of_the_leader_that_was_chosen(traced, monkeypatch):
+    real = preference.compared
+    for k in range(1, len(traced.held_out)):
+
+        def turned(*arguments, k=k):
+            rows = enumerate(real(*arguments))
+            return tuple(dataclasses.replace(a, rms_sigma=0.5 if j == k else 1.0) for j, a in rows)
+
+        monkeypatch.setattr(preference, "compared", turned)
+        other = trace()
+        assert other.best.effects == traced.held_out[k].effects and other.held_out[k].leads
+        assert other.members[0][0] == other.best.effects[0] and other.verdict == "class"
+        assert {frozenset(m) for m in other.members} == {frozenset(m) for m in traced.members}
+        found = finished(other)
+        assert [next(iter(e.members)) for e in found.effects] == list(other.best.effects)
+        assert {e.name for e in found.robot.effects} == set(other.best.effects)
+        assert any("comes first in its class by errors held out" in n for n in found.notes)
+
+
+@pytest.mark.slow
+def test_page_and_terminal_begin_with_what_gets_worse(traced, tmp_path, capsys):
+    found = finished(traced)
+    rise = Worse("slope", "motor_speed", found.errors_held_out["slope"][1]["motor_speed"]["rows"], 4.3, 4.7)
+    found = dataclasses.replace(found, held_out_worse=(rise,))
+    said = "Held out, what was found predicts worse: by slope motor speed 4.3 → 4.7 %."
+    schema = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
+    document = finite(found.to_json())
+    jsonschema.validate(document, schema)
+    assert document["held_out_worse"] == [dataclasses.asdict(rise)]
+    assert [a["effects"] for a in document["alternatives_held_out"]] == [list(a.effects) for a in traced.held_out]
+    stated = document["errors"]["as_stated"]["fitted"]
+    before = document["errors"]["before"]["fitted"]
+    assert stated["total_current"]["rms_sigma"] > before["total_current"]["rms_sigma"]
+
+    room.print_discovery(found)
+    printed = capsys.readouterr().out
+    assert said in " ".join(printed.split()) and printed.index("Held out, what") < printed.index("effect ")
+    assert printed.index("as stated, nothing fitted") < printed.index("before, fitted")
+
+    text = report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    page = Tables(text)
+    assert said in page.text
+    assert text.index('id="worse"') < text.index('id="effects"') < text.index('id="errors"')
+    assert page.tables["errors"][1][0].startswith("as stated, nothing fitted")
+    assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
+
+    found = dataclasses.replace(found, held_out_worse=())
+    assert 'id="worse"' not in report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
