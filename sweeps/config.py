@@ -228,9 +228,11 @@ class Loop(RobotPart, InferencePart, OutputPart):
 
     Attributes:
         replicates: of the bootstrap.
+        forbid: kinds of experiments, and configurations, that are not to be proposed.
     """
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
+    forbid: tuple[str, ...] = ()
 
 
 C = TypeVar("C", bound=Part)

@@ -6,7 +6,7 @@ Each stage is a function of what the stages before it found; none changes anythi
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ from calibration.data import robot_file
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import findings
+from calibration.discovery import findings, menu
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
@@ -48,6 +48,7 @@ def discover(
     library: Library = effects.BY_NAME,
     replicates: int = 500,
     seed: int = 0,
+    forbidden: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> DiscoveryResult:
     """Find what a robot's model lacks against measured runs.
@@ -59,11 +60,14 @@ def discover(
         stated: parameter → (mean, sd) [SI], priors in place of the fields'.
         library: effects to look for.
         replicates: of the bootstrap; seed: random seed.
+        forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not to be proposed.
         progress: called with a sentence as the work goes on.
 
     Raises:
-        BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be.
+        BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
+            that are not known.
     """
+    menu.check_forbidden(forbidden, robot)
     distinct, numbers, notes = without_copies(runs)
     stated = robot_file.current_values(stated or {}, robot, "--prior", notes)
     kind = observers.kind(distinct)
@@ -74,7 +78,7 @@ def discover(
         )
     known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
     notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
-    settings = settings_for(kind, replicates, seed)
+    settings = dataclasses.replace(settings_for(kind, replicates, seed), forbidden=tuple(forbidden))
 
     found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)
     sensitivity = []

@@ -40,6 +40,7 @@ class Settings:
         enough, gain: chance beyond which telling a pair apart better is no gain; what a second experiment has to
             add to the number of pairs that are expected to be told apart.
         refuted: rise of χ² by which an alternative is refuted [σ²].
+        forbidden: kinds of experiments, and configurations, that are not proposed (see `menu.KINDS`).
     """
 
     shares: dict[str, float]
@@ -67,6 +68,7 @@ class Settings:
     enough: float = 0.95
     gain: float = 0.2
     refuted: float = 4.0
+    forbidden: tuple[str, ...] = ()
 
     @property
     def family_wise_error(self) -> float:
