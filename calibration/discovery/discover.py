@@ -30,6 +30,7 @@ from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference.bases import Bases
+from calibration.inference.foreign import foreign_priors
 from calibration.inference.noise import Noise
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
@@ -78,6 +79,10 @@ def discover(
         )
     known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
     notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
+    foreign = foreign_priors(robot, stated)
+    for sentence in foreign:
+        progress(sentence)
+    notes += foreign
     settings = dataclasses.replace(settings_for(kind, replicates, seed), forbidden=tuple(forbidden))
 
     found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)

@@ -16,6 +16,7 @@ from calibration.inference import blocks as holdout
 from calibration.inference import checks, estimates, identifiability, multistart, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
+from calibration.inference.foreign import foreign_priors
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.problem import Problem
@@ -91,7 +92,10 @@ def calibrate(
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
     coordinates = dataclasses.replace(coordinates, stated=tuple(stated))
     known = noise_room.of(runs, observe.sizes(runs), noise)
-    notes = [*checks.check(runs, robot, names, known), *_of_product(of_product)]
+    foreign = foreign_priors(robot, stated)
+    for sentence in foreign:
+        tell(sentence)
+    notes = [*foreign, *checks.check(runs, robot, names, known), *_of_product(of_product)]
     posed = observers.pose(runs, base, coordinates, known.sd, model)
 
     found, beside = _searched(runs, base, posed, known, starts, seed, tell)
