@@ -13,7 +13,7 @@ from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
-from calibration.inference import checks, estimates, identifiability, multistart, observers, priors
+from calibration.inference import checks, estimates, identifiability, lack_of_fit, multistart, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.foreign import foreign_priors
@@ -141,6 +141,7 @@ def calibrate(
         converged=bool(found.best.converged),
         starts=found.starts,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
+        adequacy=lack_of_fit.adequacy(observe, runs, seen, sd, z, about, known.estimated),
         identifiability=about,
         notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
     )

@@ -111,6 +111,7 @@ def analyse(problem: Problem, z: Array, data: Data | None = None) -> Identifiabi
         rank=int(np.sum(singular > 1e-8 * singular.max())),
         sensitivity=np.linalg.norm(readings, axis=0),
         leverage=leverage.reshape(data.measured.shape),
+        jacobian=readings,
     )
 
 
