@@ -33,6 +33,7 @@ class Channel:
         sd_share: sd that is assumed where none is known, as a share of the reading [-].
         resolution: digits after the point that a person wants to see [unit].
         zero_at_rest: whether it shows 0 until the robot moves.
+        other_units: what is often written in its column by mistake, and the SI value of each.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Channel:
     sd_share: float
     resolution: int = 1
     zero_at_rest: bool = False
+    other_units: tuple[tuple[str, float], ...] = ()
 
 
 #: In the order of columns, arrays and reports. Read through the module (`channels.CHANNELS`), so that a row more
@@ -66,6 +68,7 @@ CHANNELS: tuple[Channel, ...] = (
         read=lambda robot, signals: signals.total_current,
         sd_share=0.02,
         resolution=3,
+        other_units=(("mA", 1e-3),),
     ),
     Channel(
         name="motor_speed",
@@ -80,6 +83,7 @@ CHANNELS: tuple[Channel, ...] = (
         read=lambda robot, signals: signals.speed_motor,
         sd_share=0.005,
         zero_at_rest=True,
+        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", math.pi / 180)),
     ),
     Channel(
         name="speed",
@@ -94,6 +98,7 @@ CHANNELS: tuple[Channel, ...] = (
         read=lambda robot, signals: signals.speed,
         sd_share=0.01,
         zero_at_rest=True,
+        other_units=(("m/s", 1.0), ("km/h", 1 / 3.6), ("cm/s", 1e-2), ("m/min", 1 / 60)),
     ),
 )
 

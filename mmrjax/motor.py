@@ -77,6 +77,7 @@ class Motor(eqx.Module):
         source="reference temperature of the maker's sheet",
     )
     temperature_limit: float = eqx.field(default=125.0, static=True)  # winding [°C], maker's sheet
+    voltage_limit: float | None = eqx.field(default=None, static=True)  # [V], highest for short; not on this sheet
     speed_limit: float = eqx.field(default=12_000 * 0.10471975511965977, static=True)  # 12 000 rpm, sheet
 
     def voltage_back(self, speed: Scalar) -> Scalar:

@@ -45,7 +45,8 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
 
 
 def print_calibration(found: CalibrationResult) -> None:
-    """Parameters, errors and remarks, for a person."""
+    """Whether the fit is adequate; parameters, errors and remarks, for a person."""
+    say(found.adequacy.statement)
     shown = Table(title=f"{len(found)} rows, {found.model}", title_justify="left", box=None, pad_edge=False)
     for heading in ("parameter", "value", "95 % interval", "shift [σ]", "held by"):
         left = heading in ("parameter", "held by")

@@ -381,6 +381,12 @@ def loop(
     ] = None,
     replicates: Annotated[int | None, typer.Option(help="Tables of the bootstrap.  \\[default: 500]")] = None,
     seed: Annotated[int | None, typer.Option(help="Of everything random.  \\[default: 0]")] = None,
+    forbid: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration."
+        ),
+    ] = None,
     robot: _Robot = None,
     set_: _Set = None,
     effects: _Effects = None,
@@ -399,6 +405,7 @@ def loop(
     options = _options(robot=robot, set=set_, effects=effects, report=report) | {
         "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
         "prefer": prefer,
+        "forbid": config.words(forbid),
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Loop, None, options), no_cache)
     from sweeps import loop as room

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from calibration.data import runs as records
 from calibration.inference import errors as residual
+from calibration.inference.ranges import check_ranges
 from mmrjax import channels
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
@@ -29,11 +30,12 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     stated = runs = read_runs(source, robot, measured=True)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
+    said = check_ranges(runs, robot)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)
         comparison, summary = compared(stated, table)
         folder.write_table("comparison.csv", comparison)
-        notes = missing(comparison)
+        notes = [*missing(comparison), *said]
         print_comparison(comparison, summary, notes)
         if config.report:
             from sweeps import report_comparison

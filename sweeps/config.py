@@ -229,10 +229,12 @@ class Loop(RobotPart, InferencePart, OutputPart):
     Attributes:
         replicates: of the bootstrap.
         prefer: whether the fit to all rows or errors held out choose the leader of a class.
+        forbid: kinds of experiments, and configurations, that are not to be proposed.
     """
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
     prefer: Literal["fit", "held-out"] = "fit"
+    forbid: tuple[str, ...] = ()
 
 
 C = TypeVar("C", bound=Part)

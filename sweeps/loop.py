@@ -35,7 +35,8 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
     with open_folder("loop", config, robot, out, force, runs) as folder:
         found = discover(
             runs, robot, noise=config.noise or None, stated=stated, library=effect_file.library(config.effects),
-            replicates=config.replicates, seed=config.seed, prefer=config.prefer, progress=progress,
+            replicates=config.replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
+            progress=progress,
         )  # fmt: skip
         folder.write_json("result.json", found.to_json())
         folder.write_table("rows.csv", found.rows_table())

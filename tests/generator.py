@@ -413,51 +413,32 @@ def sized(term: Term, sigmas: float, c, p, instruments: Instruments, slopes: np.
 
 # --- further experiments ----------------------------------------------------------------------------
 
-_AIR = ("total_current", "motor_speed")
-#: Experiments that can be carried out: how (see `_done`), configurations, and then voltages [V], slopes [deg],
-#: payload [kg], motors switched on.
-RUNS: dict[str, tuple[str, tuple[int, ...], tuple[float, ...], tuple[float, ...], float, int]] = {
-    "bare motor": ("motor", (), (6.0, 12.0, 24.0, 33.0, 40.0), (0.0,), 0.0, 2),
-    "braked motor": ("brake", (), (12.0, 24.0, 33.0), (0.0,), 0.0, 2),
-    "stall": ("stall", (), (1.0, 2.0), (0.0,), 0.0, 2),
-    "stall, one motor": ("stall", (), (1.0, 2.0), (0.0,), 0.0, 1),
-    "reverse": ("reverse", (0, 1), (15.0, 33.0), (0.0, 10.0), 0.0, 2),
-    "downhill": ("travel", (0, 1), (15.0, 33.0), (-5.0, -10.0), 0.0, 2),
-    "lifted": ("lifted", (0, 1), (8.0, 15.0, 24.0, 33.0, 40.0), (0.0,), 0.0, 2),
-    "one motor": ("lifted", (0, 1), (8.0, 15.0, 24.0, 33.0, 40.0), (0.0,), 0.0, 1),
-    "payload 12 kg": ("travel", (0, 1), (15.0, 33.0), (0.0, 10.0, 20.0), 12.0, 2),
-    "other voltages": ("travel", (0, 1), (8.0, 19.0, 28.0, 40.0), (0.0, 15.0), 0.0, 2),
-    "steepest slope": ("travel", (0, 1), (15.0, 24.0, 33.0), (23.0,), 0.0, 2),
-    "crawl": ("travel", (0, 1), (2.0, 3.0, 4.0), (0.0,), 0.0, 2),
-}
-#: Calibration acts: sd of a reading [kg, A, rad/s or m/s], repeats, and the true values that are set.
-ACTS: dict[str, tuple[float, int, tuple[float, ...]]] = {
-    "weigh": (0.02, 1, ()),
-    "shunt": (0.02, 10, (1.0, 5.0)),
-    "zero current": (0.02, 10, (0.0,)),
-    "strobe": (5 * np.pi / 30, 10, (300.0, 800.0)),
-    "timing": (3e-3, 10, (0.4, 0.9)),
-}
-REPEATS = 3  # of each run
-BRAKE = 0.06  # torque of the brake on a motor shaft [N·m]
+#: How a run of the menu is carried out (see `_free`), by the name of its setup.
+HOW = {
+    "on_ground": "travel", "reversed_": "reverse", "lifted": "lifted", "bare": "motor", "braked": "brake",
+    "blocked": "stall",
+}  # fmt: skip
+#: Channel whose instrument a calibration act reads; `weigh` reads the scales.
+SHOWN = {"shunt": 0, "zero current": 0, "strobe": 1, "timing": 2}
 
 
-def _act(name: str, p: Mapping[str, float], terms: Sequence[Term]) -> np.ndarray:
-    """What an instrument shows of true values; of the scales' mass the stated one is taken away."""
-    if name == "weigh":
-        c = conditions([0, 0, 1, 1], 0.0, 0.0, [0.0, 8.0, 0.0, 8.0], p)
+def _act(name: str, at: np.ndarray, p: Mapping[str, float], terms: Sequence[Term]) -> np.ndarray:
+    """What an instrument shows of true values `at`; of the scales' mass the stated one is taken away."""
+    if name == "weigh":  # configuration and payload
+        c = conditions(at[:, 0], 0.0, 0.0, at[:, 1], p)
         s = SimpleNamespace(M=c.mass, wheeled=c.wheeled)
         return 0 * c.mass + sum((t.of(s) for t in terms if t.form.balance == "mass"), 0.0)
-    true = np.array(ACTS[name][2])
-    channel = {"shunt": 0, "zero current": 0, "strobe": 1, "timing": 2}[name]
+    true = at[:, 0]
     s = SimpleNamespace(I=true / SIDES, w=true, V=true)
-    return true + sum((t.of(s) for t in terms if t.form.balance == CHANNELS[channel]), 0.0)
+    return true + sum((t.of(s) for t in terms if t.form.balance == CHANNELS[SHOWN[name]]), 0.0)
 
 
-def _free(how: str, U: np.ndarray, wheeled: int, motors: int, p: Mapping[str, float], terms: Sequence[Term]):
+def _free(
+    how: str, U: np.ndarray, wheeled: int, motors: int, p: Mapping[str, float], terms: Sequence[Term], brake: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Current [A] and speed [rad/s] shown where nothing touches the ground, shape (2, rows).
 
-    `how` is `lifted`, `motor` (nothing on its shaft), `brake` (a brake on it) or `stall` (shaft held).
+    `how` is `lifted`, `motor` (nothing on its shaft), `brake` (one of a torque [N·m] on it) or `stall` (shaft held).
     """
     chassis = ("6T2A.", "4W2T.")[wheeled]
     R, C, zero = p["motor.resistance"], p["motor.torque_constant"], np.zeros_like(U)
@@ -482,7 +463,7 @@ def _free(how: str, U: np.ndarray, wheeled: int, motors: int, p: Mapping[str, fl
             return np.stack([volts, w])
         torque = C * i - p["motor.friction_coulomb"] - p["motor.friction_viscous"] * w - extra("motor")
         if how in ("motor", "brake"):
-            return np.stack([volts, 1000 * (torque - BRAKE * (how == "brake"))])
+            return np.stack([volts, 1000 * (torque - brake * (how == "brake"))])
         torque = torque - p["gearbox.friction_coulomb"] - p["gearbox.friction_viscous"] * w
         s.B = s.M_t0 + p[chassis + "track.loss_viscous"] * s.w_k + extra("track")
         return np.stack([volts, p["gearbox.ratio"] * p["gearbox.efficiency_load"] * torque - s.B - extra("gearbox")])
@@ -495,23 +476,22 @@ def _free(how: str, U: np.ndarray, wheeled: int, motors: int, p: Mapping[str, fl
     return left(x, shown=True), np.abs(left(x)).max(0) < 1e-7
 
 
-def carried_out(name: str, p: Mapping[str, float], terms: Sequence[Term] = ()) -> tuple[np.ndarray, np.ndarray]:
+def carried_out(experiment: Any, p: Mapping[str, float], terms: Sequence[Term] = ()) -> tuple[np.ndarray, np.ndarray]:
     """What an experiment shows without noise [SI], row by row and in each row channel by channel; and what is sound.
 
-    Runs bear the name of `RUNS`, with the configuration where there is one: `lifted, 6T2A`.
+    Args:
+        experiment: of the menu, an act or a run with its conditions; nothing but these is read of it.
     """
-    if name in ACTS:
-        y = _act(name, p, terms)
+    if hasattr(experiment, "at"):
+        y = _act(experiment.name, np.array(experiment.at, float), p, terms)
         return y, np.ones(y.shape, bool)
-    wheeled = int(name.endswith("4W2T"))
-    how, _, voltages, slopes, payload, motors = RUNS[name.removesuffix(", 6T2A").removesuffix(", 4W2T")]
-    slope, U = (x.ravel() for x in np.meshgrid(slopes, voltages, indexing="ij"))
+    how, wheeled = HOW[experiment.setup.__name__], experiment.configuration
+    U, slope, payload = (np.array(x, float) for x in (experiment.voltage, experiment.slope, experiment.payload))
     if how in ("lifted", "motor", "brake", "stall"):
-        y, sound = _free(how, U, wheeled, motors, p, terms)
+        y, sound = _free(how, U, wheeled, experiment.sides or SIDES, p, terms, experiment.brake)
         y = y[:1] if how == "stall" else y
     else:
-        if how == "reverse":  # down the slope, and an angle that is too small now drives
-            slope = -slope
+        if how == "reverse":  # an angle that is too small now drives
             terms = [
                 dataclasses.replace(t, amplitude=-t.amplitude) if t.form.cls == "slope_bias" else t for t in terms
             ]
@@ -544,25 +524,18 @@ class Case:
         """The table of another experiment with the same robot."""
         return _table(c, *readings(c, self.constants, self.terms), self.instruments, np.random.default_rng(seed))
 
-    def carry_out(self, name: str, seed: int) -> dict[str, np.ndarray]:
-        """Another experiment with the same robot: `value` and `sd` of its readings [SI], repeats averaged.
+    def carry_out(self, experiment: Any, seed: int) -> dict[str, np.ndarray]:
+        """An experiment of the menu with the same robot: `value` and `sd` of its readings [SI], repeats averaged.
 
         What a robot that slides or stands still does not show is NaN.
         """
-        y, sound = carried_out(name, self.constants, self.terms)
-        if name in ACTS:
-            sd, repeats, _ = ACTS[name]
-            sd = np.full(y.shape, sd / np.sqrt(repeats))
+        y, sound = carried_out(experiment, self.constants, self.terms)
+        if hasattr(experiment, "at"):
+            one = np.full(y.shape, experiment.sd)
         else:
-            channels = (
-                1
-                if name.startswith("stall")
-                else 2
-                if name.startswith(("bare", "braked", "lifted", "one motor"))
-                else 3
-            )
-            shown = (self.instruments.stated / _SHOWN[:, 0])[:channels]
-            sd = np.tile(shown, y.size // channels) / np.sqrt(REPEATS)
+            shown = (self.instruments.stated / _SHOWN[:, 0])[: len(experiment.channels)]
+            one = np.tile(shown, len(experiment.voltage))
+        sd = one / np.sqrt(experiment.repeats)
         noise = np.random.default_rng(seed).standard_normal(y.shape)
         return {"value": np.where(sound, y + sd * noise, np.nan), "sd": sd}
 

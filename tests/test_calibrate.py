@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
+from calibration.inference.observers import SettledRuns
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
 
@@ -199,6 +201,19 @@ def test_contradictory_replicates_are_refused(measured):
         BadData, match=r"rows 4 and 21, .*, 14 sd apart; remove the wrong one or state a larger --noise"
     ):
         quick(other, noise="current=2%,motor_speed=1%,speed=1%")
+
+
+def test_thousands_of_rows_are_compared_at_once(measured):
+    long = measured.where(np.tile(np.arange(20), 250))
+    long = changed(long, payload_kg=long["payload_kg"] + 1e-3 * np.arange(5000))  # no two alike but by the last
+    long.columns["payload_kg"][-1] = long["payload_kg"][19]
+    known = noise.of(long, SettledRuns.sizes(long), "current=2%,motor_speed=1%,speed=1%")
+    began = time.monotonic()
+    assert SettledRuns.check(long, known) == []
+    long.columns["speed_mm_s"][-1] *= 2
+    with pytest.raises(BadData, match="rows 20 and 5000, speed_mm_s: the same conditions gave"):
+        SettledRuns.check(long, known)
+    assert time.monotonic() - began < 5.0  # of all pairs: minutes
 
 
 def test_samples_of_one_run_under_two_conditions_are_refused(measured):

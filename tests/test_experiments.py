@@ -10,13 +10,16 @@ import pytest
 from synthetic import SETTLED, table
 from test_generator import SHAPES
 
-from calibration.discovery import experiments, menu
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
+from calibration.discovery import experiments, foreseen, menu
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
-from mmrjax import params, robots
+from calibration.discovery.reach import reach
+from mmrjax import channels, params, robots
+from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
-from mmrjax.tables import CONFIGURATIONS
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},
@@ -24,8 +27,18 @@ PAIRS = {
     ("rolling_radius", "speed_gain"): {"timing"},
     ("mass_error", "tension_friction"): {"weigh"},
 }
-MENU = menu.menu(CONFIGURATIONS)
-SPANS = menu.spans(MENU)
+
+
+def conditions(made):
+    """Conditions of a table of the generator, for the simulator."""
+    c = made.conditions if isinstance(made, g.Case) else made
+    return Conditions(c.wheeled.astype(int), c.U, np.degrees(c.slope), c.payload, total_mass=c.mass)
+
+
+CLIMBING = params.replace(robots.nominal(), g.CLIMBING)
+REACH = reach(CLIMBING, conditions(g.table8()), channels.names())
+MENU = menu.menu(REACH)
+SPANS, BY = foreseen.spans(MENU), {e.name: e for e in MENU}
 SETTINGS = SETTLED.settings
 
 
@@ -35,9 +48,8 @@ SETTINGS = SETTLED.settings
 @pytest.fixture(scope="module")
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
-    base = params.replace(robots.nominal(), g.CLIMBING)
-    full = dataclasses.replace(base, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
-    read = eqx.filter_jit(menu.readings)
+    full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
+    read, batch = eqx.filter_jit(foreseen.readings), foreseen.batch(MENU)
 
     def of(p, term=None):
         values = dict(p)
@@ -45,7 +57,8 @@ def shown():
             values[f"effects.{term.name}.amplitude"] = term.amplitude
             values |= {f"effects.{term.name}.{SHAPES[k]}": v for k, v in term.shapes.items()}
         robot = params.replace(full, {k: jnp.asarray(np.float64(v)) for k, v in values.items()})
-        return [np.asarray(x) for x in read(robot)]
+        found = read(robot, batch)
+        return np.asarray(found.value), np.asarray(found.exists)
 
     return of
 
@@ -58,26 +71,23 @@ def test_menu_agrees_with_the_generators_own_physics(name, shown):
         term = dataclasses.replace(term, amplitude=term.amplitude * term.form.size)
     value, there = shown(p, term)
     for experiment_name, at in SPANS.items():
-        theirs, sound = g.carried_out(experiment_name, p, [] if term is None else [term])
+        theirs, sound = g.carried_out(BY[experiment_name], p, [] if term is None else [term])
         np.testing.assert_array_equal(there[at], sound, err_msg=experiment_name)
         np.testing.assert_allclose(value[at][sound], theirs[sound], rtol=1e-6, atol=1e-9, err_msg=experiment_name)
 
 
 def test_agreement_can_fail(shown):
     value, _ = shown(g.CLIMBING)
-    theirs, _ = g.carried_out("bare motor", g.CLIMBING | {"motor.resistance": 0.6117})
+    theirs, _ = g.carried_out(BY["bare motor"], g.CLIMBING | {"motor.resistance": 0.6117})
     with pytest.raises(AssertionError):
         np.testing.assert_allclose(value[SPANS["bare motor"]], theirs, rtol=1e-6)
 
 
-def test_menu_and_generator_hold_the_same_experiments():
-    ran = [f"{n}, {c}" for n, r in g.RUNS.items() for c in ("6T2A", "4W2T") if r[1]]
-    alone = [n for n, r in g.RUNS.items() if not r[1]]
-    assert {e.name for e in MENU} == {*g.ACTS, *ran, *alone}
+def test_menu_and_generator_have_the_same_instruments():
     case = g.Case({}, {}, g.conditions(0, 1, 0, 0), g.CLIMBING, (), g.Instruments())
-    sd = menu.sds(MENU, case.instruments.stated * [1.0, np.pi / 30, 1e-3])
+    sd = foreseen.sds(MENU, case.instruments.stated * [1.0, np.pi / 30, 1e-3])
     for name, at in SPANS.items():
-        np.testing.assert_allclose(case.carry_out(name, 0)["sd"], sd[at], err_msg=name)
+        np.testing.assert_allclose(case.carry_out(BY[name], 0)["sd"], sd[at], err_msg=name)
 
 
 def test_reverse_travel_turns_the_sign_of_a_biased_slope_alone(shown):
@@ -109,7 +119,10 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
     proposal = experiments.choose(seen[pair][3])
     assert proposal.name in PAIRS[pair]
     assert proposal.settles and proposal.separates == (pair[1],) and proposal.expected_sigma > 3
-    assert len(proposal.table) == len(MENU) and proposal.table[0].experiments == proposal.experiments
+    assert (
+        len(proposal.table) == len(seen[pair][3].experiments)
+        and proposal.table[0].experiments == proposal.experiments
+    )
 
 
 @pytest.mark.slow
@@ -117,7 +130,8 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
 def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
     name = experiments.choose(foreseen).name
-    verdicts = [experiments.supported(foreseen, {name: case.carry_out(name, seed)}) for seed in range(10)]
+    done = next(e for e in foreseen.experiments if e.name == name)
+    verdicts = [experiments.supported(foreseen, {name: case.carry_out(done, seed)}) for seed in range(10)]
     assert sum(v.resolved and v.best == pair[0] for v in verdicts) >= 8
     assert all(pair[0] in v.left for v in verdicts)
 
@@ -255,3 +269,206 @@ def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
     assert weak.name == experiments.NONE and weak.expected_sigma == 0
     wave = experiments.denser(space, dataclasses.replace(where, variable="order 2 of the driving shaft"), SETTINGS)
     assert wave.name == "steady speeds for order 2 of the driving shaft" and "from the mark" in wave.description
+
+
+# --- what is within reach ---------------------------------------------------------------------------
+
+#: A robot of somebody else: wheels only, 12 V, 3 kg.
+ROVER = """
+configurations = ["rover"]
+[motor]
+resistance = 1.2
+torque_constant = 0.012
+[gearbox]
+ratio = 30.0
+[rover]
+like = "4W2T"
+mass = 3.0
+[rover.ground.friction]
+static = 0.6
+"""
+
+
+@pytest.fixture
+def rover(tmp_path):
+    (tmp_path / "rover.toml").write_text(ROVER)
+    return robot_file.read(tmp_path / "rover.toml")
+
+
+def grid(voltages, slopes, payloads):
+    u, s, m = (x.ravel() for x in np.meshgrid(voltages, slopes, payloads, indexing="ij"))
+    return Conditions(0, u, s, m)
+
+
+ROVERS_TABLE = grid([6.0, 9.0, 12.0], [0.0, 8.0], [0.0, 1.0])
+
+
+def runs_of(table):
+    return [e for e in table if isinstance(e, menu.Run)]
+
+
+def test_menu_stays_within_the_reach_of_a_small_robot(rover):
+    made = menu.menu(reach(rover, ROVERS_TABLE, channels.names()))
+    runs = runs_of(made)
+    assert {r.configuration for r in runs} == {0} and not any("6T2A" in e.description for e in made)
+    assert max(max(r.voltage) for r in runs) <= 12.0 and min(min(r.voltage) for r in runs) > 0
+    assert max(max(r.payload) for r in runs) == 1.5 and max(max(r.slope) for r in runs) <= 9.5
+    assert min(min(r.slope) for r in runs) == -8.0
+    weigh = next(e for e in made if e.name == "weigh")
+    assert "payload of 1 kg" in weigh.description and weigh.at == ((0.0, 0.0), (0.0, 1.0))
+    stall = next(e for e in runs if e.name == "stall")
+    assert max(stall.voltage) / 1.2 < 3.0  # of the current of steady travel, not of 12 V / 1.2 ohm
+
+
+def test_configurations_without_rows_are_not_on_the_menu():
+    wheels_alone = g.table8(configurations=(1,))
+    made = menu.menu(reach(CLIMBING, conditions(wheels_alone), channels.names()))
+    assert not any("6T2A" in f"{e.name} {e.description}" for e in made)
+    assert {r.configuration for r in runs_of(made) if "4W2T" in r.kinds} == {1}
+    assert next(e for e in made if e.name == "weigh").at == ((1.0, 0.0), (1.0, 8.0))
+
+
+def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
+    made = menu.menu(reach(rover, grid([12.0], [0.0], [0.0]), channels.names()))
+    runs = runs_of(made)
+    assert all(set(r.slope) <= {0.0, -0.0} and set(r.payload) == {0.0} for r in runs)
+    assert not {"downhill", "steepest slope", "payload"} & {k for r in runs for k in r.kinds}
+    assert "unladen, on scales" in made[0].description
+    assert max(max(r.voltage) for r in runs) <= 12.0
+
+
+def test_higher_voltage_needs_a_rating_and_is_watched(rover):
+    rated = robot_file.change(rover, {"motor.voltage_limit": 18.0}, where="test")
+    within = reach(rated, ROVERS_TABLE, channels.names())
+    run = next(r for r in runs_of(menu.menu(within)) if r.name == "other voltages, rover")
+    assert max(run.voltage) == 18.0
+    shown = menu.carried_out(run, *plain(run), within)
+    assert "the supply: 18 V is more than the table's 12 V" in shown.description
+
+
+def plain(run, temperature=40.0, speed=100.0):
+    """All of a run kept, with one temperature and speed."""
+    rows = len(run.voltage)
+    return np.ones(rows, bool), np.full(rows, temperature), np.full(rows, speed)
+
+
+def test_channels_that_the_bench_lacks_are_not_read(rover):
+    made = menu.menu(reach(rover, ROVERS_TABLE, ("speed",)))
+    assert {c for r in runs_of(made) for c in r.channels} == {"speed"}
+    names = {e.name for e in made}
+    assert "timing" in names and not names & {"shunt", "strobe", "zero current", "stall", "lifted, rover"}
+
+
+def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
+    one = dataclasses.replace(rover, sides=jnp.asarray(1.0))
+    made = menu.menu(reach(one, ROVERS_TABLE, channels.names()))
+    assert not any("one motor" in e.kinds for e in made)
+    assert "the motor's shaft" in next(e for e in made if e.name == "stall").description
+
+
+def test_voltages_without_load_stay_below_the_permissible_speed():
+    slow = robot_file.change(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
+    within = reach(slow, conditions(g.table8(voltages=(12.0,))), channels.names())
+    runs = {r.name: r for r in runs_of(menu.menu(within))}
+    seen = within.motor_speed  # the table went there itself
+    assert max(runs["bare motor"].voltage) <= 0.0259 * 900.0
+    assert max(runs["lifted, 6T2A"].voltage) <= max(0.0259 * 500.0, 0.0259 * seen)
+
+
+def test_other_voltages_are_those_that_the_table_lacks():
+    made = menu.other_voltages(REACH, (15.0, 24.0, 33.0))
+    assert len(made) == 4 and made[0] < 15 and made[-1] < 33 and not set(made) & {15.0, 24.0, 33.0}
+    assert all(v <= 12.0 for v in menu.other_voltages(dataclasses.replace(REACH, voltage=12.0), (12.0,)))
+
+
+def test_only_levels_that_the_robot_manages_are_left():
+    run = menu._runs(REACH, "x", "travel", voltages=(5.0, 10.0), slopes=(0.0, 10.0, 20.0))
+    does = np.array(
+        [True, True, False, True, False, False]
+    )  # at 5 V the slopes are too steep, and 20 deg at 10 V too
+    kept = menu.possible(run, does)
+    assert [(run.slope[k], run.voltage[k]) for k in np.flatnonzero(kept)] == [(0.0, 5.0), (0.0, 10.0)]
+    assert not menu.possible(run, np.zeros(6, bool)).any() and menu.possible(run, np.ones(6, bool)).all()
+    steepest = menu._runs(REACH, "x", "travel", voltages=(5.0,), slopes=(23.0, 21.5, 20.0), steepest=True)
+    kept = menu.possible(steepest, np.array([False, True, True]))
+    assert [steepest.slope[k] for k in np.flatnonzero(kept)] == [21.5]
+
+
+def test_steepest_slope_is_one_that_the_robot_climbs():
+    slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
+    found = eqx.filter_jit(foreseen.readings)(slippery, foreseen.batch(MENU))
+    first = 0
+    for run in runs_of(MENU):
+        rows = slice(first, first := first + len(run.voltage))
+        if run.name == "steepest slope, 6T2A":  # tan 21.5 deg = 0.394 and rolling resistance: beyond the adhesion
+            assert not menu.possible(run, np.asarray(found.does)[rows]).any()
+        if run.name == "lifted, 6T2A":
+            assert menu.possible(run, np.asarray(found.does)[rows]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "temperature", "speed", "says"),
+    [
+        ("stall", 90.0, 0.0, "current × time"),
+        ("braked motor", 90.0, 900.0, "the brake and the winding's temperature"),
+        ("lifted, 6T2A", 40.0, 1250.0, "rpm without load at 32 V, and no more than 12"),
+        ("payload 12 kg, 6T2A", 118.0, 500.0, "would reach 118 °C (125 °C is allowed); keep the runs short"),
+    ],
+)
+def test_what_can_do_damage_says_what_to_watch(name, temperature, speed, says):
+    run = BY[name]
+    shown = menu.carried_out(run, *plain(run, temperature, speed), REACH)
+    assert ". Watch " in shown.description and says in shown.description
+
+
+def test_harmless_run_has_nothing_to_watch():
+    run = BY["crawl, 6T2A"]
+    assert menu.carried_out(run, *plain(run), REACH).watch == ""
+
+
+def test_description_follows_the_conditions():
+    run = BY["payload 12 kg, 4W2T"]
+    assert run.description == (
+        "4W2T: travel with 12 kg on the level and up 10 and 20 deg at 15 and 33 V; read total current, motor speed "
+        "and speed"
+    )
+
+
+def test_every_kind_is_on_the_packaged_menu_and_no_other():
+    kinds = {k for e in MENU for k in e.kinds}
+    assert kinds == {*menu.KINDS, "6T2A", "4W2T"}
+
+
+def test_unknown_experiments_are_refused_with_the_choices():
+    menu.check_forbidden(("stall", "one motor", "4W2T"), CLIMBING)
+    with pytest.raises(
+        BadConfiguration, match="--forbid stal: no such experiment or configuration; did you mean stall"
+    ):
+        menu.check_forbidden(("stal",), CLIMBING)
+
+
+@pytest.mark.slow
+def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
+    _, space, fitted, free = seen["series_resistance", "supply_sag"]
+    barred = dataclasses.replace(SETTINGS, forbidden=("stall", "one motor", "4W2T"))
+    left = experiments.prospect(space, fitted, barred)
+    assert not {"stall", "one motor", "4W2T"} & {k for e in left.experiments for k in e.kinds}
+    assert {e.name for e in left.experiments} < {e.name for e in free.experiments}
+    assert left.value.shape[1] == sum(foreseen.size(e) for e in left.experiments) == len(left.sd)
+    everything = dataclasses.replace(SETTINGS, forbidden=menu.KINDS)
+    nothing = experiments.choose(experiments.prospect(space, fitted, everything))
+    assert nothing.name == experiments.NONE and "forbidden or beyond reach" in nothing.description
+
+
+def test_finer_steps_are_within_the_tables_ranges(rover):
+    within = reach(rover, ROVERS_TABLE, channels.names())
+    said = {v: experiments._steps(v, within) for v in ("voltage", "slope", "payload", "current", "time", "humidity")}
+    assert "from 6 to 12 V in steps of 0.4 V" in said["voltage"]
+    assert "from 0 to 8 deg in steps of 0.6 deg" in said["slope"]
+    assert "from 0 to 1 kg in steps of 0.07 kg" in said["payload"]
+    assert "at 12 V with a payload up to 1 kg and a slope up to 8 deg" in said["current"]
+    assert "125 °C is allowed" in said["time"] and "humidity in even small steps" in said["humidity"]
+    assert "6, 9 and 12 V" in experiments._steady_speeds("order 2 of the driving shaft", within)
+    level = reach(rover, grid([12.0], [0.0], [0.0]), channels.names())
+    assert "a brake or a drawbar pull" in experiments._steps("current", level)
+    assert "from 6 to 12 V" in experiments._steps("voltage", level)

@@ -292,6 +292,10 @@ WRONG = {
         ["--prior", "tracked.ground.friction.static=1±0.1", "--prior", "6T2A.ground.friction.static=1±0.1"],
         "--prior, tracked.ground.friction.static: its new name 6T2A.ground.friction.static is stated too",
     ),
+    "forbidden nothing": (
+        ["--forbid", "stall,one moter"],
+        "--forbid one moter: no such experiment or configuration; did you mean one motor? allowed: weigh, ",
+    ),
     "prior of nothing": (["--prior", "motor.resistence=1±0.1"], "motor.resistance"),
 }
 

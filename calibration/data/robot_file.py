@@ -33,6 +33,14 @@ COUNTS = {
     "battery.cells": (1, 100, "(cells of the battery in series)"),
 }
 
+#: What makers allow, which no fit can free: least, greatest, unit and meaning. Experiments stay within it.
+RATINGS = {
+    "motor.voltage_limit": (0.1, 1000.0, "V", "highest supply voltage; not stated: what the table used"),
+    "motor.speed_limit": (1.0, 1e5, "rad/s", "permissible speed of the motor"),
+    "motor.temperature_limit": (30.0, 400.0, "°C", "permissible temperature of the winding"),
+    "gearbox.speed_limit": (1.0, 1e5, "rad/s", "permissible speed at the gearbox input"),
+}
+
 
 def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
     """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
@@ -63,7 +71,7 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
         configurations: names of those that the robot has, in order; else those of the base. One that the base does
             not have states `like`, the base's configuration that it starts from, or `movers` (`tracks` or
             `wheels`) and every parameter that has no default.
-        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`.
+        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`; and RATINGS.
         effects: one is present when its table `[effects.NAME]` is, which may name the `configurations` that it acts
             on.
 
@@ -169,7 +177,7 @@ def current_values(values: Mapping[str, T], robot: Robot, where: str, notes: lis
 
 
 def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
-    """The robot with parameters replaced, each checked against its field; `sides` and `battery.cells` too.
+    """The robot with parameters replaced, each checked against its field; `sides`, `battery.cells` and RATINGS too.
 
     Args:
         values: by dotted name [SI]; where: opens the message of an error; notes: as for `load`.
@@ -179,6 +187,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     """
     stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
+    ratings = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
     known = {p.name: p for p in params.walk(robot)}
     for name, value in stated.items():
         if name not in known:
@@ -196,8 +205,21 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         sides=counts.get("sides", robot.sides),
         battery=dataclasses.replace(robot.battery, cells=counts.get("battery.cells", robot.battery.cells)),
     )
+    for name, value in ratings.items():
+        part, _, key = name.partition(".")
+        robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})
     _check_pairs(robot, where)
     return robot
+
+
+def _rating(where: str, name: str, value: Any) -> float:
+    low, high, unit, what = RATINGS[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        got = number(value) if isinstance(value, int | float) and not isinstance(value, bool) else repr(value)
+        raise BadConfiguration(
+            f"{where}, {name}: got {got}; expected a number, {number(low)} to {number(high)} {unit} ({what})"
+        )
+    return float(value)
 
 
 def _count(where: str, name: str, value: Any) -> int:
@@ -260,6 +282,10 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
         origin = f"; {spec.source}" if value == was else origin
         tables.setdefault(head, []).append(f"{key} = {value!r}  # [{spec.unit}] {spec.meaning}{origin}")
+    for name, (_, _, unit, what) in RATINGS.items():
+        head, _, key = name.partition(".")
+        stated = getattr(getattr(robot, head), key)
+        tables[head] += [] if stated is None else [f"{key} = {stated!r}  # [{unit}] {what}"]
     lines = [f"# {line}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {int(robot.sides)}  # motors driven alike"]
     lines.append(f"configurations = {json.dumps(list(robot.configurations))}")

@@ -6,7 +6,7 @@ Each stage is a function of what the stages before it found; none changes anythi
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ from calibration.data import own_mass, robot_file
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import findings, preference
+from calibration.discovery import findings, menu, preference
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
@@ -31,6 +31,7 @@ from calibration.discovery.standing import Standing, standing
 from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference.bases import Bases
+from calibration.inference.foreign import foreign_priors
 from calibration.inference.noise import Noise
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
@@ -52,6 +53,7 @@ def discover(
     replicates: int = 500,
     seed: int = 0,
     prefer: str = FIT,
+    forbidden: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> DiscoveryResult:
     """Find what a robot's model lacks against measured runs.
@@ -64,11 +66,14 @@ def discover(
         library: effects to look for.
         replicates: of the bootstrap; seed: random seed.
         prefer: by what the leader of a class is chosen, `fit` or `held-out`.
+        forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not to be proposed.
         progress: called with a sentence as the work goes on.
 
     Raises:
-        BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be.
+        BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
+            that are not known.
     """
+    menu.check_forbidden(forbidden, robot)
     distinct, numbers, notes = without_copies(runs)
     stated = robot_file.current_values(stated or {}, robot, "--prior", notes)
     kind = observers.kind(distinct)
@@ -80,7 +85,12 @@ def discover(
     known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
     notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
     notes += own_mass.remarks(robot, distinct)
+    foreign = foreign_priors(robot, stated)
+    for sentence in foreign:
+        progress(sentence)
+    notes += foreign
     settings = settings_for(kind, replicates, seed, prefer)
+    settings = dataclasses.replace(settings, forbidden=tuple(forbidden))
 
     found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)
     sensitivity = []

@@ -21,16 +21,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from scipy import stats
 
-from calibration.discovery import menu
+from calibration.discovery import foreseen, menu
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
+from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
-from calibration.inference import priors
+from calibration.inference import bases, priors
 from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
@@ -64,7 +65,7 @@ class Prospect:
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives by experiments, all carried out [σ]."""
-        where = menu.spans(self.experiments)
+        where = foreseen.spans(self.experiments)
         spans = [where[e] for e in experiments]
         at = np.concatenate([np.flatnonzero(self.there[k]) + k.start for k in spans])
         d = self.value[a, at] - self.value[b, at]
@@ -186,51 +187,88 @@ def alternatives(best: Candidate, found: Classes) -> dict[str, Candidate]:
 
 @eqx.filter_jit
 def _foreseen(
-    problem: Problem, other: priors.Coordinates | None, which: Array, z: Array
-) -> tuple[Array, Array, Array]:
-    """Readings of the menu, what the fit leaves of their covariance, and which exist, by alternative.
+    problem: Problem, other: priors.Coordinates | None, batch: foreseen.Batch, which: Array, z: Array
+) -> tuple[foreseen.Foreseen, Array]:
+    """Readings of the menu, and ½ of what the fit leaves of their covariance, by alternative.
 
     `other` are coordinates of what the table does not show at all, known by their priors alone.
     """
     rows = informing(problem.data)
 
-    def one(w: Array, z: Float[Array, " coordinates"]) -> tuple[Array, Array, Array]:
+    def one(w: Array, z: Float[Array, " coordinates"]) -> tuple[foreseen.Foreseen, Array]:
         here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(w))
 
         def residual(x: Array) -> Array:
             return jnp.concatenate([here.misfit(x, here.data), x - here.data.centre])
 
-        def reading(x: Array) -> tuple[Array, tuple[Array, Bool[Array, " readings"]]]:
+        def reading(x: Array) -> tuple[Array, foreseen.Foreseen]:
             base = here.base if other is None else other.robot(here.base, x[z.size :])
-            value, there = menu.readings(here.coordinates.robot(base, x[: z.size]))
-            return value, (value, there)
+            found = foreseen.readings(here.coordinates.robot(base, x[: z.size]), batch)
+            return found.value, found
 
         informed = jax.jacfwd(residual)(z)[rows]
         lower = cholesky(informed.T @ informed)
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
-        slopes, (value, there) = jax.jacfwd(reading, has_aux=True)(wide)
+        slopes, found = jax.jacfwd(reading, has_aux=True)(wide)
         half = jnp.concatenate([forward(lower, slopes[:, : z.size].T).T, slopes[:, z.size :]], 1)
-        return value, half, there & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(value)
+        exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
+        return dataclasses.replace(found, exists=exists), half
 
     return jax.vmap(one)(which, z)
 
 
 def prospect(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> Prospect:
-    """What these alternatives foresee of the menu, with instruments as good as those of the table."""
+    """What these alternatives foresee of the menu, with instruments as good as those of the table.
+
+    The menu holds what is within reach of the table, what the robots of all alternatives manage, and what is not
+    forbidden.
+    """
     names, those = list(candidates), list(candidates.values())
     those += [those[0]] * (-len(those) % PAD)
     robot = space.bare.base
-    everything = priors.free_names(robot, robot.configurations.names)
-    more = [n for n in everything if n not in space.coordinates.base.names]
+    whole = priors.free_names(robot, robot.configurations.names)
+    more = [n for n in whole if n not in space.coordinates.base.names]
     other = priors.coordinates(robot, more) if more else None
     active = jnp.asarray([space.library.indices(c.active) for c in those])
     z = jnp.asarray(np.stack([c.z for c in those]))
-    found = jax.device_get(_foreseen(space.equipped, other, active, z))
-    value, half, there = (np.asarray(x)[: len(names)] for x in found)
-    experiments = menu.menu(robot.configurations.names)
-    sd = menu.sds(experiments, np.median(np.asarray(space.equipped.data.sd), 0))
-    value, half = np.nan_to_num(value), np.nan_to_num(half)
-    return Prospect(tuple(names), experiments, value, half, sd, np.all(there, axis=0), settings)
+    within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
+    everything = menu.menu(within)
+    found, half = jax.device_get(_foreseen(space.equipped, other, foreseen.batch(everything), active, z))
+    found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
+    experiments, kept = _possible(everything, found, within, settings)
+    sd = foreseen.sds(experiments, np.median(np.asarray(space.equipped.data.sd), 0))
+    value, half = np.nan_to_num(found.value[:, kept]), np.nan_to_num(half[:, kept])
+    return Prospect(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
+
+
+def _possible(
+    experiments: Sequence[menu.Experiment], found: foreseen.Foreseen, within: Reach, settings: Settings
+) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
+    """What of a menu is possible and not forbidden, and whether each reading of the whole menu is of that.
+
+    Args:
+        found: of every alternative, the best fit first.
+    """
+    runs = [e for e in experiments if isinstance(e, menu.Run)]
+    ends = dict(zip((r.name for r in runs), np.cumsum([len(r.voltage) for r in runs]).tolist(), strict=True))
+    left: list[menu.Experiment] = []
+    kept: list[np.ndarray] = []
+    for e in experiments:
+        rows = np.ones(foreseen.size(e), bool)
+        if isinstance(e, menu.Run):
+            at = slice(ends[e.name] - len(e.voltage), ends[e.name])
+            grips = np.abs(found.grip[:, at]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
+            done = menu.possible(e, np.all(found.does[:, at] & grips, 0))
+            if done.any():
+                hot, fast = np.asarray(found.temperature)[0, at], np.asarray(found.speed)[0, at]
+                e = menu.carried_out(e, done, hot, fast, within)
+            rows = np.repeat(done, len(e.read))
+        if set(e.kinds) & set(settings.forbidden):
+            rows = np.zeros(len(rows), bool)
+        if rows.any():
+            left.append(e)
+        kept.append(rows)
+    return tuple(left), np.concatenate(kept)
 
 
 # --- the choice -------------------------------------------------------------------------------------
@@ -257,10 +295,12 @@ def ranked(seen: Prospect) -> tuple[Ranked, ...]:
 def choose(seen: Prospect) -> Proposal:
     """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
     table = ranked(seen)
+    if not table:
+        return Proposal((NONE,), "Every experiment of the menu is forbidden or beyond reach", (), 0.0, False, ())
     plan = table[0]
     (first,) = plan.experiments
     both = (_ranked(seen, first, e.name) for e in seen.experiments if e.name != first)
-    more = max(both, key=_use)
+    more = max(both, key=_use, default=plan)
     if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
@@ -273,24 +313,51 @@ def choose(seen: Prospect) -> Proposal:
     )
 
 
-#: How the variable of a curve is covered more densely and further out.
-DENSER = {
-    "voltage": "Repeat at one slope and payload with the supply voltage from 8 to 36 V in steps of 2 V",
-    "current": "Repeat at one voltage with payload and slope raised in small steps, so that the current rises evenly "
-    "from no load to its largest",
-    "speed_motor": "Repeat on the level, unladen, with the supply voltage in steps of 2 V from crawl to top speed",
-    "slope": "Repeat at one voltage and payload with the slope from 0 to 20 deg in steps of 1 deg, and downhill",
-    "payload": "Repeat at one voltage and slope with the payload from 0 to 12 kg in steps of 1 kg",
-    "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest",
-    "time": "Record one condition from a cold start for ten minutes, and again at once while everything is warm",
-}
-#: The same for a wave.
-STEADY_SPEEDS = (
-    "Mark the driving shaft, start every run from the mark, and record steady travel at three speeds with at least "
-    "20 samples a wave: what keeps its {variable} at every speed turns with that part"
-)
-#: Runs of such a series, and repeats of each that are averaged.
+#: Runs of a series that covers the variable of a curve more densely, and repeats of each that are averaged.
 SERIES, REPEATS = 15, 3
+
+
+def _steps(variable: str, within: Reach) -> str | None:
+    """How the variable of a curve is covered more densely, within reach of the table; None for a wave."""
+    volts = within.voltages
+    low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.near(0.5 * volts[0]), volts[0])
+    slope = max(u.steepest for u in within.used)
+    payload = max(u.payloads[-1] for u in within.used)
+    step, angle, mass = (menu.near(x / (SERIES - 1), 1) for x in (high - low, slope, payload))
+    load = [f"a payload up to {payload:g} kg"] * (payload > 0) + [f"a slope up to {slope:g} deg"] * (slope > 0)
+    loaded = " and ".join(load) or "a brake or a drawbar pull"
+    if variable in bases.ORDERS:
+        return None
+    return {
+        "voltage": f"Repeat at one slope and payload with the supply voltage from {low:g} to {high:g} V in steps of "
+        f"{step:g} V",
+        "current": f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current rises evenly "
+        f"from no load to its largest, some {within.current * within.motors:.2g} A",
+        "speed_motor": f"Repeat on the level, unladen, with the supply voltage in steps of {step:g} V from crawl to "
+        f"{high:g} V",
+        "slope": f"Repeat at one voltage and payload with the slope from 0 to {slope:g} deg in steps of {angle:g} "
+        "deg, and downhill",
+        "payload": f"Repeat at one voltage and slope with the payload from 0 to {payload:g} kg in steps of {mass:g} "
+        "kg",
+        "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest, "
+        f"some {within.speed:.2g} m/s at {high:g} V",
+        "time": f"Record one condition from a cold start for ten minutes, at {low:g} V rather than more, and again "
+        f"at once while everything is warm; watch the winding's temperature ({within.hot:g} °C is allowed)",
+        "order": "Repeat the table in another order, rows that were first last, and one condition again after every "
+        "fifth run",
+    }.get(variable, f"Repeat with {variable.replace('_', ' ')} in even small steps from its least to its largest")
+
+
+def _steady_speeds(variable: str, within: Reach) -> str:
+    """How a wave is followed from speed to speed."""
+    volts = within.voltages
+    low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.near(0.5 * volts[0]), volts[0])
+    three = [f"{menu.near(v):g}" for v in (low, 0.5 * (low + high), high)]
+    return (
+        f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "
+        f"and {three[2]} V with at least 20 samples a wave: what keeps its {variable} at every speed turns with that "
+        "part"
+    )
 
 
 def denser(space: CandidateSpace, where: Location, settings: Settings) -> Proposal:
@@ -300,11 +367,12 @@ def denser(space: CandidateSpace, where: Location, settings: Settings) -> Propos
     runs of the series.
     """
     balance, variable = where.balance, where.variable
-    runs = space.bare.observe.runs_counting(space.included)
+    runs, within = space.bare.observe.runs_counting(space.included), reach_of(space)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
-    how = DENSER.get(variable) or STEADY_SPEEDS.format(variable=variable)
+    finer = _steps(variable, within)
+    how = _steady_speeds(variable, within) if finer is None else finer
     text = f"{how}; read every channel. What the {balance} balance lacks then shows its shape"
-    name = f"finer steps in {variable}" if variable in DENSER else f"steady speeds for {variable}"
+    name = f"finer steps in {variable}" if finer is not None else f"steady speeds for {variable}"
     if sigma < settings.worth:
         text = f"A series in {variable} would show what is missing by {sigma:.1f} sigma"
         return Proposal((NONE,), text, (), 0.0, False, ())
@@ -328,7 +396,7 @@ def supported(seen: Prospect, carried_out: Mapping[str, Mapping[str, Any]]) -> V
         carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
             NaN for what was not read.
     """
-    spans = menu.spans(seen.experiments)
+    spans = foreseen.spans(seen.experiments)
     at = np.concatenate([np.arange(len(seen.sd))[spans[name]] for name in carried_out])
     value, sd = (
         np.concatenate([np.asarray(r[what], float) for r in carried_out.values()]) for what in ("value", "sd")

@@ -1,4 +1,4 @@
-"""The menu of experiments: what to do, what to read, and what any robot would show."""
+"""The menu of experiments: what can be done with a robot within reach of its table, what to read, what to watch."""
 
 from __future__ import annotations
 
@@ -6,76 +6,31 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
-from mmrjax import balances, channels, params
+from calibration.data.errors import BadConfiguration, choices
+from calibration.discovery import setups
+from calibration.discovery.reach import SLOPE, Reach, Used
+from calibration.discovery.setups import Setup
+from mmrjax import balances, channels
 from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.steady import operating_point
-from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, STALLED, Signals, State
+from mmrjax.signals import Signals, State
 
-#: Mass of a robot whose weight is carried by stands [kg]: none, but for the sake of ratios to its load.
-UNLOADED = 1e-9
-#: Friction of a shaft that is held in a vice, and of a brake on it [N·m].
-BLOCKED, BRAKE = 1e3, 0.06
-
-
-# --- how the robot is set up ------------------------------------------------------------------------
-
-
-def _with(robot: Robot, values: Mapping[str, Scalar]) -> Robot:
-    return params.replace(robot, {k: jnp.asarray(v, float) for k, v in values.items()})
-
-
-def without(robot: Robot, *closed: str) -> Robot:
-    """The robot without the effects that enter the balances `closed`."""
-    return _with(robot, {f"effects.{e.name}.amplitude": 0.0 for e in robot.effects if e.balance in closed})
-
-
-def on_ground(robot: Robot) -> Robot:
-    """The robot as it is."""
-    return robot
-
-
-def reversed_(robot: Robot) -> Robot:
-    """The robot turned about, so that its travel is forward again.
-
-    With the negative of the slope in the command, friction, slip and what meters show stay as they are: they
-    follow the travel. What is odd in travel flips: a slope that is steeper than stated stays so, and now drives.
-    """
-    biased = {f"effects.{e.name}.amplitude": -e.amplitude for e in robot.effects if e.odd_in_travel}
-    return _with(robot, biased)
-
-
-def lifted(robot: Robot) -> Robot:
-    """The robot on stands, its movers in the air: no normal load, no ground."""
-    rolling = {f"{c}.ground.rolling_resistance": 0.0 for c in robot.configurations}
-    return _with(without(robot, "mass", "ground", "slip"), rolling)
-
-
-def bare(robot: Robot) -> Robot:
-    """The motors with their gearboxes uncoupled: of the balances, supply, electrical and motor are left."""
-    losses = {f"{c}.track.loss_{kind}": 0.0 for c in robot.configurations for kind in ("coulomb", "viscous")}
-    gear = {"gearbox.friction_coulomb": 0.0, "gearbox.friction_viscous": 0.0, "gearbox.efficiency_load": 1.0}
-    return _with(without(lifted(robot), "gearbox", "track"), losses | gear)
-
-
-def blocked(robot: Robot) -> Robot:
-    """The motors with their shafts held: U_e = E + I R at speed 0."""
-    return _with(lifted(robot), {"gearbox.friction_coulomb": BLOCKED})
-
-
-def braked(robot: Robot) -> Robot:
-    """The bare motors, each against a brake of constant torque."""
-    return _with(bare(robot), {"gearbox.friction_coulomb": BRAKE})
+#: What a user may forbid, beside configurations: every experiment is of one or more of these kinds.
+KINDS = (
+    "weigh", "zero current", "shunt", "strobe", "timing", "bare motor", "stall", "one motor", "braked motor",
+    "reverse", "downhill", "lifted", "payload", "other voltages", "steepest slope", "crawl",
+)  # fmt: skip
+#: Share of the adhesion that a slope steeper than the table's may take by the fitted robot [-].
+GRIP = 0.95
+#: How near to what is allowed something has to come to be watched: of a winding [K], of a speed [-].
+WARM, FAST = 25.0, 0.85
 
 
 # --- what is done -----------------------------------------------------------------------------------
@@ -86,15 +41,19 @@ class Act:
     """A calibration act: something is read that does not depend on the run.
 
     Attributes:
-        name, description: for an engineer, what to do and what to read.
-        reading: of a robot [SI], shape (readings,); sd: of a single reading, by reading [SI].
-        repeats: readings that are averaged.
+        name: of it; kinds: of `KINDS`.
+        description: for an engineer, what to do and what to read.
+        reading: of a robot and of what is set [SI], shape (readings,).
+        at: what is set, one tuple a reading [SI]; of `weigh`, the configuration's index and the payload.
+        sd: of a single reading [SI]; repeats: readings that are averaged.
     """
 
     name: str
+    kinds: tuple[str, ...]
     description: str
-    reading: Callable[[Robot], Array]
-    sd: tuple[float, ...]
+    reading: Callable[[Robot, Array], Array]
+    at: tuple[tuple[float, ...], ...]
+    sd: float
     repeats: int = 10
 
 
@@ -103,243 +62,336 @@ class Run:
     """Settled runs under conditions that the table does not hold.
 
     Attributes:
-        name, description: for an engineer, what to do and what to read.
+        name: of them; kinds: of `KINDS`, and the configuration where there is one.
+        doing: for an engineer, what to do; where and at what voltages follows from the conditions.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
+        channels: names of what is read.
         configuration: index of the robot's.
-        channels: names of what is read; none: all.
         sides: motors that are switched on; None: all.
+        brake: torque on each motor shaft [N·m].
+        beyond: angle above which a slope is steeper than any of the table [deg].
+        steepest: whether only the steepest slope that the robot climbs is worth while.
         repeats: readings that are averaged.
+        watch: what can be damaged, and what shows that it will be.
     """
 
     name: str
-    description: str
-    setup: Callable[[Robot], Robot]
+    kinds: tuple[str, ...]
+    doing: str
+    setup: Setup
     voltage: tuple[float, ...]
     slope: tuple[float, ...]
     payload: tuple[float, ...]
+    channels: tuple[str, ...]
     configuration: int = 0
-    channels: tuple[str, ...] = ()
     sides: int | None = None
+    brake: float = 0.0
+    beyond: float = math.inf
+    steepest: bool = False
     repeats: int = 3
+    watch: str = ""
 
     @property
     def read(self) -> tuple[int, ...]:
         """Positions of the channels that are read."""
-        return tuple(channels.index(c) for c in self.channels or channels.names())
+        return tuple(channels.index(c) for c in self.channels)
+
+    @property
+    def description(self) -> str:
+        """For an engineer: what to do, what to read, and what to watch."""
+        where = "" if self.setup in setups.WEIGHTLESS else f" {_slopes(self.slope)}"
+        labels = {c.name: c.label for c in channels.CHANNELS}
+        read = _both([labels[c] for c in self.channels])
+        text = f"{self.doing}{where} at {_amounts(self.voltage, 'V')}; read {read}"
+        return f"{text}. Watch {self.watch}" if self.watch else text
 
 
 Experiment = Act | Run
 
 
-def _show(robot: Robot, channel: str, signals: Signals) -> Array:
-    """What the instrument of a channel shows of signals that are known otherwise."""
-    return jnp.asarray(balances.sensor(robot, signals)[channel])
+def _both(words: Sequence[str]) -> str:
+    """«a, b and c»."""
+    *others, last = words
+    return f"{', '.join(others)} and {last}" if others else last
 
 
-#: Payload on the scales [kg].
-WEIGHED = (0.0, 8.0)
+def _amounts(values: Sequence[float], unit: str) -> str:
+    """«15 and 33 V», each once, in order."""
+    return f"{_both([f'{v:g}' for v in sorted(set(values), key=abs)])} {unit}"
 
 
-def _weighed(robot: Robot) -> Array:
+def _slopes(slopes: Sequence[float]) -> str:
+    """«on the level and up 10 and 20 deg»."""
+    words = ["on the level"] if any(s == 0 for s in slopes) else []
+    for word, sign in (("up", 1), ("down", -1)):
+        some = [abs(s) for s in slopes if s * sign > 0]
+        words += [f"{word} {_amounts(some, 'deg')}"] if some else []
+    return _both(words)
+
+
+def near(value: float, digits: int = 2) -> float:
+    """A number with so many digits, as a person sets it."""
+    return float(f"{value:.{digits - 1}e}")
+
+
+def below(value: float) -> float:
+    """The largest number of two digits that does not exceed a positive one."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return near(math.floor(value / step + 1e-9) * step)
+
+
+def spread(least: float, most: float, count: int) -> tuple[float, ...]:
+    """Evenly from one to the other, of two digits each and never more than the latter."""
+    top = below(most)
+    return tuple(sorted({min(near(v), top) for v in np.linspace(least, top, count).tolist() if v > 0}))
+
+
+# --- acts -------------------------------------------------------------------------------------------
+
+
+def _weighed(robot: Robot, at: Array) -> Array:
     """Mass beyond the stated one, so that it does not matter how that was come by."""
     still = State(*(jnp.zeros(()),) * 4)
-    count = len(robot.configurations)
-    loads = [Conditions(payload=m, configuration=k) for k in range(count) for m in WEIGHED]
-    stated = without(robot, "mass")
+    stated = setups.without(robot, "mass")
+    loads = [Conditions(configuration=k.astype(int), payload=m) for k, m in at]
     return jnp.stack([balances.begin(robot, c, still).mass - balances.begin(stated, c, still).mass for c in loads])
 
 
-def _shunted(*currents: float) -> Callable[[Robot], Array]:
-    shown = [Signals(total_current=jnp.asarray(i)) for i in currents]
-    return lambda robot: jnp.stack([_show(robot, "total_current", s) for s in shown])
+def _show(robot: Robot, channel: str, signals: Sequence[Signals]) -> Array:
+    """What the instrument of a channel shows of signals that are known otherwise."""
+    return jnp.stack([jnp.asarray(balances.sensor(robot, s)[channel]) for s in signals])
 
 
-def _strobed(robot: Robot) -> Array:
-    return jnp.stack([_show(robot, "motor_speed", Signals(speed_motor=jnp.asarray(w))) for w in (300.0, 800.0)])
+def _shunted(robot: Robot, at: Array) -> Array:
+    return _show(robot, "total_current", [Signals(total_current=i) for (i,) in at])
 
 
-def _timed(robot: Robot) -> Array:
-    return jnp.stack([_show(robot, "speed", Signals(speed=jnp.asarray(v))) for v in (0.4, 0.9)])
+def _strobed(robot: Robot, at: Array) -> Array:
+    return _show(robot, "motor_speed", [Signals(speed_motor=w) for (w,) in at])
 
 
-def acts(configurations: tuple[str, ...]) -> tuple[Act, ...]:
-    """The calibration acts of a robot with these configurations, the least effort first."""
-    each = "in both configurations, " if len(configurations) == 2 else "in each configuration, "
-    where = each if len(configurations) > 1 else ""
-    return (
+def _timed(robot: Robot, at: Array) -> Array:
+    return _show(robot, "speed", [Signals(speed=v) for (v,) in at])
+
+
+def acts(reach: Reach) -> tuple[Act, ...]:
+    """The calibration acts, the least effort first; none of an instrument that the table's bench lacks."""
+    several = len(reach.used) > 1
+    each = ("in both configurations, " if len(reach.used) == 2 else "in each configuration, ") if several else ""
+    payload = near(max(u.payloads[-1] for u in reach.used))
+    loads = (0.0, payload) if payload > 0 else (0.0,)
+    laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
+    total = reach.current * reach.motors
+    amperes = near(0.15 * total, 1), near(0.75 * total, 1)
+    turning = near(0.25 * reach.motor_speed), near(0.65 * reach.motor_speed)
+    paces = near(0.35 * reach.speed), near(0.8 * reach.speed)
+    weighing = Act(
+        "weigh", ("weigh",),
+        f"Weigh the robot {each}{laden}on scales that are good to 20 g; read the total mass, and take the stated one "
+        "from it",
+        _weighed, tuple((float(u.index), m) for u in reach.used for m in loads), 0.02, repeats=1,
+    )  # fmt: skip
+    ammeter = [
+        Act("zero current", ("zero current",), "Switch the motors off; read the ammeter", _shunted, ((0.0,),), 0.02),
         Act(
-            "weigh",
-            f"Weigh the robot {where}unladen and with the payload of 8 kg, on scales that are good to "
-            "20 g; read the total mass, and take the stated one from it",
-            _weighed,
-            (0.02,) * (len(WEIGHED) * len(configurations)),
-            repeats=1,
+            "shunt", ("shunt",),
+            f"Put a precision shunt and a load in the place of the robot, set {_amounts(amperes, 'A')} by the shunt; "
+            "read the ammeter", _shunted, _each(amperes), 0.02,
         ),
-        Act("zero current", "Switch the motors off; read the ammeter", _shunted(0.0), (0.02,)),
-        Act(
-            "shunt",
-            "Put a precision shunt and a load in the place of the robot, set 1 A and 5 A by the shunt; read the "
-            "ammeter",
-            _shunted(1.0, 5.0),
-            (0.02, 0.02),
-        ),
-        Act(
-            "strobe",
-            "Set the motor to 300 and to 800 rad/s by a stroboscope; read the tachometer",
-            _strobed,
-            (5 * RPM, 5 * RPM),
-        ),
-        Act(
-            "timing",
-            "Time the robot by light gates over a distance measured with a tape, at 0.4 and 0.9 m/s; read the speed "
-            "that the bench shows",
-            _timed,
-            (3e-3, 3e-3),
-        ),
-    )
+    ]  # fmt: skip
+    strobe = Act(
+        "strobe", ("strobe",),
+        f"Set the motor to {_amounts(turning, 'rad/s')} by a stroboscope; read the tachometer",
+        _strobed, _each(turning), 5 * RPM,
+    )  # fmt: skip
+    timing = Act(
+        "timing", ("timing",),
+        f"Time the robot by light gates over a distance measured with a tape, at {_amounts(paces, 'm/s')}; read the "
+        "speed that the bench shows", _timed, _each(paces), 3e-3,
+    )  # fmt: skip
+    found = [weighing]
+    found += ammeter * ("total_current" in reach.measured)
+    found += [strobe] * ("motor_speed" in reach.measured)
+    found += [timing] * ("speed" in reach.measured)
+    return tuple(found)
 
 
-def _runs(
-    name: str,
-    description: str,
-    setup: Callable[[Robot], Robot] = on_ground,
-    *,
-    voltages: tuple[float, ...],
-    slopes: tuple[float, ...] = (0.0,),
-    payloads: tuple[float, ...] = (0.0,),
-    configuration: int = 0,
-    read: tuple[str, ...] = (),
-    sides: int | None = None,
-) -> Run:
-    each = zip(*itertools.product(slopes, payloads, voltages), strict=True)
-    slope, payload, voltage = (tuple(x) for x in each)
-    return Run(name, description, setup, voltage, slope, payload, configuration, read, sides)
+def _each(values: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    return tuple((v,) for v in values)
 
+
+# --- runs -------------------------------------------------------------------------------------------
 
 #: What is read where nothing travels, and where nothing turns.
 TURNING, STANDING = ("total_current", "motor_speed"), ("total_current",)
 
 
-def _travels(configuration: str, index: int) -> tuple[Run, ...]:
+def _runs(
+    reach: Reach,
+    name: str,
+    doing: str,
+    setup: Setup = setups.on_ground,
+    *,
+    kinds: tuple[str, ...] = (),
+    voltages: Sequence[float],
+    slopes: Sequence[float] = (0.0,),
+    payload: float = 0.0,
+    read: tuple[str, ...] = (),
+    at: Used | None = None,
+    sides: int | None = None,
+    brake: float = 0.0,
+    steepest: bool = False,
+) -> Run:
+    """Runs under every combination of slopes and voltages."""
+    each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages)))
+    slope, voltage = (tuple(x) for x in zip(*each, strict=True))
+    of = (at.configuration,) if at is not None else ()
+    named, text = ", ".join((name, *of)), ": ".join((*of, doing)) if of else doing
+    return Run(
+        named, (*(kinds or (name,)), *of), text, setup, voltage, slope, (payload,) * len(each),
+        tuple(c for c in (read or channels.names()) if c in reach.measured), 0 if at is None else at.index, sides,
+        brake, math.inf if at is None else at.steepest, steepest,
+    )  # fmt: skip
+
+
+def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
+    """Four voltages that a table lacks: below its lowest, in its widest gaps, above if the motors are rated so."""
+    found = [near(0.55 * used[0])]
+    if reach.voltage > used[-1]:
+        found.append(below(reach.voltage))
+    levels = [0.55 * used[0], *used] if len(used) == 1 else list(used)
+    while len(found) < 4:
+        low, high = max(itertools.pairwise(levels), key=lambda gap: gap[1] - gap[0])
+        levels = sorted([*levels, 0.5 * (low + high)])
+        found.append(near(0.5 * (low + high)))
+    return tuple(sorted(set(found)))
+
+
+def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
     """Runs that are done with one configuration."""
 
-    def runs(name: str, description: str, *args: Callable[[Robot], Robot], **rest: Any) -> Run:
-        return _runs(
-            f"{name}, {configuration}", f"{configuration}: {description}", *args, configuration=index, **rest
-        )
-
-    return (
-        runs("reverse", "travel backwards, on the level and down the same slope of 10 deg, at 15 and 33 V; read all "
-             "three channels", reversed_, voltages=(15.0, 33.0), slopes=(0.0, -10.0)),
-        runs("downhill", "turn the slope to -5 and -10 deg by the same inclinometer and travel forwards at 15 and "
-             "33 V; read all three channels", voltages=(15.0, 33.0), slopes=(-5.0, -10.0)),
-        runs("lifted", "put it on stands, the movers in the air, and run at 8, 15, 24, 33 and 40 V; read current and "
-             "motor speed", lifted, voltages=(8.0, 15.0, 24.0, 33.0, 40.0), read=TURNING),
-        runs("one motor", "put it on stands, one motor disconnected, and run at 8, 15, 24, 33 and 40 V; read the "
-             "supply's current and the motor speed", lifted, voltages=(8.0, 15.0, 24.0, 33.0, 40.0), sides=1,
-             read=TURNING),
-        runs("payload 12 kg", "travel with 12 kg at 0, 10 and 20 deg, at 15 and 33 V; read all three channels",
-             voltages=(15.0, 33.0), slopes=(0.0, 10.0, 20.0), payloads=(12.0,)),
-        runs("other voltages", "travel at 8, 19, 28 and, for a short while, 40 V, on the level and at 15 deg; read "
-             "all three channels", voltages=(8.0, 19.0, 28.0, 40.0), slopes=(0.0, 15.0)),
-        runs("steepest slope", "travel up 23 deg at 15, 24 and 33 V; read all three channels",
-             voltages=(15.0, 24.0, 33.0), slopes=(23.0,)),
-        runs("crawl", "travel on the level at 2, 3 and 4 V; read all three channels", voltages=(2.0, 3.0, 4.0)),
-    )  # fmt: skip
-
-
-_STALLING: dict[str, Any] = {"voltages": (1.0, 2.0), "read": STANDING}
+    volts = used.voltages
+    ends, three = (volts[0], volts[-1]), (volts[0], volts[len(volts) // 2], volts[-1])
+    inclines = sorted({abs(s) for s in used.slopes if s}) or [0.0]
+    some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
+    air, payload = spread(0.2 * reach.geared, reach.geared, 5), near(used.payload)
+    runs = functools.partial(_runs, reach, at=used)
+    found = [
+        runs("reverse", "travel backwards", setups.reversed_, voltages=ends, slopes=(0.0, -some)),
+        runs("downhill", "turn the slope about by the same inclinometer and travel forwards", voltages=ends,
+             slopes=(-inclines[0], -some)),
+        runs("lifted", "put it on stands, the movers in the air, and run", setups.lifted, voltages=air, read=TURNING),
+        runs("one motor", f"put it on stands, {_others(reach)}, and run", setups.lifted,
+             kinds=("one motor", "lifted"), voltages=air, sides=1, read=TURNING),
+        runs(f"payload {payload:g} kg", f"travel with {payload:g} kg", kinds=("payload",), voltages=ends,
+             slopes=(0.0, some, most), payload=payload),
+        runs("other voltages", "travel", voltages=other_voltages(reach, volts), slopes=(0.0, more)),
+        runs("steepest slope", "travel", voltages=three, steepest=True,
+             slopes=[round(2 * most * share) / 2 for share in (SLOPE, (1 + SLOPE) / 2)]),
+        runs("crawl", "travel", voltages=[near(share * volts[0]) for share in (0.15, 0.2, 0.27)]),
+    ]  # fmt: skip
+    lacks = {
+        "downhill": most == 0, "steepest slope": most == 0, "payload": payload == 0, "one motor": reach.motors == 1,
+    }  # fmt: skip
+    return tuple(r for r in found if not lacks.get(r.kinds[0], False))
 
 
-@functools.cache
-def menu(configurations: tuple[str, ...]) -> tuple[Experiment, ...]:
-    """What can be done with a robot that has these configurations, in the order of the effort, the least first."""
-    return (
-        *acts(configurations),
-        _runs("bare motor", "uncouple the gearboxes and run the motors alone at 6, 12, 24, 33 and 40 V; read current "
-              "and motor speed", bare, voltages=(6.0, 12.0, 24.0, 33.0, 40.0), read=TURNING),
-        _runs("stall", "hold both motor shafts in a vice and switch on 1 and 2 V for a moment; read the current",
-              blocked, **_STALLING),
-        _runs("stall, one motor",
-              "hold one motor's shaft in a vice, the other motor disconnected, and switch on 1 and 2 V for a "
-              "moment; read the current", blocked, sides=1, **_STALLING),
-        _runs("braked motor", "uncouple the gearboxes and put a brake of 60 mN·m on each motor shaft, at 12, 24 and "
-              "33 V; read current and motor speed", braked, voltages=(12.0, 24.0, 33.0), read=TURNING),
-        *(r for k, name in enumerate(configurations) for r in _travels(name, k)),
-    )  # fmt: skip
+def _others(reach: Reach) -> str:
+    return "the other motor disconnected" if reach.motors == 2 else "all motors but one disconnected"
 
 
-# --- what a robot shows -----------------------------------------------------------------------------
+def _alone(reach: Reach) -> tuple[Run, ...]:
+    """Runs of the motors without the robot."""
+    volts = spread(0.2 * reach.alone, reach.alone, 5)
+    stalling = spread(0.5 * reach.current * reach.resistance, min(reach.current * reach.resistance, reach.voltage), 2)
+    brake = near(0.6 * reach.torque_constant * reach.current, 1)
+    shafts = {1: "the motor's shaft", 2: "both motor shafts"}.get(reach.motors, f"all {reach.motors} motor shafts")
+    gears = "gearbox" if reach.motors == 1 else "gearboxes"
+    found = [
+        _runs(reach, "bare motor", f"Uncouple the {gears} and run the motors alone", setups.bare, voltages=volts,
+              read=TURNING),
+        _runs(reach, "stall", f"Hold {shafts} in a vice and switch on for a moment,", setups.blocked,
+              voltages=stalling, read=STANDING),
+        _runs(reach, "stall, one motor", f"Hold one motor's shaft in a vice, {_others(reach)}, and switch on for a "
+              "moment,", setups.blocked, kinds=("stall", "one motor"), voltages=stalling, read=STANDING, sides=1),
+        _runs(reach, "braked motor", f"Uncouple the {gears} and put a brake of {1e3 * brake:g} mN·m on each motor "
+              "shaft, and run", setups.braked, voltages=spread(0.4 * reach.alone, reach.alone, 3), read=TURNING,
+              brake=brake),
+    ]  # fmt: skip
+    return tuple(r for r in found if reach.motors > 1 or r.sides is None)
 
 
-def size(experiment: Experiment) -> int:
-    """How many readings an experiment has, repeats averaged."""
-    if isinstance(experiment, Act):
-        return len(experiment.sd)
-    return len(experiment.voltage) * len(experiment.read)
+def menu(reach: Reach) -> tuple[Experiment, ...]:
+    """What can be done within reach, in the order of the effort, the least first.
+
+    What the robot cannot do (climb that slope, move at that voltage) only its readings show: see `possible`.
+    """
+    runs = (*_alone(reach), *(r for used in reach.used for r in _travels(reach, used)))
+    return (*acts(reach), *(r for r in runs if r.channels))
 
 
-def spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
-    """Where the readings of each experiment stand in those of all."""
-    ends = np.cumsum([size(e) for e in experiments]).tolist()
-    return {e.name: slice(end - size(e), end) for e, end in zip(experiments, ends, strict=True)}
+def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
+    """Refuse names that are neither kinds of experiments nor configurations.
+
+    Raises:
+        BadConfiguration: such a name, with the choices.
+    """
+    known = (*KINDS, *robot.configurations)
+    for name in forbidden:
+        if name not in known:
+            raise BadConfiguration(f"--forbid {name}: no such experiment or configuration; {choices(name, known)}")
 
 
-def sds(experiments: Sequence[Experiment], of_channels: np.ndarray) -> np.ndarray:
-    """Sd of every reading [SI], repeats averaged; runs are read with the instruments of the table.
+# --- what of it is possible ---------------------------------------------------------------------------
+
+
+def possible(run: Run, does: np.ndarray) -> np.ndarray:
+    """Which runs to carry out: of the slopes, voltages and payloads only those that the robot manages all of.
 
     Args:
-        of_channels: sds of its channels [SI], shape (channels,).
+        does: whether the robot manages each run, shape (runs,).
     """
-    found = []
-    for e in experiments:
-        one = (
-            np.asarray(e.sd) if isinstance(e, Act) else np.tile(np.asarray(of_channels)[list(e.read)], len(e.voltage))
+    kept = np.ones(len(does), bool)
+    axes = [np.asarray(x) for x in (run.slope, run.voltage, run.payload)]
+    while kept.any() and not does[kept].all():
+        levels = [(axis, level) for axis in axes for level in np.unique(axis[kept])]
+        axis, level = max(levels, key=lambda at: float(np.mean(~does[kept & (at[0] == at[1])])))
+        kept &= axis != level
+    if run.steepest and kept.any():
+        kept &= axes[0] == axes[0][kept].max()
+    return kept
+
+
+def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.ndarray, reach: Reach) -> Run:
+    """A run of what is possible, with what to watch.
+
+    Args:
+        kept: by `possible`; temperature: of a winding after long running [°C]; speed: of the motor shaft [rad/s]; as
+            foreseen, shape (runs,).
+    """
+    voltage, slope, payload = (
+        tuple(v for v, k in zip(x, kept, strict=True) if k) for x in (run.voltage, run.slope, run.payload)
+    )
+    warnings = []
+    hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
+    heats = f"a winding left on would reach {hottest:.0f} °C ({reach.hot:.0f} °C is allowed)"
+    if run.setup is setups.blocked:
+        current = highest / reach.resistance
+        warnings.append(
+            f"current × time: {current:.2g} A in a motor that does not turn, and so is not cooled; {heats}, "
+            "so switch off within seconds and let it cool between readings"
         )
-        found.append(np.asarray(one) / math.sqrt(e.repeats))
-    return np.concatenate(found)
-
-
-def _conditions(run: Run) -> Conditions:
-    weightless = run.setup in (lifted, bare, blocked, braked)
-    # None would take the robot's own mass, which a batch with the others cannot.
-    mass = UNLOADED if weightless else math.nan
-    return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass)
-
-
-def readings(robot: Robot) -> tuple[Float[Array, " readings"], Bool[Array, " readings"]]:
-    """What the robot shows in every experiment of its menu [SI], and which of it exists: a robot that slides or
-    stands still where it should travel shows nothing."""
-    experiments = menu(robot.configurations.names)
-    shown: dict[str, tuple[Array, Array]] = {}
-    for act in (e for e in experiments if isinstance(e, Act)):
-        value = act.reading(robot)
-        shown[act.name] = value, jnp.ones(value.shape, bool)
-    shown |= _run(robot, [e for e in experiments if isinstance(e, Run)])
-    values, theres = zip(*(shown[e.name] for e in experiments), strict=True)
-    return jnp.concatenate(values), jnp.concatenate(theres)
-
-
-def _run(robot: Robot, runs: list[Run]) -> dict[str, tuple[Array, Array]]:
-    """What the robot shows in runs, all in one batch."""
-    conditions = jax.tree.map(lambda *x: jnp.concatenate(x), *(_conditions(r) for r in runs))
-    own = jax.vmap(lambda k: robot.chassis(k).mass)(conditions.configuration) + conditions.payload
-    stated = jnp.asarray(conditions.total_mass)
-    conditions = dataclasses.replace(conditions, total_mass=jnp.where(jnp.isnan(stated), own, stated))
-    setups = list(dict.fromkeys((r.setup, r.sides) for r in runs))
-    which = np.concatenate([np.full(len(r.voltage), setups.index((r.setup, r.sides))) for r in runs])
-    set_up = [
-        dataclasses.replace(setup(robot), sides=robot.sides if sides is None else sides) for setup, sides in setups
-    ]
-    robots = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x])[which], *set_up)
-    result = jax.vmap(lambda r, c: operating_point(r, c)[0])(robots, conditions)
-    every = jnp.stack([result.reading[c] for c in channels.names()], -1)
-    held = np.array([setup is blocked for setup, _ in setups])[which]
-    exists = result.status == jnp.where(jnp.asarray(held), STALLED, CONVERGED)
-    shown, first = {}, 0
-    for r in runs:
-        rows = slice(first, first := first + len(r.voltage))
-        value = every[rows][:, list(r.read)]
-        shown[r.name] = value.ravel(), jnp.broadcast_to(exists[rows, None], value.shape).ravel()
-    return shown
+    elif run.setup is setups.braked:
+        warnings.append(f"the brake and the winding's temperature: {heats}; seconds are enough for a reading")
+    elif hottest > reach.hot - WARM:
+        warnings.append(f"the winding's temperature: {heats}; keep the runs short")
+    limit = reach.limit_alone if run.setup in (setups.bare, setups.braked) else reach.limit_geared
+    if run.setup in (setups.bare, setups.lifted) and fastest > FAST * limit:
+        warnings.append(
+            f"the motor speed: about {fastest / RPM:.0f} rpm without load at {highest:g} V, and no more than "
+            f"{limit / RPM:.0f} rpm; raise the voltage slowly"
+        )
+    if highest > reach.voltages[-1]:
+        warnings.append(f"the supply: {highest:g} V is more than the table's {reach.voltages[-1]:g} V")
+    return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, watch="; ".join(warnings))

@@ -46,6 +46,7 @@ class Settings:
             add to the number of pairs that are expected to be told apart.
         refuted: rise of χ² by which an alternative is refuted [σ²].
         prefer: one of `PREFERENCES`.
+        forbidden: kinds of experiments, and configurations, that are not proposed (see `menu.KINDS`).
     """
 
     shares: dict[str, float]
@@ -76,6 +77,7 @@ class Settings:
     gain: float = 0.2
     refuted: float = 4.0
     prefer: str = FIT
+    forbidden: tuple[str, ...] = ()
 
     @property
     def family_wise_error(self) -> float:

@@ -13,9 +13,10 @@ from calibration.data import own_mass, robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
-from calibration.inference import checks, estimates, identifiability, multistart, observers, priors
+from calibration.inference import checks, estimates, identifiability, lack_of_fit, multistart, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
+from calibration.inference.foreign import foreign_priors
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.problem import Problem
@@ -94,7 +95,10 @@ def calibrate(
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
     coordinates = dataclasses.replace(coordinates, stated=tuple(stated))
     known = noise_room.of(runs, observe.sizes(runs), noise)
-    notes = [*checks.check(runs, robot, names, known), *weights, *_of_product(of_product)]
+    foreign = foreign_priors(robot, stated)
+    for sentence in foreign:
+        tell(sentence)
+    notes = [*foreign, *checks.check(runs, robot, names, known), *weights, *_of_product(of_product)]
     posed = observers.pose(runs, base, coordinates, known.sd, model)
 
     found, beside = _searched(runs, base, posed, known, starts, seed, tell)
@@ -140,6 +144,7 @@ def calibrate(
         converged=bool(found.best.converged),
         starts=found.starts,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
+        adequacy=lack_of_fit.adequacy(observe, runs, seen, sd, z, about, known.estimated),
         identifiability=about,
         notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
     )

@@ -10,6 +10,7 @@ from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.noise import Noise
+from calibration.inference.ranges import check_ranges
 from mmrjax import channels
 from mmrjax.robot import Robot
 from mmrjax.signals import SLIDES, STATUSES
@@ -42,13 +43,14 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
 
     Raises:
         BadData: too few readings, a stuck channel, contradictory replicates, samples of one run under
-            different conditions, a configuration that `robot` does not have.
+            different conditions, a configuration that `robot` does not have, readings in other units.
         BadConfiguration: a free parameter of a configuration that has no rows.
     """
     _configurations(runs, robot, names)
     _enough(runs, names, noise)
     _stuck(runs)
-    return [*runs.missing(), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
+    said = [*runs.missing(), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
+    return [*said, *check_ranges(runs, robot)]
 
 
 def _configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:

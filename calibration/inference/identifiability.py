@@ -39,6 +39,7 @@ class Identifiability:
         sensitivity: norm of each column of that Jacobian: how many data sds one prior sd moves the
             readings; 0 for a parameter that nothing measures.
         leverage: share of each reading's variance that the fit explains, shape (rows, channels).
+        jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
     """
 
     names: tuple[str, ...]
@@ -49,6 +50,7 @@ class Identifiability:
     rank: int
     sensitivity: np.ndarray
     leverage: np.ndarray
+    jacobian: np.ndarray
 
     @property
     def correlation(self) -> np.ndarray:
@@ -109,6 +111,7 @@ def analyse(problem: Problem, z: Array, data: Data | None = None) -> Identifiabi
         rank=int(np.sum(singular > 1e-8 * singular.max())),
         sensitivity=np.linalg.norm(readings, axis=0),
         leverage=leverage.reshape(data.measured.shape),
+        jacobian=readings,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from calibration.data import writing
 from calibration.inference.identifiability import Identifiability
+from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
 from mmrjax import channels
 from mmrjax.robot import Robot
@@ -255,7 +256,7 @@ class CalibrationResult:
         adhesion_used: by the calibrated robot [-], shape (rows,).
         objective: at the optimum [½σ²]; converged: whether the search did.
         starts: how all searches ended.
-        chi_square: of the readings that are there.
+        chi_square: of the readings that are there; adequacy: whether they are what noise leaves.
         identifiability: the linear analysis.
         notes: sentences worth reading before it is used.
     """
@@ -281,6 +282,7 @@ class CalibrationResult:
     converged: bool
     starts: Starts
     chi_square: ChiSquare
+    adequacy: Adequacy
     identifiability: Identifiability
     notes: tuple[str, ...]
 
@@ -335,6 +337,7 @@ class CalibrationResult:
                     "seed": self.seed,
                 },
                 "chi2": dataclasses.asdict(self.chi_square),
+                "adequate": self.adequacy.to_json(),
                 "identifiability": {
                     "singular_values": about.singular_values,
                     "rank": about.rank,

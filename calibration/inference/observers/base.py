@@ -123,6 +123,11 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
+    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray]:
+        """One row a run, and about what it shows once under way [SI], shape (runs, channels)."""
+
+    @classmethod
+    @abc.abstractmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
         """Columns in which exact copies of a row agree."""
 

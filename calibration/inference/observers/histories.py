@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
@@ -44,6 +45,8 @@ LAGS = 12
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
+#: Shortest run whose later half shows about what steady travel does [s].
+UNDER_WAY = 0.25
 
 
 class HistoriesLinearization(Linearization):
@@ -210,6 +213,21 @@ class Histories(Observer):
         raise BadData(
             f"{runs.source}: column time_s: time histories are for calibrate and loop; expected one row a run"
         )
+
+    @classmethod
+    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray]:
+        """The medians of the later half of each run that is long enough to get under way."""
+        names, time, measured = _names(runs), runs["time_s"], runs.measured()
+        first, shown = [], []
+        for name in np.unique(names):
+            mine = np.flatnonzero(names == name)
+            late = mine[time[mine] > 0.5 * time[mine].max()]
+            if time[mine].max() >= UNDER_WAY:
+                first.append(mine[np.argmin(time[mine])])
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+                    shown.append(np.nanmedian(measured[late], 0))
+        return runs.where(np.array(first, int)), np.reshape(shown, (len(first), measured.shape[1]))
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:

@@ -89,24 +89,24 @@ class SettledRuns(Observer):
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[str]:
         columns = [c for c in ("configuration", *CONDITIONS, "surface") if runs.has(c)]
-        keys = ["|".join(str(runs[c][k]) for c in columns) for k in range(len(runs))]
-        measured = runs.measured()
-        for first, key in enumerate(keys):
-            for second in range(first + 1, len(keys)):
-                if keys[second] != key:
-                    continue
-                apart = np.abs(measured[first] - measured[second])
-                mean = np.abs(measured[first] + measured[second]) / 2
-                sd = np.hypot(noise.sd[first], noise.sd[second])
-                allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
-                for k in np.flatnonzero(apart > allowed):
-                    column = channels.CHANNELS[k].column
-                    known = f"{apart[k] / sd[k]:.0f} sd" if not noise.estimated[k] else f"{apart[k] / mean[k]:.0%}"
-                    raise BadData(
-                        f"{runs.source} rows {first + 1} and {second + 1}, {column}: the same conditions gave "
-                        f"{number(runs[column][first])} and {number(runs[column][second])}, {known} apart; "
-                        "remove the wrong one or state a larger --noise"
-                    )
+        measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
+        for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
+            alike.setdefault(key, []).append(row)
+        for rows in map(np.array, alike.values()):
+            here, sds = measured[rows], noise.sd[rows]
+            apart = np.abs(here[:, None] - here)
+            mean = np.abs(here[:, None] + here) / 2
+            sd = np.hypot(sds[:, None], sds)
+            allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
+            for at in np.argwhere(apart > allowed)[:1]:
+                (one, other, k), at = at.tolist(), tuple(at)
+                first, second, column = rows[one], rows[other], channels.CHANNELS[k].column
+                known = f"{apart[at] / sd[at]:.0f} sd" if not noise.estimated[k] else f"{apart[at] / mean[at]:.0%}"
+                raise BadData(
+                    f"{runs.source} rows {first + 1} and {second + 1}, {column}: the same conditions gave "
+                    f"{number(runs[column][first])} and {number(runs[column][second])}, {known} apart; "
+                    "remove the wrong one or state a larger --noise"
+                )
         return []
 
     @classmethod
@@ -116,6 +116,10 @@ class SettledRuns(Observer):
     @classmethod
     def check_settled(cls, runs: Runs) -> None:
         return
+
+    @classmethod
+    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray]:
+        return runs, runs.measured()
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:

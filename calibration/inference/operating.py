@@ -1,0 +1,40 @@
+"""Operating points of a robot under the conditions of a table: what its readings are about, before any fit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mmrjax import channels, params
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED
+
+#: Conditions are padded to a multiple of this, so that tables of about one size share what is compiled.
+PAD = 16
+#: Adhesion at which no robot slides, as a ratio: what its motors take hardly depends on the slip.
+GRIPPING = 20.0
+
+
+def operating_readings(robot: Robot, conditions: Conditions) -> Float[np.ndarray, "runs channels"]:
+    """Readings of steady travel on a surface that grips [SI]; NaN where the robot does not get under way.
+
+    Args:
+        conditions: shape (runs,).
+    """
+    runs = conditions.shape[0]
+    index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])
+    mass = conditions.total_mass
+    if mass is None:
+        own = np.asarray([float(c.mass) for c in robot.configurations.members])
+        mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
+    posed = dataclasses.replace(conditions, adhesion=jnp.full(runs, GRIPPING), total_mass=jnp.asarray(mass))
+    found = steady_batch(params.strong(robot), jax.tree.map(lambda x: jnp.asarray(x)[index], posed))
+    reading = np.stack([np.asarray(found.reading[c]) for c in channels.names()], 1)[:runs]
+    moving = np.asarray(found.status)[:runs] == CONVERGED
+    return np.where(moving[:, None], reading, np.nan)

@@ -1,0 +1,154 @@
+"""Whether a table's readings lie where its robot's can be, before anything is fitted: mostly a matter of units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from calibration.data.errors import BadData, number
+from calibration.data.runs import Runs
+from calibration.inference import observers
+from calibration.inference.operating import operating_readings
+from mmrjax import channels, params
+from mmrjax.channels import Channel
+from mmrjax.robot import Robot
+
+#: Factors between readings and robot beyond which a table is refused, and beyond which that is said.
+REFUSED, SAID = 5.0, 2.0
+#: Factor by which readings may still lie outside for another unit to explain them, or two channels to be off alike.
+ALIKE = 1.3
+#: Friction of a robot nobody has calibrated, as factors on what its file states.
+FRICTION = (0.1, 1.0, 4.0)
+#: Readings smaller than this share of the channel's largest tell no factor.
+SMALL = 0.05
+#: A slope in other units than degrees: of one of those [deg]; how well the current has to follow it.
+SLOPES = {"radians": 180 / math.pi, "percent": math.degrees(0.01)}
+FOLLOWS = 0.9
+
+
+def check_ranges(runs: Runs, robot: Robot) -> list[str]:
+    """Refuse readings that no robot like this one shows under these conditions; return what should be said of others.
+
+    Each channel's readings are compared with steady travel of the robot as its file states it, and with a tenth and
+    four times its friction: the median factor by which they lie outside.
+
+    Raises:
+        BadData: a factor beyond `REFUSED`; of histories, which need not get under way, only where a known confusion
+            of units explains it.
+    """
+    kind = observers.kind(runs)
+    runs, measured = kind.settled(runs)
+    if not len(runs):
+        return []
+    _check_masses(runs, robot)
+    conditions = runs.conditions(robot)
+    possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
+    if not np.isfinite(possible).any():
+        return []
+    factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(channels.CHANNELS)}
+    said = []
+    for k, (channel, factor) in enumerate(factors.items()):
+        off = max(factor, 1 / factor)
+        if off <= SAID:
+            continue
+        units = _units(channel, measured[:, k], possible[:, :, k], robot)
+        typical = _factor(measured[:, k], possible[1:2, :, k])
+        sentence = _sentence(channel, typical if units else factor, units, _others(channel, factors))
+        if off > REFUSED and (units or not kind.axis):
+            raise BadData(f"{runs.source}, {sentence}")
+        said.append(sentence)
+    return [*said, *_slopes(runs, measured, possible[1])]
+
+
+def _rubbing(robot: Robot, factor: float) -> Robot:
+    """The robot with so many times its friction torques, and its ground's resistance to rolling."""
+    torques = [
+        p
+        for p in params.walk(robot)
+        if p.name.endswith((".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous"))
+    ]
+    return params.replace(robot, {p.name: factor * p.value for p in torques})
+
+
+def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
+    """Median factor by which readings lie outside what is possible; 1 inside, or where nothing can be said.
+
+    Args:
+        measured: shape (runs,); possible: of several robots, NaN where one does not move, shape (robots, runs).
+    """
+    there = np.isfinite(measured) & np.isfinite(possible).any(0)
+    if not there.any():
+        return 1.0
+    size = np.abs(possible[:, there])
+    low, high = np.nanmin(size, 0), np.nanmax(size, 0)
+    tells = high > SMALL * np.nanmax(high)
+    low, high, x = low[tells], high[tells], np.abs(measured[there][tells])
+    x = np.maximum(x, 1e-9 * high)
+    return float(np.median(np.where(x > high, x / high, np.where(x < low, x / low, 1.0))))
+
+
+def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
+    """Units in which the readings would be possible, the likeliest first; the arguments as of `_factor`."""
+    known = {unit: channel.factor / size for unit, size in channel.other_units}
+    if channel.name == "motor_speed":
+        known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
+    left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}
+    return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
+
+
+def _others(channel: Channel, factors: dict[Channel, float]) -> list[str]:
+    """Columns of the other channels that are off by as much."""
+    mine = factors[channel]
+    return [c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)]
+
+
+def _sentence(channel: Channel, factor: float, units: list[str], others: list[str]) -> str:
+    off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
+    what = f"{channel.column}: readings are about {number(float(f'{off:.2g}'))} times too {size} for this robot"
+    alike = f"; {' and '.join(others)} alike: check supply_voltage_V and the robot's file" if others else ""
+    if units:
+        return f"{what}; are they in {' or '.join(units)}? expected {channel.unit}{alike}"
+    return f"{what}{alike}" if others else f"{what}; check the unit, {channel.unit}, and the robot's file"
+
+
+def _check_masses(runs: Runs, robot: Robot) -> None:
+    """Refuse total masses that are no mass of this robot."""
+    if not runs.has("total_mass_kg"):
+        return
+    own = np.asarray([float(c.mass) for c in robot.configurations.members])[runs.configurations(robot)]
+    factor = float(np.median(runs["total_mass_kg"] / (own + runs["payload_kg"])))
+    if max(factor, 1 / factor) > REFUSED:
+        off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
+        raise BadData(
+            f"{runs.source}, total_mass_kg: about {number(float(f'{off:.2g}'))} times too {size} for this robot "
+            f"({', '.join(f'{number(m)} kg' for m in np.unique(own))} and the payload); check the unit, kg, and the "
+            "mass in the robot's file"
+        )
+
+
+def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> Iterator[str]:
+    """Say so where the current rises with the slope as if that were in another unit.
+
+    Within runs that differ in their slope alone the current is about linear in it; the coefficient of what is
+    measured on what is possible is 1 where slopes are in degrees.
+    """
+    k = channels.index("total_current")
+    slope, there = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
+    columns = [c for c in ("configuration", "supply_voltage_V", "payload_kg", "surface") if runs.has(c)]
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for row in np.flatnonzero(there):
+        groups.setdefault(tuple(str(runs[c][row]) for c in columns), []).append(int(row))
+    several = [g for g in groups.values() if np.ptp(slope[g]) > 0]
+    if sum(len(g) - 1 for g in several) < 3:
+        return
+    x, y = (np.concatenate([v[g, k] - np.mean(v[g, k]) for g in several]) for v in (possible, measured))
+    follows = float(x @ y / math.sqrt(max(float((x @ x) * (y @ y)), 1e-300)))
+    rise = float(x @ y / max(float(x @ x), 1e-300))
+    for unit, size in SLOPES.items():
+        if follows > FOLLOWS and abs(math.log(max(rise, 1e-9) / size)) < math.log(1.25):
+            yield (
+                f"slope_deg: the current rises {rise:.2g} times as fast with the slope as this robot's; are the "
+                f"slopes in {unit}? expected degrees"
+            )

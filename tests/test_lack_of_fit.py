@@ -1,0 +1,138 @@
+"""Whether a calibration says that its fit is adequate: right where it is, right where it is not, honest where nobody can
+tell."""
+
+import dataclasses
+
+import generator as g
+import numpy as np
+import pytest
+from scipy import stats
+from synthetic import table
+from test_loop_command import mmrjax, written
+
+from calibration.data.runs import Runs
+from calibration.inference import lack_of_fit
+from calibration.inference.calibrate import calibrate
+from calibration.inference.identifiability import Identifiability
+from calibration.inference.lack_of_fit import Adequacy, adequacy
+from calibration.inference.observers import SettledRuns
+from mmrjax import params, robots
+
+SIGMA = np.array([0.02, 0.5, 3e-3])
+GRID = g.table8()
+
+
+def toy(rng, noise=1.0, missing=0.0, parameters=8, repeats=1):
+    """A linear fit with priors to readings of Table 8's rows, and what `adequacy` takes of it.
+
+    Args:
+        noise: true sd over the stated one; missing: of a trend of the first channel over the slope [σ].
+    """
+    rows = np.repeat(np.arange(90), repeats)
+    slope, volts = np.degrees(GRID.slope)[rows], GRID.U[rows]
+    level = np.stack([2 + 0.1 * slope, 30 * volts, 0.03 * volts], 1)
+    x = np.stack([np.ones(len(rows)), slope / 20, volts / 33, GRID.payload[rows] / 8], 1)
+    jacobian = np.einsum("rx,xcp->rcp", x, 5 * rng.standard_normal((4, 3, parameters))).reshape(-1, parameters)
+    truth = rng.standard_normal(parameters)
+    e = noise * rng.standard_normal((len(rows), 3))
+    e[:, 0] += missing * (1.5 * (slope / 10 - 1) ** 2 - 0.5)
+    y = e.ravel() + jacobian @ truth
+    whole = np.concatenate([jacobian, np.eye(parameters)])
+    z = np.linalg.lstsq(whole, np.concatenate([y, np.zeros(parameters)]), rcond=None)[0]
+    covariance = np.linalg.inv(whole.T @ whole)
+    leverage = np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian).reshape(-1, 3)
+    measured = level + y.reshape(-1, 3) * SIGMA
+    simulated = level + (jacobian @ z).reshape(-1, 3) * SIGMA
+    columns = {
+        "configuration": np.where(GRID.wheeled[rows] > 0.5, "4W2T", "6T2A"),
+        "supply_voltage_V": volts, "slope_deg": np.round(slope, 6), "payload_kg": GRID.payload[rows],
+        "total_mass_kg": GRID.mass[rows], "total_current_A": measured[:, 0],
+        "motor_speed_rpm": measured[:, 1] * 30 / np.pi, "speed_mm_s": measured[:, 2] * 1e3,
+    }  # fmt: skip
+    nothing = np.zeros(0)
+    about = Identifiability((), covariance, nothing, nothing, nothing, 0, nothing, leverage, jacobian)
+    return Runs("toy", columns), simulated, z, about
+
+
+def judged(made, estimated=False):
+    """Adequacy with the noise stated, or estimated from the misfit as `calibrate` does."""
+    runs, simulated, z, about = made
+    sd = np.broadcast_to(SIGMA, simulated.shape)
+    if estimated:
+        misfit = np.sum(((simulated - runs.measured()) / sd) ** 2, 0)
+        sd = sd * np.sqrt(misfit / (len(runs) - about.leverage.sum(0)))
+    return adequacy(SettledRuns, runs, simulated, sd, z, about, np.full(3, estimated))
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+def test_complete_models_are_called_inadequate_as_often_as_stated(estimated):
+    rng = np.random.default_rng(1)
+    wrong = sum(not judged(toy(rng), estimated).adequate for _ in range(200))
+    assert wrong <= stats.binom.ppf(0.999, 200, lack_of_fit.LEVEL)
+
+
+@pytest.mark.parametrize("estimated", [False, True])
+def test_a_trend_is_found_with_and_without_stated_noise(estimated):
+    found = judged(toy(np.random.default_rng(2), missing=1.5), estimated)
+    assert found.adequate is False and found.p_value < 1e-4
+    assert "total current" in found.shown_by or not estimated
+
+
+def test_noise_that_is_larger_than_stated_is_not_adequate():
+    found = judged(toy(np.random.default_rng(3), noise=1.5))
+    assert not found.adequate and found.shown_by == "the residuals exceed the stated noise"
+    assert found.statement.startswith("Not adequate: the residuals exceed the stated noise (χ² ")
+    assert found.statement.endswith("mmrjax loop finds what")
+
+
+def test_replicates_tell_what_the_noise_is():
+    made = toy(np.random.default_rng(4), missing=1.5, repeats=2)
+    runs, simulated, _, about = made
+    e = (simulated - runs.measured()) / SIGMA
+    found = lack_of_fit._replicates(SettledRuns, runs, e, np.isfinite(e), 540 - about.leverage.sum(), np.sum(e**2))
+    assert found[0] < 0.01 and found[1] == "the residuals exceed the scatter of repeated runs"
+    clean = toy(np.random.default_rng(5), repeats=2)
+    assert judged(clean, estimated=True).adequate
+
+
+def test_too_few_rows_cannot_be_tested_and_say_so():
+    runs, simulated, z, about = toy(np.random.default_rng(6), parameters=2)
+    few = np.arange(0, 90, 30)
+    rows = (few[:, None] * 3 + np.arange(3)).ravel()
+    small = dataclasses.replace(about, leverage=about.leverage[few], jacobian=about.jacobian[rows])
+    sd = np.broadcast_to(SIGMA, (3, 3))
+    made = adequacy(SettledRuns, runs.where(few), simulated[few], sd, z, small, np.ones(3, bool))
+    assert made.adequate is None and made.p_value is None
+    assert made.statement.startswith("Adequacy cannot be tested: the noise was estimated from")
+
+
+def test_statement_of_estimated_noise_claims_no_more_than_was_judged():
+    said = Adequacy(True, 50.0, 50.0, 0.4, "", False).statement
+    assert said.startswith("Adequate as far as can be tested") and "χ² tests nothing" in said
+
+
+@pytest.mark.slow
+def test_calibration_says_whether_it_is_adequate():
+    climbing = params.replace(robots.nominal(), g.CLIMBING)
+    few = {"starts": 2, "profiles": False, "blocks": ()}
+    clean = g.case(seed=3, free=g.FRICTION)
+    assert calibrate(table(clean), climbing, **few).adequacy.adequate
+    bare = {k: v for k, v in clean.table.items() if "_sd_" not in k}
+    guessed = calibrate(table(bare), climbing, **few).adequacy
+    assert guessed.adequate and not guessed.noise_known
+    lacking = g.case(["churning"], 12.0, seed=3, free=g.FRICTION)
+    for made in (lacking.table, {k: v for k, v in lacking.table.items() if "_sd_" not in k}):
+        found = calibrate(table(made), climbing, **few).adequacy
+        assert found.adequate is False and "mmrjax loop" in found.statement
+
+
+@pytest.mark.slow
+def test_command_opens_with_it(tmp_path):
+    written(tmp_path / "runs.csv", g.case(["churning"], 12.0, seed=3, free=g.FRICTION).table)
+    answer = mmrjax(
+        tmp_path, "calibrate", "runs.csv", "--out", "x", "--starts", "4", "--no-profiles", "--no-hold-out",
+        *(a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")),
+    )  # fmt: skip
+    assert answer.code in (0, 3) and answer.out.startswith("Not adequate: ")
+    page = (tmp_path / "x" / "report.html").read_text(encoding="utf-8")
+    assert page.index("Not adequate: ") < page.index("maximum a posteriori")

@@ -1,0 +1,122 @@
+"""Readings in other units, and readings of another robot, are found before anything is fitted."""
+
+import csv
+
+import generator as g
+import generator_series as gs
+import numpy as np
+import pytest
+from synthetic import table
+from test_loop_command import mmrjax
+
+from calibration.data import runs as records
+from calibration.data.errors import BadData
+from calibration.data.runs import Runs
+from calibration.inference.ranges import check_ranges
+from mmrjax import params, robots
+from mmrjax.channels import RPM
+
+#: Column of a table, factor on its readings, and what is said.
+WRONG = {
+    "m/s": ("speed_mm_s", 1e-3, r"speed_mm_s: readings are about \d+ times too small for this robot; are they in m/s\?"),
+    "km/h": ("speed_mm_s", 3.6e-3, r"speed_mm_s: .* too small for this robot; are they in km/h( or m/s)?\?"),
+    "rad/s": ("motor_speed_rpm", RPM, r"motor_speed_rpm: .*[89]\.\d times too small .*are they in rad/s\? expected rpm"),
+    "of the wheel": ("motor_speed_rpm", 1 / 48, "motor_speed_rpm: .* too small .*rpm of the driving wheel"),
+    "mA": ("total_current_A", 1e3, r"total_current_A: .* times too large .*are they in mA\? expected A"),
+    "seven times": ("speed_mm_s", 7.0, r"speed_mm_s: readings are about 6.9 times too large for this robot; check the unit, mm/s"),
+    "g": ("total_mass_kg", 1 / 30, r"total_mass_kg: about 3\d times too small for this robot \(11.5 kg, 13.1 kg and"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return table(g.case(seed=4))
+
+
+@pytest.fixture(scope="module")
+def histories():
+    return table(gs.case((), 0.0, 3, duration=0.8, every=0.02)[0])
+
+
+def scaled(runs, column, factor):
+    return Runs("runs.csv", {**runs.columns, column: runs[column] * factor})
+
+
+def test_right_units_pass_in_silence(runs, histories):
+    robot = robots.nominal()
+    assert check_ranges(runs, robot) == check_ranges(histories, robot) == []
+    assert check_ranges(records.read("measured"), robot) == []
+    assert check_ranges(records.read("simulated_by_paper"), robot) == []
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_units_are_refused_with_the_factor_and_the_likely_unit(runs, case):
+    column, factor, says = WRONG[case]
+    with pytest.raises(BadData, match=f"runs.csv, {says}"):
+        check_ranges(scaled(runs, column, factor), robots.nominal())
+
+
+@pytest.mark.parametrize("case", ["m/s", "rad/s"])
+def test_wrong_units_of_histories_are_refused(histories, case):
+    column, factor, says = WRONG[case]
+    with pytest.raises(BadData, match=f"runs.csv, {says}"):
+        check_ranges(scaled(histories, column, factor), robots.nominal())
+
+
+def test_histories_that_never_get_under_way_are_no_matter_of_units(histories):
+    (said,) = check_ranges(scaled(histories, "speed_mm_s", 1 / 150), robots.nominal())
+    assert said.startswith("speed_mm_s: readings are about 1")
+    early = histories.where(histories["time_s"] < 0.011)
+    assert check_ranges(early, robots.nominal()) == []
+
+
+@pytest.mark.parametrize(("factor", "words"), [(3.0, "3 times too large"), (1 / 3.0, "3 times too small"), (1.7, "")])
+def test_smaller_factors_are_said_and_not_refused(runs, factor, words):
+    said = check_ranges(scaled(runs, "speed_mm_s", factor), robots.nominal())
+    assert bool(said) == bool(words) and all(s.startswith("speed_mm_s: readings are about") for s in said)
+
+
+def test_a_factor_that_all_speeds_share_points_to_the_voltage(runs):
+    half = scaled(scaled(runs, "speed_mm_s", 1 / 6.5), "motor_speed_rpm", 1 / 6.5)
+    with pytest.raises(BadData, match=r"; speed_mm_s alike: check supply_voltage_V and the robot's file"):
+        check_ranges(half, robots.nominal())
+
+
+def test_friction_that_nobody_has_measured_is_no_matter_of_units(runs):
+    # three times the friction, as of a robot file that another robot's friction was left in
+    others = params.replace(
+        robots.nominal(),
+        {
+            f"{c}.track.loss_{k}": 3.0 * v
+            for c in ("6T2A", "4W2T")
+            for k, v in (("coulomb", 0.35), ("viscous", 0.016))
+        },
+    )
+    assert check_ranges(runs, others) == []
+
+
+@pytest.mark.parametrize(
+    ("unit", "of"), [("radians", np.radians), ("percent", lambda a: 100 * np.tan(np.radians(a)))]
+)
+def test_slopes_in_other_units_are_said(runs, unit, of):
+    other = Runs("runs.csv", {**runs.columns, "slope_deg": of(runs["slope_deg"])})
+    said = check_ranges(other, robots.nominal())
+    assert any(s.startswith("slope_deg: the current rises") and f"slopes in {unit}?" in s for s in said), said
+
+
+def test_missing_channels_and_readings_pass(runs):
+    bare = {k: v for k, v in runs.columns.items() if "current" not in k}
+    speed = runs["speed_mm_s"].copy()
+    speed[::2] = np.nan
+    assert check_ranges(Runs("runs.csv", {**bare, "speed_mm_s": speed}), robots.nominal()) == []
+
+
+@pytest.mark.parametrize("command", ["compare", "calibrate", "loop"])
+def test_every_command_on_measured_runs_refuses(runs, command, tmp_path):
+    with (tmp_path / "runs.csv").open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(runs.columns)
+        out.writerows(zip(*scaled(runs, "speed_mm_s", 1e-3).columns.values(), strict=True))
+    answer = mmrjax(tmp_path, command, "runs.csv", "--out", "x")
+    assert answer.code == 4 and "are they in m/s? expected mm/s" in answer.err
+    assert len(answer.err.strip().splitlines()) == 1 and not (tmp_path / "x").exists()
