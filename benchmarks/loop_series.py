@@ -4,8 +4,8 @@
 
 Sets of starts from `tests/generator_series_wide.py`, which shares nothing with the simulator: any surface, several
 durations and samplings, poor instruments, other robots (foreign laws on the paper's alone). Labels are read by the
-scorer alone. Every set is one line of `--out`, and a run that is started again goes on where it ended. With `--narrow`,
-six starts of 1.5 s of the paper's robot on one surface that is stated, from `tests/generator_series.py`.
+scorer alone. Every set is one line of `--out`, and a run that is started again goes on where it ended. With
+`--narrow`, six starts of 1.5 s of the paper's robot on one surface that is stated, from `tests/generator_series.py`.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ LIBRARY = (
     "armature_inductance", "cogging", "stick_slip",
 )  # fmt: skip
 OUTSIDE = ("pulley_ovality", "belt_splice", "supply_recovery", "oil_warming")
-#: Strata of all kinds but `clean_wide`, which goes through each as often, and their shares; foreign laws and events are
-#: of the paper's robot's size, and know no other robots.
+#: Strata of all kinds but `clean_wide`, which goes through each as often, and their shares; foreign laws and events
+#: are of the paper's robot's size, and know no other robots.
 SHARES = {"plain": 0.5, "durations": 0.2, "faults": 0.2, "robots": 0.1}
 #: The analyst's priors on the one surface of narrow histories, which Table 5 does not know.
 STATED = {

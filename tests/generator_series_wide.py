@@ -42,6 +42,8 @@ DEMAND = 0.5
 STABLE = 1.2
 #: What histories determine beside, and the analyst's relative sd.
 FURTHER = {"motor.inductance": 0.1, "motor.inertia": 0.05, "inertia": 0.1, "ground.friction.dynamic": 0.3}
+#: Times that an amplitude is looked for, the first at a tenth of its ordinary size.
+PASSES = 3
 #: Duration of an event, and the share of the shortest run between which it begins.
 EVENT, BEGINS = (0.05, 0.2), (0.25, 0.7)
 
@@ -191,6 +193,7 @@ def event(name: str, rng: np.random.Generator, w: SeriesWorld) -> tuple[gs.Movin
     balance, size = EVENTS[name]
     first = float(rng.uniform(*BEGINS) * min(d for d, _ in w.design))
     long = max(float(rng.uniform(*EVENT)), 2.5 * BASE * max(e for _, e in w.design))
+    long = min(long, 0.95 * min(d for d, _ in w.design) - first)
     a, b = round(first, 3), round(first + long, 3)
     law = lambda s, q: np.where((s.time >= a) & (s.time < b), 1.0, 0.0) * np.ones_like(s.w)  # noqa: E731
     return gs.Moving(balance, law, size), [a, b]
@@ -238,8 +241,8 @@ def case(
 
     Args:
         names: of effects: `generator_series.FORMS`, EVENTS or foreign laws.
-        sigmas: that each leaves after a refit of the constants, with the analyst's priors, and of the others, estimated
-            at a tenth of their ordinary size; none is larger than `generator_series.LARGEST`.
+        sigmas: that each leaves after a refit of the constants, with the analyst's priors, and of the others; none is
+            larger than `generator_series.LARGEST`.
     """
     rng = np.random.default_rng([78, seed])
     p, c, show = w.constants, w.conditions, w.instruments
@@ -287,21 +290,24 @@ def _readings(
     return times, y
 
 
-def signatures(w: SeriesWorld, terms: Sequence[tuple], good: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def signatures(
+    w: SeriesWorld, terms: Sequence[tuple], good: np.ndarray, constants: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """Whitened change of the good readings by each term alone, shape (terms, readings), and by one sd of the analyst's
     prior of each constant, shape (readings, constants); one batch of robots.
 
     Args:
         terms: (form, amplitude, shapes); good: which readings count, shape (3, runs, instants).
+        constants: whether theirs are wanted.
     """
-    p, c, free = w.constants, w.conditions, w.free
+    p, c, free = w.constants, w.conditions, w.free if constants else ()
     runs, members = len(c.U), 1 + len(free) + len(terms)
     wide = g.Conditions(*(np.tile(getattr(c, f.name), members) for f in dataclasses.fields(c)))
 
     def only(k: int, value: float) -> np.ndarray:
         return np.where(np.arange(runs * members) // runs == k, value, 0.0)
 
-    sds = {n: p[n] * FURTHER[_further(n)] for n in free if _further(n)} | gw.analyst(p, w.machine.free)
+    sds = {n: p[n] * FURTHER[_further(n)] for n in w.free if _further(n)} | gw.analyst(p, w.machine.free)
     nudge = {n: min(0.02 * p[n], 0.1 * sds[n]) if p[n] > 0 else 0.1 * sds[n] for n in free}
     batch = {n: np.full(runs * members, v) for n, v in p.items()}
     for k, name in enumerate(free):
@@ -317,17 +323,19 @@ def _sized(
     w: SeriesWorld, forms: Sequence[gs.Moving], drawn: Sequence[Mapping], wanted: Sequence[float], good: np.ndarray
 ) -> tuple[list[float], list[float]]:
     """Amplitudes at which each form leaves its sigmas beside the others, and how many it does."""
-    trial = [0.1 * f.size for f in forms]
-    changes, slopes = signatures(w, list(zip(forms, trial, drawn, strict=True)), good)
-    amplitudes, reached = [], []
-    for k, (d, want) in enumerate(zip(changes, wanted, strict=True)):
-        others = [1e4 * x / (np.linalg.norm(x) + 1e-300) for j, x in enumerate(changes) if j != k]
-        columns = np.concatenate([slopes, *(x[:, None] for x in others)], 1)
-        left = float(np.linalg.norm(g.remainder(d, columns))) + 1e-300
-        amplitude = min(want * trial[k] / left, gs.LARGEST * forms[k].size)
-        amplitudes.append(amplitude)
-        reached.append(left * amplitude / trial[k])
-    return amplitudes, reached
+    amplitudes, reached = [0.1 * f.size for f in forms], [0.0] * len(forms)
+    slopes = np.zeros((0, 0))
+    for again in range(PASSES):
+        changes, found = signatures(w, list(zip(forms, amplitudes, drawn, strict=True)), good, constants=not again)
+        slopes = slopes if again else found
+        trial = list(amplitudes)
+        for k, (d, want) in enumerate(zip(changes, wanted, strict=True)):
+            others = [1e4 * x / (np.linalg.norm(x) + 1e-300) for j, x in enumerate(changes) if j != k]
+            columns = np.concatenate([slopes, *(x[:, None] for x in others)], 1)
+            reached[k] = float(np.linalg.norm(g.remainder(d, columns)))
+            wished = want * trial[k] / (reached[k] + 1e-300)
+            amplitudes[k] = min(wished, gs.LARGEST * forms[k].size, 10.0**3 * trial[k])
+    return trial, reached
 
 
 def oracle(k: SeriesCase) -> list[dict[str, Any]]:
