@@ -40,10 +40,10 @@ FASTER = (2.5, 3.0, 1.7)
 DEMAND = 0.5
 #: Largest step times the fastest rate: the method is stable to 2.7.
 STABLE = 1.2
+#: Smallest step after the first instants [s].
+FINEST = 2e-5
 #: What histories determine beside, and the analyst's relative sd.
 FURTHER = {"motor.inductance": 0.1, "motor.inertia": 0.05, "inertia": 0.1, "ground.friction.dynamic": 0.3}
-#: Times that an amplitude is looked for, the first at a tenth of its ordinary size.
-PASSES = 3
 #: Duration of an event, and the share of the shortest run between which it begins.
 EVENT, BEGINS = (0.05, 0.2), (0.25, 0.7)
 
@@ -77,14 +77,10 @@ class SeriesWorld:
 
     @property
     def pool(self) -> tuple[str, ...]:
-        """Effects of the library that these histories may have: two need longer ones or a battery, and grousers have
-        the paper's pitch."""
-        lost = (
-            "thermal_drift",
-            "battery_sag",
-            "armature_inductance",
-            *(() if self.machine is PAPER else ("grouser_polygon",)),
-        )
+        """Effects of the library that these histories may have: two need longer ones or a battery, the inductance is
+        a constant of the base, grousers have the paper's pitch, and at small currents brushes are stiff."""
+        lost = ("thermal_drift", "battery_sag", "armature_inductance")
+        lost += () if self.machine is PAPER else ("grouser_polygon", "brush_drop")
         return tuple(n for n, f in gs.FORMS.items() if f.cls and n not in lost)
 
 
@@ -135,9 +131,9 @@ def _settings(rng: np.random.Generator, m: Machine, p: Mapping[str, float], runs
 # --- the physics ------------------------------------------------------------------------------------
 
 
-def fastest(c: g.Conditions, p: Mapping[str, Any]) -> float:
-    """The fastest rate of any run [1/s]: the armature's, or that at which a contact stops sliding."""
-    rates = [float(np.max(np.asarray(p["motor.resistance"]) / np.asarray(p["motor.inductance"])))]
+def fastest(c: g.Conditions, p: Mapping[str, Any], ohms: float = 0.0) -> float:
+    """The fastest rate of any run [1/s]: the armature's, with `ohms` more, or that at which a contact stops sliding."""
+    rates = [float(np.max((np.asarray(p["motor.resistance"]) + ohms) / np.asarray(p["motor.inductance"])))]
     for wheeled, role in enumerate(ROLES):
         mine = c.wheeled == wheeled
         if not mine.any():
@@ -159,7 +155,8 @@ def simulated(
     w: SeriesWorld, p: Mapping[str, Any], c: g.Conditions, terms: Sequence[tuple] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times [s] from 0 on by BASE, and I_Σ, w, V of every run as long as the longest, shape (3, runs, instants)."""
-    step = BASE / np.ceil(BASE / min(gs.STEP, STABLE / fastest(c, p)))
+    ohms = sum(float(np.max(a)) * SIDES for f, a, _ in terms if f.balance in ("electrical", "supply"))
+    step = BASE / np.ceil(BASE / np.clip(STABLE / fastest(c, p, min(ohms, 1.0)), FINEST, gs.STEP))
     return gs.histories(c, max(d for d, _ in w.design), BASE, p, terms, step=float(step))
 
 
@@ -241,8 +238,8 @@ def case(
 
     Args:
         names: of effects: `generator_series.FORMS`, EVENTS or foreign laws.
-        sigmas: that each leaves after a refit of the constants, with the analyst's priors, and of the others; none is
-            larger than `generator_series.LARGEST`.
+        sigmas: that each leaves after a refit of the constants, with the analyst's priors, and of the others, estimated
+            at a tenth of their ordinary size; none is larger than `generator_series.LARGEST`.
     """
     rng = np.random.default_rng([78, seed])
     p, c, show = w.constants, w.conditions, w.instruments
@@ -290,17 +287,14 @@ def _readings(
     return times, y
 
 
-def signatures(
-    w: SeriesWorld, terms: Sequence[tuple], good: np.ndarray, constants: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
+def signatures(w: SeriesWorld, terms: Sequence[tuple], good: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Whitened change of the good readings by each term alone, shape (terms, readings), and by one sd of the analyst's
     prior of each constant, shape (readings, constants); one batch of robots.
 
     Args:
         terms: (form, amplitude, shapes); good: which readings count, shape (3, runs, instants).
-        constants: whether theirs are wanted.
     """
-    p, c, free = w.constants, w.conditions, w.free if constants else ()
+    p, c, free = w.constants, w.conditions, w.free
     runs, members = len(c.U), 1 + len(free) + len(terms)
     wide = g.Conditions(*(np.tile(getattr(c, f.name), members) for f in dataclasses.fields(c)))
 
@@ -322,20 +316,21 @@ def signatures(
 def _sized(
     w: SeriesWorld, forms: Sequence[gs.Moving], drawn: Sequence[Mapping], wanted: Sequence[float], good: np.ndarray
 ) -> tuple[list[float], list[float]]:
-    """Amplitudes at which each form leaves its sigmas beside the others, and how many it does."""
-    amplitudes, reached = [0.1 * f.size for f in forms], [0.0] * len(forms)
-    slopes = np.zeros((0, 0))
-    for again in range(PASSES):
-        changes, found = signatures(w, list(zip(forms, amplitudes, drawn, strict=True)), good, constants=not again)
-        slopes = slopes if again else found
-        trial = list(amplitudes)
-        for k, (d, want) in enumerate(zip(changes, wanted, strict=True)):
-            others = [1e4 * x / (np.linalg.norm(x) + 1e-300) for j, x in enumerate(changes) if j != k]
-            columns = np.concatenate([slopes, *(x[:, None] for x in others)], 1)
-            reached[k] = float(np.linalg.norm(g.remainder(d, columns)))
-            wished = want * trial[k] / (reached[k] + 1e-300)
-            amplitudes[k] = min(wished, gs.LARGEST * forms[k].size, 10.0**3 * trial[k])
-    return trial, reached
+    """Amplitudes at which each form leaves its sigmas beside the others, and how many it does.
+
+    From a tenth of their ordinary size, in proportion: what is left of a large change after a linear refit is mostly
+    curvature, which a refit would follow.
+    """
+    trial = [0.1 * f.size for f in forms]
+    changes, slopes = signatures(w, list(zip(forms, trial, drawn, strict=True)), good)
+    amplitudes, reached = [], []
+    for k, (d, want) in enumerate(zip(changes, wanted, strict=True)):
+        others = [1e4 * x / (np.linalg.norm(x) + 1e-300) for j, x in enumerate(changes) if j != k]
+        columns = np.concatenate([slopes, *(x[:, None] for x in others)], 1)
+        left = float(np.linalg.norm(g.remainder(d, columns))) + 1e-300
+        amplitudes.append(min(want * trial[k] / left, gs.LARGEST * forms[k].size))
+        reached.append(left * amplitudes[k] / trial[k])
+    return amplitudes, reached
 
 
 def oracle(k: SeriesCase) -> list[dict[str, Any]]:
@@ -399,6 +394,7 @@ def _label(w, seed, names, forms, drawn, amplitudes, reached, where, y, odd, mis
         "noise": w.noise,
         "outliers": int(odd.sum()),
         "missing": int(missing),
+        "sound": bool(np.isfinite(y).all()),
     }  # fmt: skip
 
 
