@@ -82,10 +82,10 @@ def _friction(v, mu_s, mu_d, V_s, V_d):
 
 
 def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str, Any], terms) -> np.ndarray:
-    """d/dt of STATES, shape (8, runs); terms are (form, amplitude, shapes)."""
+    """d/dt of STATES, shape (8, runs); terms are (form, amplitude, shapes); `p` as from `_of_runs`."""
 
     def both(name: str) -> np.ndarray:
-        return np.where(c.wheeled > 0.5, p["4W2T." + name], p["6T2A." + name])
+        return p[name]
 
     def extra(balance: str) -> Any:
         return sum((a * form.of(s, q) for form, a, q in terms if form.balance == balance), 0.0)
@@ -128,6 +128,12 @@ def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str,
     ])  # fmt: skip
 
 
+def _of_runs(c: g.Conditions, p: Mapping[str, Any]) -> dict[str, Any]:
+    """Constants, those of a configuration under their own name with a value for each run."""
+    names = [n.removeprefix("6T2A.") for n in p if n.startswith("6T2A.")]
+    return dict(p) | {n: np.where(c.wheeled > 0.5, p[f"4W2T.{n}"], p[f"6T2A.{n}"]) for n in names}
+
+
 def histories(
     c: g.Conditions, duration: float, every: float, p: Mapping[str, Any] = g.CLIMBING, terms=(), battery=None,
     step: float = STEP,
@@ -138,7 +144,7 @@ def histories(
     """
     battery = np.zeros_like(c.U) if battery is None else np.asarray(battery, float)
     y = np.zeros((len(STATES), len(c.U)))
-    count, t = round(duration / every), 0.0
+    count, t, p = round(duration / every), 0.0, _of_runs(c, p)
     kept = [y[:3]]
     for instant in range(count):
         # The first currents and the end of slipping are the fastest part of a start.

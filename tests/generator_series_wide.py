@@ -40,6 +40,8 @@ FASTER = (2.5, 3.0, 1.7)
 DEMAND = 0.5
 #: Largest step times the fastest rate: the method is stable to 2.7.
 STABLE = 1.2
+#: Smallest step after the first instants [s].
+FINEST = 2e-5
 #: What histories determine beside, and the analyst's relative sd.
 FURTHER = {"motor.inductance": 0.1, "motor.inertia": 0.05, "inertia": 0.1, "ground.friction.dynamic": 0.3}
 #: Duration of an event, and the share of the shortest run between which it begins.
@@ -75,14 +77,10 @@ class SeriesWorld:
 
     @property
     def pool(self) -> tuple[str, ...]:
-        """Effects of the library that these histories may have: two need longer ones or a battery, and grousers have
-        the paper's pitch."""
-        lost = (
-            "thermal_drift",
-            "battery_sag",
-            "armature_inductance",
-            *(() if self.machine is PAPER else ("grouser_polygon",)),
-        )
+        """Effects of the library that these histories may have: two need longer ones or a battery, the inductance is
+        a constant of the base, grousers have the paper's pitch, and at small currents brushes are stiff."""
+        lost = ("thermal_drift", "battery_sag", "armature_inductance")
+        lost += () if self.machine is PAPER else ("grouser_polygon", "brush_drop")
         return tuple(n for n, f in gs.FORMS.items() if f.cls and n not in lost)
 
 
@@ -133,9 +131,9 @@ def _settings(rng: np.random.Generator, m: Machine, p: Mapping[str, float], runs
 # --- the physics ------------------------------------------------------------------------------------
 
 
-def fastest(c: g.Conditions, p: Mapping[str, Any]) -> float:
-    """The fastest rate of any run [1/s]: the armature's, or that at which a contact stops sliding."""
-    rates = [float(np.max(np.asarray(p["motor.resistance"]) / np.asarray(p["motor.inductance"])))]
+def fastest(c: g.Conditions, p: Mapping[str, Any], ohms: float = 0.0) -> float:
+    """The fastest rate of any run [1/s]: the armature's, with `ohms` more, or that at which a contact stops sliding."""
+    rates = [float(np.max((np.asarray(p["motor.resistance"]) + ohms) / np.asarray(p["motor.inductance"])))]
     for wheeled, role in enumerate(ROLES):
         mine = c.wheeled == wheeled
         if not mine.any():
@@ -157,7 +155,8 @@ def simulated(
     w: SeriesWorld, p: Mapping[str, Any], c: g.Conditions, terms: Sequence[tuple] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times [s] from 0 on by BASE, and I_Σ, w, V of every run as long as the longest, shape (3, runs, instants)."""
-    step = BASE / np.ceil(BASE / min(gs.STEP, STABLE / fastest(c, p)))
+    ohms = sum(float(np.max(a)) * SIDES for f, a, _ in terms if f.balance in ("electrical", "supply"))
+    step = BASE / np.ceil(BASE / np.clip(STABLE / fastest(c, p, min(ohms, 1.0)), FINEST, gs.STEP))
     return gs.histories(c, max(d for d, _ in w.design), BASE, p, terms, step=float(step))
 
 
@@ -191,6 +190,7 @@ def event(name: str, rng: np.random.Generator, w: SeriesWorld) -> tuple[gs.Movin
     balance, size = EVENTS[name]
     first = float(rng.uniform(*BEGINS) * min(d for d, _ in w.design))
     long = max(float(rng.uniform(*EVENT)), 2.5 * BASE * max(e for _, e in w.design))
+    long = min(long, 0.95 * min(d for d, _ in w.design) - first)
     a, b = round(first, 3), round(first + long, 3)
     law = lambda s, q: np.where((s.time >= a) & (s.time < b), 1.0, 0.0) * np.ones_like(s.w)  # noqa: E731
     return gs.Moving(balance, law, size), [a, b]
@@ -301,7 +301,7 @@ def signatures(w: SeriesWorld, terms: Sequence[tuple], good: np.ndarray) -> tupl
     def only(k: int, value: float) -> np.ndarray:
         return np.where(np.arange(runs * members) // runs == k, value, 0.0)
 
-    sds = {n: p[n] * FURTHER[_further(n)] for n in free if _further(n)} | gw.analyst(p, w.machine.free)
+    sds = {n: p[n] * FURTHER[_further(n)] for n in w.free if _further(n)} | gw.analyst(p, w.machine.free)
     nudge = {n: min(0.02 * p[n], 0.1 * sds[n]) if p[n] > 0 else 0.1 * sds[n] for n in free}
     batch = {n: np.full(runs * members, v) for n, v in p.items()}
     for k, name in enumerate(free):
@@ -316,7 +316,11 @@ def signatures(w: SeriesWorld, terms: Sequence[tuple], good: np.ndarray) -> tupl
 def _sized(
     w: SeriesWorld, forms: Sequence[gs.Moving], drawn: Sequence[Mapping], wanted: Sequence[float], good: np.ndarray
 ) -> tuple[list[float], list[float]]:
-    """Amplitudes at which each form leaves its sigmas beside the others, and how many it does."""
+    """Amplitudes at which each form leaves its sigmas beside the others, and how many it does.
+
+    From a tenth of their ordinary size, in proportion: what is left of a large change after a linear refit is mostly
+    curvature, which a refit would follow.
+    """
     trial = [0.1 * f.size for f in forms]
     changes, slopes = signatures(w, list(zip(forms, trial, drawn, strict=True)), good)
     amplitudes, reached = [], []
@@ -324,9 +328,8 @@ def _sized(
         others = [1e4 * x / (np.linalg.norm(x) + 1e-300) for j, x in enumerate(changes) if j != k]
         columns = np.concatenate([slopes, *(x[:, None] for x in others)], 1)
         left = float(np.linalg.norm(g.remainder(d, columns))) + 1e-300
-        amplitude = min(want * trial[k] / left, gs.LARGEST * forms[k].size)
-        amplitudes.append(amplitude)
-        reached.append(left * amplitude / trial[k])
+        amplitudes.append(min(want * trial[k] / left, gs.LARGEST * forms[k].size))
+        reached.append(left * amplitudes[k] / trial[k])
     return amplitudes, reached
 
 
@@ -391,6 +394,7 @@ def _label(w, seed, names, forms, drawn, amplitudes, reached, where, y, odd, mis
         "noise": w.noise,
         "outliers": int(odd.sum()),
         "missing": int(missing),
+        "sound": bool(np.isfinite(y).all()),
     }  # fmt: skip
 
 

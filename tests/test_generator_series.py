@@ -19,8 +19,9 @@ DURATION, EVERY = 0.6, 0.01
 PASSING = tuple(n for n, f in gs.FORMS.items() if f.cls)
 #: What the library calls a shape parameter.
 SHAPES = {"knee": "current_ohmic", "fade": "speed_fade"}
-#: Of each channel's largest value in the run; 4e-6 at worst (a battery run whose movers spin), else below 2e-6.
-ERROR = 1e-5
+#: Of each channel's largest value in the run; 1.3e-5 at worst (brushes, 5 ohm more while the current rises), 4e-6 for a
+#: battery run whose movers spin, else below 2e-6.
+ERROR = 2e-5
 
 
 @pytest.fixture(scope="module")
