@@ -62,7 +62,7 @@ def classes(
     """For each effect of the best fit, the effects and the stated values that explain the data as well in its place.
 
     The forms of nature are not those of a library: an effect explains as well what it explains but for a share
-    `settings.form` of the sigmas.
+    `settings.form` of the sigmas, or `form_family` where it is of the same family.
 
     Args:
         left: what the base leaves.
@@ -84,16 +84,19 @@ def classes(
     members, stated = [], []
     for slot, (name, gain) in enumerate(zip(best.effects, gains, strict=True)):
         same = [name]
-        within = max(settings.same, settings.form**2 * gain)
+        within = {f: max(settings.same, f**2 * gain) for f in (settings.form, settings.form_family)}
+        family = space.library[name].family()
         for s, other, active in wanted:
             rival = known[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
-            limit = max(within, settings.same_parallel) if parallel else within
+            limit = within[settings.form_family if space.library[other].family() == family else settings.form]
+            limit = max(limit, settings.same_parallel) if parallel else limit
             if s == slot and rival.plausible and 2 * (rival.cost - best.cost) <= limit:
                 same.append(other)
         members.append(tuple(same))
-        found = shifts(space, fewer[slot], SURE * gain, settings)
-        stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within))
+        linear = left.linear if len(best.effects) == 1 else None
+        found = shifts(space, fewer[slot], SURE * gain, settings, linear)
+        stated.append(tuple(s for s in found if 2 * (s.fit.cost - best.cost) <= within[settings.form]))
     return Classes(
         tuple(members), tuple(stated), tuple(families(space, same) for same in members), (*ladder, *fitted)
     )

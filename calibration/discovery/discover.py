@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +29,7 @@ from calibration.discovery.score_tests import bootstrap, diagnosed
 from calibration.discovery.search import Search, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import Standing, standing
+from calibration.inference import bases as bases_room
 from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference.bases import Bases
@@ -131,7 +133,7 @@ class Traced:
         verdict: `none`, `named`, `class` or `unnamed`.
         screened: the base fit, rows that stand alone set aside; left: what it leaves.
         searched: what was tried; alike: what cannot be told apart, where a name is given.
-        where: something is missing, or remains; discrepancy: its curve, where no name is given.
+        where: something is missing, or remains.
         standing: why names that were looked at do not stand, or what was put beside them.
         held_out: the alternatives compared by data held out, where these chose the leader.
     """
@@ -142,7 +144,6 @@ class Traced:
     searched: Search | None = None
     alike: Classes | None = None
     where: Location | None = None
-    discrepancy: Discrepancy | None = None
     standing: Standing | None = None
     held_out: tuple[HeldOutAlternative, ...] = ()
 
@@ -150,6 +151,24 @@ class Traced:
     def members(self) -> tuple[tuple[str, ...], ...]:
         """Of each effect found, those that these data cannot tell from it, itself first."""
         return () if self.alike is None else self.alike.members
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Families of what was found: of the members of each class, or where something without a name is."""
+        if self.alike is not None:
+            return tuple(f for of in self.alike.families for f in of)
+        return () if self.where is None else (self.where.family,)
+
+    @property
+    def events(self) -> tuple[dict[str, Any], ...]:
+        """Where something happens for a while: axis and window, and indices of the rows in it."""
+        happens = None if self.where is None else bases_room.window(self.where.variable)
+        if happens is None:
+            return ()
+        x = self.left.linear.variable(happens.axis)
+        inside = self.screened.base.space.included & (x >= happens.low) & (x <= happens.high)
+        rows = [int(k) for k in np.flatnonzero(inside)]
+        return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
     @property
     def best(self) -> Candidate:
@@ -193,8 +212,7 @@ def trace(
     stood = standing(space, base, searched, left, bases, settings)
     if best is None or after is None or not stood.stands:
         where = locate(space.bare.observe, left.scores, bases)
-        curve = fit_discrepancy(space, base, left.linear, where.balance, where.variable)
-        return Traced("unnamed", screened, left, searched, where=where, discrepancy=curve, standing=stood)
+        return Traced("unnamed", screened, left, searched, where=where, standing=stood)
 
     progress(f"what else explains as much as {' and '.join(best.effects)}?")
     alike = classes(space, base, best, searched.ladder, left, settings)
@@ -221,12 +239,12 @@ def pose(
 ) -> CandidateSpace:
     """The base problem of a table, and room for the effects that its data can show.
 
-    Rows are padded to a multiple, so that tables of about one size share what is compiled; what is padded counts
-    for nothing. A mass that the table states takes the place of the robot's own.
+    Rows are padded to one of a few sizes, so that tables of about one size share what is compiled; what is padded
+    counts for nothing. A mass that the table states takes the place of the robot's own.
     """
     robot = own_mass.weighed(robot, runs)
     kind = observers.kind(runs)
-    index, real = padded(len(runs), kind.pad)
+    index, real = padded(len(runs), kind.sizes_padded)
     names = priors.free_names(robot, runs["configuration"], *kind.free())
     coordinates = priors.coordinates(robot, names, dict(stated or {}))
     bare = observers.pose(runs.where(index), robot, coordinates, sd[index])
@@ -240,16 +258,18 @@ def visible(library: Library, robot: Robot, kind: type[observers.Observer]) -> t
     return tuple(effect() for name, effect in library.items() if name not in have and kind.shows(effect))
 
 
-def padded(rows: int, to: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows with repeats of the first behind them, to a multiple of `to`, and which of them are real."""
-    index = np.concatenate([np.arange(rows), np.zeros(-rows % to, int)])
+def padded(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows with repeats of the first behind them, to the next of `sizes` or a multiple of the last, and which of them
+    are real."""
+    size = next((s for s in sizes if s >= rows), rows + (-rows % sizes[-1] if sizes else 0))
+    index = np.concatenate([np.arange(rows), np.zeros(size - rows, int)])
     return index, np.arange(len(index)) < rows
 
 
 def bases_at(runs: Runs, base: BaseFit) -> Bases:
     """Bases of curves over the readings of a fit: over measured ones they would share their noise."""
     problem = base.space.bare
-    index, _ = padded(len(runs), problem.observe.pad)
+    index, _ = padded(len(runs), problem.observe.sizes_padded)
     columns = dict(runs.where(index).columns)
     reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
     columns |= {c.column: reading[:, k] for k, c in enumerate(channels.CHANNELS)}
@@ -323,8 +343,12 @@ def finished(
     progress: Callable[[str], None],
 ) -> DiscoveryResult:
     """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
-    screened, left, where, curve = traced.screened, traced.left, traced.where, traced.discrepancy
+    screened, left, where = traced.screened, traced.left, traced.where
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
+    curve = None
+    if traced.verdict == "unnamed" and where is not None:
+        progress("the shape of what is missing")
+        curve = fit_discrepancy(space, base, left.linear, where.balance, where.variable)
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
     included = space.included[:rows]
@@ -409,7 +433,7 @@ def _diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, l
 
 def _proposal(space: CandidateSpace, traced: Traced, settings: Settings) -> Proposal | None:
     """What to do next; None where nothing is left to tell apart."""
-    if traced.discrepancy is not None and traced.where is not None:
+    if traced.verdict == "unnamed" and traced.where is not None:
         return denser(space, traced.where, settings)
     return None if traced.alike is None else separating(space, traced.best, traced.alike, settings)
 

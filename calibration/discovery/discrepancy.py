@@ -31,6 +31,7 @@ from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax import params
 from mmrjax.effects import UNNAMED
+from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import BALANCES
 from mmrjax.robot import Robot
 
@@ -61,6 +62,15 @@ class Location:
     alike: tuple[str, ...]
     explained: float
     strongest: float
+
+    @property
+    def family(self) -> str:
+        """Its equation and what drives it, in the words of `Effect.family`."""
+        happens = bases_room.window(self.variable)
+        variable = self.variable if happens is None else happens.axis
+        drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
+        drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
+        return f"{EQUATION[self.balance]} that changes with {drivers.get(variable, variable)}"
 
 
 def locate(observe: Observer, scores: ScoreTable, bases: Bases) -> Location:

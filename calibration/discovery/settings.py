@@ -33,7 +33,8 @@ class Settings:
         visible: sigmas that the largest plausible amplitude has to leave for an effect to be visible [σ].
         same, same_parallel: rise of the objective up to which another effect explains the data as well, and up to
             which it does where |cos| of the signatures is above `parallel` [σ²].
-        form: share of an effect's sigmas by which another may explain less and still be the same but for its form.
+        form, form_family: share of an effect's sigmas by which another one may explain less and still be the same but
+            for its form; of one of its family.
         alike: |cos| above which an effect is tried in the place of another one.
         needed: what each of two effects has to explain, given the other, for both to be named [σ].
         preferred: evidence by which a smooth curve has to be the better explanation for names not to stand [σ²].
@@ -58,10 +59,11 @@ class Settings:
     width: float = 3.0
     plausible: float = 4.0
     visible: float = 3.0
-    same: float = 4.0
+    same: float = 6.0
     same_parallel: float = 9.0
     parallel: float = 0.95
-    form: float = 0.25
+    form: float = 0.2
+    form_family: float = 0.4
     alike: float = 0.5
     needed: float = 5.0
     preferred: float = 6.0

@@ -84,32 +84,35 @@ def _ruled_out(
 # --- an adequate fit: is a curve the better explanation? ---------------------------------------------------
 
 
+def cost_of_names(space: CandidateSpace, best: Candidate, settings: Settings) -> float:
+    """What the fall of χ² by a set of effects is worth less [σ²]: for what their amplitudes and shapes were free to
+    take, and the number of sets of its size."""
+    at = [space.free + slot for slot, name in enumerate(best.active) if name]
+    sds = np.asarray(best.sd)[at + [k + settings.slots for k in at]]
+    taken = -2 * np.sum(np.log(np.clip(sds, 1e-6, 1.0)))
+    return float(taken + 2 * math.log(math.comb(len(space.library), len(at))))
+
+
 def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> float:
-    """Twice the log of the evidence of a set of effects over none [σ²]: the fall of χ², less what their amplitudes
-    and shapes were free to take and the number of sets of its size."""
-    p, count = space.free, len(best.effects)
-    sds = np.asarray(best.sd)[[k for k, name in enumerate(best.active) if name] + np.array(p)]
-    shapes = np.asarray(best.sd)[[k for k, name in enumerate(best.active) if name] + np.array(p + settings.slots)]
-    taken = -2 * np.sum(np.log(np.clip(np.concatenate([sds, shapes]), 1e-6, 1.0)))
-    return float(2 * (base.cost - best.cost) - taken - 2 * math.log(math.comb(len(space.library), count)))
+    """Twice the log of the evidence of a set of effects over none [σ²]."""
+    return 2 * (base.cost - best.cost) - cost_of_names(space, best, settings)
 
 
 def _against_curves(
     space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
 ) -> Standing:
     """Names against one smooth curve of one variable, or of two, in the balance of several of them or anywhere."""
-    names = evidence_of_names(space, base, best, settings)
     equations = [EQUATION.get(space.library[e].balance, "") for e in best.effects]
     crowded = {e for e in equations if e and equations.count(e) > 1}
     tried = _curves(space, linear, bases, crowded)
     if not tried:
         return Standing(True)
     curve, word = max(tried)
-    curve -= 2 * math.log(len(tried))
-    # What is linear at the base falls short of a fit: compared with what the names would explain there.
-    shortfall = 2 * (base.cost - best.cost) - _linearly(space, best, linear, settings)
-    if curve + max(shortfall, 0.0) > names + settings.preferred:
-        return Standing(False, f"one smooth {word} explains as much as {' and '.join(best.effects)}")
+    # Curves are linear at the base: names are weighed by the better of their fit and what they explain there too.
+    fall = max(2 * (base.cost - best.cost), _linearly(space, best, linear, settings))
+    names = fall - cost_of_names(space, best, settings)
+    if curve - 2 * math.log(len(tried)) > names + settings.preferred:
+        return Standing(False, f"one smooth {word} is the better explanation than {' and '.join(best.effects)}")
     return Standing(True)
 
 

@@ -16,6 +16,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, candidate
 from calibration.discovery.settings import Settings
 from calibration.inference.held_out import search_in_batches
+from calibration.inference.linearization import Linearization
 from calibration.inference.optimizers import linearised
 
 #: Refits with a prior's mean where the last one ended, until it pulls no longer [prior sds].
@@ -52,14 +53,19 @@ def scores(jacobian: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, np.n
     return np.where(seen, left**2 / free, 0.0), np.where(seen, residual[at] / free, 0.0)
 
 
-def shifts(space: CandidateSpace, at: Candidate, needed: float, settings: Settings) -> list[Shift]:
+def shifts(
+    space: CandidateSpace, at: Candidate, needed: float, settings: Settings, linear: Linearization | None = None
+) -> list[Shift]:
     """Base parameters that, freed of their prior, would explain at least `needed` σ² of what a fit leaves.
 
     Args:
-        at: the fit; its effects stay.
+        at: the fit; its effects stay; linear: the same, linearised, where that is known.
     """
-    problem = space.problem(at.active)
-    residual, jacobian, _ = linearised(problem, jnp.asarray(at.z), problem.data)
+    if linear is None:
+        problem = space.problem(at.active)
+        residual, jacobian, _ = linearised(problem, jnp.asarray(at.z), problem.data)
+    else:
+        residual, jacobian = linear.residual, linear.jacobian
     explained, values = scores(np.asarray(jacobian), np.asarray(residual))
     found = []
     for k in np.argsort(-explained[: space.free]):

@@ -88,12 +88,16 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
     """
     names, bases = [], []
     for variable, column in VARIABLES.items():
-        if column not in columns or (variable == "order" and collinearity(columns, weight) > COLLINEAR):
+        if column not in columns:
+            continue
+        if variable == "order" and collinearity(columns, weight) > COLLINEAR:
+            # The first variable again in its place: tables of one size share what is compiled.
+            names += names[: len(BALANCES)]
+            bases += bases[: len(BALANCES)]
             continue
         basis = legendre.legvander(scaled(columns[column], weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
-        for balance in BALANCES:
-            names.append((balance, variable))
-            bases.append(basis)
+        names += [(balance, variable) for balance in BALANCES]
+        bases += [basis] * len(BALANCES)
     axes = [scaled(columns[c], weight) for c in ("supply_voltage_V", "slope_deg", "payload_kg")]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(axes)) if sum(p) <= DEGREE]
     terms = [

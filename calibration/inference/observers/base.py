@@ -51,7 +51,8 @@ class Observer(eqx.Module):
         word: what a row is; fewest: rows in which a missing effect can be told from noise.
         axes: columns of a table over which readings vary.
         axis: of those, the one along which the rows of a run follow one another; empty where a run is one row.
-        pad: rows are padded to a multiple of this, so that tables of about one size share what is compiled.
+        sizes_padded: numbers of rows to which tables are padded, so that those of about one size share what is
+            compiled; beyond the last to a multiple of that, and with none not at all.
         blocks: kinds of blocks to hold out, the most telling first.
         percent_of: what errors in percent are of.
         policy: how fits are searched for.
@@ -68,7 +69,7 @@ class Observer(eqx.Module):
     fewest: ClassVar[int]
     axes: ClassVar[tuple[str, ...]]
     axis: ClassVar[str] = ""
-    pad: ClassVar[int]
+    sizes_padded: ClassVar[tuple[int, ...]] = ()
     blocks: ClassVar[tuple[str, ...]]
     percent_of: ClassVar[str]
     policy: ClassVar[SearchPolicy]

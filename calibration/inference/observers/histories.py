@@ -117,7 +117,6 @@ class Histories(Observer):
     fewest: ClassVar[int] = 24
     axes: ClassVar[tuple[str, ...]] = (*CONDITIONS, "time_s")
     axis: ClassVar[str] = "time_s"
-    pad: ClassVar[int] = 1
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
     percent_of: ClassVar[str] = "channel's root mean square"
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)

@@ -61,7 +61,7 @@ class SettledRuns(Observer):
     word: ClassVar[str] = "runs"
     fewest: ClassVar[int] = 6
     axes: ClassVar[tuple[str, ...]] = tuple(CONDITIONS)
-    pad: ClassVar[int] = 16
+    sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
     percent_of: ClassVar[str] = "simulated reading, eq. (35)"
     policy: ClassVar[SearchPolicy] = SearchPolicy()
