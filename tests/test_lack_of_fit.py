@@ -2,6 +2,7 @@
 tell."""
 
 import dataclasses
+import re
 
 import generator as g
 import numpy as np
@@ -13,8 +14,8 @@ from test_loop_command import mmrjax, written
 from calibration.data.runs import Runs
 from calibration.inference import lack_of_fit
 from calibration.inference.calibrate import calibrate
-from calibration.inference.identifiability import Identifiability
-from calibration.inference.lack_of_fit import Adequacy, adequacy
+from calibration.inference.lack_of_fit import Adequacy, Residuals, adequacy
+from calibration.inference.noise_factor import noise_factors, noise_remarks
 from calibration.inference.observers import SettledRuns
 from mmrjax import params, robots
 
@@ -39,8 +40,6 @@ def toy(rng, noise=1.0, missing=0.0, parameters=8, repeats=1):
     y = e.ravel() + jacobian @ truth
     whole = np.concatenate([jacobian, np.eye(parameters)])
     z = np.linalg.lstsq(whole, np.concatenate([y, np.zeros(parameters)]), rcond=None)[0]
-    covariance = np.linalg.inv(whole.T @ whole)
-    leverage = np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian).reshape(-1, 3)
     measured = level + y.reshape(-1, 3) * SIGMA
     simulated = level + (jacobian @ z).reshape(-1, 3) * SIGMA
     columns = {
@@ -49,19 +48,14 @@ def toy(rng, noise=1.0, missing=0.0, parameters=8, repeats=1):
         "total_mass_kg": GRID.mass[rows], "total_current_A": measured[:, 0],
         "motor_speed_rpm": measured[:, 1] * 30 / np.pi, "speed_mm_s": measured[:, 2] * 1e3,
     }  # fmt: skip
-    nothing = np.zeros(0)
-    about = Identifiability((), covariance, nothing, nothing, nothing, 0, nothing, leverage, jacobian)
-    return Runs("toy", columns), simulated, z, about
+    runs = Runs("toy", columns)
+    whitened = (simulated - runs.measured()) / SIGMA
+    return Residuals(SettledRuns, runs, simulated, whitened, np.isfinite(whitened), jacobian, z)
 
 
 def judged(made, estimated=False):
     """Adequacy with the noise stated, or estimated from the misfit as `calibrate` does."""
-    runs, simulated, z, about = made
-    sd = np.broadcast_to(SIGMA, simulated.shape)
-    if estimated:
-        misfit = np.sum(((simulated - runs.measured()) / sd) ** 2, 0)
-        sd = sd * np.sqrt(misfit / (len(runs) - about.leverage.sum(0)))
-    return adequacy(SettledRuns, runs, simulated, sd, z, about, np.full(3, estimated))
+    return adequacy(made.rescaled() if estimated else made, known=not estimated)
 
 
 @pytest.mark.parametrize("estimated", [False, True])
@@ -87,28 +81,50 @@ def test_noise_that_is_larger_than_stated_is_not_adequate():
 
 def test_replicates_tell_what_the_noise_is():
     made = toy(np.random.default_rng(4), missing=1.5, repeats=2)
-    runs, simulated, _, about = made
-    e = (simulated - runs.measured()) / SIGMA
-    found = lack_of_fit._replicates(SettledRuns, runs, e, np.isfinite(e), 540 - about.leverage.sum(), np.sum(e**2))
+    found = lack_of_fit._replicates(made)
     assert found[0] < 0.01 and found[1] == "the residuals exceed the scatter of repeated runs"
     clean = toy(np.random.default_rng(5), repeats=2)
     assert judged(clean, estimated=True).adequate
 
 
 def test_too_few_rows_cannot_be_tested_and_say_so():
-    runs, simulated, z, about = toy(np.random.default_rng(6), parameters=2)
-    few = np.arange(0, 90, 30)
+    whole, few = toy(np.random.default_rng(6), parameters=2), np.arange(0, 90, 30)
     rows = (few[:, None] * 3 + np.arange(3)).ravel()
-    small = dataclasses.replace(about, leverage=about.leverage[few], jacobian=about.jacobian[rows])
-    sd = np.broadcast_to(SIGMA, (3, 3))
-    made = adequacy(SettledRuns, runs.where(few), simulated[few], sd, z, small, np.ones(3, bool))
+    some = {name: getattr(whole, name)[few] for name in ("simulated", "whitened", "there")}
+    small = dataclasses.replace(whole, runs=whole.runs.where(few), jacobian=whole.jacobian[rows], **some)
+    made = judged(small, estimated=True)
     assert made.adequate is None and made.p_value is None
     assert made.statement.startswith("Adequacy cannot be tested: the noise was estimated from")
 
 
-def test_statement_of_estimated_noise_claims_no_more_than_was_judged():
+def test_statement_of_estimated_noise_claims_no_more_than_was_tested():
     said = Adequacy(True, 50.0, 50.0, 0.4, "", False).statement
     assert said.startswith("Adequate as far as can be tested") and "χ² tests nothing" in said
+
+
+# --- sds that are not right ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("noise", "says"), [(10.0, "residuals are (9|10|11)[.0-9]* times"), (0.5, r"residuals are 0\.(4|5)\d* times")]
+)
+def test_noise_that_is_off_everywhere_alike_is_said_with_its_factor(noise, says):
+    (said,) = noise_remarks(toy(np.random.default_rng(7), noise=noise))
+    assert re.match(f"{says} the stated sds in every channel and everywhere alike: are the sds right", said)
+
+
+def test_noise_of_one_channel_that_is_off_is_said_of_that_channel():
+    made = toy(np.random.default_rng(8))
+    whitened, jacobian = made.whitened.copy(), made.jacobian.reshape(90, 3, -1).copy()
+    whitened[:, 2] *= 3
+    jacobian[:, 2] *= 3
+    (said,) = noise_remarks(dataclasses.replace(made, whitened=whitened, jacobian=jacobian.reshape(270, -1)))
+    assert said.startswith("residuals of speed are 3") and "are these sds right?" in said
+
+
+def test_right_sds_and_residuals_with_structure_say_nothing_of_sds():
+    assert noise_remarks(toy(np.random.default_rng(9))) == []
+    assert noise_factors(toy(np.random.default_rng(10), missing=4.0)) == {}
 
 
 @pytest.mark.slow

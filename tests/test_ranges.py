@@ -64,8 +64,7 @@ def test_wrong_units_of_histories_are_refused(histories, case):
 
 
 def test_histories_that_never_get_under_way_are_no_matter_of_units(histories):
-    (said,) = check_ranges(scaled(histories, "speed_mm_s", 1 / 150), robots.nominal())
-    assert said.startswith("speed_mm_s: readings are about 1")
+    assert check_ranges(scaled(histories, "speed_mm_s", 1 / 150), robots.nominal()) == []
     early = histories.where(histories["time_s"] < 0.011)
     assert check_ranges(early, robots.nominal()) == []
 

@@ -228,3 +228,22 @@ def test_unknown_name_lists_the_robots():
         BadConfiguration, match=r"--robot: got nominel, no such file and no known robot; did you mean nominal"
     ):
         robot_file.load("nominel")
+
+
+def test_ratings_are_stated_written_and_checked(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        "[motor]\nvoltage_limit = 14.4\nspeed_limit = 900.0\n[gearbox]\nspeed_limit = 600\n"
+    )
+    robot = robot_file.read(tmp_path / "mine.toml")
+    assert (robot.motor.voltage_limit, robot.motor.speed_limit, robot.gearbox.speed_limit) == (14.4, 900.0, 600.0)
+    assert robots.nominal().motor.voltage_limit is None  # the bench went to 33 V with a motor of 24 V
+    robot_file.write(robot, tmp_path / "again.toml")
+    assert robot_file.read(tmp_path / "again.toml").motor == robot.motor
+    robot_file.write(robots.nominal(), tmp_path / "nominal.toml")
+    assert "voltage_limit" not in (tmp_path / "nominal.toml").read_text()
+    with pytest.raises(
+        BadConfiguration, match=r"motor.voltage_limit: got -3; expected a number, 0.1 to 1000 V \(highest"
+    ):
+        robot_file.change(robot, {"motor.voltage_limit": -3}, where="--set")
+    with pytest.raises(BadConfiguration, match=r"motor.speed_limit: got 'fast'; expected a number, 1 to 1"):
+        robot_file.change(robot, {"motor.speed_limit": "fast"}, where="mine.toml")

@@ -34,7 +34,9 @@ from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference.bases import Bases
 from calibration.inference.foreign import foreign_priors
+from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.noise import Noise
+from calibration.inference.noise_factor import noise_remarks
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
@@ -421,7 +423,20 @@ def finished(
         settings=settings,
         replicates=len(left.test.null.single),
     )
-    return dataclasses.replace(result, notes=remarks(result))
+    return dataclasses.replace(result, notes=(*_noise_remarks(traced, runs, noise), *remarks(result)))
+
+
+def _noise_remarks(traced: Traced, runs: Runs, noise: Noise) -> list[str]:
+    """What the base fit says of the sds."""
+    base, linear = traced.screened.base, traced.left.linear
+    rows, count, free = len(runs), len(channels.CHANNELS), base.space.free
+    weight = base.space.weight[:rows]
+    there = (weight > 0) & np.isfinite(base.reading[:rows])
+    jacobian = np.asarray(linear.jacobian)[: rows * count, :free]
+    whitened = np.where(there, np.asarray(linear.by_row())[:rows], 0.0)
+    kind = type(base.space.bare.observe)
+    left = Residuals(kind, runs, base.reading[:rows], whitened, there, jacobian, base.candidate.z[:free])
+    return noise_remarks(left, "assumed" if "assumed" in noise.source else "stated")
 
 
 def _diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:

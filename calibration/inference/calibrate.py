@@ -19,6 +19,7 @@ from calibration.inference import optimizers as fit
 from calibration.inference.foreign import foreign_priors
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
+from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
 from calibration.inference.result import CalibrationResult
@@ -100,6 +101,7 @@ def calibrate(
         tell(sentence)
     notes = [*foreign, *checks.check(runs, robot, names, known), *weights, *_of_product(of_product)]
     posed = observers.pose(runs, base, coordinates, known.sd, model)
+    notes += observe.check_start(runs, known)
 
     found, beside = _searched(runs, base, posed, known, starts, seed, tell)
     posed, z = found.problem, np.asarray(found.best.z)
@@ -121,6 +123,11 @@ def calibrate(
 
     measured, sd = runs.measured(), np.asarray(posed.data.sd)
     seen, seen_before = _reached(posed, status, after.reading), _reached(posed, status_before, before.reading)
+    there = np.isfinite(measured) & np.isfinite(seen)
+    whitened = np.where(there, (seen - measured) / sd, 0.0)
+    left = lack_of_fit.Residuals(observe, runs, seen, whitened, there, about.jacobian, z)
+    if not known.estimated.any():
+        notes += noise_remarks(left)
     sources = {name: _OF_PRODUCT for name in of_product} | {name: "stated" for name in stated}
     result = CalibrationResult(
         robot=fitted,
@@ -144,7 +151,7 @@ def calibrate(
         converged=bool(found.best.converged),
         starts=found.starts,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
-        adequacy=lack_of_fit.adequacy(observe, runs, seen, sd, z, about, known.estimated),
+        adequacy=lack_of_fit.adequacy(left, known=not known.estimated.any()),
         identifiability=about,
         notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
     )

@@ -9,6 +9,7 @@ import numpy as np
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
+from calibration.inference.conduct import conduct
 from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
 from mmrjax import channels
@@ -50,7 +51,7 @@ def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[
     _enough(runs, names, noise)
     _stuck(runs)
     said = [*runs.missing(), *observers.kind(runs).check(runs, noise), *_constant_conditions(runs)]
-    return [*said, *check_ranges(runs, robot)]
+    return [*said, *check_ranges(runs, robot), *conduct(runs, robot)]
 
 
 def _configurations(runs: Runs, robot: Robot, names: Sequence[str]) -> None:

@@ -17,7 +17,6 @@ from numpy.polynomial import legendre
 from scipy import stats
 
 from calibration.data.runs import CONDITIONS, Runs
-from calibration.inference.identifiability import Identifiability
 from calibration.inference.observers import Observer
 from mmrjax import channels
 
@@ -25,6 +24,8 @@ from mmrjax import channels
 LEVEL = 0.05
 #: Terms of a curve of one variable, of one over time; fewest degrees of freedom that an F test has to leave.
 TERMS, OVER_TIME, LEAST = 3, 6, 10
+#: Share of a column that free parameters have to leave for it to be a direction of its own.
+CLEAR = 1e-3
 #: Fewest degrees of freedom of replicates.
 REPLICATES = 4
 
@@ -76,37 +77,59 @@ class Adequacy:
         return {**dataclasses.asdict(self), "statement": self.statement}
 
 
-def adequacy(
-    observe: type[Observer],
-    runs: Runs,
-    simulated: np.ndarray,
-    sd: np.ndarray,
-    z: np.ndarray,
-    about: Identifiability,
-    estimated: np.ndarray,
-) -> Adequacy:
+@dataclasses.dataclass(frozen=True)
+class Residuals:
+    """What a fit leaves.
+
+    Attributes:
+        observe: kind of the runs.
+        simulated: fitted readings [SI]; whitened: simulated less measured, in sds, 0 where a reading does not count;
+            there: whether it does; shape (rows, channels).
+        jacobian: of the whitened readings, row by row, shape (rows · channels, parameters).
+        z: coordinates of the fit, shape (parameters,).
+    """
+
+    observe: type[Observer]
+    runs: Runs
+    simulated: np.ndarray
+    whitened: np.ndarray
+    there: np.ndarray
+    jacobian: np.ndarray
+    z: np.ndarray
+
+    @functools.cached_property
+    def taken(self) -> np.ndarray:
+        """Orthonormal directions that the free parameters take up, shape (readings + parameters, parameters)."""
+        return np.asarray(np.linalg.qr(np.concatenate([self.jacobian, np.eye(self.jacobian.shape[1])]))[0])
+
+    @property
+    def freedom(self) -> np.ndarray:
+        """Degrees of freedom that the fit leaves each channel, shape (channels,)."""
+        leverage = np.sum(self.taken[: self.there.size] ** 2, 1).reshape(self.there.shape)
+        return np.sum(np.where(self.there, 1.0 - leverage, 0.0), 0)
+
+    @property
+    def chi2(self) -> np.ndarray:
+        """Misfit of each channel [σ²], shape (channels,)."""
+        return np.sum(self.whitened**2, 0)
+
+    def rescaled(self) -> Residuals:
+        """The same with each channel's sds as its own misfit says."""
+        factor = np.sqrt(np.maximum(self.chi2, 1e-300) / np.maximum(self.freedom, 1e-9))
+        factor = np.where(self.there.any(0) & (self.freedom > 0), factor, 1.0)
+        whitened = self.whitened / factor
+        jacobian = (self.jacobian.reshape(*self.there.shape, -1) / factor[:, None]).reshape(self.jacobian.shape)
+        return dataclasses.replace(self, whitened=whitened, jacobian=jacobian)
+
+
+def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
     """Test a fit.
 
     Args:
-        simulated: fitted readings; sd: of the measured ones [SI], shape (rows, channels).
-        z: coordinates of the fit; about: the linear analysis there.
-        estimated: whether a channel's noise was estimated from the misfit, shape (channels,).
+        known: whether the noise of every channel is, and was not estimated from the misfit.
     """
-    measured = runs.measured()
-    there = np.isfinite(measured) & np.isfinite(simulated)
-    residual = np.where(there, (simulated - measured) / sd, 0.0)
-    chi2, freedom = float(np.sum(residual**2)), float(there.sum() - about.leverage[there].sum())
-    known = not estimated.any()
-    found: list[tuple[float, str]] = []
-    clear = _Clear(about.jacobian, np.concatenate([residual.ravel(), np.asarray(z)]), freedom, chi2, known)
-    families = _families(observe, runs, simulated, there)
-    tested = [(clear.p_value(columns), words) for words, columns in families.items()]
-    structure = [(p, w) for p, w in tested if p is not None]
-    if structure:
-        p, words = min(structure)
-        found.append((min(1.0, p * len(structure)), words))
-    for made in (_memory(observe, runs, residual, there), _replicates(observe, runs, residual, there, freedom, chi2)):
-        found += [made] if made is not None else []
+    chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
+    found = structure(fit, known=known)
     if known and freedom > 0:
         found.append((float(stats.chi2.sf(chi2, freedom)), "the residuals exceed the stated noise"))
     if not found:
@@ -116,46 +139,39 @@ def adequacy(
     return Adequacy(p > LEVEL, chi2, freedom, p, words, known)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Clear:
-    """Residuals cleared of what free parameters take up.
-
-    Attributes:
-        jacobian: of the readings; residual: of the readings and then of the priors.
-        freedom: that the fit leaves the readings; chi2: their misfit; known: whether their noise is.
-    """
-
-    jacobian: np.ndarray
-    residual: np.ndarray
-    freedom: float
-    chi2: float
-    known: bool
-
-    @functools.cached_property
-    def taken(self) -> np.ndarray:
-        """Orthonormal directions that the free parameters take up, shape (readings + parameters, parameters)."""
-        return np.asarray(np.linalg.qr(np.concatenate([self.jacobian, np.eye(self.jacobian.shape[1])]))[0])
-
-    def p_value(self, columns: np.ndarray) -> float | None:
-        """Of what columns over the readings explain, shape (readings, terms); None where too little is left."""
-        wide = np.concatenate([columns, np.zeros((self.jacobian.shape[1], columns.shape[1]))])
-        size = np.linalg.norm(wide, axis=0)
-        wide = wide[:, size > 0] / size[size > 0]
-        left = wide - self.taken @ (self.taken.T @ wide)
-        directions, scale, _ = np.linalg.svd(left, full_matrices=False)
-        directions = directions[:, scale > 1e-3]
-        terms = directions.shape[1]
-        if terms == 0 or self.freedom - terms < LEAST:
-            return None
-        explained = float(np.sum((directions.T @ self.residual) ** 2))
-        if self.known:
-            return float(stats.chi2.sf(explained, terms))
-        rest = max(self.chi2 - explained, 1e-12) / (self.freedom - terms)
-        return float(stats.f.sf(explained / terms / rest, terms, self.freedom - terms))
+def structure(fit: Residuals, *, known: bool) -> list[tuple[float, str]]:
+    """Tests of structure, each p-value with what it shows: curves over the conditions, memory, replicates."""
+    families = {words: _p_value(fit, columns, known) for words, columns in _families(fit).items()}
+    tested = [(p, words) for words, p in families.items() if p is not None]
+    found = []
+    if tested:
+        p, words = min(tested)
+        found.append((min(1.0, p * len(tested)), words))
+    return [*found, *(made for made in (_memory(fit), _replicates(fit)) if made is not None)]
 
 
-def _families(observe: type[Observer], runs: Runs, simulated: np.ndarray, there: np.ndarray) -> dict[str, np.ndarray]:
+def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
+    """Of what columns over the readings explain, shape (readings, terms); None where too little is left."""
+    parameters = fit.jacobian.shape[1]
+    wide = np.concatenate([columns, np.zeros((parameters, columns.shape[1]))])
+    size = np.linalg.norm(wide, axis=0)
+    wide = wide[:, size > 0] / size[size > 0]
+    left = wide - fit.taken @ (fit.taken.T @ wide)
+    directions, scale, _ = np.linalg.svd(left, full_matrices=False)
+    directions = directions[:, scale > CLEAR]
+    terms, freedom = directions.shape[1], float(fit.freedom.sum())
+    if terms == 0 or freedom - terms < LEAST:
+        return None
+    explained = float(np.sum((directions.T @ np.concatenate([fit.whitened.ravel(), fit.z])) ** 2))
+    if known:
+        return float(stats.chi2.sf(explained, terms))
+    rest = max(float(fit.chi2.sum()) - explained, 1e-12) / (freedom - terms)
+    return float(stats.f.sf(explained / terms / rest, terms, freedom - terms))
+
+
+def _families(fit: Residuals) -> dict[str, np.ndarray]:
     """Columns over the readings by what they mean: for each channel, curves over each variable, by configuration."""
+    observe, runs, simulated, there = fit.observe, fit.runs, fit.simulated, fit.there
     variables = {c: (runs[c], TERMS) for c in CONDITIONS if runs.has(c)}
     if observe.axis:
         variables[observe.axis] = runs[observe.axis], OVER_TIME
@@ -180,8 +196,9 @@ def _families(observe: type[Observer], runs: Runs, simulated: np.ndarray, there:
     return families
 
 
-def _memory(observe: type[Observer], runs: Runs, residual: np.ndarray, there: np.ndarray) -> tuple[float, str] | None:
+def _memory(fit: Residuals) -> tuple[float, str] | None:
     """Whether residuals of a run resemble those of the sample before, where rows of a run follow one another."""
+    observe, runs, residual, there = fit.observe, fit.runs, fit.whitened, fit.there
     if not observe.axis:
         return None
     run = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
@@ -203,10 +220,10 @@ def _memory(observe: type[Observer], runs: Runs, residual: np.ndarray, there: np
     return min(1.0, p * len(found)), f"{words} the sample before"
 
 
-def _replicates(
-    observe: type[Observer], runs: Runs, residual: np.ndarray, there: np.ndarray, freedom: float, chi2: float
-) -> tuple[float, str] | None:
+def _replicates(fit: Residuals) -> tuple[float, str] | None:
     """Whether the residuals exceed the scatter of rows under the same conditions."""
+    observe, runs, residual, there = fit.observe, fit.runs, fit.whitened, fit.there
+    freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes, "surface") if runs.has(c)]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):

@@ -19,6 +19,8 @@ from mmrjax.robot import Robot
 REFUSED, SAID = 5.0, 2.0
 #: Factor by which readings may still lie outside for another unit to explain them, or two channels to be off alike.
 ALIKE = 1.3
+#: Shortest history whose later half shows about what steady travel does [s].
+UNDER_WAY = 0.25
 #: Friction of a robot nobody has calibrated, as factors on what its file states.
 FRICTION = (0.1, 1.0, 4.0)
 #: Readings smaller than this share of the channel's largest tell no factor.
@@ -39,10 +41,11 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
             of units explains it.
     """
     kind = observers.kind(runs)
-    runs, measured = kind.settled(runs)
+    runs, measured, lasts = kind.settled(runs)
+    _check_masses(runs, robot)
+    runs, measured = runs.where(lasts >= UNDER_WAY), measured[lasts >= UNDER_WAY]
     if not len(runs):
         return []
-    _check_masses(runs, robot)
     conditions = runs.conditions(robot)
     possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
     if not np.isfinite(possible).any():
@@ -54,9 +57,11 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
         if off <= SAID:
             continue
         units = _units(channel, measured[:, k], possible[:, :, k], robot)
+        if kind.axis and not units:  # a start that slides has speeds of its own
+            continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
         sentence = _sentence(channel, typical if units else factor, units, _others(channel, factors))
-        if off > REFUSED and (units or not kind.axis):
+        if off > REFUSED:
             raise BadData(f"{runs.source}, {sentence}")
         said.append(sentence)
     return [*said, *_slopes(runs, measured, possible[1])]

@@ -124,8 +124,8 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray]:
-        """One row a run, and about what it shows once under way [SI], shape (runs, channels)."""
+    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
+        """One row a run, what it shows in the end [SI], shape (runs, channels), and how long it lasts [s]."""
 
     @classmethod
     @abc.abstractmethod

@@ -45,8 +45,6 @@ LAGS = 12
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
-#: Shortest run whose later half shows about what steady travel does [s].
-UNDER_WAY = 0.25
 
 
 class HistoriesLinearization(Linearization):
@@ -214,19 +212,15 @@ class Histories(Observer):
         )
 
     @classmethod
-    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray]:
-        """The medians of the later half of each run that is long enough to get under way."""
+    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
+        """The medians of the later half of each run, which have settled where the run is long enough."""
         names, time, measured = _names(runs), runs["time_s"], runs.measured()
-        first, shown = [], []
-        for name in np.unique(names):
-            mine = np.flatnonzero(names == name)
-            late = mine[time[mine] > 0.5 * time[mine].max()]
-            if time[mine].max() >= UNDER_WAY:
-                first.append(mine[np.argmin(time[mine])])
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-                    shown.append(np.nanmedian(measured[late], 0))
-        return runs.where(np.array(first, int)), np.reshape(shown, (len(first), measured.shape[1]))
+        each = [np.flatnonzero(names == name) for name in np.unique(names)]
+        lasts = np.array([time[mine].max() for mine in each])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+            shown = [np.nanmedian(measured[m[time[m] >= 0.5 * t]], 0) for m, t in zip(each, lasts, strict=True)]
+        return runs.where(np.array([m[np.argmin(time[m])] for m in each])), np.stack(shown), lasts
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:

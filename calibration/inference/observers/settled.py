@@ -118,8 +118,8 @@ class SettledRuns(Observer):
         return
 
     @classmethod
-    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray]:
-        return runs, runs.measured()
+    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
+        return runs, runs.measured(), np.full(len(runs), np.inf)
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:

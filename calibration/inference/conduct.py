@@ -1,0 +1,60 @@
+"""What histories did, as far as it limits what they can tell: whether a run got under way, and whether it gripped."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibration.data.runs import Runs
+from calibration.inference import observers
+from calibration.inference.operating import operating_readings
+from calibration.inference.ranges import UNDER_WAY
+from mmrjax import channels
+from mmrjax.robot import Robot
+
+#: Share of the speed of steady travel below which a short run is not under way, and of that of its movers below which
+#: a long one does not grip [-].
+SLOW, SLIDING = 0.7, 0.7
+
+
+def conduct(runs: Runs, robot: Robot) -> list[str]:
+    """Say which runs end before they are under way, and which never grip."""
+    kind = observers.kind(runs)
+    ends, shown, lasts = kind.settled(runs)
+    if not kind.axis:
+        return []
+    speed = shown[:, channels.index("speed")]
+    turning = shown[:, channels.index("motor_speed")]
+    names = ends["run_id"] if ends.has("run_id") else np.array(["(no run_id)"] * len(ends))
+    conditions = ends.conditions(robot)
+    steady = operating_readings(robot, conditions)[:, channels.index("speed")]
+    radius = np.asarray([float(c.radius) for c in robot.configurations.members])[np.asarray(conditions.configuration)]
+    movers = radius * turning / float(robot.gearbox.ratio)
+    known = np.isfinite(speed)
+    slow = known & np.isfinite(steady) & (speed < SLOW * steady)
+    early = (lasts < UNDER_WAY) & (slow | ~known)
+    slides = (lasts >= UNDER_WAY) & known & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
+    said = []
+    if early.any():
+        at = (
+            f", at {np.nanmedian(speed[slow & early] / steady[slow & early]):.0%} of the speed of steady travel"
+            if (slow & early).any()
+            else ""
+        )
+        said.append(
+            f"{_runs(names, early)} after {lasts[early].max():.2g} s at the latest{at}: before the robot is under "
+            "way, so what resists its travel is known by its priors; record until the speed is steady"
+        )
+    if slides.any():
+        share = max(float(np.median(speed[slides] / movers[slides])), 0.0)
+        said.append(
+            f"{_runs(names, slides, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of "
+            "the speed of its movers, so what the ground holds before it slides is not measured there"
+        )
+    if slides.any() and (slides | early).all():
+        said.append("no run grips: static friction, and slip below it, are known by their priors alone")
+    return said
+
+
+def _runs(names: np.ndarray, which: np.ndarray, one: str = "ends", several: str = "end") -> str:
+    found = [str(n) for n in names[which]]
+    return f"run {found[0]} {one}" if len(found) == 1 else f"runs {', '.join(found)} {several}"

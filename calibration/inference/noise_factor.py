@@ -1,0 +1,50 @@
+"""Whether sds are stated rightly: by what factor residuals without structure are off."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from calibration.inference.lack_of_fit import LEVEL, Residuals, structure
+from mmrjax import channels
+
+#: Factor on the sds from which it is said, either way; probability under right sds below which it is.
+OFF, IMPROBABLE = 1.25, 0.001
+#: How far apart the factors of channels may be to be called the same.
+ALIKE = 1.3
+
+
+def noise_factors(fit: Residuals) -> dict[str, float]:
+    """By how much the residuals of each channel exceed its sds, where that is sure; none where they have structure.
+
+    Structure is looked for with sds as the misfit says, so that it does not depend on those that are stated.
+    """
+    tests = structure(fit.rescaled(), known=False)
+    if tests and min(p for p, _ in tests) * len(tests) < LEVEL:
+        return {}
+    found = {}
+    for name, chi2, freedom in zip(channels.names(), fit.chi2.tolist(), fit.freedom.tolist(), strict=True):
+        if freedom < 1 or chi2 <= 0:
+            continue
+        factor = float(np.sqrt(chi2 / freedom))
+        p = stats.chi2.sf(chi2, freedom) if factor > 1 else stats.chi2.cdf(chi2, freedom)
+        if max(factor, 1 / factor) > OFF and p < IMPROBABLE:
+            found[name] = factor
+    return found
+
+
+def noise_remarks(fit: Residuals, word: str = "stated") -> list[str]:
+    """What to say of sds that are off by a factor; `word` says where they come from."""
+    factors = noise_factors(fit)
+    here = [name for k, name in enumerate(channels.names()) if fit.there[:, k].any()]
+    if not factors:
+        return []
+    if list(factors) == here and len(here) > 1 and max(factors.values()) < ALIKE**2 * min(factors.values()):
+        typical = float(np.exp(np.mean(np.log(list(factors.values())))))
+        where = "in every channel and everywhere alike"
+        return [f"residuals are {typical:.2g} times the {word} sds {where}: are the sds right?"]
+    labels = {c.name: c.label for c in channels.CHANNELS}
+    return [
+        f"residuals of {labels[name]} are {factor:.2g} times the {word} sds, everywhere alike: are these sds right?"
+        for name, factor in factors.items()
+    ]

@@ -1,0 +1,167 @@
+"""Data that no model can make much of: each is refused, or its result says so, in `loop` and in `calibrate`."""
+
+import csv
+
+import generator as g
+import generator_series as gs
+import numpy as np
+import pytest
+from synthetic import SETTLED, known, table
+from test_loop_command import mmrjax
+
+from calibration.data.runs import Runs
+from calibration.inference import checks
+from calibration.inference.calibrate import calibrate
+from calibration.inference.conduct import conduct
+from mmrjax import params, robots
+
+CLIMBING = params.replace(robots.nominal(), g.CLIMBING)
+
+
+def started(p=g.CLIMBING, duration=0.8, every=0.02):
+    """Six starts without effects, as the generator follows them, and a little noise."""
+    c = gs.starts(p)
+    times, y = gs.histories(c, duration, every, p, [], np.zeros(len(c.U)))
+    instruments = g.Instruments(sd=(0.05, 15.0, 5.0))
+    shown = y * g._SHOWN[:, :, None]
+    shown = shown + np.random.default_rng(0).standard_normal(y.shape) * np.array(instruments.sd)[:, None, None]
+    columns = {
+        "run_id": np.array([f"start{k}" for k in range(len(c.U))]), "configuration": np.where(c.wheeled > 0.5, "4W2T", "6T2A"),
+        "supply_voltage_V": c.U, "total_mass_kg": c.mass, "payload_kg": c.payload,
+        "slope_deg": np.round(np.degrees(c.slope), 6),
+    }  # fmt: skip
+    columns = {name: np.repeat(x, len(times)) for name, x in columns.items()}
+    columns["time_s"] = np.tile(np.round(times, 6), len(c.U))
+    for k, (name, sd) in enumerate(
+        {
+            "total_current_A": "total_current_sd_A",
+            "motor_speed_rpm": "motor_speed_sd_rpm",
+            "speed_mm_s": "speed_sd_mm_s",
+        }.items()
+    ):
+        columns[name] = np.round(shown[k].ravel(), 4)
+        columns[sd] = np.full(len(shown[k].ravel()), instruments.stated[k])
+    return Runs("runs.csv", columns)
+
+
+@pytest.fixture(scope="module")
+def histories():
+    return started()
+
+
+@pytest.fixture(scope="module")
+def sliding():
+    """The same on a surface that hardly holds anything."""
+    slippery = {
+        f"{c}.ground.friction.{k}": 0.08 * f for c in ("6T2A", "4W2T") for k, f in (("static", 1.0), ("dynamic", 0.8))
+    }
+    return started(g.CLIMBING | slippery)
+
+
+@pytest.fixture(scope="module")
+def short():
+    return started(duration=0.0101, every=5e-4)
+
+
+def written(path, runs):
+    with path.open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(runs.columns)
+        out.writerows(zip(*runs.columns.values(), strict=True))
+
+
+def test_histories_that_grip_have_nothing_said(histories):
+    assert conduct(histories, CLIMBING) == []
+    assert conduct(table(g.case(seed=3)), CLIMBING) == []
+
+
+def test_histories_that_never_grip_are_said(sliding, histories):
+    which, none = conduct(sliding, CLIMBING)
+    assert which.startswith(
+        "runs start0, start1, start2, start3, start4, start5 never grip: in the end the robot travels"
+    )
+    assert "what the ground holds before it slides is not measured there" in which
+    assert none == "no run grips: static friction, and slip below it, are known by their priors alone"
+    half = {c: np.concatenate([sliding[c][sliding["run_id"] == "start0"], histories[c][histories["run_id"] != "start0"]])
+            for c in histories.columns}  # fmt: skip
+    (said,) = conduct(Runs("runs.csv", half), CLIMBING)
+    assert said.startswith("run start0 never grips: ")
+
+
+def test_runs_of_ten_milliseconds_are_said(short):
+    (said,) = conduct(short, CLIMBING)
+    assert said.startswith("runs start0, start1, start2, start3, start4, start5 end after 0.01 s at the latest, at ")
+    assert "before the robot is under way" in said and "record until the speed is steady" in said
+    bare = Runs("runs.csv", {c: x for c, x in short.columns.items() if not c.startswith("speed")})
+    (said,) = conduct(bare, CLIMBING)
+    assert "end after 0.01 s at the latest: before" in said
+
+
+def test_loop_and_calibrate_say_both(sliding, short):
+    """Both ask `checks.check` before they fit, and keep what it says."""
+    for runs, words in ((sliding, "never grip"), (short, "before the robot is under way")):
+        assert any(words in s for s in checks.check(runs, CLIMBING, (), known(runs)))
+
+
+#: A table or histories, and what is said of it by every command that fits.
+REFUSED = {
+    "moving": "run start0 is moving at 0 s",
+    "every reading equal": "total_current_A: 2.5 in every row although the conditions vary; the instrument was stuck",
+    "every sample equal": "total_current_A: 2.5 in every row although the conditions vary; the instrument was stuck",
+    "two configurations": "runs.csv, configuration: run start0 has several values; a run has one condition",
+}
+
+
+def made(case, histories):
+    columns = {c: x.copy() for c, x in histories.columns.items()}
+    if case == "moving":
+        late = {c: x[columns["time_s"] > 0.39] for c, x in columns.items()}
+        return Runs("runs.csv", late | {"time_s": np.round(late["time_s"] - 0.4, 6)})
+    if case == "two configurations":
+        columns["configuration"][np.flatnonzero(columns["run_id"] == "start0")[20:]] = "4W2T"
+        return Runs("runs.csv", columns)
+    if case == "every reading equal":
+        columns = dict(g.case(seed=3).table)
+    for name, value in {"total_current_A": 2.5, "motor_speed_rpm": 5000.0, "speed_mm_s": 400.0}.items():
+        columns[name] = np.full(len(columns["configuration"]), value)
+    return Runs("runs.csv", columns)
+
+
+@pytest.mark.parametrize("command", ["calibrate", "loop"])
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused_with_4_and_one_sentence(case, command, histories, tmp_path):
+    written(tmp_path / "runs.csv", made(case, histories))
+    answer = mmrjax(
+        tmp_path, command, "runs.csv", "--out", "x", *(["--model", "drive"] if command == "calibrate" else [])
+    )
+    if command == "calibrate" and case == "every reading equal":
+        answer = mmrjax(tmp_path, command, "runs.csv", "--out", "x")
+    assert answer.code == 4 and REFUSED[case] in answer.err
+    assert len(answer.err.strip().splitlines()) == 1 and not (tmp_path / "x").exists()
+
+
+def tenth(case):
+    """A clean table whose sds are stated ten times too small."""
+    columns = dict(case.table)
+    for name in columns:
+        columns[name] = columns[name] / 10 if "_sd_" in name else columns[name]
+    return Runs("runs.csv", columns)
+
+
+SAYS = "times the stated sds in every channel and everywhere alike: are the sds right?"
+
+
+@pytest.mark.slow
+def test_calibrate_says_that_sds_are_ten_times_too_small():
+    runs = tenth(g.case(seed=3, free=g.FRICTION))
+    found = calibrate(runs, CLIMBING, starts=2, profiles=False, blocks=())
+    (said,) = [n for n in found.notes if SAYS in n]
+    assert 9.0 < float(said.split()[2]) < 11.0
+    assert found.adequacy.adequate is False and found.adequacy.shown_by == "the residuals exceed the stated noise"
+
+
+@pytest.mark.slow
+def test_loop_says_that_sds_are_ten_times_too_small():
+    found = SETTLED.discover(tenth(g.case(seed=3)))
+    assert SAYS in found.notes[0] and 9.0 < float(found.notes[0].split()[2]) < 11.0
+    assert not any("the stated sds" in n for n in SETTLED.discover(table(g.case(seed=3))).notes)
