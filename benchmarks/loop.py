@@ -348,7 +348,9 @@ def carried_out(case: g.Case, found, settings) -> list[dict]:
             said.append({"experiments": [experiments.NONE], "left": seen.names})
             break
         for name in new:
-            done[name] = case.carry_out(name, seed=1000 * len(done) + case.label["seed"])
+            done[name] = case.carry_out(
+                next(e for e in whole.experiments if e.name == name), seed=1000 * len(done) + case.label["seed"]
+            )
         says = experiments.supported(whole, done)
         what = {k: getattr(proposal, k) for k in ("experiments", "expected_sigma", "settles", "separates")}
         said.append(what | {"chi2": says.chi2, "best": says.best, "left": says.left})

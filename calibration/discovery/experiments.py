@@ -171,15 +171,23 @@ class Verdict:
 # --- alternatives -----------------------------------------------------------------------------------
 
 
-def alternatives(best: Candidate, found: Classes) -> dict[str, Candidate]:
-    """The candidates that a table leaves, by the names of their effects; the best fit first."""
+def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dict[str, Candidate]:
+    """The candidates that a table leaves, by the names of their effects; the best fit first.
+
+    Args:
+        stated: whether values that may be wrong in the place of an effect are among them, by their names.
+    """
     fitted = {c.key: c for c in sorted(found.ladder, key=lambda c: -c.cost)}
     kept = {best.active: best}
     for slot, members in enumerate(found.members):
         for name in members[1:]:
             active = tuple(name if s == slot else n for s, n in enumerate(best.active))
             kept[active] = fitted[frozenset(n for n in active if n)]
-    return {" + ".join(c.effects): c for c in kept.values()}
+    named = {" + ".join(c.effects): c for c in kept.values()}
+    if stated:
+        for shifts in found.stated:
+            named |= {" + ".join((s.name, *s.fit.effects)): s.fit for s in shifts}
+    return named
 
 
 # --- what they foresee ------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes)
 
     Empty where there is but one, or no block to hold out.
     """
-    others = list(experiments.alternatives(best, alike).values())
+    others = list(experiments.alternatives(best, alike, stated=False).values())
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
@@ -148,7 +148,7 @@ def by_held_out(
     table = compared(space, runs, best, alike)
     if not table:
         return searched, alike, ()
-    fitted = {c.key: c for c in experiments.alternatives(best, alike).values()}
+    fitted = {c.key: c for c in experiments.alternatives(best, alike, stated=False).values()}
     for k in _order(table):
         leader = fitted[frozenset(table[k].effects)]
         if leader is best:
