@@ -66,7 +66,8 @@ def set_aside(traced) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 def test_clean_table_lacks_nothing(clean):
     found = clean.traced
-    assert found.verdict == "none" and found.members == () and found.searched is None and found.discrepancy is None
+    assert found.verdict == "none" and found.members == () and found.searched is None
+    assert found.where is None and found.standing is None and found.families == ()
     assert found.best is clean.base and found.ends is clean.left and set_aside(found) == ((), ())
     assert clean.left.test.p_value > 0.05
     # χ² of readings and priors is what noise leaves of as many readings
@@ -112,19 +113,12 @@ OUTSIDE = ["supply_hunting"], 12.0, 2
 
 
 def test_effect_outside_the_library_gets_no_name():
-    """As `trace` decides it, without the curve, which compiles for long."""
-    runs = table(g.case(*OUTSIDE))
-    screened = SETTLED.screened(runs)
-    space, base, bases_ = screened.base.space, screened.base.candidate, screened.bases
-    left = discover.diagnosis_of_base(screened, SETTLED.settings)
-    searched = search(space, base, left, bases_, SETTLED.settings, lambda text: None)
-    assert left.test.rejected
-    assert discover.not_to_the_point(space, base, searched.best) or discover.stands_for_a_curve(
-        space, left, searched.diagnosis, bases_
-    )
-    where = locate(space.bare.observe, left.scores, bases_)
+    found = SETTLED.trace(table(g.case(*OUTSIDE)))
+    where = found.where
+    assert found.verdict == "unnamed" and found.members == () and found.left.test.rejected
+    assert found.searched is not None and not found.standing.stands and found.standing.reason
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.alike)
-    assert where.variable in bases.VARIABLES
+    assert where.variable in bases.VARIABLES and found.families == (where.family,)
 
 
 @pytest.mark.slow
