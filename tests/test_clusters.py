@@ -63,7 +63,9 @@ def test_outliers_on_a_stretch_are_found_there(case):
     assert got.low <= x.min() and got.high >= x.max() and got.inside >= len(inside)
     assert got.high - got.low <= max(clusters.WINDOWS) * np.ptp(AXES[axis])
     assert got.of == len(np.union1d(inside, alone))
-    assert str(got).startswith(f"{got.inside} of {got.of} rows that lie off stand together at {axis} {got.low:.3g} to")
+    assert str(got).startswith(
+        f"{got.inside} of {got.of} rows that lie off stand together at {axis} {got.low:.3g} to"
+    )
 
 
 def test_outliers_of_one_level_are_found_there():

@@ -122,13 +122,18 @@ def test_cost_of_names_grows_with_the_library_and_their_number():
     settings = SimpleNamespace(slots=4)
     known = 0.01 * np.eye(3)
     costs = [
-        [cost_of_names(SimpleNamespace(free=2, library=range(n)), names_of(known[:k, :k], 2), settings) for k in (1, 2, 3)]
+        [
+            cost_of_names(SimpleNamespace(free=2, library=range(n)), names_of(known[:k, :k], 2), settings)
+            for k in (1, 2, 3)
+        ]
         for n in (10, 40)
     ]
     assert np.all(np.diff(costs, axis=0) > 0) and np.all(np.diff(costs, axis=1) > 0)
     # an amplitude that the data do not tell costs nothing but its place in the library
     blind = names_of(np.eye(1), 2)
-    assert cost_of_names(SimpleNamespace(free=2, library=range(10)), blind, settings) == pytest.approx(2 * math.log(10))
+    assert cost_of_names(SimpleNamespace(free=2, library=range(10)), blind, settings) == pytest.approx(
+        2 * math.log(10)
+    )
 
 
 def test_significance_beside_columns_is_that_of_a_joint_fit(toy):

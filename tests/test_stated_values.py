@@ -26,7 +26,9 @@ def toy():
     readings, p = 30, 5
     slopes = rng.standard_normal((readings, p)) * np.array([2.0, 1.0, 0.3, 1.0, 0.0])
     jacobian = np.concatenate([slopes, np.eye(p)])
-    at_zero = np.concatenate([-slopes @ np.array([8.0, 0.5, -1.0, 0.2, 0.0]) + rng.standard_normal(readings), 0 * slopes[0]])
+    at_zero = np.concatenate(
+        [-slopes @ np.array([8.0, 0.5, -1.0, 0.2, 0.0]) + rng.standard_normal(readings), 0 * slopes[0]]
+    )
     z = -np.linalg.lstsq(jacobian, at_zero, rcond=None)[0]
     return SimpleNamespace(jacobian=jacobian, residual=at_zero + jacobian @ z, at_zero=at_zero, readings=readings)
 
