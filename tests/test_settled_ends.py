@@ -1,0 +1,64 @@
+"""Base fits of histories end in the lowest valley, whatever the ground: what settled ends tell, and what they do not."""
+
+import dataclasses
+
+import generator as g
+import generator_series as gs
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import Analyst, table
+
+from calibration.discovery.candidates import fit_base
+from calibration.discovery.settings import settings_for
+from calibration.inference.observers import Histories
+from mmrjax.effects import BY_NAME
+
+#: An analyst who knows nothing of the ground but what the nominal robot's file says (0.32 and 0.38, 20 mm/s).
+ANALYST = Analyst(
+    dataclasses.replace(settings_for(Histories, 300), slots=1), {"churning": BY_NAME["churning"]}, stated={}
+)
+INSTRUMENTS = g.Instruments(sd=(0.02, 9.5, 2.0))
+
+
+def on_ground(monkeypatch, adhesion, creep, seed=3):
+    """Six clean starts of the nominal robot on a ground of this adhesion (of tracks, of wheels) and V_s [m/s], and
+    its constants."""
+    p = dict(g.CLIMBING)
+    for c, mu in zip(("6T2A", "4W2T"), adhesion, strict=True):
+        p |= {f"{c}.ground.friction.static": mu, f"{c}.ground.friction.dynamic": 0.8 * mu}
+        p |= {f"{c}.ground.friction.speed_static": creep, f"{c}.ground.friction.speed_dynamic": 10 * creep}
+    monkeypatch.setattr(g, "perturbed", lambda rng, free: p)
+    made, _ = gs.case(seed=seed, duration=1.5, every=0.05, instruments=INSTRUMENTS)
+    return table(made), p
+
+
+def at_truth(space, p):
+    """Coordinates of the true robot."""
+    c = space.bare.coordinates
+    value = np.array([p[n] for n in c.names])
+    inside = np.where(c.scale, np.log(value), value)
+    return (inside - np.asarray(c.location)) / np.asarray(c.spread)
+
+
+def is_global(monkeypatch, adhesion, creep, seed=3):
+    """Whether the base fit is at least as good as the truth, and leaves what noise leaves."""
+    runs, p = on_ground(monkeypatch, adhesion, creep, seed)
+    space = ANALYST.space(runs)
+    z = jnp.asarray(at_truth(space, p))
+    truth = 0.5 * float(jnp.sum(space.bare.misfit(z, space.bare.data) ** 2) + jnp.sum(z**2))
+    fitted = fit_base(space, ANALYST.settings, "starts")
+    assert fitted.unusable == () and fitted.candidate.cost < truth, (adhesion, creep)
+    readings = 3 * len(runs)
+    assert abs(2 * fitted.candidate.cost - readings) < 5 * np.sqrt(2 * readings), (adhesion, creep)
+
+
+def test_clean_starts_on_a_ground_that_is_not_nominal_are_fitted(monkeypatch):
+    is_global(monkeypatch, (0.55, 0.54), 0.012)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("creep", [0.005, 0.02, 0.06])
+@pytest.mark.parametrize("adhesion", [(0.2, 0.25), (0.35, 0.9), (0.7, 0.6), (1.0, 1.0)])
+def test_base_fit_of_clean_starts_is_global_on_any_ground(monkeypatch, adhesion, creep):
+    is_global(monkeypatch, adhesion, creep)
