@@ -36,7 +36,7 @@ from calibration.inference.bases import Bases
 from calibration.inference.foreign import foreign_priors
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.noise import Noise
-from calibration.inference.noise_factor import noise_remarks
+from calibration.inference.noise_factor import noise_factors, noise_remarks
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
@@ -124,7 +124,21 @@ def discover_at(
         numbers: of the rows, as messages call them; None counts from 1.
     """
     traced = trace(runs, robot, noise, settings, stated, library, progress)
-    return finished(traced, runs, noise, numbers, settings, library, progress)
+    return finished(traced, runs, numbers, settings, library, progress)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sds:
+    """The noise that a verdict is with.
+
+    Attributes:
+        noise: of the readings; factors: of the sds as given by which each channel's were changed, empty for none.
+        remarks: what to say of that.
+    """
+
+    noise: Noise
+    factors: dict[str, float] = dataclasses.field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,6 +148,7 @@ class Traced:
     Attributes:
         verdict: `none`, `named`, `class` or `unnamed`.
         screened: the base fit, rows that stand alone set aside; left: what it leaves.
+        sds: the noise that the verdict is with.
         searched: what was tried; alike: what cannot be told apart, where a name is given.
         where: something is missing, or remains.
         standing: why names that were looked at do not stand, or what was put beside them.
@@ -143,6 +158,7 @@ class Traced:
     verdict: str
     screened: Screening
     left: Diagnosis
+    sds: Sds
     searched: Search | None = None
     alike: Classes | None = None
     where: Location | None = None
@@ -155,6 +171,11 @@ class Traced:
         return () if self.alike is None else self.alike.members
 
     @property
+    def noise_factor(self) -> float | None:
+        """By what factor sds are off, the mean of the channels; None where they are right."""
+        return float(np.exp(np.mean(np.log(list(self.sds.factors.values()))))) if self.sds.factors else None
+
+    @property
     def families(self) -> tuple[str, ...]:
         """Families of what was found: of the members of each class, or where something without a name is."""
         if self.alike is not None:
@@ -163,13 +184,13 @@ class Traced:
 
     @property
     def events(self) -> tuple[dict[str, Any], ...]:
-        """Where something happens for a while: axis and window, and indices of the rows in it."""
+        """Where something happens for a while: axis and window, and numbers of the rows in it."""
         happens = None if self.where is None else bases_room.window(self.where.variable)
         if happens is None:
             return ()
         x = self.left.linear.variable(happens.axis)
         inside = self.screened.base.space.included & (x >= happens.low) & (x <= happens.high)
-        rows = [int(k) for k in np.flatnonzero(inside)]
+        rows = [int(k) + 1 for k in np.flatnonzero(inside)]
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
     @property
@@ -196,17 +217,32 @@ def trace(
     library: Library = effects.BY_NAME,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Traced:
-    """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`."""
-    space = pose(runs, robot, noise.sd, settings, stated, library)
-    progress("fitting the base model")
-    fitted = fit_base(space, settings, runs.source)
-    screened = screen(fitted, lambda base: bases_at(runs, base), runs, settings)
+    """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`.
+
+    Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
+    stages go through again with such as the residuals show.
+    """
+
+    def look(noise: Noise) -> Screening:
+        space = pose(runs, robot, noise.sd, settings, stated, library)
+        progress("fitting the base model")
+        fitted = fit_base(space, settings, runs.source)
+        return screen(fitted, lambda base: bases_at(runs, base), runs, settings)
+
+    screened = look(noise)
+    residuals = residuals_of(screened, runs)
+    factors = {} if screened.cluster is not None else noise_factors(residuals)
+    sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)) if factors else ())
+    if factors:
+        progress("the sds are not as stated: the same with those that the residuals show")
+        sds = dataclasses.replace(sds, noise=noise.scaled(factors))
+        screened = look(sds.noise)
     base, space, bases = screened.base.candidate, screened.base.space, screened.bases
 
     progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
     left = diagnosis_of_base(screened, settings)
     if not left.test.rejected and screened.cluster is None:
-        return Traced("none", screened, left)
+        return Traced("none", screened, left, sds)
 
     progress("something is missing: fitting every effect that could explain it")
     searched = search(space, base, left, bases, settings, progress)
@@ -214,7 +250,7 @@ def trace(
     stood = standing(space, base, searched, left, bases, settings)
     if best is None or after is None or not stood.stands:
         where = locate(space.bare.observe, left.scores, bases)
-        return Traced("unnamed", screened, left, searched, where=where, standing=stood)
+        return Traced("unnamed", screened, left, sds, searched, where=where, standing=stood)
 
     progress(f"what else explains as much as {' and '.join(best.effects)}?")
     alike = classes(space, base, best, searched.ladder, left, settings)
@@ -225,7 +261,7 @@ def trace(
         after = searched.diagnosis or after
     verdict = "named" if alike.single else "class"
     remains = locate(space.bare.observe, after.scores, bases) if after.test.rejected_with_margin else None
-    return Traced(verdict, screened, left, searched, alike, remains, standing=stood, held_out=compared)
+    return Traced(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
 
 
 # --- the stages that are no room of their own -----------------------------------------------------------
@@ -327,6 +363,8 @@ def _statement(traced: Traced) -> str:
     if aside > MANY * (aside + counting):
         share = 100 * aside / (aside + counting)
         said = f"{aside} of {aside + counting} rows ({share:.0f} %) lie off alone and are set aside. {said}"
+    if traced.sds.remarks and traced.verdict == "none":
+        said = f"{said} But {'; '.join(traced.sds.remarks)}"
     if traced.screened.cluster is not None:
         said = f"{said} {str(traced.screened.cluster).capitalize()}: that is a finding, and none is set aside."
     return said
@@ -338,14 +376,13 @@ def _statement(traced: Traced) -> str:
 def finished(
     traced: Traced,
     runs: Runs,
-    noise: Noise,
     numbers: np.ndarray | None,
     settings: Settings,
     library: Library,
     progress: Callable[[str], None],
 ) -> DiscoveryResult:
     """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
-    screened, left, where = traced.screened, traced.left, traced.where
+    screened, left, where, noise = traced.screened, traced.left, traced.where, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     curve = None
     if traced.verdict == "unnamed" and where is not None:
@@ -423,20 +460,19 @@ def finished(
         settings=settings,
         replicates=len(left.test.null.single),
     )
-    return dataclasses.replace(result, notes=(*_noise_remarks(traced, runs, noise), *remarks(result)))
+    return dataclasses.replace(result, notes=(*traced.sds.remarks, *remarks(result)))
 
 
-def _noise_remarks(traced: Traced, runs: Runs, noise: Noise) -> list[str]:
-    """What the base fit says of the sds."""
-    base, linear = traced.screened.base, traced.left.linear
+def residuals_of(screened: Screening, runs: Runs) -> Residuals:
+    """What the base fit leaves of every reading."""
+    base, linear = screened.base, screened.diagnosed[0]
     rows, count, free = len(runs), len(channels.CHANNELS), base.space.free
     weight = base.space.weight[:rows]
     there = (weight > 0) & np.isfinite(base.reading[:rows])
     jacobian = np.asarray(linear.jacobian)[: rows * count, :free]
     whitened = np.where(there, np.asarray(linear.by_row())[:rows], 0.0)
     kind = type(base.space.bare.observe)
-    left = Residuals(kind, runs, base.reading[:rows], whitened, there, jacobian, base.candidate.z[:free])
-    return noise_remarks(left, "assumed" if "assumed" in noise.source else "stated")
+    return Residuals(kind, runs, base.reading[:rows], whitened, there, jacobian, base.candidate.z[:free])
 
 
 def _diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -29,6 +30,16 @@ class Noise:
     sd: np.ndarray
     estimated: np.ndarray
     source: tuple[str, ...]
+
+    @property
+    def word(self) -> str:
+        """Where sds come from, for messages."""
+        return "assumed" if "assumed" in self.source else "stated"
+
+    def scaled(self, factors: Mapping[str, float]) -> Noise:
+        """The same with the sds of channels times a factor, by name."""
+        factor = np.array([factors.get(name, 1.0) for name in channels.names()])
+        return dataclasses.replace(self, sd=self.sd * factor)
 
 
 def parse(text: str) -> dict[int, tuple[float, bool]]:

@@ -385,9 +385,14 @@ class Histories(Observer):
         """As the protocol says; see `settled_ends`."""
 
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
-            weights = jnp.repeat(blunt.data.weight[None], len(starts), 0)
+            weights = jnp.repeat(blunt.data.weight[None], self.policy.batch, 0)
             evaluate = lambda z: _evaluate(blunt, z, weights, None)  # noqa: E731
-            return searches_long(evaluate, jnp.asarray(starts), blunt.data, weights, steps)[0]
+            batches = starts[: len(starts) // self.policy.batch * self.policy.batch]
+            parts = [
+                searches_long(evaluate, jnp.asarray(z), blunt.data, weights, steps)[0]
+                for z in batches.reshape(-1, self.policy.batch, starts.shape[1])
+            ]
+            return jax.tree.map(lambda *x: np.concatenate(x), *jax.device_get(parts))
 
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
         return settled_ends.starts(problem, draws, search)[:count]

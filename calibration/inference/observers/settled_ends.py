@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from calibration.inference.observers.histories import Histories
 
 #: Adhesions that are tried [-].
-ADHESIONS = (0.15, 0.2, 0.27, 0.36, 0.48, 0.64, 0.85, 1.1)
+ADHESIONS = (0.06, 0.1, 0.15, 0.2, 0.27, 0.36, 0.48, 0.64, 0.85, 1.1)
 #: Adhesion [-] and V_s [m/s] of the surfaces that are drawn.
-SURFACES = {"ground.friction.static": (0.15, 1.2), "ground.friction.speed_static": (0.002, 0.08)}
+SURFACES = {"ground.friction.static": (0.05, 1.2), "ground.friction.speed_static": (0.002, 0.08)}
 #: Share of a run that is its end, and change of a channel between the halves of an end that is settled: as a share of
 #: the reading, and in sds of the difference.
 END, CHANGE, CHANGE_SD = 0.2, 0.02, 4.0

@@ -1,0 +1,108 @@
+"""Campaigns: cases of every kind, what a scorer says of a verdict, files that were cut off."""
+
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import generator as g
+import generator_wide as gw
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+
+import campaign
+import loop
+import loop_scores as scores
+
+
+def line(verdict="none", classes=(), where=None, truth=(), **more):
+    return {
+        "kind": "x",
+        "verdict": verdict,
+        "classes": classes,
+        "where": where,
+        "truth": truth,
+        "outliers": [],
+        **more,
+    }
+
+
+def test_all_classes_of_several_truths_are_wanted_once_each():
+    truth = [{"class": c} for c in "abc"]
+    assert scores.everything(line(classes=[["b", "x"], ["a"], ["c", "b"]], truth=truth))
+    assert not scores.everything(line(classes=[["b"], ["a", "b"]], truth=truth))
+    assert not scores.everything(line(classes=[["a", "b"], ["x"], ["c"]], truth=truth))
+    assert not scores.everything(line(classes=[["a"], ["b"], ["c"], ["d"]], truth=truth))
+
+
+def test_a_drift_is_placed_over_the_order_in_its_equation():
+    truth = [{"balance": "track", "where": {"variable": "order"}}]
+    assert scores.in_place(line("unnamed", where=["gearbox", "order", []], truth=truth))
+    assert not scores.in_place(line("unnamed", where=["gearbox", "slope", []], truth=truth))
+    assert not scores.in_place(line("unnamed", where=["slip", "order", []], truth=truth))
+    assert not scores.in_place(line("named", classes=[["churning"]], truth=truth))
+
+
+def test_a_cluster_and_an_event_are_placed_by_rows_and_by_time():
+    truth = [{"balance": "sensor", "where": {"rows": [4, 5, 6, 7]}}]
+    assert scores.in_place(line("unnamed", truth=truth, events=[{"rows": [5, 6, 7, 8]}]))
+    assert not scores.in_place(line("unnamed", truth=truth, events=[{"rows": [7, 8, 9]}]))
+    truth = [{"balance": "supply", "where": {"variable": "time", "window": [0.5, 0.7]}}]
+    assert scores.in_place(line("unnamed", truth=truth, events=[{"start": 0.52, "stop": 0.7}]))
+    assert not scores.in_place(line("unnamed", truth=truth, events=[{"start": 0.9, "stop": 1.0}]))
+
+
+def test_strata_that_are_too_high_are_marked():
+    made = {"surface": {"6T2A": {"adhesion": 0.9, "V_s": 0.01}}, "robot": {"mass": 13.1}, "rows": 90}
+    lines = [
+        line("unnamed" if k < 12 else "none", stratum="long", made=made, seconds=1.0) | {"kind": "clean_wide"}
+        for k in range(80)
+    ]
+    said = loop.summary(lines)
+    assert any("stratum long" in x and "ABOVE" in x for x in said) and any("adhesion 0.75 to 1" in x for x in said)
+    assert not any("ABOVE" in x for x in loop.summary(lines[12:]))
+
+
+def test_wilson_intervals():
+    assert scores.wilson(0, 100)[1] == pytest.approx(3.70, abs=0.01)
+    assert scores.wilson(5, 100) == pytest.approx((2.15, 11.18), abs=0.01)
+
+
+def test_skipped_cases_are_listed_by_reason():
+    lines = [{"kind": "pairs", "seed": k, "skipped": "too large" if k else "slides"} for k in range(4)]
+    said = loop.summary(lines)
+    assert "skipped: pairs: too large: 3" in said and "skipped: pairs: slides: 1" in said
+
+
+def test_a_line_that_was_cut_off_is_done_again(tmp_path):
+    path = tmp_path / "x.jsonl"
+    path.write_text(json.dumps({"kind": "clean", "seed": 1}) + '\n{"kind": "cle')
+    assert campaign.known(path) == [{"kind": "clean", "seed": 1}]
+
+
+def test_what_a_result_holds_is_written_as_json():
+    held = {"a": np.float64(1.0), "b": (np.arange(2), SimpleNamespace(x=1)), "c": gw.PAPER.instruments}
+    assert json.loads(json.dumps(campaign.plain(held)))["b"][0] == [0, 1]
+
+
+@pytest.mark.parametrize("kind", [k for k in loop.KINDS if k != "blind"])
+def test_cases_of_every_kind(kind):
+    made = next(m for m in (loop.attempt(kind, s) for s in range(8)) if not isinstance(m, str))
+    count = {"pairs": 2, "compensating": 2, "triples": 3, "clean": 0, "clean_wide": 0, "noise": 0}.get(kind, 1)
+    effects = made.label["effects"]
+    assert len(effects) == count or kind == "coverage"
+    assert made.label["rows_lost"] == 0
+    if kind not in ("compensating", "drift", "cluster"):
+        assert all(e["sizes"] < loop.SIZES and e["sigmas"] > 0.9 * loop.SIGMAS[kind][0] for e in effects)
+    if kind == "noise":
+        assert made.label["noise"] in (0.5, 2.0)
+
+
+def test_blind_cases_come_from_the_foreign_laws(monkeypatch):
+    law = g.Form("", "electrical", lambda s, q: s.I * np.sin(s.w / q["at"]), 0.2, {"at": (100.0, 200.0)})
+    monkeypatch.setitem(sys.modules, "foreign_laws", SimpleNamespace(FOREIGN={"odd": law}))
+    made = next(m for m in (loop.attempt("blind", s) for s in range(8)) if not isinstance(m, str))
+    assert made.label["kind"] == "foreign" and made.label["effects"][0]["name"] == "odd"
+    assert loop.oracle(made)[0]["best_other"] > 1.0
