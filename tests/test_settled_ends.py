@@ -11,7 +11,7 @@ from synthetic import Analyst, table
 
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.settings import settings_for
-from calibration.inference.observers import Histories
+from calibration.inference.observers import Histories, settled_ends
 from mmrjax.effects import BY_NAME
 
 #: An analyst who knows nothing of the ground but what the nominal robot's file says (0.32 and 0.38, 20 mm/s).
@@ -62,3 +62,44 @@ def test_clean_starts_on_a_ground_that_is_not_nominal_are_fitted(monkeypatch):
 @pytest.mark.parametrize("adhesion", [(0.2, 0.25), (0.35, 0.9), (0.7, 0.6), (1.0, 1.0)])
 def test_base_fit_of_clean_starts_is_global_on_any_ground(monkeypatch, adhesion, creep):
     is_global(monkeypatch, adhesion, creep)
+
+
+# --- what the ends show ---------------------------------------------------------------------------------
+
+
+def ends_of(monkeypatch, adhesion, creep=0.02):
+    """The ends of six starts on a ground, which of them slide, and what settled travel of the true robot shows."""
+    runs, p = on_ground(monkeypatch, adhesion, creep)
+    problem = ANALYST.space(runs).bare
+    ends = settled_ends.settled_ends(problem)
+    truth, sound = g.readings(gs.starts(p), p)
+    return ends, settled_ends._sliding(problem, ends), truth.T, sound
+
+
+def test_ends_of_runs_that_grip_are_those_of_settled_travel(monkeypatch):
+    ends, slides, truth, sound = ends_of(monkeypatch, (0.6, 0.6))
+    assert sound.all() and not slides.any()
+    there = np.isfinite(ends.mean)
+    assert there.sum() >= 15  # of six runs and three channels
+    off = np.abs(ends.mean - truth)[there]
+    # a reading that still changes by less than a fiftieth is taken for settled
+    assert (off < 4 * ends.sd[there] + 0.02 * np.abs(truth[there])).all()
+    assert (ends.sd[there] >= settled_ends.FLOOR * np.abs(ends.mean[there]) - 1e-12).all()
+
+
+def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
+    """On a slope beyond its adhesion a robot spins its movers, and its steady state is none."""
+    ends, slides, _, sound = ends_of(monkeypatch, (0.12, 0.6))
+    assert not sound.all() and sound[3:].all()
+    np.testing.assert_array_equal(slides, ~sound)
+
+
+def test_a_reading_that_still_changes_has_no_settled_end(monkeypatch):
+    runs, _ = on_ground(monkeypatch, (0.6, 0.6), 0.02)
+    mine = runs["run_id"] == "start4"
+    current = runs["total_current_A"].copy()
+    current[mine] += 2.0 * runs["time_s"][mine]  # 2 A/s
+    changed = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": current})
+    before, after = (settled_ends.settled_ends(ANALYST.space(r).bare).mean for r in (runs, changed))
+    assert np.isfinite(before[4, 0]) and np.isnan(after[4, 0])
+    np.testing.assert_array_equal(np.delete(before, 4, 0), np.delete(after, 4, 0))
