@@ -14,17 +14,18 @@ from scipy import stats
 from synthetic import SETTLED, known, parts, table
 
 from calibration.data.runs import Runs
+from calibration.data.runs import read as read_runs
 from calibration.discovery import discover
-from calibration.discovery.discrepancy import locate
+from calibration.discovery.candidates import fit_base
+from calibration.discovery.outliers import screen
 from calibration.discovery.score_tests import bootstrap, diagnosed, score_tests
-from calibration.discovery.search import search
-from calibration.inference import bases
+from calibration.inference import bases, noise
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED, amplitude_of, scored, shape_of
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.inference.optimizers import observation
-from mmrjax import params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
 
 
@@ -340,3 +341,12 @@ def test_null_of_one_column_is_normal(clean):
     # χ² of readings and priors less the coordinates that were fitted
     freedom = 3 * len(clean.runs)
     assert abs(np.mean(null.chi2) - freedom) < 4 * np.sqrt(2 * freedom / len(null.chi2))
+
+
+def test_bootstrap_of_the_measured_runs_settles():
+    """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
+    runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
+    sd = noise.assumed(runs, SettledRuns.sizes(runs), None).sd
+    space = discover.pose(runs, robots.nominal(), sd, settings, {}, SETTLED.library)
+    screened = screen(fit_base(space, settings, "measured"), lambda b: discover.bases_at(runs, b), runs, settings)
+    assert len(discover.diagnosis_of_base(screened, settings).test.null.single) >= 0.98 * settings.replicates

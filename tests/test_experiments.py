@@ -15,9 +15,9 @@ from calibration.data.errors import BadConfiguration
 from calibration.discovery import experiments, foreseen, menu
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
-from calibration.discovery.stated_values import Shift
 from calibration.discovery.discrepancy import Location
 from calibration.discovery.reach import reach
+from calibration.discovery.stated_values import Shift
 from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME

@@ -160,32 +160,39 @@ def alternatives(
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
     """Candidates that explain the data nearly as well as what is proposed; and those that would but for their size.
 
+    One that only adds effects to what is proposed, or to another one of these, is left out where these explain next
+    to nothing.
+
     Args:
         cost: of what is proposed [½σ²]; best: the same, where it is a candidate.
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
-    seen = {best.key}
-    for c in sorted(ladder, key=lambda x: x.cost):
+    simpler = {best.key: cost} if best.key else {}
+    for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
-        if c.key in seen or not c.effects or rise > settings.alternative:
+        if c.key in simpler or not c.effects or rise > settings.alternative:
             continue
-        seen.add(c.key)
-        near[0 if c.plausible else 1].append(_alternative(space, c, rise))
-    return tuple(near[0]), tuple(near[1])
+        if any(key < c.key and 2 * (x - c.cost) < settings.alternative for key, x in simpler.items()):
+            continue
+        simpler[c.key] = c.cost
+        near[0 if c.plausible else 1].append(_alternative(space, c, rise, settings))
+    plausible, ruled_out = (tuple(sorted(x, key=lambda a: a.rise_chi2)) for x in near)
+    return plausible, ruled_out
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> Alternative:
+def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> Alternative:
     sds, sizes, why = {}, {}, []
-    for name, amplitude, size in zip(c.active, c.amplitude, c.size, strict=True):
+    for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
             continue
         sds[name], sizes[name] = float(amplitude), float(size)
+        sd = settings.width * float(c.sd[space.free + slot])
         if space.library[name].dissipative and amplitude <= 0:
             why.append(f"{name} would put power in")
         elif size >= 1:
             rests = " and ".join(space.library[name].rests_on) or amplitude_of(space.library[name]).spec.meaning
             why.append(f"{name} at {size:.2g} times its largest plausible size; check {rests}")
-        elif not c.plausible:
+        elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(f"{name} is within an sd of the largest plausible size")
     amplitudes = {name: a * size_of(space.library[name]) for name, a in sds.items()}
     return Alternative(amplitudes, sds, sizes, float(rise), "; ".join(why))
