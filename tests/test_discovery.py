@@ -343,6 +343,7 @@ def test_null_of_one_column_is_normal(clean):
     assert abs(np.mean(null.chi2) - freedom) < 4 * np.sqrt(2 * freedom / len(null.chi2))
 
 
+@pytest.mark.slow
 def test_bootstrap_of_the_measured_runs_settles():
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)

@@ -21,6 +21,7 @@ from calibration.discovery.experiments import Proposal
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
+    DiscoveryResult,
     EffectScore,
     Errors,
     Estimate,
@@ -136,12 +137,14 @@ def _without_each(space: CandidateSpace, base: Candidate, best: Candidate, setti
 
 def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> UnnamedDiscrepancy:
     """The discrepancy of an `unnamed` verdict, over the rows of the table."""
-    f, lacks = found.proposal, found.defect
+    f, lacks, happens = found.proposal, found.defect, bases_room.window(where.variable)
     return UnnamedDiscrepancy(
         balance=where.balance,
         variable=where.variable,
         unit=found.unit,
         balances_alike=where.alike,
+        families=(where.family,),
+        window=None if happens is None else dataclasses.asdict(happens),
         effect=found.effect,
         p_value=p_value,
         score=float(found.chi2[0] - found.chi2[1]),
@@ -269,7 +272,7 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
             EffectScore(
                 name=effect.name,
                 balance=effect.balance,
-                score=explained,
+                score=max(explained, 0.0),
                 amplitude=amplitude * size_of(effect),
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
@@ -383,6 +386,42 @@ def statement(
         names.append(said)
     left = "" if where is None else f" Something remains in the balance {where.balance}."
     return f"Missing: {'; '.join(names)} (family-wise p {said_p(p)}).{left}"
+
+
+def said_ruled_out(found: DiscoveryResult) -> str:
+    """What would explain the data as well as what is proposed, or better, but for its size; empty for nothing.
+
+    Beside names it is said of what would explain more than they do alone.
+    """
+    candidates = found.implausible
+    if found.verdict != "unnamed":
+        candidates = tuple(a for a in candidates if a.rise_chi2 < -found.settings.same)
+    if not candidates:
+        return ""
+    first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
+    gain = f"{-first.rise_chi2:.0f} σ² more" if first.rise_chi2 < -found.settings.same else "as much"
+    return f"{' and '.join(first.effects)} would explain {gain}, and is ruled out by size alone: {first.why}."
+
+
+def said_standing(found: DiscoveryResult) -> str:
+    """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
+    if not found.standing:
+        return ""
+    if found.verdict == "unnamed":
+        return f"Why no name: {found.standing}."
+    return f"The names keep their significance {found.standing}."
+
+
+def stated_value_said(name: str, s: StatedValue) -> str:
+    """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
+    return f"{name} is {s.value:.3g} {s.unit}".strip() + f" (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+
+
+def alike_said(e: FoundEffect) -> str:
+    """What these data cannot tell from an effect: other effects, and stated values that may be wrong instead."""
+    others = ", ".join(list(e.members)[1:])
+    values = " or ".join(stated_value_said(name, s) for name, s in e.stated.items())
+    return ", or ".join(words for words in (others, values) if words)
 
 
 def stated_in_words(space: CandidateSpace, shifts: Sequence[Shift]) -> list[str]:
