@@ -399,8 +399,11 @@ def said_ruled_out(found: DiscoveryResult) -> str:
     if not candidates:
         return ""
     first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
-    gain = f"{-first.rise_chi2:.0f} σ² more" if first.rise_chi2 < -found.settings.same else "as much"
-    return f"{' and '.join(first.effects)} would explain {gain}, and is ruled out by size alone: {first.why}."
+    what = "the curve" if found.verdict == "unnamed" else "what is proposed"
+    more = first.rise_chi2 < -found.settings.same
+    gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
+    are = "are" if len(first.effects) > 1 else "is"
+    return f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
 
 
 def said_standing(found: DiscoveryResult) -> str:
