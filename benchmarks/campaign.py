@@ -40,6 +40,7 @@ class Task:
     replicates: int = 500
     robot: str = "nominal"
     narrow: bool = False
+    stratum: str = ""
 
 
 @functools.cache
@@ -112,6 +113,7 @@ def campaign(
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--robot", default="nominal", help="of the paper's robot's cases")
+    parser.add_argument("--stratum", default="", help="one stratum of the wide kinds alone, e.g. plain")
     parser.add_argument("--narrow", action="store_true", help="one surface, its adhesion stated, as before")
     parser.add_argument("--out", type=Path, default=Path(out))
     parser.add_argument("--cache", type=Path, help="folder of compiled programs that the workers share")
@@ -126,7 +128,7 @@ def campaign(
     done = {(x["kind"], x["seed"]) for x in lines}
     wanted = {kind: getattr(given, kind) for kind in kinds}
     tasks = [
-        Task(kind, seed, given.replicates, given.robot, given.narrow)
+        Task(kind, seed, given.replicates, given.robot, given.narrow, given.stratum)
         for kind, count in wanted.items()
         for seed in range(given.first, given.first + count)
         if (kind, seed) not in done

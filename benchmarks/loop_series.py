@@ -50,7 +50,9 @@ STATED = {
 KEPT = ("variety", "surface", "robot", "rows", "noise", "outliers", "missing", "grips")
 
 
-def attempt(kind: str, seed: int, narrow: bool = False) -> tuple[dict, dict, sw.SeriesCase | None] | str:
+def attempt(
+    kind: str, seed: int, narrow: bool = False, only: str = ""
+) -> tuple[dict, dict, sw.SeriesCase | None] | str:
     """Table, label and case of a kind and a seed, or why there is none.
 
     Every constant that has a prior is off its nominal value, and refitted when an effect is sized, as in the loop.
@@ -70,6 +72,7 @@ def attempt(kind: str, seed: int, narrow: bool = False) -> tuple[dict, dict, sw.
         usual = [s for s in strata if s != "robots" or kind in ("library", "pairs", "triples", "noise")]
         share = np.array([SHARES[s] for s in usual])
         stratum = str(rng.choice(usual, p=share / share.sum()))
+    stratum = only or stratum
     w = sw.world(rng, stratum, variety, noise=(0.5, 2.0)[seed % 2] if kind == "noise" else 1.0)
     pool = {
         "library": lambda: w.pool, "outside": lambda: OUTSIDE, "blind": sw.foreign, "event": lambda: tuple(sw.EVENTS),
@@ -107,7 +110,7 @@ def work(task: Task) -> dict:
     from calibration.data import robot_file
     from calibration.data.runs import Runs
 
-    made = attempt(task.kind, task.seed, task.narrow)
+    made = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(made, str):
         return {"skipped": made}
     table, label, case = made

@@ -23,7 +23,7 @@ from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
 from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
-from calibration.discovery.outliers import Screening, screen
+from calibration.discovery.outliers import Screening, screen, screen_beside
 from calibration.discovery.result import DiscoveryResult, FoundEffect, HeldOutAlternative, Remainder, Sensitivity
 from calibration.discovery.score_tests import bootstrap, diagnosed
 from calibration.discovery.search import Search, search
@@ -36,13 +36,15 @@ from calibration.inference.bases import Bases
 from calibration.inference.foreign import foreign_priors
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.noise import Noise
-from calibration.inference.noise_factor import noise_factors, noise_remarks
+from calibration.inference.noise_factor import common_factors, noise_remarks
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
 
 #: Factors on an assumed noise at which the verdict is looked at too.
 FACTORS = (0.5, 2.0)
+#: Times that rows are looked through for such as stand alone, with what was found.
+SCREENINGS = 4
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
 
@@ -231,22 +233,30 @@ def trace(
 
     screened = look(noise)
     residuals = residuals_of(screened, runs)
-    factors = {} if screened.cluster is not None else noise_factors(residuals)
-    sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)) if factors else ())
+    factors = {} if screened.cluster is not None else common_factors(residuals)
+    sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
         progress("the sds are not as stated: the same with those that the residuals show")
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
         screened = look(sds.noise)
-    base, space, bases = screened.base.candidate, screened.base.space, screened.bases
 
-    progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
-    left = diagnosis_of_base(screened, settings)
-    if not left.test.rejected and screened.cluster is None:
-        return Traced("none", screened, left, sds)
+    for _ in range(SCREENINGS):
+        base, space, bases = screened.base.candidate, screened.base.space, screened.bases
+        progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
+        left = diagnosis_of_base(screened, settings)
+        if not left.test.rejected and screened.cluster is None:
+            return Traced("none", screened, left, sds)
+        progress("something is missing: fitting every effect that could explain it")
+        searched = search(space, base, left, bases, settings, progress)
+        best, after = searched.best, searched.diagnosis
+        if after is None or not after.test.rejected_with_margin:
+            break
+        more = screen_beside(screened, after.scores, lambda base: bases_at(runs, base), runs, settings)
+        if more is None:
+            break
+        progress("rows stand alone beside what was found: the same without them")
+        screened = more
 
-    progress("something is missing: fitting every effect that could explain it")
-    searched = search(space, base, left, bases, settings, progress)
-    best, after = searched.best, searched.diagnosis
     stood = standing(space, base, searched, left, bases, settings)
     if best is None or after is None or not stood.stands:
         where = locate(space.bare.observe, left.scores, bases)
@@ -363,7 +373,7 @@ def _statement(traced: Traced) -> str:
     if aside > MANY * (aside + counting):
         share = 100 * aside / (aside + counting)
         said = f"{aside} of {aside + counting} rows ({share:.0f} %) lie off alone and are set aside. {said}"
-    if traced.sds.remarks and traced.verdict == "none":
+    if traced.sds.factors and traced.verdict == "none":
         said = f"{said} But {'; '.join(traced.sds.remarks)}"
     if traced.screened.cluster is not None:
         said = f"{said} {str(traced.screened.cluster).capitalize()}: that is a finding, and none is set aside."

@@ -13,7 +13,7 @@ from scipy import stats
 from calibration.data.runs import Runs
 from calibration.discovery.candidates import BaseFit, empty, fit_base
 from calibration.discovery.clusters import LEVELS, Cluster, cluster
-from calibration.discovery.score_tests import Diagnosed, diagnosed
+from calibration.discovery.score_tests import Diagnosed, ScoreTable, diagnosed
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
@@ -69,27 +69,48 @@ def _together(found: Screening, outliers: np.ndarray, runs: Runs, settings: Sett
     return cluster(outliers[:rows], included[:rows], axes, levels, settings.outlier_error, settings.seed)
 
 
+def screen_beside(
+    found: Screening, left: ScoreTable, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings
+) -> Screening | None:
+    """Rows that stand alone at a fit with effects, set aside too: what was missing hid them. None where there are no
+    further ones, or they stand together.
+
+    Args:
+        left: what could explain what that fit leaves.
+    """
+    counting = found.base.space.included.sum() + len(found.outliers)
+    allowed = int(settings.outlier_share * counting) - len(found.outliers)
+    far = _alone(found.base, left, found.bases, allowed, settings)
+    if not far.size or found.cluster is not None:
+        return None
+    base = _again(found.base, far, settings, runs.source)
+    more = Screening(base, (*found.outliers, *map(int, far)), *_look(base, bases_at, settings))
+    outliers = np.zeros(len(base.space.included), bool)
+    outliers[list(more.outliers)] = True
+    return None if _together(more, outliers, runs, settings) is not None else more
+
+
+def _alone(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
+    """Indices of rows of which a reading's own shift explains more than any effect or curve, at most so many."""
+    included = base.space.included
+    level = stats.norm.isf(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
+    alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
+    smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.names(bases)]
+    together = max(np.max(np.asarray(scores.single) ** 2), np.max(np.asarray(scores.explained)[smooth]))
+    count = 1 if base.space.bare.observe.policy.one_by_one else allowed
+    far = np.argsort(-alone)[: min(count, max(allowed, 0))]
+    return far[(alone[far] >= level) & (alone[far] ** 2 >= together)]
+
+
 def _screened(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings, where: str) -> Screening:
     """Rows whose own shift explains more than any effect or curve, set aside."""
     allowed = int(settings.outlier_share * base.space.included.sum())
     base, outliers = _set_gross_aside(base, settings, where)
-    included = base.space.included
-    count = base.space.weight.shape[1]
-    level = stats.norm.isf(settings.outlier_error / 2 / (count * included.sum()))
     bases, seen = _look(base, bases_at, settings)
     while len(outliers) < allowed:
-        included, scores = base.space.included, seen[1]
-        alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
-        k = int(alone.argmax())
-        smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.names(bases)]
-        curves = np.asarray(scores.explained)[smooth]
-        together = max(np.max(np.asarray(scores.single) ** 2), np.max(curves))
-        if alone[k] < level or alone[k] ** 2 < together:
+        far = _alone(base, seen[1], bases, allowed - len(outliers), settings)
+        if not far.size:
             break
-        far = np.array([k])
-        if not base.space.bare.observe.policy.one_by_one:
-            far = np.argsort(-alone)[: allowed - len(outliers)]
-        far = far[(alone[far] >= level) & (alone[far] ** 2 >= together)]
         outliers = (*outliers, *map(int, far))
         base = _again(base, far, settings, where)
         bases, seen = _look(base, bases_at, settings)

@@ -66,7 +66,7 @@ class Settings:
     form_family: float = 0.4
     alike: float = 0.5
     needed: float = 5.0
-    preferred: float = 6.0
+    preferred: float = 9.0
     alternative: float = 9.0
     outlier_share: float = 0.1
     outlier_error: float = 0.01

@@ -86,11 +86,15 @@ def _ruled_out(
 
 def cost_of_names(space: CandidateSpace, best: Candidate, settings: Settings) -> float:
     """What the fall of χ² by a set of effects is worth less [σ²]: for what their amplitudes and shapes were free to
-    take, and the number of sets of its size."""
+    take, and the number of sets of its size.
+
+    As of a curve, the prior of an amplitude is taken of the size that the data find most likely, which is its own.
+    """
     at = [space.free + slot for slot, name in enumerate(best.active) if name]
-    sds = np.asarray(best.sd)[at + [k + settings.slots for k in at]]
-    taken = -2 * np.sum(np.log(np.clip(sds, 1e-6, 1.0)))
-    return float(taken + 2 * math.log(math.comb(len(space.library), len(at))))
+    sds = np.clip(np.asarray(best.sd), 1e-6, 1.0)
+    amplitudes = np.minimum(-2 * np.log(sds[at]), 1 + np.log1p((np.asarray(best.z)[at] / sds[at]) ** 2))
+    shapes = -2 * np.log(sds[[k + settings.slots for k in at]])
+    return float(np.sum(amplitudes) + np.sum(shapes) + 2 * math.log(math.comb(len(space.library), len(at))))
 
 
 def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> float:

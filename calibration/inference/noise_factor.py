@@ -10,17 +10,24 @@ from mmrjax import channels
 
 #: Factor on the sds from which it is said, either way; probability under right sds below which it is.
 OFF, IMPROBABLE = 1.25, 0.001
+#: Error of structure that speaks against sds that are off alike in every channel.
+BEYOND_DOUBT = 0.005
+#: Fewest degrees of freedom of a channel for its residuals to be told from structure.
+FEWEST = 30
 #: How far apart the factors of channels may be to be called the same.
 ALIKE = 1.3
 
 
-def noise_factors(fit: Residuals) -> dict[str, float]:
+def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
     """By how much the residuals of each channel exceed its sds, where that is sure; none where they have structure.
 
     Structure is looked for with sds as the misfit says, so that it does not depend on those that are stated.
+
+    Args:
+        level: family-wise error of seeing some where there is none.
     """
     tests = structure(fit.rescaled(), known=False)
-    if tests and min(p for p, _ in tests) * len(tests) < LEVEL:
+    if tests and min(p for p, _ in tests) * len(tests) < level:
         return {}
     found = {}
     for name, chi2, freedom in zip(channels.names(), fit.chi2.tolist(), fit.freedom.tolist(), strict=True):
@@ -31,6 +38,19 @@ def noise_factors(fit: Residuals) -> dict[str, float]:
         if max(factor, 1 / factor) > OFF and p < IMPROBABLE:
             found[name] = factor
     return found
+
+
+def common_factors(fit: Residuals) -> dict[str, float]:
+    """`noise_factors`, where every channel has one and they are the same; none else, or where readings are too few.
+
+    What the model lacks shows in some channels more than in others: structure has to be beyond doubt to speak against
+    sds that are off everywhere alike.
+    """
+    factors = noise_factors(fit, BEYOND_DOUBT)
+    shown = [k for k in range(fit.there.shape[1]) if fit.there[:, k].any()]
+    enough = bool(np.all(fit.freedom[shown] >= FEWEST))
+    alike = factors and max(factors.values()) < ALIKE**2 * min(factors.values())
+    return factors if enough and len(factors) == len(shown) > 1 and alike else {}
 
 
 def noise_remarks(fit: Residuals, word: str = "stated") -> list[str]:
