@@ -403,7 +403,9 @@ def said_ruled_out(found: DiscoveryResult) -> str:
     more = first.rise_chi2 < -found.settings.same
     gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
     are = "are" if len(first.effects) > 1 else "is"
-    return f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
+    return (
+        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
+    )
 
 
 def said_standing(found: DiscoveryResult) -> str:
