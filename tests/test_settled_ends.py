@@ -89,7 +89,7 @@ def test_ends_of_runs_that_grip_are_those_of_settled_travel(monkeypatch):
 
 def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
     """On a slope beyond its adhesion a robot spins its movers, and its steady state is none."""
-    ends, slides, _, sound = ends_of(monkeypatch, (0.12, 0.6))
+    _, slides, _, sound = ends_of(monkeypatch, (0.12, 0.6))
     assert not sound.all() and sound[3:].all()
     np.testing.assert_array_equal(slides, ~sound)
 
