@@ -24,7 +24,7 @@ SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.sche
 
 
 def happening():
-    """A clean table in random order, with the speed shown 4 % too low in ten runs that were made one after another."""
+    """A clean table in random order, with the speed shown 12 mm/s too low in fifteen runs that were made one after another."""
     p = dict(g.CLIMBING)
     c = g.table8(p)
     columns = g._table(c, *g.readings(c, p), g.Instruments(), np.random.default_rng(1))
@@ -127,6 +127,7 @@ def test_what_happens_for_a_while_has_a_window(shown, capsys):
     # the place is told to within half a window
     assert window["low"] >= 25 and window["high"] <= 50
     assert f"in runs {window['low']:.0f} to {window['high']:.0f}" in got.printed
+    assert not any("everywhere alike" in note for note in got.document["notes"])
     assert "curve" in drawn(got.text) and "order" in got.found.rows_table()
     assert got.document["next_experiment"]["name"] == "the same runs again"
     assert f"runs {window['low']:.0f} to {window['high']:.0f} again" in got.document["next_experiment"]["description"]

@@ -471,7 +471,9 @@ def finished(
         settings=settings,
         replicates=len(left.test.null.single),
     )
-    return dataclasses.replace(result, notes=(*traced.sds.remarks, *remarks(result)))
+    # What happens for a while is not everywhere alike.
+    of_noise = traced.sds.remarks if traced.sds.factors or not traced.events else ()
+    return dataclasses.replace(result, notes=(*of_noise, *remarks(result)))
 
 
 def residuals_of(screened: Screening, runs: Runs) -> Residuals:
