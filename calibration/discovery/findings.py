@@ -18,6 +18,7 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Discrepancy, Location
 from calibration.discovery.experiments import Proposal
+from calibration.discovery.hidden import Hidden
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
@@ -27,6 +28,7 @@ from calibration.discovery.result import (
     Evidence,
     Formula,
     FoundEffect,
+    HiddenEffect,
     KindOfEvidence,
     Member,
     NextExperiment,
@@ -172,6 +174,21 @@ def alternatives(
         seen.add(c.key)
         near[0 if c.plausible else 1].append(_alternative(space, c, rise))
     return tuple(near[0]), tuple(near[1])
+
+
+def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[HiddenEffect, ...]:
+    """Effects that a name could hide, in their units."""
+    return tuple(
+        HiddenEffect(
+            h.name,
+            h.amplitude * size_of(space.library[h.name]),
+            amplitude_of(space.library[h.name]).spec.unit,
+            h.sigmas,
+            h.experiment,
+            h.separation,
+        )
+        for h in found
+    )
 
 
 def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> Alternative:

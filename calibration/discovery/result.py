@@ -130,6 +130,19 @@ class Remainder:
 
 
 @dataclasses.dataclass(frozen=True)
+class HiddenEffect:
+    """An effect that what was found could hide: its largest amplitude in `unit`, the sigmas that it would leave by
+    itself [σ], and the experiment that would show it with its expected separation [σ] ("" and 0 for none)."""
+
+    name: str
+    amplitude: float
+    unit: str
+    sigmas: float
+    experiment: str
+    separation: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Alternative:
     """Effects that were fitted and are not proposed.
 
@@ -285,6 +298,7 @@ class DiscoveryResult:
         next_experiment: what would tell more; None where nothing is left to tell apart.
         cannot_see: effects that the data cannot show; needs_histories: that only histories can.
         alternatives, implausible: candidates nearly as good; such that would be but for their size or sign.
+        hidden: effects that what was found could hide, the largest first.
         standing: why names do not stand, or beside what they do; "" where there is nothing to say.
         before, after: evidence in what base and proposed robot leave.
         chi2: twice the objective before and after [σ²]; readings: that count.
@@ -321,6 +335,7 @@ class DiscoveryResult:
     needs_histories: tuple[str, ...]
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
+    hidden: tuple[HiddenEffect, ...]
     standing: str
     before: Evidence
     after: Evidence
@@ -369,6 +384,7 @@ class DiscoveryResult:
             **self.detail.to_json(),
             "alternatives": [dataclasses.asdict(a) for a in self.alternatives],
             "implausible": [dataclasses.asdict(a) for a in self.implausible],
+            "hidden": [dataclasses.asdict(h) for h in self.hidden],
             "standing": self.standing,
             "errors": {
                 # nothing is fitted as stated, so both are the same
