@@ -55,7 +55,7 @@ def hidden(
     """Effects that the names of the best candidate could hide, the largest first.
 
     Args:
-        alike: its classes, whose members are told of there; left: what the base leaves; after: what that candidate leaves.
+        alike: its classes, whose members are listed there; left: what the base leaves; after: what that fit leaves.
         ask: whether experiments that would show them are looked for.
     """
     found, named = [], {n for members in alike.members for n in members}
