@@ -154,6 +154,7 @@ def _declared(effect: type[Effect]) -> str:
         "on the battery alone" * effect.needs_battery,
         "odd in travel" * effect.odd_in_travel,
         f"on {effect.movers} alone" * bool(effect.movers),
+        f"rests on `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
     ]
     return ", ".join(filter(None, words)) or "-"
 
@@ -177,8 +178,11 @@ def page() -> str:
         "(`movers`), that it keeps its sign in space when the robot is turned about (`odd_in_travel`). A robot file",
         'may name the configurations that one acts on: `[effects.churning] configurations = ["4W2T"]`.',
         "",
-        "| effect | balance | equation | unit | plausible: sd, bounds | shape parameters | declares |",
-        "|---|---|---|---|---|---|---|",
+        "Effects of one equation that change with one and the same thing are a family: forms of a law that data may",
+        "not tell apart. Where no single name is sure, the loop names the family.",
+        "",
+        "| effect | balance | family | equation | unit | plausible: sd, bounds | shape parameters | declares |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for effect in ALL:
         spec = amplitude(effect)
@@ -188,7 +192,7 @@ def page() -> str:
         where = effect.balance + (f": {effect.channel}" if effect.channel else "")
         low, high = spec.bounds
         lines.append(
-            f"| `{effect.name}` | {where} | {_about(effect)[0]} | {spec.unit} | "
+            f"| `{effect.name}` | {where} | {effect.family()} | {_about(effect)[0]} | {spec.unit} | "
             f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {_declared(effect)} |"
         )
     lines += [

@@ -26,6 +26,7 @@ CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
     "battery": (0.0, 1.0, ""),
     "discharge": (0.0, 360_000.0, "C"),
     "adhesion": (1e-3, 100.0, ""),
+    "order": (0.0, 1e9, ""),
     "total_mass": (0.1, 500.0, "kg"),
 }
 

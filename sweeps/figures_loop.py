@@ -144,7 +144,7 @@ def ladder(found: DiscoveryResult) -> Figure:
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set(xlabel="what the effect alone would explain, after the base has been fitted again [σ]")
+    axes.set(xlabel="score: what the effect alone, at a plausible size, would explain beside the base [σ], linearly")
     axes.set_title("blue: found; light blue: these data cannot tell it from one that was found")
     return fig
 
@@ -253,9 +253,8 @@ def base_shift(found: DiscoveryResult) -> Figure:
 
 def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy) -> Figure:
     """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
-    column, factor, words = VARIABLE_WORDS.get(
-        found.variable, ("", 1.0, f"phase of the wave, {found.variable} [rad]")
-    )
+    variable = found.variable if found.window is None else str(found.window["axis"])
+    column, factor, words = VARIABLE_WORDS.get(variable, ("", 1.0, f"phase of the wave, {variable} [rad]"))
     fig, grid = figure(1, 1, 3.4)
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
@@ -263,7 +262,9 @@ def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy) -> Figure:
         there = np.isfinite(found.defect)
         axes.errorbar(np.asarray(table[column])[there] * factor, found.defect[there], 2 * found.defect_sd[there],
                       fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip
-    scale = SHOWN.get(found.variable, 1.0)
+    scale = SHOWN.get(variable, 1.0)
+    if found.window is not None:
+        axes.axvspan(float(found.window["low"]), float(found.window["high"]), color="#eeeeee", lw=0, zorder=0)
     low, high = found.value - 1.96 * found.sd, found.value + 1.96 * found.sd
     axes.fill_between(found.at * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
     axes.plot(found.at * scale, found.value, color=GREEN, label="smooth curve")
@@ -281,5 +282,6 @@ VARIABLE_WORDS = {
     "payload": ("payload_kg", 1.0, "payload [kg]"),
     "speed": ("speed_mm_s", 1.0, "speed [mm/s]"),
     "time": ("time_s", 1.0, "time since the start [s]"),
+    "order": ("order", 1.0, "order of the runs"),
 }
 SHOWN = {"speed_motor": 1 / RPM, "slope": 180 / np.pi, "speed": 1 / MM}

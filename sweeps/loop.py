@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.table import Table
 
 from calibration.data import effect_file, robot_file
-from calibration.discovery import preference
+from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import priors
@@ -57,20 +57,25 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person."""
     say(f"{found.verdict}: {found.statement}")
+    for said in (findings.said_standing(found), findings.said_ruled_out(found)):
+        if said:
+            say(said)
     rise = preference.said_worse(found.held_out_worse, found.errors_held_out)
     if rise:
         say(rise)
     if found.effects:
         shown = Table(box=None, pad_edge=False)
-        for heading in ("effect", "balance", "amplitude", "Δχ²", "indistinguishable from"):
-            shown.add_column(heading, justify="right" if heading in ("amplitude", "Δχ²") else "left", no_wrap=True)
+        for heading in ("effect", "what is missing", "amplitude", "explains [σ²]", "own p", "indistinguishable from"):
+            number = heading in ("amplitude", "explains [σ²]", "own p")
+            shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
         for e in found.effects:
             a = e.parameters["amplitude"]
             shown.add_row(
-                e.name, e.balance, f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", f"{e.score:.0f}",
-                ", ".join(list(e.members)[1:]) or "-",
+                e.name, ", or ".join(e.families), f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", f"{e.score:.0f}",
+                f"{e.p_value:.2g}", findings.alike_said(e) or "-",
             )  # fmt: skip
         say(shown)
+        say("explains: rise of χ² without it, all else fitted again; own p: among the strongest of the library")
     if found.unnamed is not None:
         say(f"{found.unnamed.proposal.formula} ({found.unnamed.proposal.mark})")
     after = found.next_experiment

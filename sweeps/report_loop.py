@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from calibration.discovery import preference
+from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
 from sweeps import figures_loop
@@ -29,6 +29,13 @@ def _over_time(album: Album, found: DiscoveryResult) -> None:
 
 #: What a page shows of one kind of data, by the type of the result's detail.
 SECTIONS: dict[type[Detail], Section] = {EquationDefects: _run_by_run, TimeStatistics: _over_time}
+
+
+def alike(found: DiscoveryResult) -> list[str]:
+    """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
+    if found.unnamed is not None:
+        return [", ".join(b for b in found.unnamed.balances_alike if b != found.unnamed.balance)]
+    return [findings.alike_said(e) for e in found.effects]
 
 
 def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
@@ -57,6 +64,11 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         album,
         title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
         document=found.to_json(),
+        p=findings.said_p(found.before.p_value),
+        cluster=str(found.cluster or ""),
+        standing=findings.said_standing(found),
+        ruled_out=findings.said_ruled_out(found),
+        alike=alike(found),
         worse=preference.said_worse(found.held_out_worse, found.errors_held_out),
         rows=first_rows(found.rows_table()),
         columns=columns(),

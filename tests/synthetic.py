@@ -55,11 +55,11 @@ class Analyst:
 
     def base(self, runs: Runs) -> BaseFit:
         """The base fitted to a table."""
-        return fit_base(self.space(runs), self.settings)
+        return fit_base(self.space(runs), self.settings, runs.source)
 
     def screened(self, runs: Runs) -> Screening:
         """The base fitted to a table, rows that stand alone set aside."""
-        return screen(self.base(runs), lambda base: discover.bases_at(runs, base), runs, self.settings, runs.source)
+        return screen(self.base(runs), lambda base: discover.bases_at(runs, base), runs, self.settings)
 
     def trace(self, runs: Runs) -> Traced:
         """The stages of the loop up to its verdict."""

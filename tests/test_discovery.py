@@ -14,17 +14,18 @@ from scipy import stats
 from synthetic import SETTLED, known, parts, table
 
 from calibration.data.runs import Runs
+from calibration.data.runs import read as read_runs
 from calibration.discovery import discover
-from calibration.discovery.discrepancy import locate
+from calibration.discovery.candidates import fit_base
+from calibration.discovery.outliers import screen
 from calibration.discovery.score_tests import bootstrap, diagnosed, score_tests
-from calibration.discovery.search import search
-from calibration.inference import bases
+from calibration.inference import bases, noise
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED, amplitude_of, scored, shape_of
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.inference.optimizers import observation
-from mmrjax import params
+from mmrjax import params, robots
 from mmrjax.effects import BY_NAME
 
 
@@ -66,7 +67,8 @@ def set_aside(traced) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 def test_clean_table_lacks_nothing(clean):
     found = clean.traced
-    assert found.verdict == "none" and found.members == () and found.searched is None and found.discrepancy is None
+    assert found.verdict == "none" and found.members == () and found.searched is None
+    assert found.where is None and found.standing is None and found.families == ()
     assert found.best is clean.base and found.ends is clean.left and set_aside(found) == ((), ())
     assert clean.left.test.p_value > 0.05
     # χ² of readings and priors is what noise leaves of as many readings
@@ -112,19 +114,12 @@ OUTSIDE = ["supply_hunting"], 12.0, 2
 
 
 def test_effect_outside_the_library_gets_no_name():
-    """As `trace` decides it, without the curve, which compiles for long."""
-    runs = table(g.case(*OUTSIDE))
-    screened = SETTLED.screened(runs)
-    space, base, bases_ = screened.base.space, screened.base.candidate, screened.bases
-    left = discover.diagnosis_of_base(screened, SETTLED.settings)
-    searched = search(space, base, left, bases_, SETTLED.settings, lambda text: None)
-    assert left.test.rejected
-    assert discover.not_to_the_point(space, base, searched.best) or discover.stands_for_a_curve(
-        space, left, searched.diagnosis, bases_
-    )
-    where = locate(space.bare.observe, left.scores, bases_)
+    found = SETTLED.trace(table(g.case(*OUTSIDE)))
+    where = found.where
+    assert found.verdict == "unnamed" and found.members == () and found.left.test.rejected
+    assert found.searched is not None and not found.standing.stands and found.standing.reason
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.alike)
-    assert where.variable in bases.VARIABLES
+    assert where.variable in bases.VARIABLES and found.families == (where.family,)
 
 
 @pytest.mark.slow
@@ -346,3 +341,13 @@ def test_null_of_one_column_is_normal(clean):
     # χ² of readings and priors less the coordinates that were fitted
     freedom = 3 * len(clean.runs)
     assert abs(np.mean(null.chi2) - freedom) < 4 * np.sqrt(2 * freedom / len(null.chi2))
+
+
+@pytest.mark.slow
+def test_bootstrap_of_the_measured_runs_settles():
+    """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
+    runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
+    sd = noise.assumed(runs, SettledRuns.sizes(runs), None).sd
+    space = discover.pose(runs, robots.nominal(), sd, settings, {}, SETTLED.library)
+    screened = screen(fit_base(space, settings, "measured"), lambda b: discover.bases_at(runs, b), runs, settings)
+    assert len(discover.diagnosis_of_base(screened, settings).test.null.single) >= 0.98 * settings.replicates

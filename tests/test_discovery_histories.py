@@ -20,6 +20,7 @@ from calibration.discovery.discrepancy import fit_discrepancy, locate
 from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.search import search
 from calibration.discovery.settings import settings_for
+from calibration.discovery.standing import standing
 from calibration.inference import bases, noise
 from calibration.inference.linearization import PROBED, scored, shape_of
 from calibration.inference.observers import Histories
@@ -91,13 +92,10 @@ def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
 
 
 def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
-    """As `trace` decides it, without the curve."""
     space, left, searched = oval.space, oval.left, oval.searched
-    best, after = searched.best, searched.diagnosis
     assert left.test.rejected
-    assert discover.not_to_the_point(space, oval.base, best) or discover.stands_for_a_curve(
-        space, left, after, oval.bases
-    )
+    stood = standing(space, oval.base, searched, left, oval.bases, ANALYST.settings)
+    assert not stood.stands and stood.reason
     where = locate(space.bare.observe, left.scores, oval.bases)
     assert {"track", "gearbox", "motor"} <= {where.balance, *where.alike}
     assert where.variable == "order 2 of the driving shaft"

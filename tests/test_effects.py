@@ -23,7 +23,7 @@ from conftest import REPRESENTATIVE
 import mmrjax
 from mmrjax import balances, channels, effects, params, robots
 from mmrjax.conditions import Conditions
-from mmrjax.effects import ALL, BY_NAME, Effect
+from mmrjax.effects import ALL, BY_NAME, Effect, base
 from mmrjax.effects.contract import readable
 from mmrjax.effects.periodic import Periodic
 from mmrjax.fidelities import half_robot
@@ -64,7 +64,7 @@ SIGNAL_UNITS = {
     "torque_input torque_gear torque_net",
     "H": "inductance",
     "kg·m^2": "inertia_added",
-    "-": "on_tracks battery slope adhesion direction direction_travel efficiency_load",
+    "-": "on_tracks battery slope adhesion order direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}
@@ -221,6 +221,58 @@ def law_declared(effect: type[Effect]) -> None:
         dimensions(p.spec.unit)
 
 
+#: What an effect's term may change with → the signals that make it.
+DRIVERS = {
+    "current": ("current", "total_current"),
+    "speed": ("speed_motor", "speed_wheel", "speed_theoretical", "speed"),
+    "load": (
+        "current", "payload", "mass", "normal", "demand", "traction", "torque_load", "torque_track_loss",
+        "torque_electromagnetic",
+    ),
+    "demand": ("demand", "traction", "resistance"),
+    "weight": ("normal", "mass"),
+    "slope": ("slope",),
+    "configuration": ("configuration", "on_tracks"),
+    "angle": (),
+}  # fmt: skip
+#: Of what a term without a driver is the same share everywhere, by its balance or channel; 1: the same everywhere.
+SHARED = {
+    "mass": ("mass",),
+    "slip": ("speed_theoretical",),
+    "total_current": ("total_current",),
+    "motor_speed": ("speed_motor",),
+    "speed": ("speed",),
+}
+
+
+def law_family(effect: type[Effect]) -> None:
+    """Its family is its equation and its driver; its term changes with that driver, or is a share without one."""
+    assert effect.family().startswith(base.EQUATION[effect.balance]) and effect.driver in ("", *DRIVERS)
+    assert (effect.driver or "same share everywhere") in effect.family()
+    assert all(name in {p.name for p in params.walk(robots.nominal())} for name in effect.rests_on)
+    made = fitted(effect, size(effect))
+    before = terms(made)
+    if not effect.driver:
+        of = [
+            np.ones_like(before),
+            *(np.asarray(getattr(STATES, n)) for n in SHARED.get(effect.channel or effect.balance, ())),
+        ]
+        shares = [before / x for x in of]
+        assert any(np.ptp(x) < 1e-9 * np.abs(x).max() for x in shares), "varies, and says not with what"
+        return
+    if effect.driver == "angle" or effect.memory_size is not None:
+        assert (effect.driver == "angle") == issubclass(effect, Periodic)
+        return
+    moved = {
+        n: 0.5 * getattr(STATES, n) if n != "configuration" else 1 - STATES.configuration
+        for n in DRIVERS[effect.driver]
+    }
+    if effect.driver == "configuration":
+        moved["on_tracks"] = 1 - STATES.on_tracks
+    after = terms(made, signals=dataclasses.replace(STATES, **moved))
+    assert np.abs(after - before).max() > 1e-3 * np.abs(before).max(), f"does not change with {effect.driver}"
+
+
 def law_absent_at_zero(effect: type[Effect]) -> None:
     """Zero amplitude changes no number of the steady state, to the last bits."""
     bare = compiled(outputs_steady, ())[0](jnp.zeros(0))
@@ -330,7 +382,7 @@ def law_travel(effect: type[Effect]) -> None:
 
 
 LAWS = (
-    *(law_declared, law_absent_at_zero, law_alive_at_zero, law_linear, law_unit, law_dissipative),
+    *(law_declared, law_family, law_absent_at_zero, law_alive_at_zero, law_linear, law_unit, law_dissipative),
     *(law_readable, law_travel),
 )
 
@@ -353,6 +405,7 @@ class Good(Effect):
     """ΔU = a I. Source: none, the control of the mutants."""
 
     balance = "electrical"
+    driver = "current"
     dissipative = True
     amplitude: Scalar = amplitude()
 
@@ -505,7 +558,32 @@ class UnknownUnit(Good):
     amplitude: Scalar = amplitude(unit="furlong")
 
 
+class NoDriver(Good):
+    """ΔU = a I, and does not say so. Source: mutant."""
+
+    driver = ""
+
+
+class WrongDriver(Good):
+    """ΔU = a I, which no speed changes. Source: mutant."""
+
+    driver = "speed"
+
+
+class UnknownDriver(Good):
+    """Source: mutant."""
+
+    driver = "weather"
+
+
+class RestsOnNothing(Good):
+    """Source: mutant."""
+
+    rests_on = ("motor.resistance_termal",)
+
+
 MUTANTS = {
+    law_family: (NoDriver, WrongDriver, UnknownDriver, RestsOnNothing),
     law_absent_at_zero: (Present,),
     law_alive_at_zero: (Squared, Dead, NotFinite),
     law_linear: (Squared, Softplus, Present, Dead),

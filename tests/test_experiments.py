@@ -17,6 +17,7 @@ from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
 from calibration.discovery.reach import reach
+from calibration.discovery.stated_values import Shift
 from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
@@ -231,14 +232,28 @@ def test_unaffected_experiment_separates_nothing(seen):
 
 def candidates(*names):
     return tuple(
-        Candidate((n,), np.zeros(1), np.zeros(1), float(k), np.zeros(1), True, True) for k, n in enumerate(names)
+        Candidate((n,), np.zeros(1), np.zeros(1), float(k), np.zeros(1), np.zeros(1), True, True)
+        for k, n in enumerate(names)
     )
+
+
+def of_members(*members, ladder, stated=None):
+    """Classes of these members, all of one family."""
+    return Classes(members, stated or ((),) * len(members), (("family",),) * len(members), ladder)
 
 
 def test_alternatives_are_the_class_best_first():
     made = candidates("a", "b", "c", "d")
-    left = experiments.alternatives(made[2], Classes((("c", "a"),), made))
+    left = experiments.alternatives(made[2], of_members(("c", "a"), ladder=made))
     assert list(left) == ["c", "a"] and list(left.values()) == [made[2], made[0]]
+
+
+def test_stated_value_that_may_be_wrong_is_an_alternative():
+    made = candidates("a", "b", "")
+    alike = of_members(("a", "b"), ladder=made, stated=((Shift("motor.resistance", 0, made[2]),),))
+    left = experiments.alternatives(made[0], alike)
+    assert list(left) == ["a", "b", "motor.resistance"] and left["motor.resistance"] is made[2]
+    assert list(experiments.alternatives(made[0], alike, stated=False)) == ["a", "b"]
 
 
 def test_alternatives_of_two_classes_differ_in_one_effect():
@@ -246,7 +261,7 @@ def test_alternatives_of_two_classes_differ_in_one_effect():
         dataclasses.replace(c, active=pair)
         for c, pair in zip(candidates("", "", "", ""), [("a", "b"), ("c", "b"), ("d", "a"), ("c", "d")], strict=True)
     )
-    left = experiments.alternatives(made[0], Classes((("a", "c"), ("b", "d")), made))
+    left = experiments.alternatives(made[0], of_members(("a", "c"), ("b", "d"), ladder=made))
     assert list(left) == ["a + b", "c + b", "d + a"]
 
 
@@ -254,7 +269,7 @@ def test_alternatives_of_two_classes_differ_in_one_effect():
 def test_nothing_is_proposed_where_one_name_is_left(seen):
     space = seen["mass_error", "tension_friction"][1]
     (best,) = candidates("mass_error")
-    assert experiments.separating(space, best, Classes((("mass_error",),), (best,)), SETTINGS) is None
+    assert experiments.separating(space, best, of_members(("mass_error",), ladder=(best,)), SETTINGS) is None
 
 
 @pytest.mark.slow

@@ -53,6 +53,23 @@ def toy(rng, noise=1.0, missing=0.0, parameters=8, repeats=1):
     return Residuals(SettledRuns, runs, simulated, whitened, np.isfinite(whitened), jacobian, z)
 
 
+def drifting(made, drift):
+    """The same with runs made in random order, and all channels off by so many σ at its beginning, fading."""
+    rows = len(made.runs)
+    order = np.random.default_rng(5).permutation(rows) + 1.0
+    whitened = made.whitened + drift * np.exp(-order / 20)[:, None]
+    runs = dataclasses.replace(made.runs, columns=made.runs.columns | {"order": order})
+    return dataclasses.replace(made, runs=runs, whitened=whitened)
+
+
+def test_a_drift_from_run_to_run_is_structure_and_no_wrong_sd():
+    made = toy(np.random.default_rng(6), parameters=3)
+    assert noise_factors(drifting(made, 0.0)) == {} and noise_factors(drifting(made, 8.0)) == {}
+    assert noise_factors(dataclasses.replace(made, whitened=drifting(made, 8.0).whitened)) != {}  # without the order
+    found = judged(drifting(made, 8.0), estimated=True)
+    assert found.adequate is False and "follow the order of the runs" in found.shown_by
+
+
 def judged(made, estimated=False):
     """Adequacy with the noise stated, or estimated from the misfit as `calibrate` does."""
     return adequacy(made.rescaled() if estimated else made, known=not estimated)

@@ -167,10 +167,12 @@ def observers_alone_know_the_kind_of_data(path: PurePosixPath, tree: ast.Module)
 
 #: The configurations of the paper's robot, and its tables: rooms that reproduce the paper.
 REPRODUCTION = ("sweeps", "paper")
-#: Where channels may be spelled: what is read where nothing travels or turns, what a curve may be over.
+#: Where channels may be spelled: what is read where nothing travels or turns, what a curve may be over,
+#: what shows slip.
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("calibration/inference/bases.py", "VARIABLES"),
+    ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
     ("sweeps/figures_loop.py", "VARIABLE_WORDS"),  # words of the same variables
 }
 

@@ -32,6 +32,8 @@ CONDITIONS: dict[str, tuple[float, float]] = {
 TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
 #: Place of a row in the sequence in which runs were made; without it that of the row in the file.
 ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
+#: Columns that say when a row was measured; a table without either was measured in the order of its rows.
+WHEN = ("time_s", "order")
 WORDS = ("configuration", "surface", "run_id")
 #: Columns that every table has to have, and those that a table without measurements may lack.
 REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
@@ -215,7 +217,7 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
             columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
     _check_mass(name, columns)
     _check_deviations(name, columns)
-    if "order" not in columns and "time_s" not in columns:
+    if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c in header if c not in known_columns())
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest())

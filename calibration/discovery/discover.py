@@ -466,6 +466,7 @@ def finished(
         implausible=too_large,
         hidden=concealed,
         standing="" if traced.standing is None else traced.standing.reason,
+        cluster=screened.cluster,
         before=findings.evidence(left.test, adequate=not left.test.rejected),
         after=findings.evidence(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),

@@ -336,6 +336,17 @@ def _steps(variable: str, within: Reach) -> str | None:
     loaded = " and ".join(load) or "a brake or a drawbar pull"
     if variable in bases.ORDERS:
         return None
+    happens = bases.window(variable)
+    if happens is not None and happens.axis == "order":
+        return (
+            f"Make runs {happens.low:.0f} to {happens.high:.0f} again, and as many before and after them, in another "
+            "order: what comes back with them hangs on their conditions, what does not happened then"
+        )
+    if happens is not None:
+        return (
+            f"Make two of the runs again, sampled as finely as the instruments allow from {happens.low:.3g} to "
+            f"{happens.high:.3g} s, one of them with all that is switched in that time left as it is"
+        )
     return {
         "voltage": f"Repeat at one slope and payload with the supply voltage from {low:g} to {high:g} V in steps of "
         f"{step:g} V",
@@ -381,6 +392,7 @@ def denser(space: CandidateSpace, where: Location, settings: Settings) -> Propos
     how = _steady_speeds(variable, within) if finer is None else finer
     text = f"{how}; read every channel. What the {balance} balance lacks then shows its shape"
     name = f"finer steps in {variable}" if finer is not None else f"steady speeds for {variable}"
+    name = name if bases.window(variable) is None else "the same runs again"
     if sigma < settings.worth:
         text = f"A series in {variable} would show what is missing by {sigma:.1f} sigma"
         return Proposal((NONE,), text, (), 0.0, False, ())

@@ -22,6 +22,7 @@ from calibration.discovery.hidden import Hidden
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
+    DiscoveryResult,
     EffectScore,
     Errors,
     Estimate,
@@ -138,12 +139,14 @@ def _without_each(space: CandidateSpace, base: Candidate, best: Candidate, setti
 
 def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> UnnamedDiscrepancy:
     """The discrepancy of an `unnamed` verdict, over the rows of the table."""
-    f, lacks = found.proposal, found.defect
+    f, lacks, happens = found.proposal, found.defect, bases_room.window(where.variable)
     return UnnamedDiscrepancy(
         balance=where.balance,
         variable=where.variable,
         unit=found.unit,
         balances_alike=where.alike,
+        families=(where.family,),
+        window=None if happens is None else dataclasses.asdict(happens),
         effect=found.effect,
         p_value=p_value,
         score=float(found.chi2[0] - found.chi2[1]),
@@ -162,18 +165,24 @@ def alternatives(
 ) -> tuple[tuple[Alternative, ...], tuple[Alternative, ...]]:
     """Candidates that explain the data nearly as well as what is proposed; and those that would but for their size.
 
+    One that only adds effects to what is proposed, or to another one of these, is left out where these explain next
+    to nothing.
+
     Args:
         cost: of what is proposed [½σ²]; best: the same, where it is a candidate.
     """
     near: tuple[list[Alternative], list[Alternative]] = ([], [])
-    seen = {best.key}
-    for c in sorted(ladder, key=lambda x: x.cost):
+    simpler = {best.key: cost} if best.key else {}
+    for c in sorted(ladder, key=lambda x: (len(x.effects), x.cost)):
         rise = 2 * (c.cost - cost)
-        if c.key in seen or not c.effects or rise > settings.alternative:
+        if c.key in simpler or not c.effects or rise > settings.alternative:
             continue
-        seen.add(c.key)
-        near[0 if c.plausible else 1].append(_alternative(space, c, rise))
-    return tuple(near[0]), tuple(near[1])
+        if any(key < c.key and 2 * (x - c.cost) < settings.alternative for key, x in simpler.items()):
+            continue
+        simpler[c.key] = c.cost
+        near[0 if c.plausible else 1].append(_alternative(space, c, rise, settings))
+    plausible, ruled_out = (tuple(sorted(x, key=lambda a: a.rise_chi2)) for x in near)
+    return plausible, ruled_out
 
 
 def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[HiddenEffect, ...]:
@@ -191,18 +200,19 @@ def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[Hidd
     )
 
 
-def _alternative(space: CandidateSpace, c: Candidate, rise: float) -> Alternative:
+def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> Alternative:
     sds, sizes, why = {}, {}, []
-    for name, amplitude, size in zip(c.active, c.amplitude, c.size, strict=True):
+    for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
             continue
         sds[name], sizes[name] = float(amplitude), float(size)
+        sd = settings.width * float(c.sd[space.free + slot])
         if space.library[name].dissipative and amplitude <= 0:
             why.append(f"{name} would put power in")
         elif size >= 1:
             rests = " and ".join(space.library[name].rests_on) or amplitude_of(space.library[name]).spec.meaning
             why.append(f"{name} at {size:.2g} times its largest plausible size; check {rests}")
-        elif not c.plausible:
+        elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
             why.append(f"{name} is within an sd of the largest plausible size")
     amplitudes = {name: a * size_of(space.library[name]) for name, a in sds.items()}
     return Alternative(amplitudes, sds, sizes, float(rise), "; ".join(why))
@@ -279,7 +289,7 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
             EffectScore(
                 name=effect.name,
                 balance=effect.balance,
-                score=explained,
+                score=max(explained, 0.0),
                 amplitude=amplitude * size_of(effect),
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
@@ -393,6 +403,47 @@ def statement(
         names.append(said)
     left = "" if where is None else f" Something remains in the balance {where.balance}."
     return f"Missing: {'; '.join(names)} (family-wise p {said_p(p)}).{left}"
+
+
+def said_ruled_out(found: DiscoveryResult) -> str:
+    """What would explain the data as well as what is proposed, or better, but for its size; empty for nothing.
+
+    Beside names it is said of what would explain more than they do alone.
+    """
+    candidates = found.implausible
+    if found.verdict != "unnamed":
+        candidates = tuple(a for a in candidates if a.rise_chi2 < -found.settings.same)
+    if not candidates:
+        return ""
+    first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
+    what = "the curve" if found.verdict == "unnamed" else "what is proposed"
+    more = first.rise_chi2 < -found.settings.same
+    gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
+    are = "are" if len(first.effects) > 1 else "is"
+    return (
+        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
+    )
+
+
+def said_standing(found: DiscoveryResult) -> str:
+    """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
+    if not found.standing:
+        return ""
+    if found.verdict == "unnamed":
+        return f"Why no name: {found.standing}."
+    return f"The names keep their significance {found.standing}."
+
+
+def stated_value_said(name: str, s: StatedValue) -> str:
+    """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
+    return f"{name} is {s.value:.3g} {s.unit}".strip() + f" (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+
+
+def alike_said(e: FoundEffect) -> str:
+    """What these data cannot tell from an effect: other effects, and stated values that may be wrong instead."""
+    others = ", ".join(list(e.members)[1:])
+    values = " or ".join(stated_value_said(name, s) for name, s in e.stated.items())
+    return ", or ".join(words for words in (others, values) if words)
 
 
 def stated_in_words(space: CandidateSpace, shifts: Sequence[Shift]) -> list[str]:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from calibration.data import robot_file
-from calibration.data.runs import CONDITIONS, Runs
+from calibration.data.runs import CONDITIONS, WHEN, Runs
 from calibration.data.writing import write_json, write_table
+from calibration.discovery.clusters import Cluster
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
 from mmrjax import channels
@@ -96,6 +97,8 @@ class UnnamedDiscrepancy:
 
     Attributes:
         balance, variable, unit: where, over what, in which unit; balances_alike: balances in which it acts alike.
+        families: what is missing, in words, as of `FoundEffect`.
+        window: axis, first and last place of what happens for a while; None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
         p_value: family-wise; score: fall of χ² by the curve [σ²]; score_free_in_each_run: by a wave with a phase
             of its own in each run, None for other curves.
@@ -108,6 +111,8 @@ class UnnamedDiscrepancy:
     variable: str
     unit: str
     balances_alike: tuple[str, ...]
+    families: tuple[str, ...]
+    window: dict[str, str | float] | None
     effect: str
     p_value: float
     score: float
@@ -300,6 +305,7 @@ class DiscoveryResult:
         alternatives, implausible: candidates nearly as good; such that would be but for their size or sign.
         hidden: effects that what was found could hide, the largest first.
         standing: why names do not stand, or beside what they do; "" where there is nothing to say.
+        cluster: what rows that lie off have in common, so that they were not set aside; None for nothing.
         before, after: evidence in what base and proposed robot leave.
         chi2: twice the objective before and after [σ²]; readings: that count.
         base_shift: of every base parameter; scores: of the library at the base fit, strongest first.
@@ -337,6 +343,7 @@ class DiscoveryResult:
     implausible: tuple[Alternative, ...]
     hidden: tuple[HiddenEffect, ...]
     standing: str
+    cluster: Cluster | None
     before: Evidence
     after: Evidence
     chi2: tuple[float, float]
@@ -386,6 +393,7 @@ class DiscoveryResult:
             "implausible": [dataclasses.asdict(a) for a in self.implausible],
             "hidden": [dataclasses.asdict(h) for h in self.hidden],
             "standing": self.standing,
+            "cluster": None if self.cluster is None else dataclasses.asdict(self.cluster),
             "errors": {
                 # nothing is fitted as stated, so both are the same
                 "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
@@ -418,7 +426,7 @@ class DiscoveryResult:
         seen = self.readings_of_rows
         table = {
             "row": self.numbers,
-            **{k: self.runs[k] for k in ("run_id", "time_s", "configuration", *CONDITIONS) if self.runs.has(k)},
+            **{k: self.runs[k] for k in ("run_id", *WHEN, "configuration", *CONDITIONS) if self.runs.has(k)},
         }
         main = next(iter(seen.held_out.values()), None)
         for k, channel in enumerate(channels.CHANNELS):
@@ -482,9 +490,11 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
     return {
         "name": "unnamed",
         "class": [],
+        "families": list(d.families),
         "balance": d.balance,
         "balances_alike": list(d.balances_alike),
         "variable": d.variable,
+        "window": d.window,
         "unit": d.unit,
         "equation": None,
         "parameters": {},

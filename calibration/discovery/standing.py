@@ -78,7 +78,7 @@ def _ruled_out(
     names = evidence_of_names(space, base, best, settings)
     ruled_out = [c for c in ladder if not c.plausible and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
     better = [c for c in ruled_out if evidence_of_names(space, base, c, settings) > names + settings.preferred]
-    return min(better, key=lambda c: c.cost, default=None)
+    return max(better, key=lambda c: evidence_of_names(space, base, c, settings), default=None)
 
 
 # --- an adequate fit: is a curve the better explanation? ---------------------------------------------------

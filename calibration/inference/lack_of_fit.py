@@ -175,6 +175,8 @@ def _families(fit: Residuals) -> dict[str, np.ndarray]:
     variables = {c: (runs[c], TERMS) for c in CONDITIONS if runs.has(c)}
     if observe.axis:
         variables[observe.axis] = runs[observe.axis], OVER_TIME
+    if runs.has("order"):
+        variables["the order of the runs"] = runs["order"], OVER_TIME
     variables |= {
         f"the fitted {c.label}": (simulated[:, k], TERMS)
         for k, c in enumerate(channels.CHANNELS)

@@ -57,10 +57,12 @@ class Ends:
 
     Attributes:
         mean, sd: [SI], NaN where a channel is not read or not settled, shape (runs, channels).
+        shown: the same means, settled or not.
     """
 
     mean: np.ndarray
     sd: np.ndarray
+    shown: np.ndarray
 
 
 def settled_ends(problem: Problem) -> Ends:
@@ -68,7 +70,7 @@ def settled_ends(problem: Problem) -> Ends:
     observe, data = problem.observe, problem.data
     measured, sd, weight = (np.asarray(x) for x in (data.measured, data.sd, data.weight))
     rows_of, time = np.asarray(observe.rows_of), np.asarray(observe.time)  # type: ignore[attr-defined]
-    mean, error = (np.full((len(rows_of), measured.shape[1]), np.nan) for _ in range(2))
+    mean, error, shown = (np.full((len(rows_of), measured.shape[1]), np.nan) for _ in range(3))
     for k, mine in enumerate(rows_of):
         rows = mine[mine >= 0]
         end = rows[time[rows] >= (1 - END) * time[rows[-1]]]
@@ -76,14 +78,15 @@ def settled_ends(problem: Problem) -> Ends:
             these = end[weight[end, c] > 0]
             if len(these) < 4:
                 continue
+            shown[k, c] = measured[these, c].mean()
             halves = np.array_split(measured[these, c], 2)
             change = abs(halves[1].mean() - halves[0].mean())
             noise = 2 * np.median(sd[these, c]) / np.sqrt(len(these))
-            size = abs(measured[these, c].mean())
+            size = abs(shown[k, c])
             if change < max(CHANGE * size, CHANGE_SD * noise):
-                mean[k, c] = measured[these, c].mean()
+                mean[k, c] = shown[k, c]
                 error[k, c] = max(noise / 2, FLOOR * size)
-    return Ends(mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan))
+    return Ends(mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), shown)
 
 
 def starts(
@@ -167,10 +170,10 @@ def _at_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
 
 
 def _sliding(problem: Problem, ends: Ends) -> np.ndarray:
-    """Whether a run's movers spin at its end, shape (runs,)."""
+    """Whether a run's movers spin at its end, shape (runs,): also while it still gains speed, forwards or back."""
     if not {"motor_speed", "speed"} <= set(channels.names()):
         return np.zeros(len(ends.mean), bool)
-    turning, travelling = (ends.mean[:, channels.index(c)] for c in ("motor_speed", "speed"))
+    turning, travelling = (ends.shown[:, channels.index(c)] for c in ("motor_speed", "speed"))
     robot = problem.base
     radius = np.array([float(c.radius) for c in robot.configurations.members])
     circumference = radius[np.asarray(problem.observe.conditions.configuration)] * turning

@@ -1,0 +1,147 @@
+"""Bases of curves: over what they go, windows in which something happens, and when row order says nothing new."""
+
+import numpy as np
+import pytest
+
+from calibration.inference import bases
+from calibration.inference.bases import COLLINEAR, Window, collinearity, families, names, window, windows
+
+RNG = np.random.default_rng(0)
+ROWS = 60
+
+
+def table(rows=ROWS, **more):
+    """A grid of three voltages, slopes and payloads for two configurations, in the order of its loops."""
+    axes = (["4W2T", "6T2A"], [0.0, 8.0, 16.0, 20.0, 24.0], [0.0, 4.0, 8.0], [15.0, 24.0])
+    word, slope, payload, voltage = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
+    take = np.arange(rows) % len(word)
+    columns = {
+        "configuration": word[take],
+        "supply_voltage_V": voltage[take],
+        "slope_deg": slope[take],
+        "payload_kg": payload[take],
+        "total_current_A": RNG.uniform(1, 5, rows),
+        "motor_speed_rpm": RNG.uniform(3000, 9000, rows),
+        "speed_mm_s": RNG.uniform(200, 900, rows),
+        "order": np.arange(1.0, rows + 1),
+    }
+    return columns | more
+
+
+def shuffled(columns, seed=1):
+    """The same runs made in another order."""
+    return columns | {"order": 1.0 + np.random.default_rng(seed).permutation(len(columns["order"]))}
+
+
+COUNTS = np.ones(ROWS)
+
+# --- drift from run to run ------------------------------------------------------------------------------
+
+
+def test_order_of_a_grid_that_is_run_through_is_collinear_with_its_conditions():
+    assert collinearity(table(), COUNTS) > 0.99 > COLLINEAR
+    for seed in range(5):
+        assert collinearity(shuffled(table(), seed), COUNTS) < 0.5
+    # of rows that do not count nothing is known; one value of the order says nothing
+    few = np.zeros(ROWS)
+    few[:3] = 1
+    assert collinearity(table(), few) == collinearity(table(order=np.ones(ROWS)), COUNTS) == 1.0
+
+
+def test_collinearity_is_not_made_by_the_number_of_terms():
+    """R² of noise is the share of the parameters; adjusted for them it is about 0."""
+    found = [collinearity(shuffled(table(), seed), COUNTS) for seed in range(40)]
+    assert abs(np.mean(found)) < 0.1
+
+
+def variables(found):
+    return [v for _, v in names(found)]
+
+
+def test_curves_over_the_order_where_it_says_something_new():
+    assert "order" in variables(families(shuffled(table()), COUNTS))
+    assert "order" not in variables(families(table(), COUNTS))
+    bare = {k: v for k, v in table().items() if k != "order"}
+    assert "order" not in variables(families(bare, COUNTS))
+
+
+# --- windows --------------------------------------------------------------------------------------------
+
+
+def test_a_window_is_read_from_its_name():
+    for of in (Window("time", 0.6, 0.75), Window("order", 12.0, 19.0), Window("time", 1e-05, 12345.0)):
+        assert window(str(of)) == of
+    for word in ("time", "order", bases.CONDITIONS, "speed_motor", *bases.ORDERS):
+        assert window(word) is None
+
+
+def test_windows_cover_the_order_and_overlap_by_half():
+    (basis,) = windows(shuffled(table()), COUNTS)
+    assert basis.columns.shape[2] == 1 and set(np.unique(basis.columns)) == {0.0, 1.0}
+    order = shuffled(table())["order"]
+    mine = [k for k, n in enumerate(basis.names) if n[0] == "track"]
+    for k in mine:
+        of, inside = window(basis.names[k][1]), np.asarray(basis.columns)[k, :, 0] > 0
+        np.testing.assert_array_equal(inside, (order >= of.low) & (order <= of.high))
+        assert bases.FEWEST <= inside.sum() <= ROWS / 2 and of.axis == "order"
+    shapes = np.asarray(basis.columns)[mine, :, 0]
+    assert (shapes.sum(0) >= 1).all()
+    # something that happens within half a window of the smallest share lies in one
+    for first in range(1, ROWS - 3):
+        assert any(s[(order >= first) & (order < first + 2)].all() for s in shapes)
+
+
+def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
+    time = np.tile(np.linspace(0, 1.5, 30), 2)
+    (basis,) = windows(table(time_s=time), COUNTS)
+    assert {window(v).axis for _, v in basis.names} == {"time"}
+    for shape in np.asarray(basis.columns)[:, :, 0]:
+        np.testing.assert_array_equal(shape[:30], shape[30:])
+
+
+def test_rows_that_do_not_count_are_in_no_window():
+    counts = COUNTS.copy()
+    counts[[5, 20, 40]] = 0
+    (basis,) = windows(shuffled(table()), counts)
+    assert not np.asarray(basis.columns)[:, [5, 20, 40]].any()
+
+
+def test_a_table_without_order_or_time_has_no_windows():
+    assert windows({k: v for k, v in table().items() if k != "order"}, COUNTS) == ()
+
+
+# --- sizes ----------------------------------------------------------------------------------------------
+
+
+def shapes(columns, counts):
+    whole = (*families(columns, counts), *windows(columns, counts))
+    return [(b.columns.shape[0], b.columns.shape[2], b.balance) for b in whole]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tables_of_one_size_have_families_of_one_size(seed):
+    """Whatever their order, gaps and rows that do not count: else each table is compiled for itself."""
+    rng = np.random.default_rng(seed)
+    first = shapes(table(), COUNTS)
+    counts = (rng.uniform(size=ROWS) < 0.6).astype(float)
+    gaps = np.sort(rng.choice(np.arange(1.0, 500.0), ROWS, replace=False))
+    short = np.where(np.arange(ROWS) < 40, 1.0, 0.0)
+    for columns, weight in (
+        (shuffled(table(), seed), COUNTS), (table(), counts), (table(order=gaps), counts), (table(), short),
+        (table(order=rng.permutation(gaps)), short), (table(slope_deg=np.zeros(ROWS)), COUNTS),
+    ):  # fmt: skip
+        assert shapes(columns, weight) == first
+    assert all(len(b) == n for n, _, b in first)
+
+
+def test_families_that_fill_up_repeat_others():
+    """What stands in the place of a family that says nothing is one that is there already, so that it finds nothing
+    that this does not."""
+    found = (*families(table(), COUNTS), *windows(table(order=np.repeat([1.0, 2, 3, 60], 15)), COUNTS))
+    for basis in found:
+        columns = np.asarray(basis.columns)
+        for k, name in enumerate(basis.names):
+            same = [j for j, n in enumerate(basis.names) if n == name]
+            for j in same:
+                np.testing.assert_array_equal(columns[j], columns[k])
+    assert len(set(names(found))) < len(names(found))

@@ -1,0 +1,137 @@
+"""What would explain the data but for its size is said beside `unnamed`, with how large it is and what to check."""
+
+import dataclasses
+
+import generator as g
+import numpy as np
+import pytest
+from synthetic import SETTLED, table
+
+from calibration.discovery import findings
+from calibration.discovery.candidates import Candidate
+from calibration.discovery.search import own_p, search
+from calibration.inference.linearization import amplitude_of
+from mmrjax.effects import BY_NAME
+
+LARGEST = amplitude_of(BY_NAME["winding_heating"]()).spec.bounds[1]
+
+
+def heated(times):
+    """A table of the nominal robot whose windings heat so many times as much as is plausible."""
+    p = dict(g.CLIMBING)
+    c = g.table8(p)
+    readings = g.readings(c, p, (g.Term("winding_heating", times * LARGEST),))
+    return table(g._table(c, *readings, g.Instruments(), np.random.default_rng(1)))
+
+
+@pytest.fixture(scope="module")
+def hot():
+    return SETTLED.trace(heated(3.0))
+
+
+def listed(traced, cost):
+    space, base = traced.screened.base.space, traced.screened.base.candidate
+    return findings.alternatives(space, base, cost, traced.searched.ladder, SETTLED.settings)
+
+
+def test_heating_of_a_plausible_size_is_named():
+    found = SETTLED.trace(heated(0.6))
+    assert found.verdict == "named" and found.members == (("winding_heating",),)
+
+
+def test_heating_three_times_too_large_is_unnamed_and_said(hot):
+    assert hot.verdict == "unnamed" and hot.members == () and "winding_heating" in hot.standing.reason
+    least = min(c.cost for c in hot.searched.ladder)
+    plausible, ruled_out = listed(hot, least)
+    assert plausible == ()
+    first = next(a for a in ruled_out if list(a.effects) == ["winding_heating"])
+    assert 2.7 < first.sizes["winding_heating"] < 3.3 and abs(first.rise_chi2) < 9
+    assert first.why == (
+        f"winding_heating at {first.sizes['winding_heating']:.2g} times its largest plausible size; "
+        "check motor.resistance_thermal"
+    )
+    assert first.effects["winding_heating"] == pytest.approx(3.0 * LARGEST, rel=0.1)
+
+
+def test_companions_that_explain_nothing_are_not_listed(hot):
+    """Of pairs with the heating none is left, and of each effect that is ruled out it is said why, of it alone."""
+    _, ruled_out = listed(hot, min(c.cost for c in hot.searched.ladder))
+    assert [list(a.effects) for a in ruled_out] == [["winding_heating"]]
+    pairs = [c for c in hot.searched.ladder if len(c.effects) == 2 and "winding_heating" in c.effects]
+    assert len(pairs) > 3  # there were some
+    space = hot.screened.base.space
+    for c in pairs:
+        why = findings._alternative(space, c, 0.0, SETTLED.settings).why
+        for name, size in zip(c.effects, c.size, strict=False):
+            if 0 < size < 0.3 and not (space.library[name].dissipative and c.amplitude[c.active.index(name)] <= 0):
+                assert name not in why
+
+
+def made(*effects, cost, plausible=True):
+    slots = SETTLED.settings.slots
+    active = (*effects, *("",) * (slots - len(effects)))
+    size = np.where([bool(n) for n in active], 0.1 if plausible else 2.0, 0.0)
+    return Candidate(active, np.zeros(40), np.ones(40), cost, size, size, plausible, True)
+
+
+def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
+    """Costs are half of χ²."""
+    space = hot.screened.base.space
+    best = made("churning", cost=100.0)
+    ladder = (
+        made("windage", cost=101.0), made("churning", "load_slip", cost=99.0), made("churning", "mass_offset", cost=90.0),
+        made("windage", "load_slip", cost=100.5), made("brush_drop", cost=98.0, plausible=False), best,
+    )  # fmt: skip
+    plausible, ruled_out = findings.alternatives(space, best, best.cost, ladder, SETTLED.settings)
+    assert [(tuple(a.effects), a.rise_chi2) for a in plausible] == [
+        (("churning", "mass_offset"), -20.0),
+        (("windage",), 2.0),
+    ]
+    assert [(tuple(a.effects), a.rise_chi2) for a in ruled_out] == [(("brush_drop",), -4.0)]
+    assert "2 times its largest plausible size" in ruled_out[0].why
+
+
+# --- weak companions ------------------------------------------------------------------------------------
+
+
+def test_own_p_is_the_share_of_tables_whose_strongest_effect_explains_as_much():
+    null = np.array([1.0, 2.0, 3.0, 4.0])
+    assert own_p(9.0, null) == pytest.approx(3 / 5) and own_p(100.0, null) == pytest.approx(1 / 5)
+    assert own_p(0.0, null) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("names", "sigmas"),
+    [(["stribeck_track", "gear_load_loss"], 9.0), (["churning", "mass_offset"], 9.0), (["series_resistance"], 25.0)],
+)
+def test_named_effects_are_of_a_sign_and_a_strength_of_their_own(names, sigmas):
+    """Whatever stands beside a strong effect: none gives power, none is at a bound, each has a p of its own."""
+    seen = 0
+    for seed in range(4):
+        found = SETTLED.trace(table(g.case(names, sigmas, seed)))
+        if found.alike is None:
+            continue
+        space, base = found.screened.base.space, found.screened.base.candidate
+        told = findings.found_effects(space, base, found.best, found.alike, found.left.test, SETTLED.settings)
+        for e in told:
+            amplitude = e.parameters["amplitude"]
+            assert e.p_value <= SETTLED.settings.family_wise_error, e.name
+            assert not BY_NAME[e.name].dissipative or amplitude.value > 0, e.name
+            spec = amplitude_of(BY_NAME[e.name]()).spec
+            assert spec.bounds[0] < amplitude.value < spec.bounds[1]
+            seen += 1
+        assert found.best.plausible
+    assert seen >= 3
+
+
+def test_an_effect_without_a_p_of_its_own_is_not_proposed():
+    """The same search, once as it is and once where noise explains as much in every table of the bootstrap."""
+    runs = table(g.case(["churning"], 10.0, seed=4))
+    found = SETTLED.trace(runs)
+    assert "churning" in found.members[0]
+    space, base, left = found.screened.base.space, found.screened.base.candidate, found.left
+    quiet = lambda text: None  # noqa: E731
+    assert search(space, base, left, found.screened.bases, SETTLED.settings, quiet).best is not None
+    loud = dataclasses.replace(left.test.null, single=np.full_like(left.test.null.single, 1e3))
+    left = dataclasses.replace(left, test=dataclasses.replace(left.test, null=loud))
+    assert search(space, base, left, found.screened.bases, SETTLED.settings, quiet).best is None

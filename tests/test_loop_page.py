@@ -1,0 +1,163 @@
+"""What the loop's page, its terminal output and result.json say, and that their numbers agree."""
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import generator as g
+import jsonschema
+import numpy as np
+import pytest
+from pages import Tables, drawn
+from synthetic import SETTLED, table
+from test_implausible import heated
+from test_stated_values import made as leads
+
+from calibration.data.writing import finite
+from calibration.discovery import findings
+from calibration.discovery.clusters import Cluster
+from sweeps import loop as room
+from sweeps import report_loop
+
+SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
+
+
+def happening():
+    """A clean table in random order, with the speed shown 4 % too low in ten runs that were made one after another."""
+    p = dict(g.CLIMBING)
+    c = g.table8(p)
+    columns = g._table(c, *g.readings(c, p), g.Instruments(), np.random.default_rng(1))
+    columns["order"] = np.random.default_rng(5).permutation(len(columns["slope_deg"])) + 1.0
+    off = (columns["order"] >= 30) & (columns["order"] <= 44)
+    columns["speed_mm_s"] = columns["speed_mm_s"] - 12.0 * off
+    return table(columns)
+
+
+CASES = {"leads": lambda: leads(lead=0.8), "heated": lambda: heated(3.0), "happening": happening}
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """A case → its result, result.json, page and terminal output; made once."""
+    known = {}
+
+    def of(name, capsys):
+        if name not in known:
+            found = SETTLED.discover(CASES[name]())
+            folder = tmp_path_factory.mktemp(name)
+            text = report_loop.write(folder, found, robot_name="nominal").read_text("utf-8")
+            document = finite(found.to_json())
+            known[name] = SimpleNamespace(found=found, document=document, text=text, page=Tables(text))
+        capsys.readouterr()
+        room.print_discovery(known[name].found)
+        return SimpleNamespace(**vars(known[name]), printed=" ".join(capsys.readouterr().out.split()))
+
+    return of
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_result_has_its_schema(shown, capsys, name):
+    got = shown(name, capsys)
+    jsonschema.validate(got.document, SCHEMA)
+    for field in ("standing", "cluster"):
+        less = {k: v for k, v in got.document.items() if k != field}
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(less, SCHEMA)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_numbers_of_a_page_agree(shown, capsys, name):
+    got = shown(name, capsys)
+    d = got.document
+    score = {s["name"]: s["score"] for s in d["scores"]}
+    assert all(s >= 0 for s in score.values())
+    # what these data cannot see explains next to nothing
+    assert all(score[n] < d["settings"]["visible"] ** 2 for n in d["cannot_see"])
+    # what would explain more than what is proposed is not left without a word
+    assert all(a["why"] for a in d["implausible"]) and not any(a["why"] for a in d["alternatives"])
+    best = min((a["rise_chi2"] for a in d["implausible"]), default=0.0)
+    assert best > -d["settings"]["same"] or "ruled out by size or sign alone" in got.page.text
+    # one family-wise p on all of the page, each effect with a p of its own that is no larger than is allowed
+    p = findings.said_p(got.found.before.p_value)
+    assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["statement"]
+    for e in got.found.effects:
+        assert e.p_value <= d["bootstrap"]["family_wise_error"]
+        fall = got.found.chi2[0] - got.found.chi2[1]
+        assert e.score == pytest.approx(fall, abs=0.1) or len(got.found.effects) > 1
+    assert got.text.count('id="definitions"') == 1
+    for words in ("Explains:", "Family-wise p:", "Rise of χ²:", "Score:"):
+        assert got.page.text.count(words) == 1
+
+
+def test_class_lists_family_and_stated_value(shown, capsys):
+    got = shown("leads", capsys)
+    (effect,) = got.document["effects"]
+    assert effect["families"] == ["voltage drop that changes with current"]
+    value = effect["stated_values"]["motor.resistance"]
+    assert effect["class"][-1] == "motor.resistance" and value["value"] == pytest.approx(1.411, rel=0.05)
+    said = f"motor.resistance is {value['value']:.3g} ohm (stated 0.611, {value['prior_sds']:+.1f} sds)"
+    row = got.page.tables["effects"][1]
+    assert said in row[-1] and "voltage drop that changes with current" in row
+    assert said.split(" (")[0] in got.printed and "voltage drop that changes with current, one of" in got.printed
+    assert 'id="standing"' not in got.text and 'id="ruled_out"' not in got.text
+
+
+def test_what_is_too_large_is_said_beside_the_verdict(shown, capsys):
+    got = shown("heated", capsys)
+    (ruled_out,) = (a for a in got.document["implausible"] if list(a["effects"]) == ["winding_heating"])
+    times = f"{ruled_out['sizes']['winding_heating']:.2g}"
+    assert got.document["verdict"] == "unnamed" and 2.7 < float(times) < 3.3
+    said = (
+        "winding_heating would explain as much as the curve, but is ruled out by size or sign alone: "
+        f"winding_heating at {times} times its largest plausible size; check motor.resistance_thermal."
+    )
+    assert said in got.printed and said in got.page.text
+    assert got.text.index('id="ruled_out"') < got.text.index('id="effects"')
+    why = f"Why no name: {got.found.standing}."
+    assert why in got.printed and why in got.page.text and "winding_heating" in why
+    assert got.page.tables["implausible"][1][-1] == ruled_out["why"]
+
+
+def test_what_happens_for_a_while_has_a_window(shown, capsys):
+    got = shown("happening", capsys)
+    (effect,) = got.document["effects"]
+    window = effect["window"]
+    assert got.document["verdict"] == "unnamed" and window["axis"] == "order"
+    # the place is told to within half a window
+    assert window["low"] >= 25 and window["high"] <= 50
+    assert f"in runs {window['low']:.0f} to {window['high']:.0f}" in got.printed
+    assert "curve" in drawn(got.text) and "order" in got.found.rows_table()
+    assert got.document["next_experiment"]["name"] == "the same runs again"
+    assert f"runs {window['low']:.0f} to {window['high']:.0f} again" in got.document["next_experiment"]["description"]
+
+
+def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_path):
+    found = shown("leads", capsys).found
+    cluster = Cluster("time", 0.6, 0.7, "", 12, 13, 1e-5)
+    found = dataclasses.replace(found, cluster=cluster, standing="beside smooth curves (slip over slope)")
+    document = finite(found.to_json())
+    jsonschema.validate(document, SCHEMA)
+    assert document["cluster"] == {
+        "axis": "time", "low": 0.6, "high": 0.7, "level": "", "inside": 12, "of": 13, "p": 1e-5
+    }  # fmt: skip
+    page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
+    assert str(cluster) in page.text
+    assert "The names keep their significance beside smooth curves (slip over slope)." in page.text
+
+
+def test_names_say_what_would_explain_more_than_they():
+    def of(verdict, *ruled_out):
+        return SimpleNamespace(verdict=verdict, implausible=ruled_out, settings=SETTLED.settings)
+
+    def candidate(rise, *names):
+        return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
+
+    near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
+    assert findings.said_ruled_out(of("named", near)) == "" == findings.said_ruled_out(of("unnamed"))
+    assert findings.said_ruled_out(of("class", near, better)) == (
+        "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
+    )
+    assert findings.said_ruled_out(of("unnamed", better, near)).startswith(
+        "a would explain as much as the curve, but is"
+    )

@@ -1,0 +1,105 @@
+"""Base fits of histories end in the lowest valley, whatever the ground: what settled ends tell, and what they do not."""
+
+import dataclasses
+
+import generator as g
+import generator_series as gs
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import Analyst, table
+
+from calibration.discovery.candidates import fit_base
+from calibration.discovery.settings import settings_for
+from calibration.inference.observers import Histories, settled_ends
+from mmrjax.effects import BY_NAME
+
+#: An analyst who knows nothing of the ground but what the nominal robot's file says (0.32 and 0.38, 20 mm/s).
+ANALYST = Analyst(
+    dataclasses.replace(settings_for(Histories, 300), slots=1), {"churning": BY_NAME["churning"]}, stated={}
+)
+INSTRUMENTS = g.Instruments(sd=(0.02, 9.5, 2.0))
+
+
+def on_ground(monkeypatch, adhesion, creep, seed=3):
+    """Six clean starts of the nominal robot on a ground of this adhesion (of tracks, of wheels) and V_s [m/s], and
+    its constants."""
+    p = dict(g.CLIMBING)
+    for c, mu in zip(("6T2A", "4W2T"), adhesion, strict=True):
+        p |= {f"{c}.ground.friction.static": mu, f"{c}.ground.friction.dynamic": 0.8 * mu}
+        p |= {f"{c}.ground.friction.speed_static": creep, f"{c}.ground.friction.speed_dynamic": 10 * creep}
+    monkeypatch.setattr(g, "perturbed", lambda rng, free: p)
+    made, _ = gs.case(seed=seed, duration=1.5, every=0.05, instruments=INSTRUMENTS)
+    return table(made), p
+
+
+def at_truth(space, p):
+    """Coordinates of the true robot."""
+    c = space.bare.coordinates
+    value = np.array([p[n] for n in c.names])
+    inside = np.where(c.scale, np.log(value), value)
+    return (inside - np.asarray(c.location)) / np.asarray(c.spread)
+
+
+def is_global(monkeypatch, adhesion, creep, seed=3):
+    """Whether the base fit is at least as good as the truth, and leaves what noise leaves."""
+    runs, p = on_ground(monkeypatch, adhesion, creep, seed)
+    space = ANALYST.space(runs)
+    z = jnp.asarray(at_truth(space, p))
+    truth = 0.5 * float(jnp.sum(space.bare.misfit(z, space.bare.data) ** 2) + jnp.sum(z**2))
+    fitted = fit_base(space, ANALYST.settings, "starts")
+    assert fitted.unusable == () and fitted.candidate.cost < truth, (adhesion, creep)
+    readings = 3 * len(runs)
+    assert abs(2 * fitted.candidate.cost - readings) < 5 * np.sqrt(2 * readings), (adhesion, creep)
+
+
+def test_clean_starts_on_a_ground_that_is_not_nominal_are_fitted(monkeypatch):
+    is_global(monkeypatch, (0.55, 0.54), 0.012)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("creep", [0.005, 0.02, 0.06])
+@pytest.mark.parametrize("adhesion", [(0.2, 0.25), (0.35, 0.9), (0.7, 0.6), (1.0, 1.0)])
+def test_base_fit_of_clean_starts_is_global_on_any_ground(monkeypatch, adhesion, creep):
+    is_global(monkeypatch, adhesion, creep)
+
+
+# --- what the ends show ---------------------------------------------------------------------------------
+
+
+def ends_of(monkeypatch, adhesion, creep=0.02):
+    """The ends of six starts on a ground, which of them slide, and what settled travel of the true robot shows."""
+    runs, p = on_ground(monkeypatch, adhesion, creep)
+    problem = ANALYST.space(runs).bare
+    ends = settled_ends.settled_ends(problem)
+    truth, sound = g.readings(gs.starts(p), p)
+    return ends, settled_ends._sliding(problem, ends), truth.T, sound
+
+
+def test_ends_of_runs_that_grip_are_those_of_settled_travel(monkeypatch):
+    ends, slides, truth, sound = ends_of(monkeypatch, (0.6, 0.6))
+    assert sound.all() and not slides.any()
+    there = np.isfinite(ends.mean)
+    assert there.sum() >= 15  # of six runs and three channels
+    off = np.abs(ends.mean - truth)[there]
+    # a reading that still changes by less than a fiftieth is taken for settled
+    assert (off < 4 * ends.sd[there] + 0.02 * np.abs(truth[there])).all()
+    assert (ends.sd[there] >= settled_ends.FLOOR * np.abs(ends.mean[there]) - 1e-12).all()
+
+
+def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
+    """On a slope beyond its adhesion a robot spins its movers, and its steady state is none."""
+    _, slides, _, sound = ends_of(monkeypatch, (0.12, 0.6))
+    assert not sound.all() and sound[3:].all()
+    np.testing.assert_array_equal(slides, ~sound)
+
+
+def test_a_reading_that_still_changes_has_no_settled_end(monkeypatch):
+    runs, _ = on_ground(monkeypatch, (0.6, 0.6), 0.02)
+    mine = runs["run_id"] == "start4"
+    current = runs["total_current_A"].copy()
+    current[mine] += 2.0 * runs["time_s"][mine]  # 2 A/s
+    changed = dataclasses.replace(runs, columns=runs.columns | {"total_current_A": current})
+    before, after = (settled_ends.settled_ends(ANALYST.space(r).bare).mean for r in (runs, changed))
+    assert np.isfinite(before[4, 0]) and np.isnan(after[4, 0])
+    np.testing.assert_array_equal(np.delete(before, 4, 0), np.delete(after, 4, 0))

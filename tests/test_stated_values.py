@@ -1,0 +1,101 @@
+"""A stated value that may be wrong is listed in the place of an effect, with the value that the data have."""
+
+from types import SimpleNamespace
+
+import generator as g
+import numpy as np
+import pytest
+from synthetic import SETTLED, table
+
+from calibration.discovery import discover, findings
+from calibration.discovery.stated_values import scores, shifts
+
+NOMINAL = g.CLIMBING["motor.resistance"]
+#: χ² that a shift has to explain to be tried.
+NEEDED = 25.0
+
+
+# --- the score of a prior's shift, on a linear problem --------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def toy():
+    """Thirty readings and five coordinates, the last of which no reading shows, at their optimum; the prior of the
+    first is off by eight of its sds."""
+    rng = np.random.default_rng(3)
+    readings, p = 30, 5
+    slopes = rng.standard_normal((readings, p)) * np.array([2.0, 1.0, 0.3, 1.0, 0.0])
+    jacobian = np.concatenate([slopes, np.eye(p)])
+    at_zero = np.concatenate(
+        [-slopes @ np.array([8.0, 0.5, -1.0, 0.2, 0.0]) + rng.standard_normal(readings), 0 * slopes[0]]
+    )
+    z = -np.linalg.lstsq(jacobian, at_zero, rcond=None)[0]
+    return SimpleNamespace(jacobian=jacobian, residual=at_zero + jacobian @ z, at_zero=at_zero, readings=readings)
+
+
+def refitted(toy, without=()):
+    """χ² and coordinates of a least-squares fit without some of the priors."""
+    keep = np.setdiff1d(np.arange(len(toy.residual)), toy.readings + np.asarray(without, int))
+    a, e = toy.jacobian[keep], toy.at_zero[keep]
+    z = -np.linalg.lstsq(a, e, rcond=None)[0]
+    return float(np.sum((e + a @ z) ** 2)), z
+
+
+def test_scores_are_falls_of_chi2_without_a_prior(toy):
+    explained, values = scores(toy.jacobian, toy.residual)
+    whole, _ = refitted(toy)
+    for k in range(4):
+        without, z = refitted(toy, [k])
+        assert explained[k] == pytest.approx(whole - without, rel=1e-8)
+        assert values[k] == pytest.approx(z[k], rel=1e-8)
+    assert explained[0] > 30 and explained[0] > 5 * explained[1:].max() and abs(values[0] - 8.0) < 1.0
+
+
+def test_a_coordinate_that_nothing_shows_cannot_be_the_wrong_one(toy):
+    explained, values = scores(toy.jacobian, toy.residual)
+    assert explained[4] == values[4] == 0.0
+
+
+# --- a robot whose sheet is wrong -----------------------------------------------------------------------
+
+
+def made(resistance=NOMINAL, lead=0.0):
+    """A table of a robot with this winding, and leads beside it, all else at its sheets."""
+    p = dict(g.CLIMBING) | {"motor.resistance": resistance}
+    terms = (g.Term("series_resistance", lead),) * (lead > 0)
+    c, instruments = g.table8(p), g.Instruments()
+    return table(g._table(c, *g.readings(c, p, terms), instruments, np.random.default_rng(1)))
+
+
+@pytest.mark.parametrize(
+    ("runs", "truth"), [(made(lead=0.8), NOMINAL + 0.8), (made(resistance=1.3), 1.3)], ids=["leads", "winding"]
+)
+def test_resistance_freed_of_its_prior_is_the_right_one(runs, truth):
+    fitted = SETTLED.base(runs)
+    found = {s.name: s for s in shifts(fitted.space, fitted.candidate, NEEDED, SETTLED.settings)}
+    assert "motor.resistance" in found
+    shift = found["motor.resistance"]
+    said = findings._stated(fitted.space, fitted.candidate, shift)
+    sd = shift.fit.sd[shift.index] * NOMINAL * 0.1
+    assert abs(said.value - truth) < 0.05 * truth and sd < 0.05 * truth
+    assert said.stated == pytest.approx(NOMINAL) and said.unit == "ohm" and said.prior_sds > 5
+    # freed of its prior it explains more than held by it, and the fit is as good as noise allows
+    assert said.rise_chi2 < -NEEDED
+    readings = 3 * len(runs)
+    assert 2 * shift.fit.cost < readings + 4 * np.sqrt(2 * readings)
+    assert findings.stated_in_words(fitted.space, [shift]) == [f"motor.resistance is {said.value:.3g} ohm"]
+
+
+def test_nothing_is_shifted_where_the_sheet_is_right():
+    fitted = SETTLED.base(made())
+    assert shifts(fitted.space, fitted.candidate, NEEDED, SETTLED.settings) == []
+
+
+def test_verdict_lists_the_resistance_that_may_be_wrong():
+    """Beside the leads, so that no single name is given; its prior is one fifteenth of the shift."""
+    runs = made(lead=0.8)
+    found = SETTLED.trace(runs)
+    assert found.verdict == "class"
+    (members,), (stated,) = found.alike.members, found.alike.stated
+    assert "series_resistance" in members and [s.name for s in stated] == ["motor.resistance"]
+    assert "or motor.resistance is 1.4" in discover._statement(found)
