@@ -86,7 +86,8 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
     Args:
         columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,).
     """
-    names, bases = [], []
+    names: list[tuple[str, str]] = []
+    bases: list[np.ndarray] = []
     for variable, column in VARIABLES.items():
         if column not in columns:
             continue
