@@ -143,19 +143,19 @@ def judged(robot, runs, label: dict, stated: dict, task: Task) -> dict:
         **verdict(found),
         "stratum": label.get("stratum", "narrow"),
         "made": {k: label[k] for k in KEPT if k in label},
-        "truth": [{**{k: e[k] for k in facts if k in e}, **_left(found, e)} for e in label["effects"]],
+        "truth": [{**{k: e[k] for k in facts if k in e}, **_left(found, e, settings)} for e in label["effects"]],
         **_amplitudes(found, settings),
     }
 
 
-def _left(found, effect: dict) -> dict:
+def _left(found, effect: dict, settings) -> dict:
     """What the loop's own base leaves of a library effect, which is what its base frees at its own fit."""
     from calibration.discovery.findings import effect_scores, size_of
 
     if not effect["class"]:
         return {}
     space = found.screened.base.space
-    left = {s.name: s.sigmas_per_prior_sd for s in effect_scores(space, found.left.scores)}
+    left = {s.name: s.sigmas_per_prior_sd for s in effect_scores(space, found.left.scores, settings)}
     if effect["class"] not in left:
         return {}
     sd = size_of(space.library[effect["class"]])

@@ -23,8 +23,16 @@ from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
 from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
+from calibration.discovery.hidden import hidden
 from calibration.discovery.outliers import Screening, screen, screen_beside
-from calibration.discovery.result import DiscoveryResult, FoundEffect, HeldOutAlternative, Remainder, Sensitivity
+from calibration.discovery.result import (
+    DiscoveryResult,
+    FoundEffect,
+    HeldOutAlternative,
+    HiddenEffect,
+    Remainder,
+    Sensitivity,
+)
 from calibration.discovery.score_tests import bootstrap, diagnosed
 from calibration.discovery.search import Search, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
@@ -431,6 +439,12 @@ def finished(
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
         remains = None if where is None else Remainder(where.balance, where.alike, where.variable)
+    concealed: tuple[HiddenEffect, ...] = ()
+    if traced.alike is not None:
+        ask = not observe.long
+        concealed = findings.hidden_effects(
+            space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
+        )
     unnamed = None if curve is None or where is None else findings.unnamed(curve, where, p, rows)
     result = DiscoveryResult(
         verdict=traced.verdict,
@@ -450,6 +464,7 @@ def finished(
         needs_histories=_needs_histories(library, type(observe)),
         alternatives=near,
         implausible=too_large,
+        hidden=concealed,
         standing="" if traced.standing is None else traced.standing.reason,
         cluster=screened.cluster,
         before=findings.evidence(left.test, adequate=not left.test.rejected),

@@ -18,6 +18,7 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Discrepancy, Location
 from calibration.discovery.experiments import Proposal
+from calibration.discovery.hidden import Hidden
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
@@ -28,6 +29,7 @@ from calibration.discovery.result import (
     Evidence,
     Formula,
     FoundEffect,
+    HiddenEffect,
     KindOfEvidence,
     Member,
     NextExperiment,
@@ -181,6 +183,21 @@ def alternatives(
         near[0 if c.plausible else 1].append(_alternative(space, c, rise, settings))
     plausible, ruled_out = (tuple(sorted(x, key=lambda a: a.rise_chi2)) for x in near)
     return plausible, ruled_out
+
+
+def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[HiddenEffect, ...]:
+    """Effects that a name could hide, in their units."""
+    return tuple(
+        HiddenEffect(
+            h.name,
+            h.amplitude * size_of(space.library[h.name]),
+            amplitude_of(space.library[h.name]).spec.unit,
+            h.sigmas,
+            h.experiment,
+            h.separation,
+        )
+        for h in found
+    )
 
 
 def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> Alternative:

@@ -135,6 +135,19 @@ class Remainder:
 
 
 @dataclasses.dataclass(frozen=True)
+class HiddenEffect:
+    """An effect that what was found could hide: its largest amplitude in `unit`, the sigmas that it would leave by
+    itself [σ], and the experiment that would show it with its expected separation [σ] ("" and 0 for none)."""
+
+    name: str
+    amplitude: float
+    unit: str
+    sigmas: float
+    experiment: str
+    separation: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Alternative:
     """Effects that were fitted and are not proposed.
 
@@ -290,6 +303,7 @@ class DiscoveryResult:
         next_experiment: what would tell more; None where nothing is left to tell apart.
         cannot_see: effects that the data cannot show; needs_histories: that only histories can.
         alternatives, implausible: candidates nearly as good; such that would be but for their size or sign.
+        hidden: effects that what was found could hide, the largest first.
         standing: why names do not stand, or beside what they do; "" where there is nothing to say.
         cluster: what rows that lie off have in common, so that they were not set aside; None for nothing.
         before, after: evidence in what base and proposed robot leave.
@@ -327,6 +341,7 @@ class DiscoveryResult:
     needs_histories: tuple[str, ...]
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
+    hidden: tuple[HiddenEffect, ...]
     standing: str
     cluster: Cluster | None
     before: Evidence
@@ -376,6 +391,7 @@ class DiscoveryResult:
             **self.detail.to_json(),
             "alternatives": [dataclasses.asdict(a) for a in self.alternatives],
             "implausible": [dataclasses.asdict(a) for a in self.implausible],
+            "hidden": [dataclasses.asdict(h) for h in self.hidden],
             "standing": self.standing,
             "cluster": None if self.cluster is None else dataclasses.asdict(self.cluster),
             "errors": {
