@@ -76,6 +76,8 @@ def print_discovery(found: DiscoveryResult) -> None:
             )  # fmt: skip
         say(shown)
         say("explains: rise of χ² without it, all else fitted again; own p: among the strongest of the library")
+    if found.hidden:
+        say(findings.said_hidden(found))
     if found.unnamed is not None:
         say(f"{found.unnamed.proposal.formula} ({found.unnamed.proposal.mark})")
     after = found.next_experiment

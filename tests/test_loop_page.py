@@ -17,6 +17,7 @@ from test_stated_values import made as leads
 from calibration.data.writing import finite
 from calibration.discovery import findings
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.result import HiddenEffect
 from sweeps import loop as room
 from sweeps import report_loop
 
@@ -60,7 +61,7 @@ def shown(tmp_path_factory):
 def test_result_has_its_schema(shown, capsys, name):
     got = shown(name, capsys)
     jsonschema.validate(got.document, SCHEMA)
-    for field in ("standing", "cluster"):
+    for field in ("standing", "cluster", "hidden"):
         less = {k: v for k, v in got.document.items() if k != field}
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(less, SCHEMA)
@@ -145,6 +146,28 @@ def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_
     page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
     assert str(cluster) in page.text
     assert "The names keep their significance beside smooth curves (slip over slope)." in page.text
+
+
+def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
+    found = shown("leads", capsys).found
+    two = (
+        HiddenEffect("brush_drop", 0.21, "V", 5.5, "stall", 7.2),
+        HiddenEffect("load_slip", 1e-4, "1/N", 5.1, "", 0.0),
+    )
+    found = dataclasses.replace(found, hidden=two)
+    jsonschema.validate(finite(found.to_json()), SCHEMA)
+    page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
+    assert page.tables["hidden"][1:] == [
+        ["brush_drop", "0.21 V", "5.5", "stall (expected 7.2 σ)"], ["load_slip", "0.0001 1/N", "5.1", ""]
+    ]  # fmt: skip
+    capsys.readouterr()
+    room.print_discovery(found)
+    assert (
+        "Could be hidden behind what was found: brush_drop up to 0.21 V (stall would show it), load_slip up to 0.0001 1/N."
+        in " ".join(capsys.readouterr().out.split())
+    )
+    found = dataclasses.replace(found, hidden=())
+    assert 'id="hidden"' not in report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
 
 
 def test_names_say_what_would_explain_more_than_they():

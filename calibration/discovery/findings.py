@@ -425,6 +425,18 @@ def said_ruled_out(found: DiscoveryResult) -> str:
     )
 
 
+def said_hidden(found: DiscoveryResult) -> str:
+    """Which effects what was found could hide, and what would show them, in a sentence; empty for none."""
+    if not found.hidden:
+        return ""
+    each = [
+        f"{h.name} up to {h.amplitude:.2g} {h.unit}".strip()
+        + (f" ({h.experiment} would show it)" if h.experiment else "")
+        for h in found.hidden
+    ]
+    return f"Could be hidden behind what was found: {', '.join(each)}."
+
+
 def said_standing(found: DiscoveryResult) -> str:
     """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
     if not found.standing:
