@@ -99,23 +99,33 @@ def names_of(posterior, free):
     return Candidate(active, np.zeros(free + 2 * slots), sd, 0.0, np.zeros(slots), np.zeros(slots), True, True)
 
 
-def test_evidence_of_a_name_is_its_marginal_likelihood_less_what_was_searched(toy):
-    """Of one effect of an amplitude with a standard normal prior, among a library of twelve."""
-    column = columns_of(toy.linear, "track", np.sin(toy.linear.variable("speed_motor") / 120)[:, None])
+@pytest.mark.parametrize("scale", [1.0, 30.0], ids=["of the prior's size", "far smaller"])
+def test_evidence_of_a_name_is_its_marginal_likelihood_less_what_was_searched(toy, scale):
+    """Of one effect among a library of twelve; the prior of its amplitude is standard normal, or where the data have
+    it far smaller, of the size that they find most likely."""
+    over = np.sin(toy.linear.variable("speed_motor") / 120)[:, None]
+    column = scale * columns_of(toy.linear, "track", over)
     whole = np.concatenate([toy.slopes, column], 1)
     posterior = np.linalg.inv(whole.T @ whole + np.eye(5))
 
-    def cost(a):
+    def fit(a):
         long = np.concatenate([a, np.eye(a.shape[1])])
         e = np.append(toy.readings, np.zeros(a.shape[1]))
-        return 0.5 * float(np.sum((e - long @ np.linalg.lstsq(long, e, rcond=None)[0]) ** 2))
+        z = -np.linalg.lstsq(long, e, rcond=None)[0]
+        return z, 0.5 * float(np.sum((e + long @ z) ** 2))
 
     space = SimpleNamespace(free=4, library=range(12))
     settings = SimpleNamespace(slots=4)
-    base = dataclasses.replace(names_of(np.eye(0), 4), cost=cost(toy.slopes))
-    best = dataclasses.replace(names_of(posterior[4:, 4:], 4), cost=cost(whole))
-    expected = gained(toy, column) - 2 * math.log(12)
-    assert evidence_of_names(space, base, best, settings) == pytest.approx(expected, rel=1e-6)
+    base = dataclasses.replace(names_of(np.eye(0), 4), cost=fit(toy.slopes)[1])
+    z, cost = fit(whole)
+    best = dataclasses.replace(names_of(posterior[4:, 4:], 4), cost=cost, z=np.append(z, np.zeros(7)))
+    unit = gained(toy, column) - 2 * math.log(12)
+    likeliest = max(gained(toy, s * column) for s in np.geomspace(1e-3, 1.0, 60)) - 2 * math.log(12)
+    got = evidence_of_names(space, base, best, settings)
+    if scale == 1.0:
+        assert got == pytest.approx(unit, rel=1e-6)
+    else:
+        assert got == pytest.approx(likeliest, abs=0.3) and got > unit + 1.0
 
 
 def test_cost_of_names_grows_with_the_library_and_their_number():
