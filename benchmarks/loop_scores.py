@@ -143,7 +143,7 @@ def in_place(x: dict) -> bool:
     where = truth["where"]
     right = truth["balance"] == "sensor" or _equation(x) == _equation_of(truth)
     over = {"order": ("order", "row"), "time": ("time",)}.get(where.get("variable", ""), (where.get("variable"),))
-    over = (*over, truth["name"].split(".")[0])  # of a condition, all of whose rows are shifted
+    over = (*over, truth.get("name", "").split(".")[0])  # of a condition, all of whose rows are shifted
     if x["verdict"] == "unnamed" and right and x["where"] and x["where"][1] in over:
         return True
     for event in x.get("events") or ():
