@@ -135,7 +135,7 @@ def trace():
 
 
 def finished(traced):
-    return discover.finished(traced, RUNS, known(RUNS), None, SETTINGS, SETTLED.library, lambda text: None)
+    return discover.finished(traced, RUNS, None, SETTINGS, SETTLED.library, lambda text: None)
 
 
 @pytest.fixture(scope="module")
