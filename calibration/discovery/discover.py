@@ -34,7 +34,7 @@ from calibration.discovery.result import (
     Sensitivity,
 )
 from calibration.discovery.score_tests import bootstrap, diagnosed
-from calibration.discovery.search import Search, search
+from calibration.discovery.search import Search, fewest, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import Standing, standing
 from calibration.inference import bases as bases_room
@@ -266,6 +266,13 @@ def trace(
         screened = more
 
     stood = standing(space, base, searched, left, bases, settings)
+    if not stood.stands and best is not None and len(best.effects) > 1:
+        # One of them may stand where they do not together.
+        fewer = fewest(space, searched, bases, left, settings)
+        by_itself = stood if fewer is None else standing(space, base, fewer, left, bases, settings)
+        if fewer is not None and by_itself.stands:
+            searched, stood = fewer, by_itself
+            best, after = searched.best, searched.diagnosis
     if best is None or after is None or not stood.stands:
         where = locate(space.bare.observe, left.scores, bases)
         return Traced("unnamed", screened, left, sds, searched, where=where, standing=stood)
@@ -374,6 +381,9 @@ def _statement(traced: Traced) -> str:
     space, alike, p = traced.screened.base.space, traced.alike, traced.left.test.p_value
     if alike is None:
         said = findings.statement(traced.verdict, p, traced.where)
+        if traced.verdict == "unnamed" and traced.searched is not None and traced.searched.best is not None:
+            nearest = " and ".join(traced.searched.best.effects)
+            said = f"{said} Nearest comes {nearest}: {traced.standing.reason if traced.standing else ''}."
     else:
         stated = [findings.stated_in_words(space, shifts) for shifts in alike.stated]
         said = findings.statement(traced.verdict, p, traced.where, alike.members, stated, alike.families)

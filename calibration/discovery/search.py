@@ -80,6 +80,18 @@ def search(
     return Search(tuple(ladder), seen, diagnosis)
 
 
+def fewest(space: CandidateSpace, found: Search, bases: Bases, left: Diagnosis, settings: Settings) -> Search | None:
+    """The search with its best single effect in the place of what it proposes, None where there is none.
+
+    Args:
+        left: what the base leaves.
+    """
+    best = _best([c for c in found.ladder if len(c.effects) == 1])
+    if best is None:
+        return None
+    return Search(found.ladder, best, diagnose(space, best, bases, left.test.null, settings))
+
+
 def own_p(gain: float, null: np.ndarray) -> float:
     """Share of bootstrap tables in which the strongest single effect explains as much [σ²], never below
     1 / (replicates + 1).

@@ -67,7 +67,7 @@ def standing(
     if other is not None:
         return Standing(False, f"{' and '.join(other.effects)} would explain more, but not at a plausible size")
     if after.test.rejected_with_margin:
-        return _beside_curves(space, best, after, bases, settings)
+        return _beside_curves(space, best, left, after, bases, settings)
     return _against_curves(space, base, best, left.linear, bases, settings)
 
 
@@ -159,27 +159,27 @@ def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, set
 
 
 def _beside_curves(
-    space: CandidateSpace, best: Candidate, after: Diagnosis, bases: Bases, settings: Settings
+    space: CandidateSpace, best: Candidate, left: Diagnosis, after: Diagnosis, bases: Bases, settings: Settings
 ) -> Standing:
     """Names beside the best smooth curves, as many as leave nothing: each has to keep its significance, and what is
-    left with both has to be noise."""
-    linear, chosen = after.linear, list[int]()
+    left with both has to be noise.
+
+    Curves of other equations come first: a curve in a name's own takes away what it explains, whatever that is, so it
+    counts only where the others do not do. Where one curve alone does, no name is needed.
+    """
     names = bases_room.names(bases)
-    columns = np.zeros((linear.readings, 0))
-    deviate = np.array(after.scores.curve)
-    test = after.test
-    for _ in range(CURVES):
-        chosen.append(int(np.argmax(deviate)))
-        columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
-        found, deviate = beside_columns(linear, bases, columns, [names[k][0] for k in chosen])
-        test = AdequacyTest(found, after.test.null, settings)
-        if not test.rejected_with_margin:
-            break
+    alone, test = _curves_beside(left.linear, left, bases, set(), 1, settings)
+    if not test.rejected_with_margin:
+        balance, variable = names[alone[0]]
+        return Standing(False, f"one smooth curve in {balance} over {variable.replace('_', ' ')} leaves nothing")
+    own = {EQUATION.get(space.library[e].balance, "") for e in best.effects}
+    chosen, test = _curves_beside(after.linear, after, bases, own, CURVES, settings)
+    if test.rejected_with_margin:
+        chosen, test = _curves_beside(after.linear, after, bases, set(), CURVES, settings)
     if test.rejected_with_margin:
         return Standing(False, f"the fit with {' and '.join(best.effects)} is not adequate")
-    for e in best.effects:
-        columns = np.concatenate([columns, _strongest_surface(space, linear, space.library[e].balance)], 1)
-    significance = _significance(space, best, linear, columns)
+    columns = np.concatenate([family_columns(after.linear, bases, k) for k in chosen], 1)
+    significance = _significance(space, best, after.linear, columns)
     needed = after.test.threshold("single")
     lost = [e for e, t in zip(best.effects, significance, strict=True) if abs(t) < needed]
     words = ", ".join(f"{names[k][0]} over {names[k][1].replace('_', ' ')}" for k in chosen)
@@ -188,16 +188,27 @@ def _beside_curves(
     return Standing(True, f"beside smooth curves ({words})")
 
 
-def _strongest_surface(space: CandidateSpace, linear: Linearization, balance: str) -> np.ndarray:
-    """Columns of the surface of most evidence in an effect's equation, none where it has no curves."""
-    equation = EQUATION.get(balance)
-    included = space.included
-    known = [v for v in VARIABLES if _varies(linear, v, included)]
-    if equation is None or len(known) < 2:
-        return np.zeros((linear.readings, 0))
-    project = Projection(linear)
-    tried = [surface(linear, equation, pair, included, project) for pair in itertools.combinations(known, 2)]
-    return max(tried, key=lambda s: s.evidence).columns
+def _curves_beside(
+    linear: Linearization, seen: Diagnosis, bases: Bases, without: set[str], most: int, settings: Settings
+) -> tuple[list[int], AdequacyTest]:
+    """Families of curves, the most improbable first, until what is left with them is noise, at most so many; and the
+    test of what is left.
+
+    Args:
+        seen: what the fit leaves; without: balances that get none.
+    """
+    balances = np.array([n[0] for n in bases_room.names(bases)])
+    barred = np.isin(balances, list(without))
+    chosen, columns = list[int](), np.zeros((linear.readings, 0))
+    deviate, test = np.array(seen.scores.curve), seen.test
+    for _ in range(most):
+        chosen.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
+        columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
+        found, deviate = beside_columns(linear, bases, columns, [balances[k] for k in chosen])
+        test = AdequacyTest(found, seen.test.null, settings)
+        if not test.rejected_with_margin:
+            break
+    return chosen, test
 
 
 def _significance(space: CandidateSpace, best: Candidate, linear: Linearization, columns: np.ndarray) -> list[float]:
