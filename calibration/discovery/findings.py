@@ -388,9 +388,10 @@ def statement(
     if verdict == "unnamed" and where is not None:
         others = [b for b in where.alike if b != where.balance]
         also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
+        what = f": {where.family}" if where.variable in bases_room.VARIABLES else ""
         return (
-            f"Something is missing in the balance {where.balance}{also}, {shown_over(where.variable)}, and no effect "
-            f"of the library explains it (family-wise p {said_p(p)})."
+            f"Something is missing in the balance {where.balance}{also}, {shown_over(where.variable)}{what}; no "
+            f"effect of the library explains it (family-wise p {said_p(p)})."
         )
     names = []
     for k, words in enumerate(classes):
