@@ -43,7 +43,7 @@ FLOOR = 0.01
 #: Shares of the V_s at the settled ends that are tried: creep at the noise's size does not tell it.
 FINER = (1.0, 0.25)
 #: Steps of a fit to settled ends; of one with blunt instruments, and how many of those there are.
-STEPS, STEPS_BLUNT, SEARCHES = 40, 20, 16
+STEPS, STEPS_BLUNT, SEARCHES = 40, 20, 8
 #: Sd of a blunt instrument, over its channel's root mean square [-].
 BLUNT = 0.03
 #: Draws of the prior, beside the settled ends.
