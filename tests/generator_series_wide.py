@@ -97,8 +97,7 @@ def world(rng: np.random.Generator, stratum: str = "plain", variety: int = 0, *,
         design = DESIGNS.get(kind, DESIGNS["plain"])
         c = _settings(rng, m, p, len(design))
         y, sound = g.readings(c, p)
-        rolled = y[1] * np.where(c.wheeled > 0.5, p["4W2T.radius"], p["6T2A.radius"]) / p["gearbox.ratio"]
-        if sound.all() and (y[2] > 0.25 * rolled).all():
+        if sound.all() and gw.gripping(c, p, y):
             break
     else:
         raise ValueError("no such world without runs that never grip")

@@ -122,6 +122,12 @@ class World:
         return tuple(n for n in g.LIBRARY if n != "mass_offset" or self.machine is PAPER)
 
 
+def gripping(c: g.Conditions, p: dict[str, float], y: np.ndarray) -> bool:
+    """Whether no row's movers roll four times as far as it travels; y are its readings, shape (3, rows)."""
+    rolled = y[1] * np.where(c.wheeled > 0.5, p["4W2T.radius"], p["6T2A.radius"]) / p["gearbox.ratio"]
+    return bool((y[2] > 0.25 * rolled).all())
+
+
 def world(
     rng: np.random.Generator, stratum: str = "plain", *, shuffled: bool | None = None, noise: float = 1.0,
     from_priors: bool = False,
@@ -142,8 +148,7 @@ def world(
         order = bool(rng.random() < 0.5) if shuffled is None else shuffled
         c, order = _conditions(rng, m, p, length, order)
         y, sound = g.readings(c, p)
-        rolled = y[1] * np.where(c.wheeled > 0.5, p["4W2T.radius"], p["6T2A.radius"]) / p["gearbox.ratio"]
-        if sound.all() and (y[2] > 0.25 * rolled).all():
+        if sound.all() and gripping(c, p, y):
             break
     else:
         raise ValueError("no such world without rows that slide")

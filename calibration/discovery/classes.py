@@ -68,7 +68,7 @@ def classes(
         left: what the base leaves.
     """
     cosine, names = cosines(space, left.scores), space.library.names
-    fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings)
+    fewer = [base] if len(best.effects) == 1 else without_each(space, best, settings, ladder)
     gains = [2 * (c.cost - best.cost) for c in fewer]
     wanted: list[tuple[int, str, tuple[str, ...]]] = []
     for slot, name in enumerate(best.effects):

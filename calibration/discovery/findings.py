@@ -78,7 +78,7 @@ def found_effects(
     Args:
         test: of the base fit, whose bootstrap gives the p-values.
     """
-    gains = _without_each(space, base, best, settings)
+    gains = _without_each(space, base, best, found.ladder, settings)
     null = np.asarray(test.null.single)
     listed = []
     for slot, members in enumerate(found.members):
@@ -130,11 +130,13 @@ def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue
     return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
 
 
-def _without_each(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> list[float]:
+def _without_each(
+    space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
+) -> list[float]:
     """What each effect explains that the others cannot: the rise of χ² when it is taken away and all is refitted."""
     if len(best.effects) == 1:
         return [2 * (base.cost - best.cost)]
-    return [2 * (c.cost - best.cost) for c in without_each(space, best, settings)]
+    return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
 def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> UnnamedDiscrepancy:

@@ -178,6 +178,21 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     raise IndexError(chosen)
 
 
+def widened(linear: Linearization, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobian and residuals of a fit with further columns, each of prior mean 0 and sd 1, fitted beside.
+
+    Args:
+        extra: columns over the readings, shape (readings, columns).
+    """
+    jacobian, (readings, wide) = np.asarray(linear.jacobian), extra.shape
+    total, free = jacobian.shape
+    whole = np.zeros((total + wide, free + wide))
+    whole[:total, :free] = jacobian
+    whole[:readings, free:] = extra
+    whole[total:, free:] = np.eye(wide)
+    return whole, np.concatenate([np.asarray(linear.residual), np.zeros(wide)])
+
+
 def beside_columns(
     linear: Linearization, bases: Bases, extra: np.ndarray, of: Sequence[str]
 ) -> tuple[Statistics, np.ndarray]:
@@ -187,16 +202,10 @@ def beside_columns(
     Args:
         extra: columns over the readings, shape (readings, columns); of: their balances.
     """
+    filled = np.pad(extra, ((0, 0), (0, -extra.shape[1] % FILLED)))  # to few sizes: each is compiled
+    jacobian, residual = map(jnp.asarray, widened(linear, filled))
     linear = jax.tree.map(jnp.asarray, linear)
-    jacobian = np.asarray(linear.jacobian)
-    readings, total = extra.shape[0], jacobian.shape[0]
-    wide = -(-extra.shape[1] // FILLED) * FILLED  # to few sizes: each is compiled
-    whole = np.zeros((total + wide, jacobian.shape[1] + wide))
-    whole[:total, : jacobian.shape[1]] = jacobian
-    whole[:readings, jacobian.shape[1] : jacobian.shape[1] + extra.shape[1]] = extra
-    whole[total:, jacobian.shape[1] :] = np.eye(wide)
-    residual = jnp.concatenate([linear.residual, jnp.zeros(wide)])
-    padded = dataclasses.replace(linear, jacobian=jnp.asarray(whole), residual=residual)
+    padded = dataclasses.replace(linear, jacobian=jacobian, residual=residual)
     scores = _score_tests(padded, bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(of)), -np.inf, np.asarray(scores.curve))

@@ -102,10 +102,19 @@ def own_p(gain: float, null: np.ndarray) -> float:
     return (1 + int(np.sum(null**2 >= gain))) / (1 + len(null))
 
 
-def without_each(space: CandidateSpace, best: Candidate, settings: Settings) -> list[Candidate]:
-    """The candidate without each of its effects in turn, all else fitted again."""
+def without_each(
+    space: CandidateSpace, best: Candidate, settings: Settings, ladder: Sequence[Candidate] = ()
+) -> list[Candidate]:
+    """The candidate without each of its effects in turn, all else fitted again.
+
+    Args:
+        ladder: fits that are known, of which none is made again.
+    """
     fewer = [tuple("" if s == slot else n for s, n in enumerate(best.active)) for slot in range(len(best.effects))]
-    return fit_candidates(space, [(w, start(space, best, w, settings)) for w in fewer], settings)
+    known = {c.active: c for c in ladder}
+    new = fit_candidates(space, [(w, start(space, best, w, settings)) for w in fewer if w not in known], settings)
+    known |= {c.active: c for c in new}
+    return [known[w] for w in fewer]
 
 
 def _most(space: CandidateSpace, settings: Settings) -> int:

@@ -19,7 +19,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.projection import Projection
-from calibration.discovery.score_tests import beside_columns, family_columns
+from calibration.discovery.score_tests import beside_columns, family_columns, widened
 from calibration.discovery.search import Search
 from calibration.discovery.settings import Settings
 from calibration.discovery.smooth import smooth, surface
@@ -31,10 +31,9 @@ from calibration.inference.linearization import Linearization
 CURVES = 3
 #: Balances whose curves stand for effects of a balance: those of one equation.
 EQUATION = {
-    **dict.fromkeys(("supply", "electrical"), "electrical"),
-    **dict.fromkeys(("motor", "gearbox", "track"), "track"),
-    **dict.fromkeys(("ground", "mass"), "ground"),
-    "slip": "slip",
+    "mass": "ground",
+    **{b: b for b in bases_room.BALANCES},
+    **{other: b for b, others in bases_room.STANDS_FOR.items() for other in others},
 }
 #: Pairs of variables over which a surface is tried.
 VARIABLES = ("voltage", "current", "speed_motor", "slope", "payload")
@@ -213,15 +212,9 @@ def _curves_beside(
 
 def _significance(space: CandidateSpace, best: Candidate, linear: Linearization, columns: np.ndarray) -> list[float]:
     """Amplitude of each effect over its sd, with columns fitted beside (of prior sd 1 each)."""
-    jacobian, residual = np.asarray(linear.jacobian), np.asarray(linear.residual)
-    width = columns.shape[1]
-    whole = np.zeros((len(jacobian) + width, jacobian.shape[1] + width))
-    whole[: len(jacobian), : jacobian.shape[1]] = jacobian
-    whole[: linear.readings, jacobian.shape[1] :] = columns
-    whole[len(jacobian) :, jacobian.shape[1] :] = np.eye(width)
-    long = np.concatenate([residual, np.zeros(width)])
-    normal = whole.T @ whole
-    step = -np.linalg.solve(normal, whole.T @ long)
+    jacobian, residual = widened(linear, columns)
+    normal = jacobian.T @ jacobian
+    step = -np.linalg.solve(normal, jacobian.T @ residual)
     sd = np.sqrt(np.diag(np.linalg.inv(normal)))
     at = [space.free + slot for slot, name in enumerate(best.active) if name]
     return [float((best.z[k] + step[k]) / sd[k]) for k in at]

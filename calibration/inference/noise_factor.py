@@ -47,19 +47,20 @@ def common_factors(fit: Residuals) -> dict[str, float]:
     sds that are off everywhere alike.
     """
     factors = noise_factors(fit, BEYOND_DOUBT)
-    shown = [k for k in range(fit.there.shape[1]) if fit.there[:, k].any()]
-    enough = bool(np.all(fit.freedom[shown] >= FEWEST))
-    alike = factors and max(factors.values()) < ALIKE**2 * min(factors.values())
-    return factors if enough and len(factors) == len(shown) > 1 and alike else {}
+    enough = bool(np.all(fit.freedom[fit.there.any(0)] >= FEWEST))
+    return factors if enough and _everywhere(fit, factors) else {}
+
+
+def _everywhere(fit: Residuals, factors: dict[str, float]) -> bool:
+    """Whether every channel that is read has a factor, and they are the same."""
+    count = int(fit.there.any(0).sum())
+    return len(factors) == count > 1 and max(factors.values()) < ALIKE**2 * min(factors.values())
 
 
 def noise_remarks(fit: Residuals, word: str = "stated") -> list[str]:
     """What to say of sds that are off by a factor; `word` says where they come from."""
     factors = noise_factors(fit)
-    here = [name for k, name in enumerate(channels.names()) if fit.there[:, k].any()]
-    if not factors:
-        return []
-    if list(factors) == here and len(here) > 1 and max(factors.values()) < ALIKE**2 * min(factors.values()):
+    if _everywhere(fit, factors):
         typical = float(np.exp(np.mean(np.log(list(factors.values())))))
         where = "in every channel and everywhere alike"
         return [f"residuals are {typical:.2g} times the {word} sds {where}: are the sds right?"]
