@@ -11,7 +11,10 @@ import multiprocessing
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -98,13 +101,118 @@ def known(path: Path) -> list[dict]:
     return lines
 
 
+# --- processes ----------------------------------------------------------------------------------------
+
+
+def programs(program: Callable[[Task], Hashable | dict], task: Task) -> tuple[Task, Hashable | dict]:
+    """A task with the shape of what it compiles, or the line of a case that is none."""
+    try:
+        return task, program(task)
+    except Exception as error:
+        return task, {"error": f"{type(error).__name__}: {error}"}
+
+
+class Shares:
+    """Tasks that wait, dealt out so that a worker keeps to what it has compiled.
+
+    Compiling takes a minute and judging seconds, and a program is compiled in every process that runs it.
+    """
+
+    def __init__(self, tasks: Iterable[tuple[Task, Hashable]]) -> None:
+        self.waiting: dict[Hashable, list[Task]] = {}
+        for task, shape in tasks:
+            self.waiting.setdefault(shape, []).append(task)
+        self.at_work: Counter[Hashable] = Counter()
+
+    def next(self, before: Hashable | None) -> tuple[Task, Hashable] | None:
+        """A task for a worker that has just done one of shape `before`, and its shape; None where all are dealt out.
+
+        Where none of that shape is left, one of the shape for which the fewest work, by what waits of it.
+        """
+        if before is not None:
+            self.at_work[before] -= 1
+        shape = before
+        if not self.waiting.get(shape):
+            shape = max(
+                (k for k, tasks in self.waiting.items() if tasks),
+                key=lambda k: len(self.waiting[k]) / (1 + self.at_work[k]) ** 2,
+                default=None,
+            )
+        if shape is None:
+            return None
+        self.at_work[shape] += 1
+        return self.waiting[shape].pop(0), shape
+
+
+def _worker(work: Callable[[Task], dict], line: Connection) -> None:
+    while (task := line.recv()) is not None:
+        line.send(guarded(work, task))
+
+
+def judged(work: Callable[[Task], dict], shares: Shares, jobs: int, limit: float = np.inf) -> Iterator[dict]:
+    """Lines of tasks as workers finish them, until all are done or `limit` seconds have passed.
+
+    A worker that dies costs its case, which then has an error, and another takes its place.
+    """
+    began, spawn = time.monotonic(), multiprocessing.get_context("spawn")
+    workers: dict[Connection, tuple[BaseProcess, Task, Hashable]] = {}
+
+    def hire() -> None:
+        dealt = shares.next(None)
+        if dealt is None:
+            return
+        mine, theirs = spawn.Pipe()
+        process = spawn.Process(target=_worker, args=(work, theirs), daemon=True)
+        process.start()
+        theirs.close()
+        mine.send(dealt[0])
+        workers[mine] = (process, *dealt)
+
+    for _ in range(jobs):
+        hire()
+    try:
+        while workers:
+            ready = wait(list(workers), timeout=max(min(limit - (time.monotonic() - began), 1e6), 0.01))
+            if not ready:
+                print("the limit is reached", flush=True)
+                return
+            for line in ready:
+                process, task, shape = workers.pop(line)
+                try:
+                    done = line.recv()
+                except (EOFError, OSError):
+                    process.join()
+                    shares.at_work[shape] -= 1
+                    yield {
+                        "kind": task.kind,
+                        "seed": task.seed,
+                        "error": f"the process ended with {process.exitcode}",
+                    }
+                    hire()
+                    continue
+                dealt = shares.next(shape)
+                line.send(None if dealt is None else dealt[0])
+                if dealt is not None:
+                    workers[line] = (process, *dealt)
+                yield done
+    finally:
+        for process, *_ in workers.values():
+            process.terminate()
+
+
 def campaign(
-    doc: str | None, kinds: tuple[str, ...], work: Callable[[Task], dict], summary: Callable[..., list[str]], out: str
+    doc: str | None,
+    kinds: tuple[str, ...],
+    work: Callable[[Task], dict],
+    program: Callable[[Task], Hashable | dict],
+    summary: Callable[..., list[str]],
+    out: str,
 ) -> None:
     """Read the command line, make and judge cases in processes of their own, and print the figures.
 
     Args:
         work: a function of a module; summary: of all lines.
+        program: of a module too: the shape of what a task compiles, or the line of a case that is none.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     for kind in kinds:
@@ -142,22 +250,26 @@ def campaign(
     began = time.monotonic()
     made = 0
     cut = given.out.exists() and given.out.read_bytes()[-1:] not in (b"", b"\n")  # killed while writing
-    with multiprocessing.get_context("spawn").Pool(given.jobs) as pool, given.out.open("a", encoding="utf-8") as file:
+    with given.out.open("a", encoding="utf-8") as file:
         file.write("\n" if cut else "")
-        results = pool.imap_unordered(functools.partial(guarded, work), tasks)
-        while made < len(tasks):
-            left = given.limit - (time.monotonic() - began)
-            try:
-                line = results.next(timeout=max(min(left, 1e6), 0.01))
-            except multiprocessing.TimeoutError:
-                print("the limit is reached", flush=True)
-                pool.terminate()
-                break
+
+        def keep(line: dict) -> None:
+            nonlocal made
             made += 1
             lines.append(line)
             file.write(json.dumps(plain(line)) + "\n")
             file.flush()
             if made % 50 == 0:
                 print(f"{made}/{len(tasks)} cases, {time.monotonic() - began:.0f} s", flush=True)
+
+        with multiprocessing.get_context("spawn").Pool(given.jobs) as pool:
+            shaped = pool.map(functools.partial(programs, program), tasks, chunksize=4)
+        for task, shape in shaped:
+            if isinstance(shape, dict):
+                keep({"kind": task.kind, "seed": task.seed, **shape})
+        print(f"{len(tasks) - made} cases to judge, {time.monotonic() - began:.0f} s", flush=True)
+        shares = Shares((t, shape) for t, shape in shaped if not isinstance(shape, dict))
+        for line in judged(work, shares, given.jobs, given.limit - (time.monotonic() - began)):
+            keep(line)
     print("\n".join(summary(lines)))
     print(f"{made} of {len(tasks)} cases in {time.monotonic() - began:.0f} s with {given.jobs} processes")

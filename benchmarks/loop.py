@@ -363,6 +363,18 @@ def work(task: Task) -> dict:
     return one(task)
 
 
+def program(task: Task) -> tuple | dict:
+    """What tables have alike that share what is compiled; the line of a case that is none."""
+    from calibration.discovery.discover import padded
+    from calibration.inference.observers.settled import SettledRuns
+
+    case = attempt(task.kind, task.seed, task.narrow)
+    if isinstance(case, str):
+        return {"skipped": case}
+    names = case.world.machine.names.values() if isinstance(case, gw.WideCase) else ()
+    return len(padded(len(case.conditions.U), SettledRuns.sizes_padded)[0]), *names
+
+
 def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
     f = scores.Figures(lines)
@@ -413,4 +425,4 @@ def _experiments(f: scores.Figures) -> None:
 
 
 if __name__ == "__main__":
-    campaign(__doc__, KINDS, work, summary, "runs/campaign.jsonl")
+    campaign(__doc__, KINDS, work, program, summary, "runs/campaign.jsonl")

@@ -105,6 +105,17 @@ def _refused(label: dict, kind: str, low: float) -> str:
     return ""
 
 
+def program(task: Task) -> tuple | dict:
+    """What sets of histories have alike that share what is compiled; the line of a case that is none."""
+    made = attempt(task.kind, task.seed, task.narrow, task.stratum)
+    if isinstance(made, str):
+        return {"skipped": made}
+    table, _, case = made
+    if case is None:
+        return ("narrow",)
+    return len(table["time_s"]), *case.world.machine.names.values(), case.world.design
+
+
 def work(task: Task) -> dict:
     """One case in a worker."""
     from calibration.data import robot_file
@@ -193,4 +204,4 @@ def summary(lines: list[dict]) -> list[str]:
 
 
 if __name__ == "__main__":
-    campaign(__doc__, KINDS, work, summary, "runs/campaign_series.jsonl")
+    campaign(__doc__, KINDS, work, program, summary, "runs/campaign_series.jsonl")

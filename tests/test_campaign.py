@@ -1,6 +1,7 @@
 """Campaigns: cases of every kind, what a scorer says of a verdict, files that were cut off."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -106,3 +107,30 @@ def test_blind_cases_come_from_the_foreign_laws(monkeypatch):
     made = next(m for m in (loop.attempt("blind", s) for s in range(8)) if not isinstance(m, str))
     assert made.label["kind"] == "foreign" and made.label["effects"][0]["name"] == "odd"
     assert loop.oracle(made)[0]["best_other"] > 1.0
+
+
+def test_workers_keep_to_the_programs_that_they_have_compiled():
+    tasks = [(campaign.Task("x", k), "ab"[k % 2]) for k in range(8)]
+    shares = campaign.Shares(tasks)
+    one, two = shares.next(None), shares.next(None)
+    assert {one[1], two[1]} == {"a", "b"}
+    for _ in range(3):
+        one, before = shares.next(one[1]), one[1]
+        assert one[1] == before
+    assert [shares.next(two[1])[1], shares.next(None)[1]] == [two[1], two[1]]  # the other shape is dealt out
+    assert shares.next(None)[1] == two[1] and shares.next(None) is None
+
+
+def _judge(task):
+    if task.seed == 3:
+        os._exit(7)
+    return {"verdict": "none", "pid": os.getpid()}
+
+
+def test_a_worker_that_dies_costs_its_case_alone():
+    shares = campaign.Shares((campaign.Task("x", k), k % 2) for k in range(10))
+    lines = list(campaign.judged(_judge, shares, 2))
+    assert sorted(x["seed"] for x in lines) == list(range(10))
+    assert [x["seed"] for x in lines if "error" in x] == [3] and "7" in next(
+        x["error"] for x in lines if "error" in x
+    )
