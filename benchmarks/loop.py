@@ -240,7 +240,7 @@ def verdict(found) -> dict:
 
 def located(found) -> tuple | None:
     """(balance, variable, balances that act alike) of what has no name, or remains."""
-    return None if found.where is None else (found.where.balance, found.where.variable, list(found.where.alike))
+    return None if found.where is None else (found.where.place, found.where.variable, list(found.where.alike))
 
 
 #: Of a label, what the scorer keeps of a case.

@@ -11,12 +11,14 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
+#: Channels, whose readings may be off.
+CHANNELS = ("total_current", "motor_speed", "speed")
 #: Balances that act on the same of the three equations that current, motor speed and speed close.
 EQUATION = {
     **dict.fromkeys(("supply", "electrical", "inductance"), "electrical"),
     **dict.fromkeys(("motor", "gearbox", "track", "ground", "mass", "inertia"), "torque"),
     "slip": "slip",
-    "sensor": "sensor",
+    **dict.fromkeys(("sensor", *CHANNELS), "sensor"),
 }
 #: Sigmas that the best library effect has to leave of a foreign one for it not to be a mimic.
 MIMIC = 5.0

@@ -32,6 +32,7 @@ class Channel:
         read: what of the signals an ideal instrument shows [SI].
         sd_share: sd that is assumed where none is known, as a share of the reading [-].
         resolution: digits after the point that a person wants to see [unit].
+        unit_si: of readings inside; empty where `factor` is 1.
         zero_at_rest: whether it shows 0 until the robot moves.
         other_units: what is often written in its column by mistake, and the SI value of each.
     """
@@ -48,6 +49,7 @@ class Channel:
     read: Callable[[Robot, Signals], Any]
     sd_share: float
     resolution: int = 1
+    unit_si: str = ""
     zero_at_rest: bool = False
     other_units: tuple[tuple[str, float], ...] = ()
 
@@ -82,6 +84,7 @@ CHANNELS: tuple[Channel, ...] = (
         sd_largest=10_000.0,
         read=lambda robot, signals: signals.speed_motor,
         sd_share=0.005,
+        unit_si="rad/s",
         zero_at_rest=True,
         other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", math.pi / 180)),
     ),
@@ -97,6 +100,7 @@ CHANNELS: tuple[Channel, ...] = (
         sd_largest=5_000.0,
         read=lambda robot, signals: signals.speed,
         sd_share=0.01,
+        unit_si="m/s",
         zero_at_rest=True,
         other_units=(("m/s", 1.0), ("km/h", 1 / 3.6), ("cm/s", 1e-2), ("m/min", 1 / 60)),
     ),

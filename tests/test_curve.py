@@ -12,7 +12,7 @@ import test_effects as laws
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.inference import bases as curves
-from mmrjax import balances, effects, params, robots
+from mmrjax import balances, channels, effects, params, robots
 from mmrjax.effects import CURVES, UNNAMED, WAVES, curve
 from mmrjax.fidelities.drive import drive
 from mmrjax.signals import Signals
@@ -141,6 +141,7 @@ def test_curves_are_no_part_of_the_library():
 def test_curves_are_those_that_the_trace_looks_for():
     assert tuple(curve.BALANCES) == curves.BALANCES and tuple(curve.VARIABLES) == tuple(curves.VARIABLES)
     assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
+    assert tuple(curve.READINGS) == channels.names()
 
 
 def test_robot_with_curves_written_and_read_is_the_same(tmp_path):

@@ -248,9 +248,11 @@ def toy():
     signatures[:, 3] = 2 * signatures[:, 0] + 1e-3 * signatures[:, 3]  # look-alikes
     defects = rng.standard_normal((len(PROBED), rows, 3))
     columns = rng.standard_normal((2, rows, 3))
-    basis = bases.Basis(jnp.asarray(columns), (2, 5), (("electrical", "a"), ("track", "b")))
-    linear = SettledLinearization(*map(jnp.asarray, (e, jacobian, signatures, defects)), None)
-    return SimpleNamespace(linear=linear, basis=basis, scores=score_tests(linear, (basis,)))
+    basis = bases.Basis(jnp.asarray(columns), (("electrical", "a"), ("track", "b")))
+    shown = bases.Basis(jnp.asarray(columns), (("speed", "a"), ("total_current", "b")))
+    scale = rng.uniform(0.5, 2.0, (rows, 3))
+    linear = SettledLinearization(*map(jnp.asarray, (e, jacobian, signatures, defects, scale)), None)
+    return SimpleNamespace(linear=linear, bases=(basis, shown), scores=score_tests(linear, (basis, shown)))
 
 
 def left(linear: SettledLinearization, columns: np.ndarray) -> np.ndarray:
@@ -291,8 +293,10 @@ def test_scores_are_falls_of_the_sum_of_squares(toy):
 
 def test_curve_scores_are_ridge_regressions(toy):
     e = np.asarray(toy.linear.residual)
-    for k, balance in enumerate(toy.basis.balance):
-        columns = np.asarray(toy.linear.defects)[balance][..., None] * np.asarray(toy.basis.columns)[k][:, None, :]
+    of_channel = [np.asarray(toy.linear.scale) * (np.arange(3) == k) for k in (2, 0)]  # speed, total current
+    moves = [*np.asarray(toy.linear.defects)[[2, 5]], *of_channel]
+    for k, move in enumerate(moves):
+        columns = move[..., None] * np.asarray(toy.bases[k // 2].columns)[k % 2][:, None, :]
         r = left(toy.linear, columns.reshape(-1, 3))
         r *= 10 / np.linalg.norm(r, axis=0)
         inverse = np.linalg.inv(r.T @ r + np.eye(3))

@@ -15,11 +15,12 @@ from synthetic import SETTLED, STATED, Analyst, table
 
 from calibration.discovery import discover
 from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
-from calibration.discovery.projection import Projection, columns_of
+from calibration.discovery.projection import Projection
 from calibration.discovery.search import Search, diagnose
 from calibration.discovery.settings import settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
 from calibration.discovery.standing import _significance, cost_of_names, evidence_of_names, standing
+from calibration.inference import bases
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers import Histories, SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
@@ -43,7 +44,7 @@ def toy():
     residual = np.concatenate([readings + slopes @ z, np.zeros(rows), z])
     jacobian = np.concatenate([slopes, np.zeros((rows, p)), np.eye(p)])
     signals = SimpleNamespace(speed_motor=speed, slope=slope)
-    arrays = (jnp.asarray(x) for x in (residual, jacobian, np.zeros((3 * rows, 1)), defects))
+    arrays = (jnp.asarray(x) for x in (residual, jacobian, np.zeros((3 * rows, 1)), defects, np.ones((rows, 3))))
     linear = SettledLinearization(*arrays, signals)
     return SimpleNamespace(linear=linear, readings=readings, slopes=slopes, rows=rows, counts=np.ones(rows, bool))
 
@@ -60,7 +61,7 @@ def gained(toy, columns):
 
 def test_evidence_of_a_curve_is_the_largest_marginal_likelihood(toy):
     found = smooth(toy.linear, "track", "speed_motor", toy.counts)
-    raw = columns_of(toy.linear, "track", found.basis(toy.linear.variable("speed_motor")))
+    raw = bases.signature(toy.linear, "track", found.basis(toy.linear.variable("speed_motor")))
     assert found.evidence == pytest.approx(gained(toy, found.scale * raw @ found.root), rel=1e-6)
     # no other prior that is tried makes the readings more likely
     distance = np.subtract.outer(np.arange(6), np.arange(6))
@@ -83,7 +84,7 @@ def test_evidence_of_a_surface_is_the_largest_marginal_likelihood(toy):
         x = toy.linear.variable(name)
         x = 2 * (x - x.min()) / np.ptp(x) - 1
         sides.append(legendre.legvander(x, PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT)))
-    raw = columns_of(toy.linear, "track", np.einsum("ri,rj->rij", *sides).reshape(toy.rows, -1))
+    raw = bases.signature(toy.linear, "track", np.einsum("ri,rj->rij", *sides).reshape(toy.rows, -1))
     ratio = found.columns[:, 0] / raw[:, 0]
     np.testing.assert_allclose(found.columns, ratio[0] * raw, rtol=1e-9)
     for factor in (0.3, 0.6, 1.7, 3.0):
@@ -104,7 +105,7 @@ def test_evidence_of_a_name_is_its_marginal_likelihood_less_what_was_searched(to
     """Of one effect among a library of twelve; the prior of its amplitude is standard normal, or where the data have
     it far smaller, of the size that they find most likely."""
     over = np.sin(toy.linear.variable("speed_motor") / 120)[:, None]
-    column = scale * columns_of(toy.linear, "track", over)
+    column = scale * bases.signature(toy.linear, "track", over)
     whole = np.concatenate([toy.slopes, column], 1)
     posterior = np.linalg.inv(whole.T @ whole + np.eye(5))
 

@@ -40,7 +40,7 @@ from calibration.discovery.standing import Standing, standing
 from calibration.inference import bases as bases_room
 from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
-from calibration.inference.bases import Bases
+from calibration.inference.bases import Bases, in_words
 from calibration.inference.foreign import foreign_priors
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.noise import Noise
@@ -415,7 +415,7 @@ def finished(
     curve = None
     if traced.verdict == "unnamed" and where is not None:
         progress("the shape of what is missing")
-        curve = fit_discrepancy(space, base, left.linear, where.balance, where.variable)
+        curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
     included = space.included[:rows]
@@ -448,7 +448,9 @@ def finished(
     remains = None
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
-        remains = None if where is None else Remainder(where.balance, where.alike, where.variable)
+        remains = (
+            None if where is None else Remainder(where.balance, where.channel, where.balances_alike, where.variable)
+        )
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
         ask = not observe.long
@@ -562,9 +564,9 @@ def remarks(found: DiscoveryResult) -> tuple[str, ...]:
             f"each, {wave.score:.0f} with one phase): robot.toml holds the mean; start runs from a mark"
         )
     if found.remains is not None:
-        over = found.remains.variable.replace("_", " ")
+        place, over = found.remains.channel or found.remains.balance, found.remains.variable.replace("_", " ")
         said.append(
-            f"what was found does not explain everything: {found.remains.balance} still lacks something over {over}"
+            f"what was found does not explain everything: the {in_words(place)} still lacks something over {over}"
         )
     said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates

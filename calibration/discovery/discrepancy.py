@@ -32,7 +32,7 @@ from calibration.inference.problem import Problem
 from mmrjax import params
 from mmrjax.effects import UNNAMED
 from mmrjax.effects.base import EQUATION
-from mmrjax.effects.curve import BALANCES
+from mmrjax.effects.curve import PLACES
 from mmrjax.robot import Robot
 
 #: Starts of the curve's fit, from what the linear analysis says to none.
@@ -51,26 +51,43 @@ class Location:
     """Where something is missing.
 
     Attributes:
-        balance: in which a curve explains most; variable: over which it does.
-        alike: balances in which one explains as much, or would if it had curves of its own.
+        place: balance in which a curve explains most, or channel whose readings it shifts; variable: over which it
+            does.
+        alike: places in which one explains as much, or would if it had curves of its own.
         explained: what the curves of that balance and variable explain [σ²]; strongest: what the most improbable
             family does.
     """
 
-    balance: str
+    place: str
     variable: str
     alike: tuple[str, ...]
     explained: float
     strongest: float
 
     @property
+    def balance(self) -> str:
+        """The balance, `sensor` where it is in what an instrument shows."""
+        return bases_room.balance_of(self.place)
+
+    @property
+    def channel(self) -> str:
+        """The channel whose readings are off, empty for none."""
+        return self.place if bases_room.in_readings(self.place) else ""
+
+    @property
+    def balances_alike(self) -> tuple[str, ...]:
+        """Balances of the places that act alike."""
+        return tuple(dict.fromkeys(map(bases_room.balance_of, self.alike)))
+
+    @property
     def family(self) -> str:
         """Its equation and what drives it, in the words of `Effect.family`."""
         happens = bases_room.window(self.variable)
         variable = self.variable if happens is None else happens.axis
+        what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
         drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
         drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
-        return f"{EQUATION[self.balance]} that changes with {drivers.get(variable, variable)}"
+        return f"{what} that changes with {drivers.get(variable, variable)}"
 
 
 def locate(observe: Observer, scores: ScoreTable, bases: Bases) -> Location:
@@ -85,7 +102,8 @@ def locate(observe: Observer, scores: ScoreTable, bases: Bases) -> Location:
     balance = names[k][0]
     over = [j for j in those if names[j][0] == balance and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: by[j])
-    best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in bases_room.BALANCES}
+    places = dict.fromkeys(names[i][0] for i in those)
+    best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in places}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     explained = np.asarray(scores.explained)
     return Location(balance, names[j][1], tuple(itertools.chain(*alike)), float(explained[j]), float(explained[k]))
@@ -171,7 +189,8 @@ def fit_discrepancy(
 
     Args:
         base: the fit that leaves it; linear: the same, linearised.
-        balance: one of `bases.BALANCES`; variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
+        balance: one of `bases.BALANCES`, or a channel.
+        variable: one of `bases.VARIABLES`, of `bases.ORDERS`, or a window.
     """
     included = space.included
     at_base = smooth(linear, balance, variable, included)
@@ -190,7 +209,7 @@ def fit_discrepancy(
     return Discrepancy(
         balance=balance,
         variable=variable,
-        unit=BALANCES[balance][0],
+        unit=PLACES[balance][0],
         effect=at_base.effect,
         robot=_present(problem.robot(jnp.asarray(z)), space, base, at_base.effect),
         defect=defect(linear, balance) if space.bare.observe.rows_tell else None,

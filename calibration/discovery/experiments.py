@@ -385,18 +385,18 @@ def denser(space: CandidateSpace, where: Location, settings: Settings) -> Propos
     Its expected separation from nothing is that of the table [σ], whose curve explains so much a run, over the
     runs of the series.
     """
-    balance, variable = where.balance, where.variable
+    place, variable = bases.in_words(where.place), where.variable
     runs, within = space.bare.observe.runs_counting(space.included), reach_of(space)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
     finer = _steps(variable, within)
     how = _steady_speeds(variable, within) if finer is None else finer
-    text = f"{how}; read every channel. What the {balance} balance lacks then shows its shape"
+    text = f"{how}; read every channel. What the {place} lacks then shows its shape"
     name = f"finer steps in {variable}" if finer is not None else f"steady speeds for {variable}"
     name = name if bases.window(variable) is None else "the same runs again"
     if sigma < settings.worth:
         text = f"A series in {variable} would show what is missing by {sigma:.1f} sigma"
         return Proposal((NONE,), text, (), 0.0, False, ())
-    return Proposal((name,), text, (f"{balance} curve in {variable}",), sigma, False, ())
+    return Proposal((name,), text, (f"curve of the {place} over {variable}",), sigma, False, ())
 
 
 def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:

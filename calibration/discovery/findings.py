@@ -144,9 +144,10 @@ def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> U
     f, lacks, happens = found.proposal, found.defect, bases_room.window(where.variable)
     return UnnamedDiscrepancy(
         balance=where.balance,
+        channel=where.channel,
         variable=where.variable,
         unit=found.unit,
-        balances_alike=where.alike,
+        balances_alike=where.balances_alike,
         families=(where.family,),
         window=None if happens is None else dataclasses.asdict(happens),
         effect=found.effect,
@@ -388,12 +389,13 @@ def statement(
     if verdict == "none":
         return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
     if verdict == "unnamed" and where is not None:
-        others = [b for b in where.alike if b != where.balance]
+        others = [bases_room.in_words(p).removeprefix("balance ") for p in where.alike if p != where.place]
         also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
         what = f": {where.family}" if where.variable in bases_room.VARIABLES else ""
+        place = bases_room.in_words(where.place)
         return (
-            f"Something is missing in the balance {where.balance}{also}, {shown_over(where.variable)}{what}; no "
-            f"effect of the library explains it (family-wise p {said_p(p)})."
+            f"Something is missing in the {place}{also}, {shown_over(where.variable)}{what}; no effect of the "
+            f"library explains it (family-wise p {said_p(p)})."
         )
     names = []
     for k, words in enumerate(classes):
@@ -404,7 +406,7 @@ def statement(
             listed = ", ".join(words) if len(words) == 1 else f"one of {', '.join(words)}"
             said = f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
         names.append(said)
-    left = "" if where is None else f" Something remains in the balance {where.balance}."
+    left = "" if where is None else f" Something remains in the {bases_room.in_words(where.place)}."
     return f"Missing: {'; '.join(names)} (family-wise p {said_p(p)}).{left}"
 
 

@@ -7,15 +7,18 @@ import itertools
 
 import numpy as np
 
-from calibration.discovery.projection import Projection, columns_of
+from calibration.discovery.projection import Projection
 from calibration.discovery.smooth import Smooth
-from calibration.inference.bases import ORDERS
+from calibration.inference.bases import ORDERS, signature
 from calibration.inference.linearization import Linearization
-from mmrjax.effects.curve import BALANCES
+from mmrjax import channels
+from mmrjax.effects.curve import PLACES
 from mmrjax.signals import Signals
 
 #: What a formula is called, in the symbols of the paper.
-SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV"}
+SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV"} | {
+    c.name: f"Δ({c.label})" for c in channels.CHANNELS
+}
 #: Variables over which things fade: symbol, and unit of its constant.
 FADING = {"time": ("t", " s"), "order": ("k", "")}
 #: Exponents of a factor alone, and in a product of two.
@@ -159,9 +162,9 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     shapes = np.zeros((rows, len(terms)))
     for k, value in enumerate(known.values()):
         shapes[counts, k] = value
-    a, b = Projection(linear)(columns_of(linear, balance, shapes))
+    a, b = Projection(linear)(signature(linear, balance, shapes))
     scale = np.sqrt(np.maximum(np.diag(a), 0))
-    visible = scale > 1e-3 * np.linalg.norm(columns_of(linear, balance, shapes), axis=0)
+    visible = scale > 1e-3 * np.linalg.norm(signature(linear, balance, shapes), axis=0)
     scale = np.where(visible, scale, 1.0)
     a, b = a / scale / scale[:, None], np.where(visible, b / scale, 0.0)
     cost = np.log(3 * counts.sum())
@@ -186,7 +189,7 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     inverse = np.linalg.inv(a[part])
     value = inverse @ b[list(chosen)] / scale[list(chosen)]
     sd = np.sqrt(np.diag(inverse)) / scale[list(chosen)]
-    unit = BALANCES[balance][0]
+    unit = PLACES[balance][0]
     picked = tuple(terms[k] for k in chosen)
     said = " ".join(
         f"{'-' if v < 0 else '+' if i else ''}{' ' if i else ''}{abs(v):.2g} {unit} {t}"
@@ -208,7 +211,7 @@ def _harmonic(balance: str, curve: Smooth) -> Proposal:
     """A wave is its own formula."""
     sine, cosine = curve.scale * curve.root @ curve.start
     size, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
-    order, unit = ORDERS[curve.variable][0], BALANCES[balance][0]
+    order, unit = ORDERS[curve.variable][0], PLACES[balance][0]
     formula = (
         f"{SYMBOL[balance]} = {size:.2g} {unit} sin({order:.3g} θ_k {'-' if phase < 0 else '+'} {abs(phase):.2g})"
     )
@@ -218,7 +221,7 @@ def _harmonic(balance: str, curve: Smooth) -> Proposal:
 def _while(balance: str, curve: Smooth) -> Proposal:
     """What happens for a while: its mean over that."""
     level = float(np.mean((curve.scale * curve.root @ curve.start)[1:-1]))
-    formula = f"{SYMBOL[balance]} = {level:.2g} {BALANCES[balance][0]} while {curve.variable}"
+    formula = f"{SYMBOL[balance]} = {level:.2g} {PLACES[balance][0]} while {curve.variable}"
     axis = curve.variable.split()[0]
     return Proposal(formula, (), (level,), (float("nan"),), (axis,), curve.explained, 0.0, 1)
 
@@ -232,13 +235,13 @@ def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoot
     best: tuple[float, tuple] = (np.inf, ())
     project, cost = Projection(linear), np.log(3 * counts.sum())
     for tau in constants:
-        a, b = project(columns_of(linear, balance, np.exp(-t / tau)[:, None] * counts[:, None]))
+        a, b = project(signature(linear, balance, np.exp(-t / tau)[:, None] * counts[:, None]))
         if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
             best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
     if not best[1]:
         return Proposal("none: no term shows in these data", (), (), (), (), 0.0, 0.0, len(constants))
     tau, value, sd = best[1]
-    formula = f"{SYMBOL[balance]} = {value:.2g} {BALANCES[balance][0]} exp(-{symbol} / {tau:.2g}{unit})"
+    formula = f"{SYMBOL[balance]} = {value:.2g} {PLACES[balance][0]} exp(-{symbol} / {tau:.2g}{unit})"
     gain = float(curve.freedom * cost - curve.explained - best[0])
     return Proposal(
         formula, (), (float(value),), (float(sd),), (curve.variable,), float(2 * cost - best[0]), gain, len(constants)

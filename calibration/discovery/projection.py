@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference.linearization import PROBED, Linearization
+from calibration.inference.bases import signature
+from calibration.inference.linearization import Linearization
 
 
 class Projection:
@@ -36,18 +36,18 @@ class Projection:
 
 @dataclasses.dataclass(frozen=True)
 class Defect:
-    """What a balance lacks in each row by itself, after what the free parameters absorb.
+    """What a place lacks in each row by itself, after what the free parameters absorb.
 
     Attributes:
-        value, sd: [unit of the balance], shape (rows,); NaN where the readings do not show it.
+        value, sd: [unit of the place], shape (rows,); NaN where the readings do not show it.
     """
 
     value: np.ndarray
     sd: np.ndarray
 
 
-def defect(linear: Linearization, balance: str) -> Defect:
-    """The defect of a balance in each row: least squares of the row's residual along its sensitivity.
+def defect(linear: Linearization, place: str) -> Defect:
+    """The defect of a place in each row: least squares of the row's residual along its sensitivity.
 
     δ_i = -(r_i·e) / ‖r_i‖², sd 1/‖r_i‖, r_i = (I - P) g_i, g_i the change of all readings by a defect of row i
     (of histories: at that instant, falling to zero at the knots beside it; NaN between knots).
@@ -55,7 +55,7 @@ def defect(linear: Linearization, balance: str) -> Defect:
     places = linear.places()
     shapes = np.zeros((linear.rows, len(places)))
     shapes[places, np.arange(len(places))] = 1.0
-    columns = columns_of(linear, balance, shapes)
+    columns = signature(linear, place, shapes)
     a, b = Projection(linear)(columns)
     norm2, whole = np.diag(a), np.sum(columns**2, 0)
     seen = norm2 > 1e-6 * np.maximum(whole, 1e-300)
@@ -63,8 +63,3 @@ def defect(linear: Linearization, balance: str) -> Defect:
     value, sd = np.full(linear.rows, np.nan), np.full(linear.rows, np.nan)
     value[places], sd[places] = b / norm2, 1 / np.sqrt(norm2)
     return Defect(value, sd)
-
-
-def columns_of(linear: Linearization, balance: str, shapes: np.ndarray) -> np.ndarray:
-    """Change of the readings by terms of a balance, shape (readings, terms), of shapes (rows, terms)."""
-    return np.asarray(linear.columns(PROBED.index(balance), jnp.asarray(shapes)))

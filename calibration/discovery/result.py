@@ -97,6 +97,7 @@ class UnnamedDiscrepancy:
 
     Attributes:
         balance, variable, unit: where, over what, in which unit; balances_alike: balances in which it acts alike.
+        channel: whose readings are off, where the balance is `sensor`; else "".
         families: what is missing, in words, as of `FoundEffect`.
         window: axis, first and last place of what happens for a while; None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
@@ -108,6 +109,7 @@ class UnnamedDiscrepancy:
     """
 
     balance: str
+    channel: str
     variable: str
     unit: str
     balances_alike: tuple[str, ...]
@@ -127,9 +129,10 @@ class UnnamedDiscrepancy:
 
 @dataclasses.dataclass(frozen=True)
 class Remainder:
-    """What the effects of a verdict leave beyond doubt."""
+    """What the effects of a verdict leave beyond doubt; as of `UnnamedDiscrepancy`."""
 
     balance: str
+    channel: str
     balances_alike: tuple[str, ...]
     variable: str
 
@@ -492,6 +495,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "class": [],
         "families": list(d.families),
         "balance": d.balance,
+        "channel": d.channel,
         "balances_alike": list(d.balances_alike),
         "variable": d.variable,
         "window": d.window,

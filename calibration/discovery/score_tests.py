@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.inference.bases import Bases, Basis
+from calibration.inference.bases import Bases, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.problem import Problem
@@ -67,11 +67,6 @@ def _projected(linear: Linearization, columns: Array) -> tuple[Array, Array, Arr
     return dots, inside, lower
 
 
-def basis_columns(linear: Linearization, basis: Basis) -> Float[Array, "families readings terms"]:
-    """Signatures of every curve's columns."""
-    return jax.vmap(linear.columns)(jnp.asarray(basis.balance), basis.columns)
-
-
 def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     """Scores of every instance, pair, curve and reading."""
     g = linear.signatures
@@ -95,7 +90,7 @@ def score_tests(linear: Linearization, bases: Bases) -> ScoreTable:
     fitted = e[:readings] - half.T @ forward(lower, linear.jacobian.T @ e)
     row = jnp.where(leverage < 1 - 1e-6, fitted / jnp.sqrt(jnp.maximum(1 - leverage, 1e-12)), 0.0)
 
-    found = [jax.vmap(lambda c: _curve_score(linear, c))(basis_columns(linear, basis)) for basis in bases]
+    found = [jax.vmap(lambda c: _curve_score(linear, c))(basis.signatures(linear)) for basis in bases]
     deviate, explained = (jnp.concatenate([f[k] for f in found] or [jnp.zeros(0)]) for k in (0, 1))
     amplitude = jnp.where(seen, -dots / norm**2, 0.0)
     row = row.reshape(linear.rows, -1)
@@ -171,7 +166,7 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     linear = jax.tree.map(jnp.asarray, linear)
     for basis in bases:
         if chosen < len(basis.names):
-            columns = np.asarray(linear.columns(basis.balance[chosen], basis.columns[chosen]))
+            columns = signature(linear, basis.names[chosen][0], np.asarray(basis.columns[chosen]))
             norm = np.linalg.norm(columns, axis=0)
             return columns[:, norm > 0] / norm[norm > 0] * WIDE
         chosen -= len(basis.names)
@@ -197,10 +192,10 @@ def beside_columns(
     linear: Linearization, bases: Bases, extra: np.ndarray, of: Sequence[str]
 ) -> tuple[Statistics, np.ndarray]:
     """The strongest statistics that are left once further columns are fitted with the free parameters, and the normal
-    deviate of every family of curves, -inf for those of the columns' own balances.
+    deviate of every family of curves, -inf for those of the columns' own places.
 
     Args:
-        extra: columns over the readings, shape (readings, columns); of: their balances.
+        extra: columns over the readings, shape (readings, columns); of: their places.
     """
     filled = np.pad(extra, ((0, 0), (0, -extra.shape[1] % FILLED)))  # to few sizes: each is compiled
     jacobian, residual = map(jnp.asarray, widened(linear, filled))

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
 
-from calibration.discovery.projection import Projection, columns_of
-from calibration.inference.bases import ORDERS, scaled, window
+from calibration.discovery.projection import Projection
+from calibration.inference.bases import ORDERS, scaled, signature, window
 from calibration.inference.linearization import Linearization
 from mmrjax.effects.curve import ORDINATES, weights
 
@@ -100,7 +100,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # the variable stands still: an offset is all that can be seen
     basis = _basis(variable, x, low, high)
-    a, b = Projection(linear)(columns_of(linear, balance, basis))
+    a, b = Projection(linear)(signature(linear, balance, basis))
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     roots = [np.eye(2)] if variable in ORDERS else [_smoothness(length, happens is not None) for length in LENGTHS]
     best: tuple[float, tuple] = (-np.inf, ())
@@ -161,7 +161,7 @@ def surface(
         for v in variables
     ]
     shapes = (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.rows, -1)
-    columns = columns_of(linear, balance, shapes)
+    columns = signature(linear, balance, shapes)
     a, b = project(columns)
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))
     best = (-np.inf, 0.0, 0.0)

@@ -29,14 +29,18 @@ from calibration.inference.linearization import Linearization
 
 #: Curves that are put beside effects, one after the other.
 CURVES = 3
-#: Balances whose curves stand for effects of a balance: those of one equation.
-EQUATION = {
-    "mass": "ground",
-    **{b: b for b in bases_room.BALANCES},
-    **{other: b for b, others in bases_room.STANDS_FOR.items() for other in others},
+#: Balances whose curves stand for effects of a balance: those of one equation. What a speed meter shows too much is
+#: what slip takes away.
+EQUATION = {"mass": "ground", "speed": "slip"} | {
+    other: b for b, others in bases_room.STANDS_FOR.items() for other in others
 }
 #: Pairs of variables over which a surface is tried.
 VARIABLES = ("voltage", "current", "speed_motor", "slope", "payload")
+
+
+def equation(place: str) -> str:
+    """The place whose curves stand for what is in a balance, or in the readings of a channel."""
+    return EQUATION.get(place, place)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,8 +109,9 @@ def _against_curves(
     space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
 ) -> Standing:
     """Names against one smooth curve of one variable, or of two, in the balance of several of them or anywhere."""
-    equations = [EQUATION.get(space.library[e].balance, "") for e in best.effects]
-    crowded = {e for e in equations if e and equations.count(e) > 1}
+    equations = [equation(space.library[e].channel or space.library[e].balance) for e in best.effects]
+    places = {place for place, _ in bases_room.names(bases)}
+    crowded = {e for e in equations if equations.count(e) > 1 and e in places}
     tried = _curves(space, linear, bases, crowded)
     if not tried:
         return Standing(True)
@@ -120,21 +125,27 @@ def _against_curves(
 
 
 def _curves(space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]) -> list[tuple[float, str]]:
-    """(evidence, words) of every smooth curve: of one variable in any balance, of two in the crowded ones."""
-    included, offered = space.included, {n[1] for n in bases_room.names(bases)}
-    known = [v for v in bases_room.VARIABLES if v in offered and _varies(linear, v, included)]
+    """(evidence, words) of every smooth curve: of one variable in any place, of two in the crowded ones."""
+    included, offered = space.included, dict.fromkeys(bases_room.names(bases))
+    known = [
+        v for v in bases_room.VARIABLES if any(v == over for _, over in offered) and _varies(linear, v, included)
+    ]
     tried = []
-    for balance in bases_room.BALANCES:
-        for variable in known:
-            found = smooth(linear, balance, variable, included)
-            tried.append((found.evidence, f"curve in {balance} over {variable.replace('_', ' ')}"))
+    for place, variable in offered:
+        if variable in known:
+            found = smooth(linear, place, variable, included)
+            tried.append((found.evidence, f"curve in the {_over(place, variable)}"))
     project = Projection(linear)
-    for balance in sorted(crowded):
+    for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known], 2):
-            over = surface(linear, balance, pair, included, project)
-            words = " and ".join(v.replace("_", " ") for v in pair)
-            tried.append((over.evidence, f"surface in {balance} over {words}"))
+            over = surface(linear, place, pair, included, project)
+            tried.append((over.evidence, f"surface in the {_over(place, *pair)}"))
     return tried
+
+
+def _over(place: str, *variables: str) -> str:
+    """`balance slip over speed motor and slope`."""
+    return f"{bases_room.in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
 
 
 def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
@@ -169,9 +180,8 @@ def _beside_curves(
     names = bases_room.names(bases)
     alone, test = _curves_beside(left.linear, left, bases, set(), 1, settings)
     if not test.rejected_with_margin:
-        balance, variable = names[alone[0]]
-        return Standing(False, f"one smooth curve in {balance} over {variable.replace('_', ' ')} leaves nothing")
-    own = {EQUATION.get(space.library[e].balance, "") for e in best.effects}
+        return Standing(False, f"one smooth curve in the {_over(*names[alone[0]])} leaves nothing")
+    own = {equation(space.library[e].channel or space.library[e].balance) for e in best.effects}
     chosen, test = _curves_beside(after.linear, after, bases, own, CURVES, settings)
     if test.rejected_with_margin:
         chosen, test = _curves_beside(after.linear, after, bases, set(), CURVES, settings)
@@ -181,7 +191,7 @@ def _beside_curves(
     significance = _significance(space, best, after.linear, columns)
     needed = after.test.threshold("single")
     lost = [e for e, t in zip(best.effects, significance, strict=True) if abs(t) < needed]
-    words = ", ".join(f"{names[k][0]} over {names[k][1].replace('_', ' ')}" for k in chosen)
+    words = ", ".join(_over(*names[k]) for k in chosen)
     if lost:
         return Standing(False, f"beside smooth curves ({words}) {' and '.join(lost)} would explain nothing")
     return Standing(True, f"beside smooth curves ({words})")
@@ -194,16 +204,16 @@ def _curves_beside(
     test of what is left.
 
     Args:
-        seen: what the fit leaves; without: balances that get none.
+        seen: what the fit leaves; without: equations that get none.
     """
-    balances = np.array([n[0] for n in bases_room.names(bases)])
-    barred = np.isin(balances, list(without))
+    places = [n[0] for n in bases_room.names(bases)]
+    barred = np.isin([equation(p) for p in places], list(without))
     chosen, columns = list[int](), np.zeros((linear.readings, 0))
     deviate, test = np.array(seen.scores.curve), seen.test
     for _ in range(most):
         chosen.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
-        found, deviate = beside_columns(linear, bases, columns, [balances[k] for k in chosen])
+        found, deviate = beside_columns(linear, bases, columns, [places[k] for k in chosen])
         test = AdequacyTest(found, seen.test.null, settings)
         if not test.rejected_with_margin:
             break

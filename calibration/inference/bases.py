@@ -8,12 +8,15 @@ import re
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
-from calibration.inference.linearization import PROBED
+from calibration.inference.linearization import PROBED, Linearization
+from mmrjax import channels
+from mmrjax.effects import UNNAMED
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
 #: also loads the contact; and those for which they stand, as what these lack has the same shape in them.
@@ -55,22 +58,52 @@ RESOLVED = 2.5
 
 
 class Basis(eqx.Module):
-    """Families of smooth curves: a defect of one balance as a combination of columns over the rows.
+    """Families of smooth curves: a defect of one balance, or what is added to the readings of one channel, as a
+    combination of columns over the rows.
 
     All families of one `Basis` have as many columns.
 
     Attributes:
         columns: of each family, shape (families, rows, terms).
-        balance: index into PROBED of each family.
-        names: (balance, variable) of each family.
+        names: (place, variable) of each family; all places are balances, or all are channels.
     """
 
     columns: Float[Array, "families rows terms"]
-    balance: tuple[int, ...] = eqx.field(static=True)
     names: tuple[tuple[str, str], ...] = eqx.field(static=True)
+
+    @property
+    def _of_channels(self) -> bool:
+        return in_readings(self.names[0][0])
+
+    def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
+        """Change of the whitened readings by every family's columns."""
+        known, change = (channels.names(), linear.shown) if self._of_channels else (PROBED, linear.columns)
+        return jax.vmap(change)(jnp.asarray([known.index(place) for place, _ in self.names]), self.columns)
 
 
 Bases = tuple[Basis, ...]
+
+
+def in_readings(place: str) -> bool:
+    """Whether a place of curves is a channel, whose readings are off; else it is a balance."""
+    return place in channels.names()
+
+
+def balance_of(place: str) -> str:
+    """The balance of a place of curves: `sensor` for a channel."""
+    return "sensor" if in_readings(place) else place
+
+
+def in_words(place: str) -> str:
+    """`balance slip`, `reading of motor speed`."""
+    return f"reading of {place}".replace("_", " ") if in_readings(place) else f"balance {place}"
+
+
+def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
+    """Change of the readings by terms of a place, shape (readings, terms), of shapes (rows, terms)."""
+    if in_readings(place):
+        return np.asarray(linear.shown(channels.index(place), jnp.asarray(shapes)))
+    return np.asarray(linear.columns(PROBED.index(place), jnp.asarray(shapes)))
 
 
 def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -81,24 +114,31 @@ def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
-    """Curves of one variable, and polynomials in all conditions for each configuration, in every balance.
+    """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
+    of what the readings of a channel are off by, over the reading and over what time or order brings.
 
     Args:
         columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,).
     """
-    names: list[tuple[str, str]] = []
-    bases: list[np.ndarray] = []
+    over: dict[str, tuple[str, np.ndarray]] = {}
     for variable, column in VARIABLES.items():
         if column not in columns:
             continue
         if variable == "order" and collinearity(columns, weight) > COLLINEAR:
-            # The first variable again in its place: tables of one size share what is compiled.
-            names += names[: len(BALANCES)]
-            bases += bases[: len(BALANCES)]
+            # Another variable again in its place: tables of one size share what is compiled.
+            over[variable] = next(iter(over.values()))
             continue
         basis = legendre.legvander(scaled(columns[column], weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
-        names += [(balance, variable) for balance in BALANCES]
-        bases += [basis] * len(BALANCES)
+        over[variable] = variable, basis
+    names = [(balance, variable) for variable, _ in over.values() for balance in BALANCES]
+    bases = [basis for _, basis in over.values() for _ in BALANCES]
+    read = [
+        ((c.name, over[v][0]), over[v][1])
+        for c in channels.CHANNELS
+        for v in over
+        if v in AXES or VARIABLES[v] == c.column
+        if f"curve_{c.name}_{v}" in UNNAMED
+    ]
     axes = [scaled(columns[c], weight) for c in ("supply_voltage_V", "slope_deg", "payload_kg")]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(axes)) if sum(p) <= DEGREE]
     terms = [
@@ -107,10 +147,12 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
         for p in powers
     ]
     wide = np.stack(terms, 1)
-    groups = [(names, bases), ([(b, CONDITIONS) for b in BALANCES], [wide] * len(BALANCES))]
-    return tuple(
-        Basis(jnp.asarray(np.stack(b)), tuple(PROBED.index(n[0]) for n in ns), tuple(ns)) for ns, b in groups if ns
-    )
+    groups = [
+        (names, bases),
+        ([(b, CONDITIONS) for b in BALANCES], [wide] * len(BALANCES)),
+        ([n for n, _ in read], [b for _, b in read]),
+    ]
+    return tuple(Basis(jnp.asarray(np.stack(b)), tuple(ns)) for ns, b in groups if ns)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +174,7 @@ def window(variable: str) -> Window | None:
 
 
 def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
-    """Windows in time (at the same instants of all runs) or in the order of runs, in every balance.
+    """Windows in time (at the same instants of all runs) or in the order of runs, in every balance and channel.
 
     Args:
         columns: of the table; weight: 0 for rows that do not count, shape (rows,).
@@ -157,9 +199,15 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
         return ()
     # The first again for those that hold too few or too many rows: tables of one size share what is compiled.
     shapes += shapes[:1] * (tried - len(shapes))
-    every = [(b, name) for b in BALANCES for _, name in shapes]
-    whole = jnp.asarray(np.stack([s for s, _ in shapes] * len(BALANCES))[:, :, None])
-    return (Basis(whole, tuple(PROBED.index(b) for b, _ in every), tuple(every)),)
+    read = [c.name for c in channels.CHANNELS if f"curve_{c.name}_{axis}" in UNNAMED]
+    return tuple(
+        Basis(
+            jnp.asarray(np.stack([s for s, _ in shapes] * len(places))[:, :, None]),
+            tuple((place, name) for place in places for _, name in shapes),
+        )
+        for places in (BALANCES, read)
+        if places
+    )
 
 
 def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> float:
@@ -211,9 +259,9 @@ def waves(on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.
         return ()
     every = [(b, w) for b in BALANCES for w in words]
     whole = jnp.asarray(np.stack(bases * len(BALANCES)))
-    return (Basis(whole, tuple(PROBED.index(b) for b, _ in every), tuple(every)),)
+    return (Basis(whole, tuple(every)),)
 
 
 def names(bases: Bases) -> tuple[tuple[str, str], ...]:
-    """(balance, variable) of every family, in order."""
+    """(place, variable) of every family, in order."""
     return tuple(n for basis in bases for n in basis.names)

@@ -139,6 +139,7 @@ class Linearization(eqx.Module):
         jacobian: by the free coordinates, shape (residuals, coordinates).
         signatures: by each instance's amplitude in prior sds, shape (readings, instances).
         defects: by a defect of each balance of PROBED [its unit]; what further axes are is the observer's.
+        scale: of what is added to a reading [1/SI], 0 where it does not count, shape (rows, channels).
         signals: of every row, at the fit.
     """
 
@@ -146,6 +147,7 @@ class Linearization(eqx.Module):
     jacobian: Float[Array, "residuals coordinates"]
     signatures: Float[Array, "readings instances"]
     defects: Float[Array, "balances ..."]
+    scale: Float[Array, "rows channels"]
     signals: Signals
 
     @property
@@ -173,6 +175,15 @@ class Linearization(eqx.Module):
             balance: index into PROBED.
         """
         raise NotImplementedError
+
+    def shown(self, channel: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+        """Change of the whitened readings by what is added to those of a channel [SI], each a column over the rows.
+
+        Args:
+            channel: position in the table of channels.
+        """
+        mine = jnp.where(jnp.arange(self.scale.shape[1]) == channel, self.scale, 0.0)
+        return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
         """Rows at which a defect of a single row is told, indices."""

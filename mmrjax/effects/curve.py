@@ -1,4 +1,4 @@
-"""Smooth curves in a balance: a discrepancy that has a place and a shape and no name."""
+"""Smooth curves in a balance, or in what an instrument shows: a discrepancy with a place, a shape and no name."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mmrjax import channels
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
 from mmrjax.params import Index, Scalar, parameter
@@ -21,6 +22,9 @@ BALANCES = {
     "ground": ("N", 4.0, "direction_travel"),
     "slip": ("m/s", 0.05, "direction"),
 }
+#: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
+READINGS = {c.name: (c.unit_si or c.unit, 0.01 * c.range[1] * c.factor, "direction") for c in channels.CHANNELS}
+PLACES = {**BALANCES, **READINGS}
 #: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the
 #: place of a run in the sequence: unit and ordinary range.
 VARIABLES = {
@@ -83,13 +87,15 @@ def _size(unit: str, size: float) -> Scalar:
 
 
 def _curve(place: str, over: str) -> type[Effect]:
-    """The curve of one variable in one balance."""
-    unit, size, along = BALANCES[place]
+    """The curve of one variable in one balance, or in the readings of one channel."""
+    shown = place in READINGS
+    unit, size, along = PLACES[place]
     unit_x, first, last = VARIABLES[over]
 
     class Curve(Effect):
         name = f"curve_{place}_{over}"
-        balance = place
+        balance = "sensor" if shown else place
+        channel = place if shown else ""
         variable: ClassVar[str] = over
         memory_size = 1.0 if over == "time" else None
         memory_unit = unit_x
@@ -138,7 +144,8 @@ def _curve(place: str, over: str) -> type[Effect]:
 
     words = "".join(w.capitalize() for w in Curve.name.split("_"))
     Curve.__name__ = Curve.__qualname__ = words
-    Curve.__doc__ = f"""Δ = a y(x) along the travel in the balance `{place}` [{unit}], x = {over} [{unit_x}].
+    where = f"the readings of `{place}`" if shown else f"the balance `{place}`"
+    Curve.__doc__ = f"""Δ = a y(x) along the travel in {where} [{unit}], x = {over} [{unit_x}].
 
     y is smooth through six ordinates equally spaced from `low` to `high`, and levels out beyond.
 
@@ -193,5 +200,5 @@ WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, B
 
 #: Every curve by its name. Robot files know them; they are no part of the library that is scored.
 CURVES: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (_curve(place, over) for place in BALANCES for over in VARIABLES)
+    effect.name: effect for effect in (_curve(place, over) for place in PLACES for over in VARIABLES)
 }

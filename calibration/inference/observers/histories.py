@@ -351,14 +351,15 @@ class Histories(Observer):
         by_point = jax.lax.map(moved, jnp.arange(max(len(e.at) for e in effects)))
         parts = [by_point[j, :, k] for k, e in enumerate(effects) for j in range(len(e.at))]
         defects = self.defective(robot, tuple(probe(b) for b in PROBED))
-        scale = (data.weight / data.sd)[self.rows_of]
-        defects = jnp.where(self.rows_of[:, None, :, None] < 0, 0.0, defects * scale[:, None])
+        scale = data.weight / data.sd
+        defects = jnp.where(self.rows_of[:, None, :, None] < 0, 0.0, defects * scale[self.rows_of][:, None])
         runs = self.whole(robot)
         return HistoriesLinearization(
             residual,
             jacobian,
             finite(jnp.stack(parts, 1)),
             finite(defects),
+            scale,
             self.at_rows(runs),
             self.rows_of,
             self.knots,

@@ -196,7 +196,7 @@ class SettledRuns(Observer):
             return moved.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
-        return SettledLinearization(residual, jacobian[:, :size], finite(signatures), defects, signals)
+        return SettledLinearization(residual, jacobian[:, :size], finite(signatures), defects, scale, signals)
 
     def replicate(
         self,
