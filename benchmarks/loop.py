@@ -295,10 +295,14 @@ def deviates(case: gw.WideCase, found, settings) -> dict:
             if not ladder:
                 return {}
             best = min(ladder, key=lambda c: c.cost)
-    names, z = space.coordinates.base.names, case.label["z"]
-    free = space.free
+    coordinates, z = space.coordinates.base, case.label["z"]
+    names, free = coordinates.names, space.free
+    # Truths are drawn from the fields' priors; of the ground's friction the loop takes wider ones.
+    wider = {n: gw.spread(n) / float(coordinates.spread[k]) for k, n in enumerate(names) if coordinates.scale[k]}
     line = {
-        "deviates": {n: float((best.z[k] - z[n]) / best.sd[k]) for k, n in enumerate(names) if n in z},
+        "deviates": {
+            n: float((best.z[k] - z[n] * wider.get(n, 1.0)) / best.sd[k]) for k, n in enumerate(names) if n in z
+        },
         "leader": not truths or found.best.effects == (truths[0],),
         "amplitude_deviate": None,
     }

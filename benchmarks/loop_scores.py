@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -113,29 +113,18 @@ def family_right(x: dict) -> bool:
     """Whether the verdict names the truth or its family: the equation it enters and what drives it."""
     if contains(x):
         return True
+    from mmrjax.effects import BY_NAME
+
     truth = x["truth"][0]
-    drives = DRIVEN.get(truth["class"], ())
-    there = [str(f) for f in _flat(x.get("families") or ())]
-    if truth["class"] in there:
-        return True
-    if any(w in there for w in (truth["balance"], _equation_of(truth))) and any(d in there for d in drives):
-        return True
-    return placed(x) and x["where"][1] in drives
+    if x["verdict"] in ("named", "class"):
+        return contains(x) or (
+            len(x["classes"]) == 1 and BY_NAME[truth["class"]].family() in (x.get("families") or ())
+        )
+    return placed(x) and x["where"][1] in DRIVEN.get(truth["class"], ())
 
 
 def _equation_of(truth: dict) -> str:
     return EQUATION[truth["balance"]]
-
-
-def _flat(x: object) -> Iterable[object]:
-    if isinstance(x, dict):
-        for v in x.values():
-            yield from _flat(v)
-    elif isinstance(x, list | tuple):
-        for v in x:
-            yield from _flat(v)
-    else:
-        yield x
 
 
 def in_place(x: dict) -> bool:

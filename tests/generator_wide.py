@@ -38,6 +38,11 @@ ABSOLUTE: dict[str, tuple[float, float, float]] = {"track.guide_share": (0.2, 0.
 SOFTNESS = 0.05  # sds over which a bound is rounded
 
 
+def spread(name: str) -> float:
+    """Sd of the log of a constant that the analyst knows as a scale; configurations by any name."""
+    return float(np.sqrt(np.log1p((RELATIVE.get(name) or RELATIVE[name.split(".", 1)[1]]) ** 2)))
+
+
 def _last(name: str) -> str:
     """A constant's name without its configuration."""
     head, _, rest = name.partition(".")
@@ -46,10 +51,7 @@ def _last(name: str) -> str:
 
 def analyst(p: Mapping[str, float], names: Sequence[str]) -> dict[str, float]:
     """One sd of each constant as the analyst's priors have it, at the values `p`."""
-    return {
-        n: ABSOLUTE[_last(n)][0] if _last(n) in ABSOLUTE else p[n] * np.sqrt(np.log1p(RELATIVE[_last(n)] ** 2))
-        for n in names
-    }
+    return {n: ABSOLUTE[_last(n)][0] if _last(n) in ABSOLUTE else p[n] * spread(_last(n)) for n in names}
 
 
 def drawn_from_priors(rng: np.random.Generator, m: Machine) -> tuple[dict[str, float], dict[str, float]]:
@@ -63,7 +65,7 @@ def drawn_from_priors(rng: np.random.Generator, m: Machine) -> tuple[dict[str, f
             u = u + w * np.logaddexp(0, (low - u) / w) - w * np.logaddexp(0, (u - high) / w)
             p[name] = float(np.clip(u, low, high))
         else:
-            p[name] *= float(np.exp(np.sqrt(np.log1p(RELATIVE[_last(name)] ** 2)) * z[name]))
+            p[name] *= float(np.exp(spread(_last(name)) * z[name]))
     return _followed(p), z
 
 

@@ -18,7 +18,7 @@ from calibration.data.runs import read as read_runs
 from calibration.discovery import discover
 from calibration.discovery.candidates import fit_base
 from calibration.discovery.outliers import screen
-from calibration.discovery.score_tests import bootstrap, diagnosed, score_tests
+from calibration.discovery.score_tests import bootstrap, diagnosed, normal_deviate, score_tests
 from calibration.inference import bases, noise
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED, amplitude_of, scored, shape_of
@@ -291,6 +291,14 @@ def test_scores_are_falls_of_the_sum_of_squares(toy):
     )
 
 
+def test_normal_deviates_are_those_of_chi2():
+    z = np.array([-2, -1, -0.1, 0, 0.3, 1, 2, 4, 8])
+    for freedom in (1.0, 2.0, 5.0, 20.0):
+        chi2 = stats.chi2.isf(stats.norm.sf(z), freedom)
+        np.testing.assert_allclose(normal_deviate(jnp.asarray(chi2), jnp.asarray(freedom)), z, atol=0.04)
+    assert np.isfinite(normal_deviate(jnp.asarray([0.0, 1e-300, 3.0, 1e9]), jnp.asarray(3.0))).all()
+
+
 def test_curve_scores_are_ridge_regressions(toy):
     e = np.asarray(toy.linear.residual)
     of_channel = [np.asarray(toy.linear.scale) * (np.arange(3) == k) for k in (2, 0)]  # speed, total current
@@ -303,8 +311,8 @@ def test_curve_scores_are_ridge_regressions(toy):
         explained = (r.T @ e) @ inverse @ (r.T @ e)
         np.testing.assert_allclose(toy.scores.explained[k], explained, rtol=1e-9)
         freedom = np.trace(r.T @ r @ inverse)
-        deviate = ((explained / freedom) ** (1 / 3) - (1 - 2 / (9 * freedom))) / np.sqrt(2 / (9 * freedom))
-        np.testing.assert_allclose(toy.scores.curve[k], deviate, rtol=1e-8)
+        deviate = stats.norm.isf(stats.chi2.sf(explained, freedom))
+        np.testing.assert_allclose(toy.scores.curve[k], deviate, atol=0.03)
 
 
 def test_column_within_the_fit_scores_nothing(toy):

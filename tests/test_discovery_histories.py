@@ -96,7 +96,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
     assert left.test.rejected
     stood = standing(space, oval.base, searched, left, oval.bases, ANALYST.settings)
     assert not stood.stands and stood.reason
-    where = locate(space.bare.observe, left.scores, oval.bases)
+    where = locate(left, oval.bases, space.included)
     assert {"track", "gearbox", "motor"} <= {where.balance, *where.alike}
     assert where.variable == "order 2 of the driving shaft"
     told = space.bare.observe.detail(oval.bases, space.included, left, left).before
@@ -108,7 +108,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
 @pytest.mark.slow
 def test_wave_without_a_name_is_in_the_result(oval):
     found = ANALYST.discover(oval.runs)
-    where = locate(oval.space.bare.observe, oval.left.scores, oval.bases)
+    where = locate(oval.left, oval.bases, oval.space.included)
     assert found.verdict == "unnamed" and found.effects == () and found.after.adequate
     assert (found.unnamed.balance, found.unnamed.variable) == (where.balance, where.variable)
     assert found.unnamed.defect is None and found.unnamed.score > 0.5 * oval.label["sigmas"] ** 2

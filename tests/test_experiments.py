@@ -232,7 +232,7 @@ def test_unaffected_experiment_separates_nothing(seen):
 
 def candidates(*names):
     return tuple(
-        Candidate((n,), np.zeros(1), np.zeros(1), float(k), np.zeros(1), np.zeros(1), True, True)
+        Candidate((n,), np.zeros(1), np.zeros(1), float(k), np.zeros(1), np.zeros(1), True, True, True)
         for k, n in enumerate(names)
     )
 

@@ -71,7 +71,7 @@ def made(*effects, cost, plausible=True):
     slots = SETTLED.settings.slots
     active = (*effects, *("",) * (slots - len(effects)))
     size = np.where([bool(n) for n in active], 0.1 if plausible else 2.0, 0.0)
-    return Candidate(active, np.zeros(40), np.ones(40), cost, size, size, plausible, True)
+    return Candidate(active, np.zeros(40), np.ones(40), cost, size, size, plausible, plausible, True)
 
 
 def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):

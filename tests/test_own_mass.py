@@ -96,7 +96,7 @@ def fits(tmp_path_factory):
         active = filled([name] if name else [], SETTLED.settings)
         problem = space.problem(active)
         seen = jax.device_get(read(problem, problem.robot(jnp.asarray(z))))
-        candidate = Candidate(active, z, z, 0.0, z, z, True, True)
+        candidate = Candidate(active, z, z, 0.0, z, z, True, True, True)
         again, status = written(findings.proposed_robot(space, candidate))
         return seen.reading[: len(runs)], seen.status[: len(runs)], again, status
 

@@ -97,7 +97,7 @@ def names_of(posterior, free):
     sd = np.ones(free + 2 * slots)
     sd[free : free + k] = np.sqrt(np.diag(posterior))
     active = tuple(f"e{i}" for i in range(k)) + ("",) * (slots - k)
-    return Candidate(active, np.zeros(free + 2 * slots), sd, 0.0, np.zeros(slots), np.zeros(slots), True, True)
+    return Candidate(active, np.zeros(free + 2 * slots), sd, 0.0, np.zeros(slots), np.zeros(slots), True, True, True)
 
 
 @pytest.mark.parametrize("scale", [1.0, 30.0], ids=["of the prior's size", "far smaller"])

@@ -32,6 +32,7 @@ class Candidate:
         amplitude: in prior sds of each slot's effect (0 where empty).
         size: of each slot over the largest plausible amplitude in its direction; 0 where empty.
         plausible: whether every amplitude is of a plausible size, off its bounds, and of a sign that physics allows.
+        nearly: whether it is plausible, but for amplitudes up to `settings.stretched` times the largest.
         converged: whether the fit is an optimum.
     """
 
@@ -42,6 +43,7 @@ class Candidate:
     amplitude: np.ndarray
     size: np.ndarray
     plausible: bool
+    nearly: bool
     converged: bool
 
     @property
@@ -75,8 +77,10 @@ def candidate(space: CandidateSpace, active: tuple[str, ...], best: Optimum, set
     signs = [not (n and space.library[n].dissipative and a <= 0) for n, a in zip(active, amplitude, strict=True)]
     # What lies within an sd of a bound is held by it, unless its sd is as large as all that is plausible.
     ok = bool(np.all(size + np.where(near < 0.25, near, 0.0) < 1.0)) and all(signs)
+    nearly = bool(np.all(size < settings.stretched)) and all(signs)
     cost = float(best.cost) if np.isfinite(best.cost) else np.inf
-    return Candidate(active, np.asarray(best.z), np.asarray(best.sd), cost, amplitude, size, ok, bool(best.converged))
+    z, sd = np.asarray(best.z), np.asarray(best.sd)
+    return Candidate(active, z, sd, cost, amplitude, size, ok, nearly, bool(best.converged))
 
 
 def _size(space: CandidateSpace, name: str, amplitude: float, settings: Settings) -> float:

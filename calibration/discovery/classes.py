@@ -89,9 +89,10 @@ def classes(
         for s, other, active in wanted:
             rival = known[frozenset(n for n in active if n)]
             parallel = cosine[names.index(name), names.index(other)] > settings.parallel
-            limit = within[settings.form_family if space.library[other].family() == family else settings.form]
+            akin = space.library[other].family() == family
+            limit = within[settings.form_family if akin else settings.form]
             limit = max(limit, settings.same_parallel) if parallel else limit
-            if s == slot and rival.plausible and 2 * (rival.cost - best.cost) <= limit:
+            if s == slot and (rival.nearly if akin else rival.plausible) and 2 * (rival.cost - best.cost) <= limit:
                 same.append(other)
         members.append(tuple(same))
         linear = left.linear if len(best.effects) == 1 else None

@@ -21,7 +21,7 @@ from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
 from calibration.discovery.classes import Classes, classes, cosines
-from calibration.discovery.discrepancy import Discrepancy, Location, fit_discrepancy, locate
+from calibration.discovery.discrepancy import Location, diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.hidden import hidden
 from calibration.discovery.outliers import Screening, screen, screen_beside
@@ -33,7 +33,7 @@ from calibration.discovery.result import (
     Remainder,
     Sensitivity,
 )
-from calibration.discovery.score_tests import bootstrap, diagnosed
+from calibration.discovery.score_tests import bootstrap
 from calibration.discovery.search import Search, fewest, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import Standing, standing
@@ -198,8 +198,7 @@ class Traced:
         happens = None if self.where is None else bases_room.window(self.where.variable)
         if happens is None:
             return ()
-        x = self.left.linear.variable(happens.axis)
-        inside = self.screened.base.space.included & (x >= happens.low) & (x <= happens.high)
+        inside = self.screened.base.space.included & happens.holds(self.left.linear.variable(happens.axis))
         rows = [int(k) + 1 for k in np.flatnonzero(inside)]
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
@@ -274,7 +273,7 @@ def trace(
             searched, stood = fewer, by_itself
             best, after = searched.best, searched.diagnosis
     if best is None or after is None or not stood.stands:
-        where = locate(space.bare.observe, left.scores, bases)
+        where = locate(left, bases, space.included)
         return Traced("unnamed", screened, left, sds, searched, where=where, standing=stood)
 
     progress(f"what else explains as much as {' and '.join(best.effects)}?")
@@ -285,7 +284,7 @@ def trace(
         searched, alike, compared = preference.by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
     verdict = "named" if alike.single else "class"
-    remains = locate(space.bare.observe, after.scores, bases) if after.test.rejected_with_margin else None
+    remains = locate(after, bases, space.included) if after.test.rejected_with_margin else None
     return Traced(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
 
 
@@ -303,13 +302,14 @@ def pose(
     """The base problem of a table, and room for the effects that its data can show.
 
     Rows are padded to one of a few sizes, so that tables of about one size share what is compiled; what is padded
-    counts for nothing. A mass that the table states takes the place of the robot's own.
+    counts for nothing. A mass that the table states takes the place of the robot's own, and the ground may be any
+    surface whose friction is not stated: its own prior, of another surface, would pull on what depends on slip.
     """
     robot = own_mass.weighed(robot, runs)
     kind = observers.kind(runs)
     index, real = padded(len(runs), kind.sizes_padded)
     names = priors.free_names(robot, runs["configuration"], *kind.free())
-    coordinates = priors.coordinates(robot, names, dict(stated or {}))
+    coordinates = priors.coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose(runs.where(index), robot, coordinates, sd[index])
     space = candidate_space(bare, visible(library, robot, kind), library, settings.slots, settings.width)
     return space.without(~real)
@@ -424,7 +424,7 @@ def finished(
     cost, converged = best.cost, best.converged
     if curve is not None:
         after = findings.Fitted(curve.problem, curve.z, None)
-        ends = _diagnosis_beside(space, curve, screened.bases, left)
+        ends = diagnosis_beside(space, curve, screened.bases, left)
         robot, z, sd = curve.robot, curve.z, np.sqrt(np.diag(curve.covariance))
         cost, converged = curve.chi2[1] / 2, curve.converged
     elif best is not base:
@@ -513,13 +513,6 @@ def residuals_of(screened: Screening, runs: Runs) -> Residuals:
     whitened = np.where(there, np.asarray(linear.by_row())[:rows], 0.0)
     kind = type(base.space.bare.observe)
     return Residuals(kind, runs, base.reading[:rows], whitened, there, jacobian, base.candidate.z[:free])
-
-
-def _diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
-    """A look at the fit with a curve, against the thresholds of the base."""
-    linear, scores, strongest = diagnosed(found.problem, jnp.asarray(found.z), space.library.scored, bases)
-    test = AdequacyTest(strongest, left.test.null, left.test.settings)
-    return Diagnosis(linear, scores, test)
 
 
 def _proposal(space: CandidateSpace, traced: Traced, settings: Settings) -> Proposal | None:

@@ -16,16 +16,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.discovery.active_set import ActiveSet, CandidateSpace
+from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose
 from calibration.discovery.projection import Defect, defect
-from calibration.discovery.score_tests import ScoreTable
+from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.smooth import Smooth, smooth
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import search_in_batches
 from calibration.inference.linearization import Linearization
-from calibration.inference.observers import Observer
 from calibration.inference.optimizers import informing
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
@@ -90,10 +90,15 @@ class Location:
         return f"{what} that changes with {drivers.get(variable, variable)}"
 
 
-def locate(observe: Observer, scores: ScoreTable, bases: Bases) -> Location:
-    """Balance and variable of the curve that explains most, and the balances in which one explains as much."""
+def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
+    """Place of the curve whose score is the most improbable, the variable over which a curve there has the greatest
+    evidence, and the places in which one is as improbable.
+
+    Args:
+        left: what a fit leaves; included: whether a row counts, shape (rows,).
+    """
     names = bases_room.names(bases)
-    deviate, by = np.asarray(scores.curve), np.asarray(getattr(scores, observe.compares))
+    deviate, explained = np.asarray(left.scores.curve), np.asarray(left.scores.explained)
     happens = np.array([bases_room.window(n[1]) is not None for n in names])
     # A smooth curve shows something of what happens for a while, and the other way round.
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
@@ -101,11 +106,13 @@ def locate(observe: Observer, scores: ScoreTable, bases: Bases) -> Location:
     k = max(those, key=lambda j: deviate[j])
     balance = names[k][0]
     over = [j for j in those if names[j][0] == balance and names[j][1] != bases_room.CONDITIONS]
-    j = k if for_a_while else max(over, key=lambda j: by[j])
+    j = k if for_a_while else max(over, key=lambda j: deviate[j])
+    if names[j][1] in bases_room.VARIABLES:
+        smoothly = [i for i in over if names[i][1] in bases_room.VARIABLES]
+        j = max(smoothly, key=lambda i: smooth(left.linear, *names[i], included).evidence)
     places = dict.fromkeys(names[i][0] for i in those)
     best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in places}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
-    explained = np.asarray(scores.explained)
     return Location(balance, names[j][1], tuple(itertools.chain(*alike)), float(explained[j]), float(explained[k]))
 
 
@@ -224,6 +231,12 @@ def fit_discrepancy(
         converged=bool(found.converged[k]),
         proposal=propose(linear, balance, included, at_base),
     )
+
+
+def diagnosis_beside(space: CandidateSpace, found: Discrepancy, bases: Bases, left: Diagnosis) -> Diagnosis:
+    """A look at the fit with a curve, against the thresholds of the base, which `left` has."""
+    linear, scores, strongest = diagnosed(found.problem, jnp.asarray(found.z), space.library.scored, bases)
+    return Diagnosis(linear, scores, AdequacyTest(strongest, left.test.null, left.test.settings))
 
 
 def _with_curve(space: CandidateSpace, base: Candidate, curve: Smooth) -> Problem:

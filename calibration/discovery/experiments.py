@@ -342,6 +342,8 @@ def _steps(variable: str, within: Reach) -> str | None:
             f"Make runs {happens.low:.0f} to {happens.high:.0f} again, and as many before and after them, in another "
             "order: what comes back with them hangs on their conditions, what does not happened then"
         )
+    if happens is not None and happens.axis != "time":
+        return f"Make the runs at {happens.words} again, on another day, and as many a little below and above that"
     if happens is not None:
         return (
             f"Make two of the runs again, sampled as finely as the instruments allow from {happens.low:.3g} to "

@@ -119,8 +119,9 @@ def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, n
     """An effect of a class in the leader's place."""
     wanted = frozenset(name if s == slot else n for s, n in enumerate(best.active)) - {""}
     other = next(c for c in (best, *found.ladder) if c.key == wanted)
-    amplitude = other.amplitude[other.active.index(name)] * size_of(space.library[name])
-    return Member(float(amplitude), float(2 * (other.cost - best.cost)))
+    at = other.active.index(name)
+    amplitude = other.amplitude[at] * size_of(space.library[name])
+    return Member(float(amplitude), float(other.size[at]), float(2 * (other.cost - best.cost)))
 
 
 def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
@@ -458,7 +459,10 @@ def stated_value_said(name: str, s: StatedValue) -> str:
 
 def alike_said(e: FoundEffect) -> str:
     """What these data cannot tell from an effect: other effects, and stated values that may be wrong instead."""
-    others = ", ".join(list(e.members)[1:])
+    others = ", ".join(
+        name + (f" (at {m.size:.2g} times its largest plausible size)" if m.size >= 1 else "")
+        for name, m in list(e.members.items())[1:]
+    )
     values = " or ".join(stated_value_said(name, s) for name, s in e.stated.items())
     return ", or ".join(words for words in (others, values) if words)
 
@@ -479,7 +483,9 @@ def shown_over(variable: str) -> str:
         return f"best shown over {variable.replace('_', ' ')}" if variable != "order" else "drifting from run to run"
     if happens.axis == "time":
         return f"from {happens.low:.3g} to {happens.high:.3g} s after the start of the runs"
-    return f"in runs {happens.low:.0f} to {happens.high:.0f}"
+    if happens.axis == "order":
+        return f"in runs {happens.low:.0f} to {happens.high:.0f}"
+    return f"in the runs at {happens.words}"
 
 
 def said_p(p: float) -> str:

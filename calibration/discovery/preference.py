@@ -81,9 +81,9 @@ def _change(before: float, after: float) -> str:
 def compared(space: CandidateSpace, runs: Runs, best: Candidate, alike: Classes) -> tuple[HeldOutAlternative, ...]:
     """Held-out errors of a fit and of those with one effect replaced by a member of its class, that fit first.
 
-    Empty where there is but one, or no block to hold out.
+    Those that are not quite plausible cannot lead, and are left out. Empty where there is but one, or no block.
     """
-    others = list(experiments.alternatives(best, alike, stated=False).values())
+    others = [c for c in experiments.alternatives(best, alike, stated=False).values() if c.plausible]
     data, rows = space.equipped.data, len(runs)
     measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
     kinds = blocks_room.distinct(runs, space.bare.observe.blocks)

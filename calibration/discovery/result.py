@@ -31,9 +31,11 @@ class Estimate:
 
 @dataclasses.dataclass(frozen=True)
 class Member:
-    """An effect of a class in the leader's place: its amplitude, and what the data say against it [σ²]."""
+    """An effect of a class in the leader's place: its amplitude; the same over the largest plausible one; what the
+    data say against it [σ²]."""
 
     amplitude: float
+    size: float
     rise_chi2: float
 
 

@@ -112,12 +112,26 @@ def _curve_score(linear: Linearization, columns: Array) -> tuple[Array, Array]:
     lower = cholesky(products + jnp.eye(dots.size))
     half = forward(lower, dots)
     explained = jnp.sum(half**2)
-    # E = tr(A (A + I)⁻¹) under the null: degrees of freedom, then Wilson and Hilferty (1931).
+    # E = tr(A (A + I)⁻¹) under the null: degrees of freedom.
     freedom = dots.size - jnp.sum(forward(lower, jnp.eye(dots.size)) ** 2)
-    freedom = jnp.maximum(freedom, 1e-3)
-    spread = 2 / (9 * freedom)
-    deviate = ((explained / freedom) ** (1 / 3) - (1 - spread)) / jnp.sqrt(spread)
+    deviate = normal_deviate(explained, jnp.maximum(freedom, 1e-3))
     return jnp.where(jnp.any(seen), deviate, -1.0 / ABSORBED), explained
+
+
+def normal_deviate(chi2: Array, freedom: Array) -> Array:
+    """The standard normal deviate that is as improbable as χ² with so many degrees of freedom, [-].
+
+    Modified signed root, Barndorff-Nielsen (1986), of a gamma distribution: within 0.03 from 1 to 20 degrees of
+    freedom and for any improbability, where Wilson and Hilferty's cube root makes much too little of a large χ² with
+    few of them; the latter near the mean, where the root is 0/0.
+    """
+    x, k = jnp.maximum(chi2, 1e-12) / 2, freedom / 2
+    spread = 1 / (9 * k)
+    cube = ((x / k) ** (1 / 3) - (1 - spread)) / jnp.sqrt(spread)
+    near = jnp.abs(x / k - 1) < 0.05
+    x = jnp.where(near, 2 * k, x)
+    root = jnp.sign(x - k) * jnp.sqrt(2 * jnp.maximum(x - k - k * jnp.log(x / k), 1e-12))
+    return jnp.where(near, cube, root + jnp.log((x - k) / jnp.sqrt(k) / root) / root)
 
 
 class Statistics(eqx.Module):

@@ -29,7 +29,8 @@ class Settings:
         replicates: of the bootstrap; seed: random.
         slots: most effects that are found at once; rows_per_effect: rows that each needs.
         width: prior sd of an amplitude in a fit, in sds of its field: wide enough to leave a visible effect
-            unshrunk; plausible: sds of its field beyond which an amplitude is not plausible.
+            unshrunk; plausible: sds of its field beyond which an amplitude is not plausible; stretched: times that
+            up to which an effect is listed beside a plausible one of its family, whose size is known no better.
         visible: sigmas that the largest plausible amplitude has to leave for an effect to be visible [σ].
         same, same_parallel: rise of the objective up to which another effect explains the data as well, and up to
             which it does where |cos| of the signatures is above `parallel` [σ²].
@@ -58,6 +59,7 @@ class Settings:
     rows_per_effect: int = 5
     width: float = 3.0
     plausible: float = 4.0
+    stretched: float = 2.0
     visible: float = 3.0
     same: float = 6.0
     same_parallel: float = 9.0

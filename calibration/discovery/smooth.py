@@ -20,6 +20,8 @@ LENGTHS, SIZES = (1.0, 1.5, 2.5, 4.0), tuple(np.geomspace(0.3, 300.0, 25))
 PRODUCT, FALL = 4, 0.35
 #: Room beside what happens for a while for it to begin and end, as a share of how long it lasts.
 BESIDE = 0.3
+#: Width of a level of a condition for that, as a share of the condition's range.
+NARROW = 0.05
 #: Prior sd of a curve's level and trend, over that of its shape.
 WIDE = 3.0
 
@@ -95,7 +97,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     x = linear.variable(axis)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
     if happens is not None:
-        beside = BESIDE * max(happens.high - happens.low, 1e-6 * (high - low))
+        beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
         low, high = happens.low - beside, happens.high + beside
     if not high - low > 1e-9 * max(abs(high), abs(low), 1e-9):
         high = low + max(abs(low), 1.0)  # the variable stands still: an offset is all that can be seen

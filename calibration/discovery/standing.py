@@ -18,6 +18,7 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
+from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import beside_columns, family_columns, widened
 from calibration.discovery.search import Search
@@ -29,6 +30,8 @@ from calibration.inference.linearization import Linearization
 
 #: Curves that are put beside effects, one after the other.
 CURVES = 3
+#: Curves that are tried by themselves, whether one of them does without any name.
+ALONE = 4
 #: Balances whose curves stand for effects of a balance: those of one equation. What a speed meter shows too much is
 #: what slip takes away.
 EQUATION = {"mass": "ground", "speed": "slip"} | {
@@ -70,7 +73,7 @@ def standing(
     if other is not None:
         return Standing(False, f"{' and '.join(other.effects)} would explain more, but not at a plausible size")
     if after.test.rejected_with_margin:
-        return _beside_curves(space, best, left, after, bases, settings)
+        return _beside_curves(space, base, best, left, after, bases, settings)
     return _against_curves(space, base, best, left.linear, bases, settings)
 
 
@@ -169,7 +172,13 @@ def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, set
 
 
 def _beside_curves(
-    space: CandidateSpace, best: Candidate, left: Diagnosis, after: Diagnosis, bases: Bases, settings: Settings
+    space: CandidateSpace,
+    base: Candidate,
+    best: Candidate,
+    left: Diagnosis,
+    after: Diagnosis,
+    bases: Bases,
+    settings: Settings,
 ) -> Standing:
     """Names beside the best smooth curves, as many as leave nothing: each has to keep its significance, and what is
     left with both has to be noise.
@@ -178,9 +187,10 @@ def _beside_curves(
     counts only where the others do not do. Where one curve alone does, no name is needed.
     """
     names = bases_room.names(bases)
-    alone, test = _curves_beside(left.linear, left, bases, set(), 1, settings)
-    if not test.rejected_with_margin:
-        return Standing(False, f"one smooth curve in the {_over(*names[alone[0]])} leaves nothing")
+    for k in _strongest(left, names):
+        found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
+        if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
+            return Standing(False, f"one smooth curve in the {_over(*names[k])} leaves nothing")
     own = {equation(space.library[e].channel or space.library[e].balance) for e in best.effects}
     chosen, test = _curves_beside(after.linear, after, bases, own, CURVES, settings)
     if test.rejected_with_margin:
@@ -194,7 +204,22 @@ def _beside_curves(
     words = ", ".join(_over(*names[k]) for k in chosen)
     if lost:
         return Standing(False, f"beside smooth curves ({words}) {' and '.join(lost)} would explain nothing")
+    where = locate(left, bases, space.included)
+    if equation(where.place) in own & {equation(names[k][0]) for k in chosen}:
+        # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
+        curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
+        if not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
+            return Standing(False, f"one smooth curve in the {_over(where.place, where.variable)} leaves nothing")
     return Standing(True, f"beside smooth curves ({words})")
+
+
+def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
+    """The most improbable family of curves of each place, the most improbable of these first, at most `ALONE`."""
+    deviate = np.asarray(left.scores.curve)
+    first: dict[str, int] = {}
+    for k in np.argsort(-deviate):
+        first.setdefault(names[k][0], int(k))
+    return list(first.values())[:ALONE]
 
 
 def _curves_beside(

@@ -40,6 +40,10 @@ CONDITIONS = "conditions"
 #: Axes along which something may happen for a while, the first that a table has; shares of the range that its windows
 #: have, each of which starts in the middle of the one before; fewest rows in one.
 AXES, WINDOWS, FEWEST = ("time", "order"), (1 / 4, 1 / 8, 1 / 16), 3
+#: Conditions of which a level may differ from the others, the SI value of their column's unit, and the unit; most
+#: levels that each may have.
+LEVELS = {"voltage": (1.0, "V"), "slope": (np.pi / 180, "deg"), "payload": (1.0, "kg")}
+MOST_LEVELS = 6
 #: Share of the variance of the order that conditions explain from which drift cannot be told from them.
 COLLINEAR = 0.9
 #: Waves of histories: per turn of the driving pulley or wheel, and whether of the belt (168 teeth, 24 grousers
@@ -157,7 +161,7 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """A stretch of an axis, `time` [s] or `order` [-], in which something happens."""
+    """A stretch of an axis, `time` [s] or `order` [-], in which something happens, or a level of a condition [SI]."""
 
     axis: str
     low: float
@@ -166,40 +170,59 @@ class Window:
     def __str__(self) -> str:
         return f"{self.axis} {self.low:.5g} to {self.high:.5g}"
 
+    def holds(self, x: np.ndarray) -> np.ndarray:
+        """Whether places of the axis are in it; its ends are rounded to five digits."""
+        slack = 1e-4 * max(abs(self.low), abs(self.high), 1e-9)
+        return (x >= self.low - slack) & (x <= self.high + slack)
+
+    @property
+    def words(self) -> str:
+        """`15 deg of slope`."""
+        factor, unit = LEVELS.get(self.axis, (1.0, ""))
+        return f"{self.low / factor:.4g} {unit} of {self.axis}"
+
 
 def window(variable: str) -> Window | None:
     """The window that a variable's name stands for, None for another variable."""
-    found = re.fullmatch(rf"({'|'.join(AXES)}) (\S+) to (\S+)", variable)
+    found = re.fullmatch(rf"({'|'.join((*AXES, *LEVELS))}) (\S+) to (\S+)", variable)
     return None if found is None else Window(found[1], float(found[2]), float(found[3]))
 
 
 def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
-    """Windows in time (at the same instants of all runs) or in the order of runs, in every balance and channel.
+    """Windows in time (at the same instants of all runs) or in the order of runs, and levels of conditions, in every
+    balance and channel.
 
     Args:
         columns: of the table; weight: 0 for rows that do not count, shape (rows,).
     """
+    counts = weight > 0
+    offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
-    if axis is None:
-        return ()
-    x, counts = np.asarray(columns[VARIABLES[axis]], float), weight > 0
-    low, high = x[counts].min(), x[counts].max()
-    shapes: list[tuple[np.ndarray, str]] = []
-    tried = 0
-    for share in WINDOWS:
-        size = share * (high - low)
-        for k in range(round(2 / share) - 1):
-            tried += 1
-            first = low + k * size / 2
-            inside = counts & (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
-            if FEWEST <= inside.sum() <= 0.5 * counts.sum():
-                name = str(Window(axis, float(x[inside].min()), float(x[inside].max())))
-                shapes.append((inside.astype(float), name))
+    if axis is not None:
+        x = np.asarray(columns[VARIABLES[axis]], float)
+        low, high = x[counts].min(), x[counts].max()
+        for share in WINDOWS:
+            size = share * (high - low)
+            for k in range(round(2 / share) - 1):
+                first = low + k * size / 2
+                inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
+                offered.append((axis, x, counts & inside))
+    for condition, (factor, _) in LEVELS.items():
+        x = factor * np.asarray(columns[VARIABLES[condition]], float)
+        levels = np.unique(x[counts])
+        levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
+        offered += [(condition, x, counts & (x == level)) for level in levels]
+        offered += [(condition, x, np.zeros_like(counts))] * (MOST_LEVELS - len(levels))
+    shapes = [
+        (inside.astype(float), str(Window(axis, float(x[inside].min()), float(x[inside].max()))))
+        for axis, x, inside in offered
+        if FEWEST <= inside.sum() <= 0.5 * counts.sum()
+    ]
     if not shapes:
         return ()
     # The first again for those that hold too few or too many rows: tables of one size share what is compiled.
-    shapes += shapes[:1] * (tried - len(shapes))
-    read = [c.name for c in channels.CHANNELS if f"curve_{c.name}_{axis}" in UNNAMED]
+    shapes += shapes[:1] * (len(offered) - len(shapes))
+    read = [c.name for c in channels.CHANNELS if f"curve_{c.name}_order" in UNNAMED]
     return tuple(
         Basis(
             jnp.asarray(np.stack([s for s, _ in shapes] * len(places))[:, :, None]),

@@ -37,6 +37,15 @@ TIED = (
     ("ground.friction.dynamic", "ground.friction.static"),
     ("ground.friction.speed_dynamic", "ground.friction.speed_static"),
 )
+#: What a surface may be where nobody states it: relative sds around the robot's friction that hold dry grounds of
+#: every kind (μ_s from 0.2 to 1, V_s from 2 to 60 mm/s) within two sds. The fields' own are those of the surface of
+#: Table 5.
+SURFACE = {
+    "ground.friction.static": 0.7,
+    "ground.friction.dynamic": 0.7,
+    "ground.friction.speed_static": 3.0,
+    "ground.friction.speed_dynamic": 3.0,
+}
 
 _SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
 
@@ -259,7 +268,11 @@ def parse_priors(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 def coordinates(
-    robot: Robot, names: Sequence[str], stated: dict[str, tuple[float, float]] | None = None
+    robot: Robot,
+    names: Sequence[str],
+    stated: dict[str, tuple[float, float]] | None = None,
+    *,
+    any_surface: bool = False,
 ) -> Coordinates:
     """Coordinates of the named parameters: prior from their fields around `robot`'s values, or as stated.
 
@@ -267,6 +280,7 @@ def coordinates(
         robot: its values are the prior means (medians for scales).
         names: of the free parameters, from `choose`.
         stated: name → (mean, sd) [SI] that replace the field's.
+        any_surface: whether the friction of the ground has the priors of `SURFACE` where none is stated.
 
     Raises:
         BadConfiguration: a stated prior for an unknown or a fixed parameter, a mean out of bounds, or a
@@ -279,7 +293,9 @@ def coordinates(
             raise BadConfiguration(f"--prior {name}: no such parameter; {choices(name, _near(name, list(fields)))}")
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
-    rows = [_row(fields[name], stated.get(name)) for name in names]
+    wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
+    known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()} | stated
+    rows = [_row(fields[name], known_sds.get(name)) for name in names]
     location, spread, low, high, scale = zip(*rows, strict=True)
     tied = tuple(
         (follower, names.index(leader), float(fields[follower].value / fields[leader].value))

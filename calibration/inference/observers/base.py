@@ -56,8 +56,6 @@ class Observer(eqx.Module):
         blocks: kinds of blocks to hold out, the most telling first.
         percent_of: what errors in percent are of.
         policy: how fits are searched for.
-        compares: field of the score table by which curves are compared: what they `explained`, or where they have
-            different numbers of terms (waves have two a run) how improbable that is, `curve`.
         rows_tell: whether a single row shows a defect by itself.
         evidence: kinds of evidence that something is missing.
         searches: of a calibration; None takes the fidelity's.
@@ -73,7 +71,6 @@ class Observer(eqx.Module):
     blocks: ClassVar[tuple[str, ...]]
     percent_of: ClassVar[str]
     policy: ClassVar[SearchPolicy]
-    compares: ClassVar[str]
     rows_tell: ClassVar[bool]
     evidence: ClassVar[tuple[str, ...]]
     searches: ClassVar[int | None] = None

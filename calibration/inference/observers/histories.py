@@ -118,7 +118,6 @@ class Histories(Observer):
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
     percent_of: ClassVar[str] = "channel's root mean square"
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
-    compares: ClassVar[str] = "curve"
     rows_tell: ClassVar[bool] = False
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
     searches: ClassVar[int | None] = 8

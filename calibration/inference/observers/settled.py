@@ -65,7 +65,6 @@ class SettledRuns(Observer):
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
     percent_of: ClassVar[str] = "simulated reading, eq. (35)"
     policy: ClassVar[SearchPolicy] = SearchPolicy()
-    compares: ClassVar[str] = "explained"
     rows_tell: ClassVar[bool] = True
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
 
