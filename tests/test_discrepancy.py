@@ -15,13 +15,14 @@ from synthetic import SETTLED, table
 
 from calibration.data import robot_file
 from calibration.discovery import discover, formula
-from calibration.discovery.discrepancy import fit_discrepancy
+from calibration.discovery.discrepancy import fit_discrepancy, refined
 from calibration.discovery.projection import defect
 from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.smooth import smooth
 from calibration.inference import bases
 from calibration.inference.held_out import held_out
 from calibration.inference.linearization import PROBED
+from calibration.inference.observers.settled import SettledLinearization
 from mmrjax import channels, params
 from mmrjax.fidelities.steady import steady_batch
 
@@ -192,3 +193,23 @@ def test_no_formula_is_proposed_where_nothing_shows(found):
     proposal = formula.propose(blind, found.what.balance, found.space.included, curve)
     assert proposal.formula == "none: no term shows in these data" and proposal.terms == ()
     assert np.isnan(defect(blind, found.what.balance).value).all()
+
+
+def test_a_window_is_refined_to_its_rows():
+    """Eighty settled rows, of which 13 to 24 lack something in one balance; coarse windows begin every 2.5 rows."""
+    rng = np.random.default_rng(5)
+    rows, p = 80, 4
+    defects = rng.standard_normal((len(PROBED), rows, 3))
+    inside = (np.arange(rows) >= 13) & (np.arange(rows) <= 24)
+    slopes = rng.standard_normal((3 * rows, p))
+    missing = -6.0 * (defects[PROBED.index("track")] * inside[:, None]).ravel()
+    residual = np.concatenate([missing + rng.standard_normal(3 * rows), np.zeros(p)])
+    jacobian = np.concatenate([slopes, np.eye(p)])
+    linear = SettledLinearization(
+        *map(jnp.asarray, (residual, jacobian, np.zeros((3 * rows, 1)), defects, np.ones((rows, 3)))),
+        SimpleNamespace(order=np.arange(1.0, rows + 1)),
+    )
+    found, explained = refined(linear, "track", "order", np.ones(rows, bool))
+    assert (found.low, found.high) == (14, 25) and explained > 60
+    half, _ = refined(linear, "track", "order", np.arange(rows) % 2 == 0)
+    assert (half.low, half.high) == (15, 25)

@@ -19,7 +19,7 @@ from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose
-from calibration.discovery.projection import Defect, defect
+from calibration.discovery.projection import Defect, Projection, defect
 from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.smooth import Smooth, smooth
 from calibration.inference import bases as bases_room
@@ -39,6 +39,8 @@ from mmrjax.robot import Robot
 STARTS = 8
 #: Points of a curve that are shown.
 POINTS = 61
+#: Most instants between which the ends of a window are looked for.
+INSTANTS = 200
 #: How much less improbable a balance's best curve may be for it to act alike [normal deviate].
 ALIKE = 1.0
 
@@ -113,7 +115,40 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
     places = dict.fromkeys(names[i][0] for i in those)
     best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in places}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
-    return Location(balance, names[j][1], tuple(itertools.chain(*alike)), float(explained[j]), float(explained[k]))
+    variable, strength = names[j][1], float(explained[j])
+    happening = bases_room.window(variable)
+    if happening is not None and happening.axis in bases_room.AXES:
+        happening, strength = refined(left.linear, balance, happening.axis, included)
+        variable = str(happening)
+    return Location(balance, variable, tuple(itertools.chain(*alike)), strength, max(strength, float(explained[k])))
+
+
+def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) -> tuple[bases_room.Window, float]:
+    """The window of an axis, of all that begin and end at its instants and hold at most half of the rows, that
+    explains most, and how much [σ²]; those that are tried for evidence are coarse.
+
+    Args:
+        included: whether a row counts, shape (rows,).
+    """
+    x = linear.variable(axis)
+    at, counts = np.unique(x[included], return_counts=True)
+    merged = -(-len(at) // INSTANTS)
+    edges = at[::merged]
+    index = np.searchsorted(edges, x, side="right") - 1
+    shapes = (index[:, None] == np.arange(len(edges))) & included[:, None]
+    a, b = Projection(linear)(bases_room.signature(linear, place, shapes.astype(float)))
+    sums = np.zeros((len(edges) + 1,) * 2)
+    sums[1:, 1:] = a.cumsum(0).cumsum(1)
+    pull = np.append(0.0, b.cumsum())
+    rows = np.append(0, np.add.reduceat(counts, np.arange(0, len(at), merged)).cumsum())
+    first, last = np.triu_indices(len(edges) + 1, 1)
+    norm2 = sums[last, last] - 2 * sums[first, last] + sums[first, first]
+    held = rows[last] - rows[first]
+    fair = (held >= bases_room.FEWEST) & (held <= 0.5 * rows[-1]) & (norm2 > 1e-9 * max(float(a.max()), 1e-300))
+    gain = np.where(fair, (pull[last] - pull[first]) ** 2 / np.where(fair, norm2, 1.0), -np.inf)
+    k = int(np.argmax(gain))
+    inside = included & (index >= first[k]) & (index < last[k])
+    return bases_room.Window(axis, float(x[inside].min()), float(x[inside].max())), float(gain[k])
 
 
 # --- the curve ------------------------------------------------------------------------------------------
