@@ -106,6 +106,9 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
     for_a_while = bool(np.max(deviate[happens], initial=-np.inf) > np.max(deviate[~happens]) + ALIKE)
     those = [j for j in range(len(names)) if happens[j] == for_a_while]
     k = max(those, key=lambda j: deviate[j])
+    # What a balance does as well is not put down to an instrument; it is listed beside it.
+    lacks = [j for j in those if not bases_room.in_readings(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
+    k = max(lacks, key=lambda j: deviate[j]) if lacks else k
     balance = names[k][0]
     over = [j for j in those if names[j][0] == balance and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
