@@ -1,10 +1,12 @@
 """Bases of curves: over what they go, windows in which something happens, and when row order says nothing new."""
 
+import jax
 import numpy as np
 import pytest
 
 from calibration.inference import bases
 from calibration.inference.bases import COLLINEAR, Window, collinearity, families, names, window, windows
+from mmrjax import channels
 
 RNG = np.random.default_rng(0)
 ROWS = 60
@@ -76,14 +78,16 @@ def test_a_window_is_read_from_its_name():
 
 
 def test_windows_cover_the_order_and_overlap_by_half():
-    (basis,) = windows(shuffled(table()), COUNTS)
+    basis, shown = windows(shuffled(table()), COUNTS)
+    assert [v for _, v in shown.names[:4]] == [v for _, v in basis.names[:4]]
+    assert {n[0] for n in basis.names} == set(bases.BALANCES) and {n[0] for n in shown.names} == set(channels.names())
     assert basis.columns.shape[2] == 1 and set(np.unique(basis.columns)) == {0.0, 1.0}
     order = shuffled(table())["order"]
-    mine = [k for k, n in enumerate(basis.names) if n[0] == "track"]
+    mine = [k for k, n in enumerate(basis.names) if n[0] == "track" and window(n[1]).axis == "order"]
     for k in mine:
         of, inside = window(basis.names[k][1]), np.asarray(basis.columns)[k, :, 0] > 0
-        np.testing.assert_array_equal(inside, (order >= of.low) & (order <= of.high))
-        assert bases.FEWEST <= inside.sum() <= ROWS / 2 and of.axis == "order"
+        np.testing.assert_array_equal(inside, of.holds(order))
+        assert bases.FEWEST <= inside.sum() <= ROWS / 2
     shapes = np.asarray(basis.columns)[mine, :, 0]
     assert (shapes.sum(0) >= 1).all()
     # something that happens within half a window of the smallest share lies in one
@@ -93,21 +97,38 @@ def test_windows_cover_the_order_and_overlap_by_half():
 
 def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
     time = np.tile(np.linspace(0, 1.5, 30), 2)
-    (basis,) = windows(table(time_s=time), COUNTS)
-    assert {window(v).axis for _, v in basis.names} == {"time"}
-    for shape in np.asarray(basis.columns)[:, :, 0]:
-        np.testing.assert_array_equal(shape[:30], shape[30:])
+    for basis in windows(table(time_s=time), COUNTS):
+        over_time = [k for k, (_, v) in enumerate(basis.names) if window(v).axis == "time"]
+        assert over_time
+        for shape in np.asarray(basis.columns)[over_time, :, 0]:
+            np.testing.assert_array_equal(shape[:30], shape[30:])
+
+
+def test_levels_of_conditions_are_windows():
+    columns = table()
+    basis = windows({k: v for k, v in columns.items() if k != "order"}, COUNTS)[0]
+    found = {window(v) for place, v in basis.names if place == "slip"}
+    slopes = np.unique(columns["slope_deg"])
+    mine = sorted((w for w in found if w.axis == "slope"), key=lambda w: w.low)
+    np.testing.assert_allclose([w.low for w in mine], np.radians(slopes), rtol=1e-4, atol=1e-6)
+    for w in found:
+        k = basis.names.index(("slip", str(w)))
+        x = columns[bases.VARIABLES[w.axis]] * bases.LEVELS[w.axis][0]
+        np.testing.assert_array_equal(np.asarray(basis.columns)[k, :, 0] > 0, w.holds(x))
+    assert mine[-1].words == f"{slopes[-1]:g} deg of slope"
 
 
 def test_rows_that_do_not_count_are_in_no_window():
     counts = COUNTS.copy()
     counts[[5, 20, 40]] = 0
-    (basis,) = windows(shuffled(table()), counts)
-    assert not np.asarray(basis.columns)[:, [5, 20, 40]].any()
+    for basis in windows(shuffled(table()), counts):
+        assert not np.asarray(basis.columns)[:, [5, 20, 40]].any()
 
 
-def test_a_table_without_order_or_time_has_no_windows():
-    assert windows({k: v for k, v in table().items() if k != "order"}, COUNTS) == ()
+def test_a_table_without_order_or_levels_has_no_windows():
+    rng = np.random.default_rng(3)
+    measured = {c: rng.uniform(1, 9, ROWS) for c in ("supply_voltage_V", "slope_deg", "payload_kg")}
+    assert windows({k: v for k, v in (table() | measured).items() if k != "order"}, COUNTS) == ()
 
 
 # --- sizes ----------------------------------------------------------------------------------------------
@@ -115,7 +136,7 @@ def test_a_table_without_order_or_time_has_no_windows():
 
 def shapes(columns, counts):
     whole = (*families(columns, counts), *windows(columns, counts))
-    return [(b.columns.shape[0], b.columns.shape[2], b.balance) for b in whole]
+    return jax.tree.structure(bases.compiled(whole)), [b.columns.shape for b in whole]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -131,7 +152,6 @@ def test_tables_of_one_size_have_families_of_one_size(seed):
         (table(order=rng.permutation(gaps)), short), (table(slope_deg=np.zeros(ROWS)), COUNTS),
     ):  # fmt: skip
         assert shapes(columns, weight) == first
-    assert all(len(b) == n for n, _, b in first)
 
 
 def test_families_that_fill_up_repeat_others():

@@ -248,8 +248,8 @@ def toy():
     signatures[:, 3] = 2 * signatures[:, 0] + 1e-3 * signatures[:, 3]  # look-alikes
     defects = rng.standard_normal((len(PROBED), rows, 3))
     columns = rng.standard_normal((2, rows, 3))
-    basis = bases.Basis(jnp.asarray(columns), (("electrical", "a"), ("track", "b")))
-    shown = bases.Basis(jnp.asarray(columns), (("speed", "a"), ("total_current", "b")))
+    basis = bases.Basis.of(columns, (("electrical", "a"), ("track", "b")))
+    shown = bases.Basis.of(columns, (("speed", "a"), ("total_current", "b")))
     scale = rng.uniform(0.5, 2.0, (rows, 3))
     linear = SettledLinearization(*map(jnp.asarray, (e, jacobian, signatures, defects, scale)), None)
     return SimpleNamespace(linear=linear, bases=(basis, shown), scores=score_tests(linear, (basis, shown)))

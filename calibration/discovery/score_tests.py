@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.inference.bases import Bases, signature
+from calibration.inference.bases import Bases, compiled, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.problem import Problem
@@ -163,9 +163,13 @@ def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
 Diagnosed = tuple[Linearization, ScoreTable, Statistics]
 
 
-@eqx.filter_jit
 def diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
     """A fit linearised, what effects and curves could explain of its residual, and the strongest of that."""
+    return _diagnosed(problem, z, effects, compiled(bases))
+
+
+@eqx.filter_jit
+def _diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
     linear = problem.observe.linearise(problem, z, problem.data, effects)
     scores = score_tests(linear, bases)
     return linear, scores, strongest(scores, linear)
@@ -179,11 +183,11 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     """
     linear = jax.tree.map(jnp.asarray, linear)
     for basis in bases:
-        if chosen < len(basis.names):
-            columns = signature(linear, basis.names[chosen][0], np.asarray(basis.columns[chosen]))
+        if chosen < len(basis.places):
+            columns = signature(linear, basis.places[chosen], np.asarray(basis.columns[chosen]))
             norm = np.linalg.norm(columns, axis=0)
             return columns[:, norm > 0] / norm[norm > 0] * WIDE
-        chosen -= len(basis.names)
+        chosen -= len(basis.places)
     raise IndexError(chosen)
 
 
@@ -215,7 +219,7 @@ def beside_columns(
     jacobian, residual = map(jnp.asarray, widened(linear, filled))
     linear = jax.tree.map(jnp.asarray, linear)
     padded = dataclasses.replace(linear, jacobian=jacobian, residual=residual)
-    scores = _score_tests(padded, bases)
+    scores = _score_tests(padded, compiled(bases))
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(of)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
@@ -250,9 +254,9 @@ def bootstrap(
         problem: of the base alone, z its fit; linear: the same fit, linearised.
         seed: random seed.
     """
-    count = -(-replicates // CHUNK)
+    count, nameless = -(-replicates // CHUNK), compiled(bases)
     keys = jax.random.split(jax.random.key(seed), (count, CHUNK))
-    parts = [jax.device_get(_replicates(problem, jnp.asarray(z), linear, effects, bases, k)) for k in keys]
+    parts = [jax.device_get(_replicates(problem, jnp.asarray(z), linear, effects, nameless, k)) for k in keys]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)
 

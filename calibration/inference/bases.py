@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -69,23 +69,39 @@ class Basis(eqx.Module):
 
     Attributes:
         columns: of each family, shape (families, rows, terms).
-        names: (place, variable) of each family; all places are balances, or all are channels.
+        places: of each family; all are balances, or all are channels.
+        variables: of each family, over which it is; a window's is the table's own, so it is no part of what is
+            compiled.
     """
 
     columns: Float[Array, "families rows terms"]
-    names: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    places: tuple[str, ...] = eqx.field(static=True)
+    variables: tuple[str, ...] = eqx.field(static=True)
+
+    @staticmethod
+    def of(columns: np.ndarray, names: Sequence[tuple[str, str]]) -> Basis:
+        """Families with the (place, variable) of each."""
+        places, variables = zip(*names, strict=True)
+        return Basis(jnp.asarray(columns), places, variables)
 
     @property
-    def _of_channels(self) -> bool:
-        return in_readings(self.names[0][0])
+    def names(self) -> tuple[tuple[str, str], ...]:
+        """(place, variable) of each family."""
+        return tuple(zip(self.places, self.variables, strict=True))
 
     def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
         """Change of the whitened readings by every family's columns."""
-        known, change = (channels.names(), linear.shown) if self._of_channels else (PROBED, linear.columns)
-        return jax.vmap(change)(jnp.asarray([known.index(place) for place, _ in self.names]), self.columns)
+        of_channels = in_readings(self.places[0])
+        known, change = (channels.names(), linear.shown) if of_channels else (PROBED, linear.columns)
+        return jax.vmap(change)(jnp.asarray([known.index(place) for place in self.places]), self.columns)
 
 
 Bases = tuple[Basis, ...]
+
+
+def compiled(bases: Bases) -> Bases:
+    """Bases without the variables of their families: those of tables of one size are of one kind to a compiler."""
+    return tuple(dataclasses.replace(basis, variables=()) for basis in bases)
 
 
 def in_readings(place: str) -> bool:
@@ -156,7 +172,7 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
         ([(b, CONDITIONS) for b in BALANCES], [wide] * len(BALANCES)),
         ([n for n, _ in read], [b for _, b in read]),
     ]
-    return tuple(Basis(jnp.asarray(np.stack(b)), tuple(ns)) for ns, b in groups if ns)
+    return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,9 +240,9 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
     shapes += shapes[:1] * (len(offered) - len(shapes))
     read = [c.name for c in channels.CHANNELS if f"curve_{c.name}_order" in UNNAMED]
     return tuple(
-        Basis(
-            jnp.asarray(np.stack([s for s, _ in shapes] * len(places))[:, :, None]),
-            tuple((place, name) for place in places for _, name in shapes),
+        Basis.of(
+            np.stack([s for s, _ in shapes] * len(places))[:, :, None],
+            [(place, name) for place in places for _, name in shapes],
         )
         for places in (BALANCES, read)
         if places
@@ -281,8 +297,7 @@ def waves(on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.
     if not words:
         return ()
     every = [(b, w) for b in BALANCES for w in words]
-    whole = jnp.asarray(np.stack(bases * len(BALANCES)))
-    return (Basis(whole, tuple(every)),)
+    return (Basis.of(np.stack(bases * len(BALANCES)), every),)
 
 
 def names(bases: Bases) -> tuple[tuple[str, str], ...]:
