@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
+import importlib.util
 import pickle
 import sys
 import threading
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from sweeps.scale import Job, Produced
 
 #: Longest wait for a scheduler to answer, and for it to have a worker [s].
-ANSWER, WORKER = 6.0, 60.0
+ANSWER, WORKER = 4.0, 60.0
 #: How often a chunk is given to another worker before the sweep ends.
 RETRIES = 5
 #: Chunks that wait at each worker beside the one that it computes.
@@ -75,7 +77,9 @@ class Pool:
             return future
 
         room = max(len(self.client.scheduler_info(n_workers=-1)["workers"]), 1) * (1 + AHEAD)
-        under_way = as_completed([submit(chunk) for _, chunk in zip(range(room), left, strict=False)])
+        under_way = as_completed(
+            [submit(chunk) for _, chunk in zip(range(room), left, strict=False)], loop=self.client.loop
+        )
         while not under_way.is_empty():
             try:
                 future = self._next(under_way)
@@ -147,19 +151,9 @@ def connect(address: str) -> Pool:
         BadConfiguration: dask is not installed, nobody answers at the address, there is no worker, or workers differ
             from this process or among each other.
     """
-    try:
-        import distributed
-    except ImportError:
-        raise BadConfiguration("--scheduler: needs dask; install mmrjax[cluster]") from None
-    with _quiet():
-        try:
-            client = distributed.Client(address, timeout=ANSWER, name="mmrjax sweep")
-        except Exception as error:  # whatever comes of talking to something that is no scheduler
-            reason = str(error).split("\n")[0] or type(error).__name__
-            raise BadConfiguration(
-                f"--scheduler: got {address}; no scheduler answers there within {ANSWER:g} s ({reason}); expected "
-                "the address that dask scheduler prints, such as tcp://host:8786"
-            ) from None
+    if importlib.util.find_spec("distributed") is None:
+        raise BadConfiguration("--scheduler: needs dask; install mmrjax[cluster]")
+    client = _client(address)
     try:
         try:
             client.wait_for_workers(1, timeout=ANSWER)
@@ -182,6 +176,35 @@ def connect(address: str) -> Pool:
     except BaseException:
         client.close()
         raise
+
+
+def _client(address: str) -> Any:
+    """A client of the scheduler at an address, in `ANSWER` seconds or not at all.
+
+    dask limits how long it waits for a connection, not for what is said over it; so it waits in a thread here.
+    """
+    import distributed
+
+    found: list[Any] = []
+    failed: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            found.append(distributed.Client(address, timeout=ANSWER, name="mmrjax sweep", set_as_default=False))
+        except BaseException as error:  # whatever comes of talking to something that is no scheduler
+            failed.append(error)
+
+    with _quiet():
+        asking = threading.Thread(target=ask, daemon=True)
+        asking.start()
+        asking.join(ANSWER + 0.5)
+    if found:
+        return found[0]
+    reason = (str(failed[0]).split("\n")[0] or type(failed[0]).__name__) if failed else "silence"
+    raise BadConfiguration(
+        f"--scheduler: got {address}; no scheduler answers there within {ANSWER:g} s ({reason}); expected the "
+        "address that dask scheduler prints, such as tcp://host:8786"
+    )
 
 
 @contextlib.contextmanager
@@ -211,6 +234,7 @@ def program() -> dict[str, dict[str, str]]:
     return {"code": code(), "versions": versions(PACKAGES)}
 
 
+@functools.cache
 def _start() -> None:
     """Double precision and compiled programs kept, as in the command itself."""
     from sweeps import compilation_cache

@@ -102,6 +102,7 @@ class SweepStore:
         self.layout = layout
         self.finished = False
         self._journal: TextIO | None = None
+        self._lock: TextIO | None = None
         self._identity = identity
         if path.is_dir() and (path / "identity.json").is_file() and not force:
             self._same(path)
@@ -123,16 +124,20 @@ class SweepStore:
             raise BadConfiguration(
                 f"--out: {path} cannot be written ({error.strerror}); choose another path"
             ) from error
-        with self._locked():
-            if not (self.partial / "lock").is_file():  # another process has just finished
-                self._same(path)
-                self.finished = True
-                return
-            if (self.partial / "identity.json").is_file():
-                if not force or not self._differs(self.partial):
-                    self._same(self.partial)
-                    return
-                self._clear()
+        try:
+            with self._locked():
+                self._begin_or_take_up(force)
+        except BaseException:
+            self.close()
+            raise
+
+    def _begin_or_take_up(self, force: bool) -> None:
+        if not (self.partial / "lock").is_file():  # another process has just finished
+            self._same(self.path)
+            self.finished = True
+        elif (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
+            self._same(self.partial)
+        else:
             self._create()
 
     # --- identity ---------------------------------------------------------------------------------
@@ -151,6 +156,7 @@ class SweepStore:
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
+        assert self._lock is not None
         fcntl.flock(self._lock, fcntl.LOCK_EX)
         try:
             yield
@@ -265,10 +271,10 @@ class SweepStore:
 
     def close(self) -> None:
         """Let other processes work on what is left."""
-        for file in (self._journal, None if self.finished else self._lock):
+        for file in (self._journal, self._lock):
             if file is not None:
                 file.close()
-        self._journal = None
+        self._journal = self._lock = None
 
     def abandon(self) -> None:
         """Leave nothing behind, where no chunk is done and nobody else is at work."""

@@ -43,7 +43,7 @@ def test_points_do_not_depend_on_how_they_are_cut(kind, nominal):
     samples = sampled(nominal, kind, number=10_000).samples
     whole = samples.values(0, 10_000)
     for size in (1, 7, 4096, 9999):
-        parts = [samples.values(k, min(size, 10_000 - k)) for k in range(0, 10_000, size)][: 300]
+        parts = [samples.values(k, min(size, 10_000 - k)) for k in range(0, 10_000, size)][:300]
         cut = np.concatenate(parts, axis=1)
         assert np.array_equal(cut, whole[:, : cut.shape[1]])
     assert np.array_equal(samples.values(7777, 1)[:, 0], whole[:, 7777])
@@ -145,7 +145,11 @@ def test_joint_names_are_sampled_together_whatever_the_chunk():
 def test_points_of_a_grid_are_every_combination_the_last_axis_fastest(nominal):
     plan = planned(
         nominal,
-        axes={"configuration": "all", "slope_deg": "0:20:10", "motor.resistance": {"start": 0.5, "stop": 2, "number": 3, "scale": "log"}},
+        axes={
+            "configuration": "all",
+            "slope_deg": "0:20:10",
+            "motor.resistance": {"start": 0.5, "stop": 2, "number": 3, "scale": "log"},
+        },
     )
     found = plan.design.block(tuple(slice(0, n) for n in plan.design.shape))
     np.testing.assert_allclose(found, list(itertools.product([0, 1], [0, 10, 20], [0.5, 1, 2])))
