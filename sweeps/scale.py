@@ -51,9 +51,11 @@ class Job:
 
 @dataclasses.dataclass
 class Times:
-    """Seconds spent by what overlaps: computing, fetching from the device, writing; and the whole."""
+    """Seconds spent by what overlaps: making points and starting to compute them (on processors that is computing
+    itself); waiting for what is computed, fetching it from the device, writing it; and the whole."""
 
     points: float = 0.0
+    start: float = 0.0
     compute: float = 0.0
     transfer: float = 0.0
     write: float = 0.0
@@ -167,8 +169,11 @@ def produce(compiled: Compiled, chunks: Iterable[int], times: Times) -> Produced
     for chunk in chunks:
         start = time.perf_counter()
         values = compiled.points(chunk)
-        times.points += time.perf_counter() - start
-        yield Piece(chunk, compiled(values), values)
+        made = time.perf_counter()
+        arrays = compiled(values)
+        times.points += made - start
+        times.start += time.perf_counter() - made
+        yield Piece(chunk, arrays, values)
 
 
 def fetched(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:

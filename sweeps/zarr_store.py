@@ -28,6 +28,8 @@ from sweeps.identity import Identity, differences
 
 STORE = "results.zarr"
 STATUS = "status"
+#: Folder in which files are written before they are moved into place.
+ASIDE = "writing"
 #: Status of a point that has not been simulated.
 ABSENT = 255
 
@@ -104,6 +106,7 @@ class SweepStore:
         self._journal: TextIO | None = None
         self._lock: TextIO | None = None
         self._identity = identity
+        self._aside = self.partial / ASIDE / "identity"
         if path.is_dir() and (path / "identity.json").is_file() and not force:
             self._same(path)
             self.finished = True
@@ -174,8 +177,9 @@ class SweepStore:
         """Metadata and axes, and the identity last: what has one is whole."""
         self._clear()
         (self.partial / "journal").mkdir()
+        (self.partial / ASIDE).mkdir()
         create(self.partial / STORE, self.layout)
-        write_file(self.partial / "identity.json", json.dumps(self._identity, indent=1).encode())
+        write_file(self.partial / "identity.json", json.dumps(self._identity, indent=1).encode(), self._aside)
 
     # --- chunks -----------------------------------------------------------------------------------
 
@@ -185,7 +189,8 @@ class SweepStore:
         Raises:
             BadConfiguration: another process does.
         """
-        file = self.partial / "journal" / f"{shard[0]}-of-{shard[1]}.jsonl"
+        name = f"{shard[0]}-of-{shard[1]}"
+        file, self._aside = self.partial / "journal" / f"{name}.jsonl", self.partial / ASIDE / name
         self._journal = file.open("a+", encoding="utf-8")
         try:
             fcntl.flock(self._journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -248,7 +253,7 @@ class SweepStore:
         file = array.joinpath("c", *map(str, place))
         file.parent.mkdir(parents=True, exist_ok=True)
         content = np.ascontiguousarray(values).data
-        write_file(file, content if self.layout.compression == "none" else _compressed(content))
+        write_file(file, content if self.layout.compression == "none" else _compressed(content), self._aside)
 
     # --- the end ----------------------------------------------------------------------------------
 
@@ -265,6 +270,7 @@ class SweepStore:
         if self.path.is_dir():
             shutil.rmtree(self.path)
         (self.partial / "lock").unlink()
+        shutil.rmtree(self.partial / ASIDE)
         os.replace(self.partial, self.path)
         self.finished = True
         return self.path
@@ -282,9 +288,12 @@ class SweepStore:
             shutil.rmtree(self.partial, ignore_errors=True)
 
 
-def write_file(path: Path, content: Any) -> None:
-    """Write a file that is there whole or not at all, and outlives a loss of power."""
-    aside = path.with_name(f"{path.name}.{os.getpid()}.writing")
+def write_file(path: Path, content: Any, aside: Path) -> None:
+    """Write a file that is there whole or not at all, and outlives a loss of power.
+
+    Args:
+        aside: where it is written, on the same disk, before it is moved into place.
+    """
     try:
         with aside.open("wb") as stream:
             stream.write(content)

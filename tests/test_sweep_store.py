@@ -227,10 +227,10 @@ def stopping(monkeypatch, at, error):
     """Let the writing of files fail from the `at`-th on."""
     honest, count = zarr_store.write_file, iter(range(10**9))
 
-    def write(path, content):
+    def write(path, content, aside):
         if next(count) >= at:
             raise error
-        honest(path, content)
+        honest(path, content, aside)
 
     monkeypatch.setattr(zarr_store, "write_file", write)
     return lambda: monkeypatch.setattr(zarr_store, "write_file", honest)
@@ -287,7 +287,7 @@ def test_full_disk_in_the_middle_ends_with_2_and_goes_on_later(sweep, whole, mon
 def test_failing_write_leaves_no_file_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
     with pytest.raises(OSError, match="full"):
-        zarr_store.write_file(tmp_path / "c", b"abc")
+        zarr_store.write_file(tmp_path / "c", b"abc", tmp_path / "aside")
     assert not list(tmp_path.iterdir())
 
 
