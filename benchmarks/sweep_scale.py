@@ -130,10 +130,14 @@ def memory(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def weak(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """The same number of runs a device, on more and more devices; the second of two sweeps is timed."""
+    """The same number of runs a device, on more and more devices; the second of two sweeps is timed.
+
+    Samples, so that each device has its share of easy and of hard runs.
+    """
     import jax
 
-    rows = []
+    arguments.sampled = True
+    rows: list[dict[str, Any]] = []
     for count in map(int, arguments.weak.split(",")):
         devices = jax.local_devices()[:count]
         if len(devices) < count:

@@ -536,3 +536,11 @@ def test_layout_counts_its_bytes_without_writing(whole):
     layout = campaign.laid_out(config, job)
     assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up
     assert dataclasses.replace(layout, variables=()).size == 3 * 8
+
+
+def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):  # noqa: F811
+    page = (Path(__file__).resolve().parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    code, out, err = mmrjax("sweep", "plan.toml", "--dry-run", "--chunk", "1000")
+    assert code == 0, err
+    assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out
