@@ -17,6 +17,7 @@ from mmrjax.robot import Robot
 from mmrjax.tables import SURFACES, adhesion_ratio
 from mmrjax.variation import Axis
 from sweeps import config as configuration
+from sweeps.config_campaign import Campaign
 from sweeps.design import DESIGNS, Design, Joint, Samples
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class Plan:
         return Conditions(which, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
 
 
-def plan(config: configuration.Campaign, robot: Robot, where: str) -> Plan:
+def plan(config: Campaign, robot: Robot, where: str) -> Plan:
     """The design of a configuration, checked.
 
     Args:

@@ -91,7 +91,7 @@ class Compiled:
         self.size = -(-job.blocks.points // len(devices)) * len(devices)
         variation = Variation(job.robot, job.plan.design.names)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
-        self._known = _placed((variation, job.plan.fixed()), everywhere)
+        self._variation, self._conditions = _placed((variation, job.plan.fixed()), everywhere)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
         surface = None if job.plan.surface is None else adhesions(job.robot, job.plan.surface)
         self._program = eqx.filter_jit(_program(job, surface, self.mesh))
@@ -105,7 +105,10 @@ class Compiled:
 
     def __call__(self, values: Float[np.ndarray, "points names"]) -> dict[str, Array]:
         """Start computing; returns arrays of the compiled shape that may not be there yet."""
-        return self._program(*self._known, jax.device_put(values, self._split))
+        found: dict[str, Array] = self._program(
+            self._variation, self._conditions, jax.device_put(values, self._split)
+        )
+        return found
 
 
 def _placed(tree: Any, sharding: NamedSharding) -> Any:
@@ -135,7 +138,8 @@ def _program(
         arrays, rest = eqx.partition((variation, conditions), eqx.is_array)
 
         def part(arrays: Any, values: Array) -> dict[str, Array]:
-            return one_device(*eqx.combine(arrays, rest), values)
+            variation, conditions = eqx.combine(arrays, rest)
+            return one_device(variation, conditions, values)
 
         # Each device searches its own roots and steps its own runs: none waits for another inside a loop.
         split = jax.shard_map(
