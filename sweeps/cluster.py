@@ -31,6 +31,7 @@ ANSWER, WORKER = 4.0, 60.0
 RETRIES = 5
 #: Chunks that wait at each worker beside the one that it computes.
 AHEAD = 1
+GONE = "--scheduler: it has gone away; start it again, and the same command goes on"
 
 
 class LostWorkers(InputError):
@@ -76,7 +77,7 @@ class Pool:
             numbers[future.key] = chunk
             return future
 
-        room = max(len(self.client.scheduler_info(n_workers=-1)["workers"]), 1) * (1 + AHEAD)
+        room = max(self._workers(), 1) * (1 + AHEAD)
         under_way = as_completed(
             [submit(chunk) for _, chunk in zip(range(room), left, strict=False)], loop=self.client.loop
         )
@@ -92,9 +93,7 @@ class Pool:
                 arrays = future.result()
             except (KilledWorker, CancelledError) as error:
                 if self.client.status != "running":
-                    raise LostWorkers(
-                        "--scheduler: it has gone away; start it again, and the same command goes on"
-                    ) from error
+                    raise LostWorkers(GONE) from error
                 if tried[chunk] > RETRIES:
                     raise LostWorkers(
                         f"--scheduler: chunk {chunk} lost its worker {tried[chunk]} times, perhaps short of memory; "
@@ -108,8 +107,20 @@ class Pool:
             if following is not None:
                 under_way.add(submit(following))
 
+    def _workers(self) -> int:
+        """How many there are."""
+        try:
+            return len(self.client.scheduler_info(n_workers=-1)["workers"])
+        except Exception as error:  # whatever comes of asking one that is no more
+            raise LostWorkers(GONE) from error
+
     def _next(self, under_way: Any) -> Any:
-        """The next finished future, however long it takes while some worker is there."""
+        """The next finished future, however long it takes while some worker is there.
+
+        Raises:
+            TimeoutError: no worker for `WORKER` seconds.
+            LostWorkers: the scheduler is gone.
+        """
         found: list[Any] = []
         failed: list[BaseException] = []
 
@@ -123,7 +134,7 @@ class Pool:
         thread.start()
         while thread.is_alive():
             thread.join(WORKER / 4)
-            if thread.is_alive() and not self.client.scheduler_info(n_workers=-1)["workers"]:
+            if thread.is_alive() and not self._workers():
                 self.client.wait_for_workers(1, timeout=WORKER)
         if failed:
             raise failed[0]

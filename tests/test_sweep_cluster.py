@@ -16,7 +16,9 @@ from test_effect_file import GOOD
 from test_sweep_store import CONFIG, arrays
 
 from calibration.data.errors import BadConfiguration
-from sweeps import cluster, identity
+from mmrjax import robots
+from sweeps import axes, campaign, cluster, identity
+from sweeps.config_campaign import Campaign
 
 pytest.importorskip("distributed")
 
@@ -24,7 +26,7 @@ pytest.importorskip("distributed")
 class Cluster:
     """A scheduler and workers, processes of their own."""
 
-    def __init__(self, folder: Path, workers: int) -> None:
+    def __init__(self, folder: Path, workers: int, nanny: str = "--no-nanny") -> None:
         self.folder = folder
         environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONWARNINGS": "ignore"}
         self.log = (folder / "cluster.log").open("w")
@@ -41,7 +43,7 @@ class Cluster:
         self.workers = [
             start(
                 sys.executable, "-m", "distributed.cli.dask_worker", self.address, "--nthreads", "1", "--no-dashboard",
-                "--no-nanny", "--local-directory", str(folder / f"worker-{k}"),
+                nanny, "--local-directory", str(folder / f"worker-{k}"),
             )
             for k in range(workers)
         ]  # fmt: skip
@@ -175,3 +177,74 @@ def test_users_own_effects_travel_to_the_workers(tmp_path, two_workers):
     assert done.returncode == 3, done.stderr
     assert command(tmp_path, "--out", "here").returncode == 3
     assert arrays(tmp_path / "there") == arrays(tmp_path / "here")
+
+
+@pytest.fixture
+def job():
+    """Ten chunks of one point each."""
+    config = Campaign(axes={"voltage": [*range(15, 25)]}, chunk=1, outputs=("speed",))
+    robot = robots.nominal()
+    return campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
+
+
+@pytest.mark.filterwarnings("ignore")  # of dask, about what it loses here
+@pytest.mark.parametrize(
+    "victim, message", [("workers", "no worker has been there for 1 s; start one"), ("scheduler", "it has gone away")]
+)
+def test_workers_or_scheduler_lost_for_good_end_the_sweep(two_workers, job, monkeypatch, victim, message):
+    monkeypatch.setattr(cluster, "WORKER", 1.0)
+    pool = cluster.connect(two_workers.address)
+    try:
+        pieces = pool.produce(job, range(10))
+        next(pieces)
+        for process in two_workers.workers if victim == "workers" else [two_workers.scheduler]:
+            process.kill()
+        with pytest.raises(cluster.LostWorkers, match=message):
+            list(pieces)
+    finally:
+        pool.client.close(timeout=2)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
+def test_chunk_that_kills_its_workers_ends_the_sweep(tmp_path, job, monkeypatch):
+    (tmp_path / "cluster").mkdir()
+    restarting = Cluster(tmp_path / "cluster", 1, "--nanny")
+    deadly = eval("lambda *_: __import__('os')._exit(1)", {})  # of no module, so that it travels whole
+    monkeypatch.setattr(cluster, "compute", deadly)
+    monkeypatch.setattr(cluster, "RETRIES", 0)
+    pool = cluster.connect(restarting.address)
+    try:
+        with pytest.raises(cluster.LostWorkers, match=r"chunk 3 lost its worker 1 times, perhaps short of memory"):
+            list(pool.produce(job, [3]))
+    finally:
+        pool.client.close(timeout=2)
+        restarting.close()
+
+
+def test_worker_that_comes_later_and_differs_is_refused():
+    expected = {**cluster.program(), "device": {"device": "gpu: another"}}
+    with pytest.raises(BadConfiguration, match=r"a worker that came later has another program or device: device \("):
+        cluster.compute(b"", "x", 0, expected)
+
+
+def test_workers_of_several_kinds_are_refused(monkeypatch):
+    class Client:
+        closed = False
+
+        def wait_for_workers(self, *_, **__):
+            pass
+
+        def run(self, _):
+            return {"tcp://a": (cluster.program(), "cpu: cpu"), "tcp://b": (cluster.program(), "gpu: H200")}
+
+        def close(self):
+            self.closed = True
+
+    client = Client()
+    monkeypatch.setattr(cluster, "_client", lambda _: client)
+    with pytest.raises(
+        BadConfiguration, match=r"workers have different devices, cpu: cpu, gpu: H200; expected one kind"
+    ):
+        cluster.connect("tcp://x:1")
+    assert client.closed
