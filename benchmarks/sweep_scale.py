@@ -6,6 +6,7 @@
     python benchmarks/sweep_scale.py --weak 1,2,4 --model drive       # 16384 runs a device, on 1, 2 and 4 devices
     python benchmarks/sweep_scale.py --weak 1,2,4 --model track
     python benchmarks/sweep_scale.py --model track --points 100000 --duration 1   # track at the standard step
+    python benchmarks/sweep_scale.py --against-cpu --points 200000    # largest difference of GPU and CPU results
     python benchmarks/sweep_scale.py --designs                        # points a second of the sampled designs
 
 Prints one line of JSON: machine, versions, times. Programs are compiled before the time is taken, unless said.
@@ -51,17 +52,13 @@ def divisor(number: int, most: int) -> int:
     return next(k for k in range(most, 0, -1) if number % k == 0)
 
 
-def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None = None) -> dict[str, Any]:
-    """One sweep into a store on disk; its times."""
-    import jax
-
+def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[Any, Any]:
+    """Configuration and job of a sweep."""
     from mmrjax import channels, robots
     from sweeps import axes, campaign, scale
     from sweeps.config_campaign import Campaign
-    from sweeps.zarr_store import SweepStore
 
-    devices = jax.local_devices() if devices is None else devices
-    chunk = arguments.chunk or scale.default_chunk(arguments.model, scale.accelerated(), len(devices))
+    chunk = arguments.chunk or scale.default_chunk(arguments.model, scale.accelerated(), devices)
     config = Campaign(
         model=arguments.model, chunk=min(chunk, points), storage=arguments.storage, outputs=channels.names(),
         duration_s=arguments.duration if arguments.model != "steady" else None,
@@ -69,7 +66,44 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
     )  # fmt: skip
     robot = robots.nominal()
     plan = axes.plan(config, robot, "benchmark")
-    job = campaign.prepare(config, robot, plan, "benchmark")
+    return config, campaign.prepare(config, robot, plan, "benchmark")
+
+
+def against_cpu(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The first chunk on the default devices and on the processor: largest relative difference of each output."""
+    import jax
+
+    from sweeps import scale
+
+    _, job = prepared(arguments, arguments.points, 1)
+    count = job.blocks.count(0)
+    found = []
+    for devices in (jax.local_devices(), jax.local_devices(backend="cpu")[:1]):
+        compiled = scale.Compiled(job, devices)
+        found.append(scale.fetched(compiled(compiled.points(0)), count))
+    one, other = found
+    differences = {}
+    for name in job.outputs:
+        finite = np.isfinite(other[name])
+        size = np.abs(other[name][finite])
+        differences[name] = float(np.max(np.abs(one[name][finite] - other[name][finite]) / np.maximum(size, 1e-9)))
+    return {
+        "points": count,
+        "devices": [f"{d.platform}: {d.device_kind}" for d in jax.local_devices()],
+        "different_statuses": int(np.sum(one["status"] != other["status"])),
+        "largest_relative_difference": differences,
+    }
+
+
+def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None = None) -> dict[str, Any]:
+    """One sweep into a store on disk; its times."""
+    import jax
+
+    from sweeps import campaign, scale
+    from sweeps.zarr_store import SweepStore
+
+    devices = jax.local_devices() if devices is None else devices
+    config, job = prepared(arguments, points, len(devices))
     folder = Path(tempfile.mkdtemp(dir=arguments.out))
     try:
         compiled = scale.Compiled(job, devices)
@@ -88,13 +122,13 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         shutil.rmtree(folder)
     return {
         "model": job.model,
-        "points": plan.design.points,
+        "points": job.plan.design.points,
         "devices": len(devices),
         "chunk": job.blocks.points,
         "chunks": len(job.blocks),
         "bytes": layout.size,
         "seconds": total,
-        "points_per_s": plan.design.points / total,
+        "points_per_s": job.plan.design.points / total,
         "first_chunk_with_compiling_s": first,
         # two threads: one makes points and starts to compute (on processors, that is all of computing), the other
         # waits for what is computed, fetches and writes
@@ -181,6 +215,7 @@ def main() -> None:
     options.add_argument("--weak", help="numbers of devices, such as 1,2,4")
     options.add_argument("--per-device", type=int, default=16_384, help="runs a device and chunk of --weak")
     options.add_argument("--rounds", type=int, default=2, help="chunks of --weak")
+    options.add_argument("--against-cpu", action="store_true")
     options.add_argument("--designs", action="store_true")
     arguments = options.parse_args()
     from sweeps import compilation_cache
@@ -190,6 +225,8 @@ def main() -> None:
     record: dict[str, Any] = {"benchmark": "sweep_scale", "machine": machine()}
     if arguments.designs:
         record["designs"] = designs()
+    elif arguments.against_cpu:
+        record["against_cpu"] = against_cpu(arguments)
     elif arguments.memory:
         record["sweeps"] = memory(arguments)
     elif arguments.weak:
