@@ -279,7 +279,8 @@ class SweepStore:
         """Let other processes work on what is left."""
         for file in (self._journal, self._lock):
             if file is not None:
-                file.close()
+                with contextlib.suppress(OSError):  # of a line that found no room, which has been said
+                    file.close()
         self._journal = self._lock = None
 
     def abandon(self) -> None:

@@ -283,6 +283,50 @@ def test_full_disk_in_the_middle_ends_with_2_and_goes_on_later(sweep, whole, mon
     assert arrays("s") == arrays(whole)
 
 
+class FullDisk:
+    """A journal on a disk that is full from its third line on."""
+
+    def __init__(self, file):
+        self.file, self.lines = file, 0
+
+    def write(self, text):
+        self.lines += 1
+        self.file.write(text if self.lines < 3 else text[: len(text) // 2])
+
+    def flush(self):
+        self.file.flush()
+        if self.lines >= 3:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    def close(self):
+        self.file.close()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def fileno(self):
+        return self.file.fileno()
+
+
+def test_full_disk_of_the_journal_loses_no_more_than_its_chunk(sweep, whole, monkeypatch):
+    honest = zarr_store.SweepStore.begin
+
+    def begin(store, shard):
+        honest(store, shard)
+        store._journal = FullDisk(store._journal)
+
+    monkeypatch.setattr(zarr_store.SweepStore, "begin", begin)
+    code, _, err = sweep("s")
+    assert code == 2 and "No space left on device after 2 of 12 chunks" in err
+    monkeypatch.setattr(zarr_store.SweepStore, "begin", honest)
+    assert sweep("s")[0] == 3
+    assert arrays("s") == arrays(whole)
+
+
+def test_progress_has_rate_and_time_and_the_path_comes_last(sweep):
+    code, out, err = sweep("s")
+    assert code == 3 and "300/300" in err and "/s" in err and out.splitlines()[-1] == "s"
+    assert "slides" in out and "traction demand above the adhesion limit" in out
+
+
 def test_failing_write_leaves_no_file_behind(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
     with pytest.raises(OSError, match="full"):
