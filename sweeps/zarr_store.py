@@ -140,6 +140,10 @@ class SweepStore:
             self.finished = True
         elif (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
             self._same(self.partial)
+        elif not force and (self.path / "identity.json").is_file():  # finished between our looking and our coming
+            self._same(self.path)
+            shutil.rmtree(self.partial)
+            self.finished = True
         else:
             self._create()
 

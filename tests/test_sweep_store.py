@@ -438,6 +438,20 @@ def test_shares_make_the_same_store_in_any_order(sweep, whole, tmp_path):
     assert sweep("s", "--shard", "1/3")[0] == 3  # a job of the array that comes late
 
 
+def test_shares_started_at_once_finish_one_store(whole, tmp_path):
+    (tmp_path / "plan.toml").write_text(CONFIG)
+    running = [
+        subprocess.Popen(
+            [*MMRJAX, "sweep", "plan.toml", "--out", "s", "--shard", f"{k}/4"], cwd=tmp_path, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )
+        for k in (1, 2, 3, 4)
+    ]  # fmt: skip
+    ended = [(process.communicate(), process.returncode) for process in running]
+    assert {code for _, code in ended} <= {0, 3} and 3 in {code for _, code in ended}, ended
+    assert arrays(tmp_path / "s") == arrays(whole) and not (tmp_path / "s.partial").exists()
+
+
 def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
     assert sweep("s", "--shard", "2/5")[0] == 0
     code, _, err = sweep("s")
