@@ -79,6 +79,11 @@ def table() -> tuple[Output, ...]:
     return shown + FURTHER
 
 
+def names() -> tuple[str, ...]:
+    """Names of all outputs, the channels first."""
+    return tuple(output.name for output in table())
+
+
 def columns(result: Result, further: Mapping[str, Any] | None = None) -> dict[str, np.ndarray]:
     """Results in the units and words of `runs.csv`.
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances
+from mmrjax import balances, outputs
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.newton import root
@@ -133,6 +133,24 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
 def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     """`steady` over a batch of conditions (leading axis of every field) for one robot, compiled."""
     return jax.vmap(steady, in_axes=(None, 0))(robot, conditions)
+
+
+@eqx.filter_jit
+def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...]) -> dict[str, Array]:
+    """Chosen outputs of `steady` over points of which each may have its own robot, compiled.
+
+    Args:
+        robot: leaves are scalars, or arrays of shape (points,).
+        conditions: shape (points,).
+        names: of `outputs.table()`, `status` and `flags`.
+
+    Returns:
+        By name in SI units, shape (points,).
+    """
+    axes = jax.tree.map(lambda x: 0 if eqx.is_array(x) and x.ndim else None, robot)
+    found = jax.vmap(steady, in_axes=(axes, 0))(robot, conditions)
+    rows = {row.name: row for row in outputs.table()}
+    return {name: rows[name].get(found) if name in rows else getattr(found, name) for name in names}
 
 
 def _settled(robot: Robot, conditions: Conditions) -> Result:

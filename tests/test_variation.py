@@ -1,0 +1,131 @@
+"""What varies by name: each point is the robot and the conditions that its values say, in every fidelity."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import fidelities, outputs, params, robots
+from mmrjax.conditions import Conditions
+from mmrjax.errors import UsageError
+from mmrjax.fidelities.steady import steady
+from mmrjax.tables import CONDITION_LIMITS
+from mmrjax.variation import CONDITIONS, Variation, check_outputs, evaluate
+
+NAMES = ("motor.resistance", "6T2A.ground.friction.static", "slope_deg", "voltage")
+VALUES = np.array([[0.7, 0.5, 0.0, 24.0], [0.9, 0.6, 5.0, 33.0], [0.611, 0.2, 20.0, 15.0]])
+
+
+@pytest.fixture(scope="module")
+def variation():
+    return Variation(robots.nominal(), NAMES)
+
+
+def one_by_one(robot, row):
+    changed = params.replace(robot, {"motor.resistance": row[0], "6T2A.ground.friction.static": row[1]})
+    return steady(changed, Conditions(slope_deg=row[2], voltage=row[3]))
+
+
+def test_point_is_the_robot_and_conditions_that_its_values_state(variation):
+    robot, conditions = variation.at(jnp.asarray(VALUES[1]), Conditions(payload=3.0))
+    assert float(robot.motor.resistance) == 0.9
+    assert float(robot.configurations["6T2A"].ground.friction.static) == 0.6
+    assert float(robot.motor.inductance) == float(variation.robot.motor.inductance)
+    assert (float(conditions.slope_deg), float(conditions.voltage), float(conditions.payload)) == (5.0, 33.0, 3.0)
+
+
+def test_configuration_is_an_index_and_total_mass_may_be_none_before():
+    variation = Variation(robots.nominal(), ("configuration", "total_mass"))
+    _, conditions = variation.at(jnp.array([1.0, 12.5]), Conditions())
+    assert int(conditions.configuration) == 1 and jnp.issubdtype(conditions.configuration.dtype, jnp.integer)
+    assert float(conditions.total_mass) == 12.5
+    assert Variation(robots.nominal(), ("total_mass",)).axes["total_mass"].value is None
+
+
+def test_evaluate_steady_is_each_point_by_itself(variation):
+    found = evaluate(variation, "steady", jnp.asarray(VALUES), Conditions(), {}, ("total_current", "speed", "flags"))
+    for k, row in enumerate(VALUES):
+        alone = one_by_one(variation.robot, row)
+        assert int(found["status"][k]) == int(alone.status)
+        np.testing.assert_allclose(found["total_current"][k], alone.total_current, rtol=1e-12)
+        np.testing.assert_allclose(found["speed"][k], alone.speed, rtol=1e-12)
+    assert list(found) == ["total_current", "speed", "flags", "status"]
+    assert len(set(map(float, found["total_current"][:2]))) == 2  # the points differ, or the test says nothing
+
+
+@pytest.mark.parametrize("names", [NAMES, ("slope_deg", "voltage")])
+def test_evaluate_drive_is_the_run_of_each_robot(names):
+    robot, chosen = robots.nominal(), [NAMES.index(n) for n in names]
+    values, options = jnp.asarray(VALUES[:2, chosen]), {"duration": 0.5}
+    found = evaluate(Variation(robot, names), "drive", values, Conditions(), options, ("total_current",))
+    for k, row in enumerate(values):
+        given = {n: v for n, v in zip(names, row, strict=True)}
+        conditions = Conditions(slope_deg=given.pop("slope_deg")[None], voltage=given.pop("voltage")[None])
+        alone = fidelities.get("drive").run(params.replace(robot, given), conditions, options).result
+        np.testing.assert_allclose(found["total_current"][k], alone.total_current[0], rtol=1e-10)
+        assert int(found["status"][k]) == int(alone.status[0])
+
+
+def test_evaluate_compiles_once_a_shape(variation, compilations):
+    def call(shift):
+        found = evaluate(variation, "steady", jnp.asarray(VALUES + shift), Conditions(), {}, ("slip",))
+        return jax.block_until_ready(found)
+
+    other = Variation(params.replace(variation.robot, {"motor.inductance": jnp.asarray(2e-4)}), NAMES)
+    call(0.0)
+    compilations.clear()
+    call(0.01)
+    evaluate(other, "steady", jnp.asarray(VALUES), Conditions(), {}, ("slip",))
+    assert compilations == []
+
+
+def test_derivatives_go_through_evaluate(variation):
+    def current(values):
+        return evaluate(variation, "steady", values, Conditions(), {}, ("total_current",))["total_current"].sum()
+
+    values, h = jnp.asarray(VALUES[:2]), 1e-6
+    exact = jax.grad(current)(values)[1, 0]
+    central = (current(values.at[1, 0].add(h)) - current(values.at[1, 0].add(-h))) / (2 * h)
+    np.testing.assert_allclose(exact, central, rtol=1e-6)
+    assert float(exact) != 0.0
+
+
+def test_axes_know_unit_bounds_prior_and_meaning(variation):
+    axes = variation.axes
+    resistance = axes["motor.resistance"]
+    spec = next(p.spec for p in params.walk(variation.robot) if p.name == "motor.resistance")
+    assert (resistance.unit, resistance.bounds, resistance.meaning) == (spec.unit, spec.bounds, spec.meaning)
+    assert resistance.prior_sd == spec.prior_sd(float(variation.robot.motor.resistance)) > 0
+    slope = axes["slope_deg"]
+    assert slope.is_condition and slope.prior_sd is None and slope.bounds == CONDITION_LIMITS["slope_deg"][:2]
+
+
+def test_every_condition_has_words_and_limits():
+    fields = {f.name for f in dataclasses.fields(Conditions)}
+    assert set(CONDITIONS) == fields == {*CONDITION_LIMITS, "configuration"}
+    assert all(axis.meaning for axis in Variation(robots.nominal(), tuple(CONDITIONS)).axes.values())
+
+
+def test_unknown_and_repeated_names_are_refused_with_those_that_are_near():
+    robot = robots.nominal()
+    with pytest.raises(
+        UsageError, match=r"motor\.resistanse: .*did you mean motor\.resistance.*expected one of .*slope_deg"
+    ):
+        Variation(robot, ("motor.resistanse",))
+    with pytest.raises(UsageError, match="voltage: stated twice"):
+        Variation(robot, ("voltage", "voltage"))
+
+
+@pytest.mark.parametrize("model", ["steady", "drive"])
+def test_unknown_output_is_refused_with_the_choices(variation, model):
+    options = fidelities.facts(model).resolved()
+    with pytest.raises(UsageError, match=r"outputs: got total_curent; did you mean total_current.*efficiency_motor"):
+        check_outputs(variation, model, Conditions(), options, ("total_curent",))
+    check_outputs(variation, model, Conditions(), options, outputs.names())
+
+
+def test_a_fidelitys_own_column_is_an_output(variation):
+    options = fidelities.facts("track").resolved(duration=0.002)
+    check_outputs(variation, "track", Conditions(), options, ("guide_share", "speed"))
