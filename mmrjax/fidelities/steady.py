@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
+from mmrjax.fidelities.linear import Vector
 from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.robot import Robot
@@ -22,7 +23,7 @@ from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Re
 _CURRENT, _SPEED_MOTOR, _SPEED, _VOLTAGE, _TORQUE = 10.0, 1000.0, 1.0, 10.0, 100.0
 
 
-def _state(unknowns: Float[Array, " 3"], discharge: Float[Array, ""]) -> State:
+def _state(unknowns: Vector, discharge: Float[Array, ""]) -> State:
     return State(_CURRENT * unknowns[0], _SPEED_MOTOR * unknowns[1], _SPEED * unknowns[2], discharge)
 
 
@@ -30,12 +31,12 @@ _balanced = eqx.filter_jit(balances.settled)
 
 
 @eqx.filter_jit
-def _residual(unknowns: Float[Array, " 3"], run: tuple[Robot, Conditions]) -> Float[Array, " 3"]:
+def _residual(unknowns: Vector, run: tuple[Robot, Conditions]) -> Vector:
     robot, conditions = run
     signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge))
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
     torque = jnp.minimum(unknowns[1], -signals.torque_net / _TORQUE)
-    return jnp.stack([signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep])
+    return signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep
 
 
 def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
@@ -45,24 +46,22 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     """
     stated = conditions.total_mass
     mass = robot.chassis(conditions.configuration).mass + conditions.payload if stated is None else stated
-    sound = jnp.all(jnp.isfinite(jnp.stack([jnp.asarray(x, float) for x in jax.tree.leaves(conditions)]))) & (
-        mass > 0
-    )
+    sound = mass > 0
+    for number in jax.tree.leaves(conditions):
+        sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
     # No adhesion at all: the robot slides, but a share of nothing has no value.
     return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
 
 
-def _start(robot: Robot, conditions: Conditions) -> Float[Array, " 3"]:
+def _start(robot: Robot, conditions: Conditions) -> Vector:
     battery = robot.battery.voltage(0.0, conditions.discharge)
     nominal = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
     speed = 0.9 * nominal / robot.motor.torque_constant
-    return jnp.stack(
-        [
-            0.1 * nominal / robot.motor.resistance / _CURRENT,
-            speed / _SPEED_MOTOR,
-            robot.chassis(conditions.configuration).radius * speed / robot.gearbox.ratio / _SPEED,
-        ]
+    return (
+        0.1 * nominal / robot.motor.resistance / _CURRENT,
+        speed / _SPEED_MOTOR,
+        robot.chassis(conditions.configuration).radius * speed / robot.gearbox.ratio / _SPEED,
     )
 
 
