@@ -60,4 +60,4 @@ def mass_factor(mass_side: Scalar, radius: Scalar, inertia_rotating: Scalar) -> 
 
 def normal_load(mass: Scalar, slope: Scalar, gravity: float, sides: Scalar) -> Scalar:
     """Normal load of one side m_i g cos α [N], eq. (5)."""
-    return mass / sides * gravity * cosine(slope)
+    return mass * (gravity / sides) * cosine(slope)

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax.fidelities.linear import factorise, inverse, substitute
+from mmrjax.fidelities import elimination
+from mmrjax.fidelities.linear import factorise, substitute
 
 RNG = np.random.default_rng(1)
 EXCHANGE = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # no pivot on the diagonal at all
@@ -51,19 +52,63 @@ def test_singular_matrix_spoils_no_neighbour():
     np.testing.assert_array_equal(answers[2], 0.5)
 
 
-@pytest.mark.parametrize("matrix", [EXCHANGE, ZERO_LATER, RNG.normal(size=(3, 3))])
+# --- elimination of scalars, without exchanges -----------------------------------------------------------------------
+
+DIAGONAL = 3 * np.eye(3)  # added to a matrix: pivots where elimination without exchanges looks for them
+
+
+def rows(matrix):
+    return [[matrix[i, j] for j in range(matrix.shape[1])] for i in range(matrix.shape[0])]
+
+
+@jax.jit
+def inverse(matrix):
+    return jnp.stack([jnp.stack(row) for row in elimination.inverse(rows(matrix))])
+
+
+@jax.jit
+def eliminate(matrix, vector):
+    return jnp.stack(elimination.substitute(elimination.factorise(rows(matrix)), list(vector)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_elimination_matches_numpy(n):
+    matrices, vectors = 3 * np.eye(n) + RNG.uniform(-1, 1, (200, n, n)), RNG.normal(size=(200, n))
+    expected = np.linalg.solve(matrices, vectors[..., None])[..., 0]
+    np.testing.assert_allclose(jax.vmap(eliminate)(matrices, vectors), expected, rtol=1e-10, atol=1e-13)
+
+
+def test_elimination_leaves_out_zeros_that_are_stated():
+    """The pattern of the balances: slip by speed and motor speed, voltage by current and motor speed."""
+    matrix = np.array([[-1.0, 0.0, 0.8], [0.0, -0.6, -2.6], [0.0, -0.12, -0.3]])
+    sparse = [[None if x == 0 else jnp.asarray(x) for x in row] for row in matrix]
+    vector = [jnp.asarray(x) for x in (0.3, -1.2, 0.7)]
+    found = elimination.substitute(elimination.factorise(sparse), vector)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, np.asarray(vector)), rtol=1e-14)
+    inverted = elimination.inverse(sparse)
+    assert inverted[1][0] is None and inverted[2][0] is None  # the slip moves neither current nor motor speed
+    filled = [[0.0 if x is None else float(x) for x in row] for row in inverted]
+    np.testing.assert_allclose(filled, np.linalg.inv(matrix), rtol=1e-14)
+
+
+def test_elimination_without_a_pivot_in_its_place_gives_no_number():
+    """`inverse` has zeros there; Newton's method does not move."""
+    assert not np.isfinite(eliminate(EXCHANGE, np.ones(3))).any()
+
+
+@pytest.mark.parametrize("matrix", [DIAGONAL + RNG.uniform(-1, 1, (3, 3)) for _ in range(3)])
 def test_inverse_matches_numpy(matrix):
     np.testing.assert_allclose(inverse(jnp.asarray(matrix)), np.linalg.inv(matrix), rtol=1e-12, atol=1e-15)
 
 
 def test_inverse_of_singular_matrix_is_zero_and_spoils_no_neighbour():
-    batch = np.stack([np.eye(3), np.ones((3, 3)), np.full((3, 3), np.nan), 2 * np.eye(3)])
+    batch = np.stack([np.eye(3), np.zeros((3, 3)), np.full((3, 3), np.nan), 2 * np.eye(3)])
     answers = jax.vmap(inverse)(batch)
     np.testing.assert_array_equal(answers, [np.eye(3), np.zeros((3, 3)), np.zeros((3, 3)), np.eye(3) / 2])
 
 
 def test_inverse_reverse_derivative_matches_numpy():
-    matrix, vector = RNG.normal(size=(3, 3)), RNG.normal(size=3)
+    matrix, vector = DIAGONAL + RNG.uniform(-1, 1, (3, 3)), RNG.normal(size=3)
     got = jax.grad(lambda a: (inverse(a) @ vector)[0])(jnp.asarray(matrix))
     x, inverted = np.linalg.solve(matrix, vector), np.linalg.inv(matrix)
     np.testing.assert_allclose(got, -np.outer(inverted[0], x), rtol=1e-9)

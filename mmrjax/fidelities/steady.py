@@ -13,30 +13,34 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
-from mmrjax.fidelities.linear import Vector
+from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Result, Signals, State
 
 # Units of the unknowns and of the torque residual, so that all are of the order of one.
-_CURRENT, _SPEED_MOTOR, _SPEED, _VOLTAGE, _TORQUE = 10.0, 1000.0, 1.0, 10.0, 100.0
+_SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0
 
 
 def _state(unknowns: Vector, discharge: Float[Array, ""]) -> State:
-    return State(_CURRENT * unknowns[0], _SPEED_MOTOR * unknowns[1], _SPEED * unknowns[2], discharge)
+    """Of speed, current and motor speed, in the order in which the balances are eliminated: the slip determines the
+    speed and the voltage the current, whatever the robot; the torque what is left, the motor speed."""
+    speed, current, speed_motor = unknowns
+    return State(_CURRENT * current, _SPEED_MOTOR * speed_motor, _SPEED * speed, discharge)
 
 
 _balanced = eqx.filter_jit(balances.settled)
 
 
 @eqx.filter_jit
-def _residual(unknowns: Vector, run: tuple[Robot, Conditions]) -> Vector:
-    robot, conditions = run
+def _residual(unknowns: Vector, robot: Robot, conditions: Conditions) -> Vector:
+    _, conditions = _sound(robot, conditions)
     signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge))
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
-    torque = jnp.minimum(unknowns[1], -signals.torque_net / _TORQUE)
-    return signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep
+    lacking = -signals.torque_net / _TORQUE
+    torque = jnp.where(unknowns[2] < lacking, unknowns[2], lacking)
+    return signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE, torque
 
 
 def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
@@ -57,26 +61,27 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
 def _start(robot: Robot, conditions: Conditions) -> Vector:
     battery = robot.battery.voltage(0.0, conditions.discharge)
     nominal = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
-    speed = 0.9 * nominal / robot.motor.torque_constant
+    speed = nominal * (0.9 / robot.motor.torque_constant)
     return (
-        0.1 * nominal / robot.motor.resistance / _CURRENT,
+        robot.chassis(conditions.configuration).radius * speed * (1 / robot.gearbox.ratio / _SPEED),
+        nominal * (0.1 / robot.motor.resistance / _CURRENT),
         speed / _SPEED_MOTOR,
-        robot.chassis(conditions.configuration).radius * speed / robot.gearbox.ratio / _SPEED,
     )
 
 
 def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
     """The state at which the balances close, and whether the search got there; derivatives are implicit."""
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
-    run = (robot, conditions)
-    unknowns, solved = root(_residual, jax.lax.stop_gradient(_start(robot, conditions)), run, tolerance)
-    return _state(unknowns, conditions.discharge), solved
+    sound = _sound(robot, conditions)[1]
+    start = jax.lax.stop_gradient(_start(robot, sound))
+    unknowns, solved = root(_residual, start, robot, conditions, tolerance)
+    return _state(unknowns, sound.discharge), solved
 
 
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
-    _, conditions = _sound(robot, conditions)
-    return _balanced(robot, conditions, _root(robot, conditions)[0])[0]
+    state, _ = _root(robot, conditions)
+    return _balanced(robot, _sound(robot, conditions)[1], state)[0]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -112,8 +117,8 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     Returns:
         The result, and whether robot and conditions are sound (see `_sound`).
     """
-    sound, conditions = _sound(robot, conditions)
     state, solved = _root(robot, conditions)
+    sound, conditions = _sound(robot, conditions)
     signals, _ = _balanced(robot, conditions, state)
     solved = solved & jnp.isfinite(signals.voltage_left + signals.torque_net)
     rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
