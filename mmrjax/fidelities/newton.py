@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
-from mmrjax.fidelities.elimination import Entry, Matrix, Vector, factorise, inverse, substitute
+from mmrjax.fidelities.elimination import Entry, Matrix, Vector, factorise, regular, substitute
 
 #: f(y, shared, own): as many numbers as there are unknowns, each a scalar, so that a batch of them is an array each.
 Residual = Callable[[Vector, Any, Any], Vector]
@@ -108,9 +108,7 @@ def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tu
     moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, own), tangents[2:4])[1]
     if moved is None or all(m is None for m in moved):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
-    rows = inverse(_linearised(residual, y, shared, own)[0])
-    change = tuple(
-        -sum((a * m for a, m in zip(row, moved, strict=True) if not (a is None or m is None)), jnp.zeros(()))
-        for row in rows
-    )
+    factors, own_factors = regular(factorise(_linearised(residual, y, shared, own)[0]))
+    step = substitute(factors, moved)
+    change = tuple(jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True))
     return (y, solved), (change, None)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+import operator
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances
+from mmrjax import balances, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
@@ -120,7 +123,6 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     state, solved = _root(robot, conditions)
     sound, conditions = _sound(robot, conditions)
     signals, _ = _balanced(robot, conditions, state)
-    solved = solved & jnp.isfinite(signals.voltage_left + signals.torque_net)
     rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
     stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest
     # Ordered by what a person would say first.
@@ -133,10 +135,99 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     return result(robot, signals, status), sound
 
 
+def _axes(tree: Any) -> Any:
+    """Which numbers have a leading axis of points, for `jax.vmap`."""
+    return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, tree)
+
+
 @eqx.filter_jit
 def steady_batch(robot: Robot, conditions: Conditions) -> Result:
-    """`steady` over a batch of conditions (leading axis of every field) for one robot, compiled."""
-    return jax.vmap(steady, in_axes=(None, 0))(robot, conditions)
+    """`steady` over a batch, compiled.
+
+    Args:
+        robot: one robot, or parameters of shape (points,) among its numbers.
+        conditions: leading axis of every field.
+    """
+    return jax.vmap(steady, in_axes=_axes((robot, conditions)))(robot, conditions)
+
+
+#: What `steady_outputs` gives beside the numbers of `outputs.table`.
+_CODES = ("status", "flags")
+
+
+@functools.cache
+def _getters() -> dict[str, Callable[[Result], Array]]:
+    codes = {name: operator.attrgetter(name) for name in _CODES}
+    return {**{output.name: output.get for output in outputs.table()}, **codes}
+
+
+def _check_outputs(names: Iterable[str]) -> None:
+    for name in names:
+        if name not in _getters():
+            raise KeyError(f"no output {name}; there are {', '.join(_getters())}")
+
+
+@eqx.filter_jit
+def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...]) -> dict[str, Array]:
+    """`steady` over a batch, of which only what is asked for is computed.
+
+    Args:
+        robot: one robot, or parameters of shape (points,) among its numbers.
+        conditions: shape (points,).
+        names: of `outputs.table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
+
+    Returns:
+        Arrays of shape (points,) by name [SI]; NaN where a point has no such number, see `steady`.
+
+    Raises:
+        KeyError: an unknown name; the message lists those that there are.
+    """
+    _check_outputs(names)
+
+    def one(robot: Robot, conditions: Conditions) -> dict[str, Array]:
+        answer = steady(robot, conditions)
+        return {name: jnp.asarray(_getters()[name](answer)) for name in names}
+
+    return jax.vmap(one, in_axes=_axes((robot, conditions)))(robot, conditions)
+
+
+@eqx.filter_jit
+def steady_derivatives(
+    robot: Robot, conditions: Conditions, names: tuple[str, ...], parameters: tuple[str, ...]
+) -> dict[str, Float[Array, "points parameters"]]:
+    """Derivatives of outputs over a batch by parameters of the robot: exact, implicit.
+
+    By one parameter after another, each of which enters few terms of the balances; the linearisation of the
+    balances is the same for all. `jax.jacfwd` carries a full tangent of every term for every parameter.
+
+    Args:
+        robot, conditions: as for `steady_outputs`.
+        names: of `outputs.table`.
+        parameters: dotted names as `params.walk` gives them, such as `motor.resistance`.
+
+    Returns:
+        Derivatives [SI of the output / unit of the parameter] by output, in the order of `parameters`; zero
+        where a point has no such number.
+
+    Raises:
+        KeyError: an unknown name; the message lists the outputs that there are, or says that the robot has no such
+            parameter.
+    """
+    _check_outputs(names)
+    for name in set(names) & set(_CODES):
+        raise KeyError(f"{name} has no derivative; outputs that have one: {', '.join(_getters())}")
+    values = {p.name: p.value for p in params.walk(robot)}
+    params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have
+
+    def one(robot: Robot, conditions: Conditions, at: tuple[Array, ...]) -> dict[str, dict[str, Array]]:
+        def outcome(at: tuple[Array, ...], name: str) -> Array:
+            given = params.replace(robot, dict(zip(parameters, at, strict=True)))
+            return _getters()[name](steady(given, conditions))
+
+        return {name: dict(zip(parameters, jax.grad(outcome)(at, name), strict=True)) for name in names}
+
+    arguments = robot, conditions, tuple(jnp.asarray(values[name], float) for name in parameters)
+    return jax.vmap(one, in_axes=_axes(arguments))(*arguments)
 
 
 def _settled(robot: Robot, conditions: Conditions) -> Result:
