@@ -53,25 +53,29 @@ def _watched(value: Array, index: int, moved: set[int]) -> Array:
     return watched(value)
 
 
-def _improved(residual: Residual, y: Vector, shared: Any, own: Any, tolerance: float) -> tuple[Vector, Array]:
-    """One pass of `root`: the next y, and whether its residual is below `tolerance`."""
+def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
+    return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value])
+
+
+def _step(residual: Residual, y: Vector, shared: Any, own: Any) -> tuple[Vector, Vector]:
+    """y - J⁻¹ f, each unknown as it was where that is no number; and f."""
     jacobian, value = _linearised(residual, y, shared, own)
     step = substitute(factorise(jacobian), value)
-    y = tuple(a if b is None else jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True))
-    small = [jnp.abs(x) < tolerance for x in residual(y, shared, own)]
-    return y, functools.reduce(jnp.logical_and, small)
+    return tuple(
+        a if b is None else jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)
+    ), value
 
 
 @eqx.filter_custom_jvp
 def root(
-    residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float
+    residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float, linear: bool
 ) -> tuple[Vector, Bool[Array, ""]]:
-    """y with f(y) = 0, by y ← y - J⁻¹ f(y), ended as soon as max |f| < tolerance.
+    """y with f(y) = 0, by y ← y - J⁻¹ f(y), until every member of a batch is there.
 
-    It stops on the residual that it has just computed, not when two iterates agree, which takes a linearisation
-    more. The balances without effects are linear in the unknowns: one linearisation and one look at the residual
-    are then all. That first pass stands outside the loop, where XLA fuses it over a batch with what comes before
-    and after; the loop turns while some member of the batch is not there yet, and seldom at all.
+    A member is there once |f| < `tolerance`; in the loop as soon as it is small enough for the step that is then
+    made anyway to take off what is left (quadratic convergence). A linear f needs one pass, which stands outside the
+    loop, where XLA fuses it over a batch with what comes before and after; the loop turns for members that crossed
+    into another branch of f, and seldom at all.
 
     Args:
         residual: f, scaled to the order of one; pure, with no data of its own that is differentiated. Equation k
@@ -80,9 +84,10 @@ def root(
         shared, own: what f depends on beside y: data of all members of a batch and of each. Derivatives by both
             are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero where ∂f/∂y
             is singular. The program holds no host callback.
+        linear: whether f is linear in y but for branches; right for any f, fast for such.
 
     Returns:
-        y, and whether the residual got below `tolerance` in `MAX_STEPS`; one that is not finite does not.
+        y, and whether it was there within `MAX_STEPS` turns; one whose residual is not finite is not.
     """
 
     def going(search: tuple[Array, Vector, Array]) -> Bool[Array, ""]:
@@ -91,24 +96,33 @@ def root(
 
     def turn(search: tuple[Array, Vector, Array]) -> tuple[Array, Vector, Array]:
         count, y, solved = search
-        # Members that are there count for nothing. Were this not said, the compiler would compute and store what
-        # the turns have in common before the first of them, also where there is none.
-        open_ = jax.tree.map(lambda x: jnp.where(solved, jnp.ones_like(x), x), own)
-        return count + 1, *_improved(residual, y, shared, open_, tolerance)
+        here = own
+        if linear:
+            # Members that are there count for nothing. Were this not said, the compiler would compute and store
+            # what the turns have in common before the first of them, also where there is none.
+            here = jax.tree.map(lambda x: jnp.where(solved, jnp.ones_like(x), x), own)
+        # The residual is that before the step, which is made too and takes off what is left of it.
+        y, value = _step(residual, y, shared, here)
+        return count + 1, y, _small(value, tolerance**0.7)
 
-    first = (jnp.asarray(1, jnp.int8), *_improved(residual, start, shared, own, tolerance))
-    _, y, solved = jax.lax.while_loop(going, turn, first)
+    y, solved = start, jnp.asarray(False)
+    if linear:
+        y, _ = _step(residual, start, shared, own)
+        solved = _small(residual(y, shared, own), tolerance)
+    _, y, solved = jax.lax.while_loop(going, turn, (jnp.asarray(0, jnp.int8), y, solved))
     return y, solved
 
 
 @root.def_jvp
 def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tuple[Any, None]]:
-    residual, start, shared, own, tolerance = primals
-    y, solved = root(residual, start, shared, own, tolerance)
+    residual, start, shared, own, tolerance, linear = primals
+    y, solved = root(residual, start, shared, own, tolerance, linear)
     moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, own), tangents[2:4])[1]
     if moved is None or all(m is None for m in moved):
         return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
     factors, own_factors = regular(factorise(_linearised(residual, y, shared, own)[0]))
     step = substitute(factors, moved)
-    change = tuple(jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True))
+    change = tuple(
+        jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)
+    )
     return (y, solved), (change, None)

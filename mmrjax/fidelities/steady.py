@@ -67,7 +67,7 @@ def _start(robot: Robot, conditions: Conditions) -> Vector:
     speed = nominal * (0.9 / robot.motor.torque_constant)
     return (
         robot.chassis(conditions.configuration).radius * speed * (1 / robot.gearbox.ratio / _SPEED),
-        nominal * (0.1 / robot.motor.resistance / _CURRENT),
+        nominal * (0.05 / robot.motor.resistance / _CURRENT),
         speed / _SPEED_MOTOR,
     )
 
@@ -77,7 +77,7 @@ def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
-    unknowns, solved = root(_residual, start, robot, conditions, tolerance)
+    unknowns, solved = root(_residual, start, robot, conditions, tolerance, not robot.effects)
     return _state(unknowns, sound.discharge), solved
 
 
