@@ -58,12 +58,10 @@ def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
 
 
 def _step(residual: Residual, y: Vector, shared: Any, own: Any) -> tuple[Vector, Vector]:
-    """y - J⁻¹ f, each unknown as it was where that is no number; and f."""
+    """y - J⁻¹ f, each unknown as it was where that is no number; and J⁻¹ f."""
     jacobian, value = _linearised(residual, y, shared, own)
-    step = substitute(factorise(jacobian), value)
-    return tuple(
-        a if b is None else jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)
-    ), value
+    step = tuple(jnp.zeros(()) if x is None else x for x in substitute(factorise(jacobian), value))
+    return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)), step
 
 
 @eqx.filter_custom_jvp
@@ -72,10 +70,9 @@ def root(
 ) -> tuple[Vector, Bool[Array, ""]]:
     """y with f(y) = 0, by y ← y - J⁻¹ f(y), until every member of a batch is there.
 
-    A member is there once |f| < `tolerance`; in the loop as soon as it is small enough for the step that is then
-    made anyway to take off what is left (quadratic convergence). A linear f needs one pass, which stands outside the
-    loop, where XLA fuses it over a batch with what comes before and after; the loop turns for members that crossed
-    into another branch of f, and seldom at all.
+    A member is there once |f| < `tolerance`, or after a step so small that what it leaves is. A linear f needs one
+    pass, which stands outside the loop, where XLA fuses it over a batch with what comes before and after; the loop
+    then turns for members that crossed into another branch of f, and seldom at all.
 
     Args:
         residual: f, scaled to the order of one; pure, with no data of its own that is differentiated. Equation k
@@ -101,9 +98,9 @@ def root(
             # Members that are there count for nothing. Were this not said, the compiler would compute and store
             # what the turns have in common before the first of them, also where there is none.
             here = jax.tree.map(lambda x: jnp.where(solved, jnp.ones_like(x), x), own)
-        # The residual is that before the step, which is made too and takes off what is left of it.
-        y, value = _step(residual, y, shared, here)
-        return count + 1, y, _small(value, tolerance**0.7)
+        # A step so small leaves an error of its square.
+        y, step = _step(residual, y, shared, here)
+        return count + 1, y, _small(step, tolerance**0.7)
 
     y, solved = start, jnp.asarray(False)
     if linear:

@@ -140,6 +140,28 @@ def _axes(tree: Any) -> Any:
     return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, tree)
 
 
+#: Most points that a CPU computes at once: what is stored between two steps of a block stays in its cache.
+BLOCK = 32_768
+
+
+def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function` of scalars over the leading axis of whatever numbers have one; on a CPU block by block."""
+    batched = jax.vmap(function, in_axes=_axes(arguments))
+    leaves, tree = jax.tree.flatten(arguments)
+    points = max((len(x) for x in leaves if jnp.ndim(x)), default=0)
+    # Blocks of one size, so that one is compiled; points that have no such divisor go together.
+    block = next((size for size in range(BLOCK, BLOCK // 8, -1) if points % size == 0), points)
+    if points <= BLOCK or block == points or jax.default_backend() != "cpu":
+        return batched(*arguments)
+
+    def of_block(rows: list[Array | None]) -> Any:
+        own = [x if row is None else row for x, row in zip(leaves, rows, strict=True)]
+        return batched(*jax.tree.unflatten(tree, own))
+
+    found = jax.lax.map(of_block, [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves])
+    return jax.tree.map(lambda x: jnp.reshape(x, points), found)
+
+
 @eqx.filter_jit
 def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     """`steady` over a batch, compiled.
@@ -148,7 +170,7 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
         robot: one robot, or parameters of shape (points,) among its numbers.
         conditions: leading axis of every field.
     """
-    return jax.vmap(steady, in_axes=_axes((robot, conditions)))(robot, conditions)
+    return _over_points(steady, robot, conditions)
 
 
 #: What `steady_outputs` gives beside the numbers of `outputs.table`.
@@ -188,17 +210,17 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
         answer = steady(robot, conditions)
         return {name: jnp.asarray(_getters()[name](answer)) for name in names}
 
-    return jax.vmap(one, in_axes=_axes((robot, conditions)))(robot, conditions)
+    return _over_points(one, robot, conditions)
 
 
 @eqx.filter_jit
 def steady_derivatives(
     robot: Robot, conditions: Conditions, names: tuple[str, ...], parameters: tuple[str, ...]
-) -> dict[str, Float[Array, "points parameters"]]:
+) -> dict[str, dict[str, Float[Array, " points"]]]:
     """Derivatives of outputs over a batch by parameters of the robot: exact, implicit.
 
-    By one parameter after another, each of which enters few terms of the balances; the linearisation of the
-    balances is the same for all. `jax.jacfwd` carries a full tangent of every term for every parameter.
+    In reverse, by one output after another: a few outputs by many parameters cost about as much as a run for each
+    output. `jax.jacfwd` carries a tangent of every term for every parameter.
 
     Args:
         robot, conditions: as for `steady_outputs`.
@@ -206,8 +228,8 @@ def steady_derivatives(
         parameters: dotted names as `params.walk` gives them, such as `motor.resistance`.
 
     Returns:
-        Derivatives [SI of the output / unit of the parameter] by output, in the order of `parameters`; zero
-        where a point has no such number.
+        Derivatives [SI of the output / unit of the parameter] by output and parameter, each of shape (points,);
+        zero where a point has no such number.
 
     Raises:
         KeyError: an unknown name; the message lists the outputs that there are, or says that the robot has no such
@@ -215,7 +237,7 @@ def steady_derivatives(
     """
     _check_outputs(names)
     for name in set(names) & set(_CODES):
-        raise KeyError(f"{name} has no derivative; outputs that have one: {', '.join(_getters())}")
+        raise KeyError(f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table())}")
     values = {p.name: p.value for p in params.walk(robot)}
     params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have
 
