@@ -43,7 +43,8 @@ def _residual(unknowns: Vector, robot: Robot, conditions: Conditions) -> Vector:
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
     lacking = -signals.torque_net / _TORQUE
     torque = jnp.where(unknowns[2] < lacking, unknowns[2], lacking)
-    return signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE, torque
+    slip, voltage = signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE
+    return jnp.asarray(slip), jnp.asarray(voltage), torque
 
 
 def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
