@@ -53,7 +53,7 @@ def _fill(signals: Signals, **values: Any) -> Signals:
 def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
     """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(conditions.configuration)
-    speed_wheel = state.speed_motor / robot.gearbox.ratio
+    speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.ground.friction.speed_rest
     signals = Signals(
@@ -119,7 +119,7 @@ def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
     """Forces along the slope that traction has to overcome [N]."""
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
     resistance = resistance + added(robot, signals, "ground")
-    gravity = ground.force_gravity(signals.mass / robot.sides, signals.slope, GRAVITY)
+    gravity = ground.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
     return _fill(
         signals,
         resistance=resistance,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from mmrjax.ground import Ground
 from mmrjax.params import Scalar, as_float, parameter
 from mmrjax.track import Track
+from mmrjax.trigonometry import cosine
 
 
 class Chassis(eqx.Module):
@@ -60,4 +60,4 @@ def mass_factor(mass_side: Scalar, radius: Scalar, inertia_rotating: Scalar) -> 
 
 def normal_load(mass: Scalar, slope: Scalar, gravity: float, sides: Scalar) -> Scalar:
     """Normal load of one side m_i g cos α [N], eq. (5)."""
-    return mass / sides * gravity * jnp.cos(slope)
+    return mass * (gravity / sides) * cosine(slope)

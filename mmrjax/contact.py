@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from mmrjax.params import Scalar, parameter
+from mmrjax.trigonometry import sine_third
 
 _SLIPS = "Tables A1, A2 simulated: slip at 5 and 10 deg implies 9-39 mm/s with the adhesion of Table 5"
 _PACKAGE = "10 V_s, the ratio of the defaults of the multibody package of ref. [48]; the paper prints none"
@@ -87,8 +88,8 @@ class Friction(eqx.Module):
         """
         share = coefficient / self.static
         within = jnp.abs(share) < 1.0
-        angle = jnp.arcsin(jnp.where(within, share, 0.0))
-        return self.speed_static * jnp.where(within, 2 * jnp.sin(angle / 3), jnp.sign(share))
+        third = sine_third(jnp.where(within, share, 0.0))
+        return self.speed_static * jnp.where(within, 2 * third, jnp.sign(share))
 
 
 def force_contact(

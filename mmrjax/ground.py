@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from mmrjax.contact import Friction
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import quotient
+from mmrjax.trigonometry import sine
 
 
 class Ground(eqx.Module):
@@ -41,7 +41,7 @@ class Ground(eqx.Module):
 
 def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:
     """Downhill pull m g sin α [N], eq. (1)."""
-    return mass * gravity * jnp.sin(slope)
+    return mass * gravity * sine(slope)
 
 
 def slip(speed: Scalar, speed_theoretical: Scalar) -> Scalar:

@@ -1,5 +1,7 @@
 """Newton's method with implicit derivatives: problems with exact roots and gradients, and programs without callbacks."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,21 +14,29 @@ from mmrjax.fidelities.steady import steady
 TOLERANCE = 1e-13
 
 
-def circle(y, radius):
+START = (jnp.asarray(1.0), jnp.asarray(0.5), jnp.asarray(0.0))
+
+
+def circle(y, _, radius):
     """Where a circle of `radius` meets the bisector and a third unknown follows."""
-    return jnp.stack([y[0] ** 2 + y[1] ** 2 - radius**2, y[0] - y[1], y[2] - radius * y[0]])
+    return y[0] ** 2 + y[1] ** 2 - radius**2, y[0] - y[1], y[2] - radius * y[0]
 
 
-def meeting(radius):
-    return root(circle, jnp.array([1.0, 0.5, 0.0]), radius, TOLERANCE)[0]
+def meeting_of(radius, linear):
+    return jnp.stack(root(circle, START, None, radius, TOLERANCE, linear)[0])
+
+
+meeting = partial(meeting_of, linear=False)
 
 
 def exact(radius):
     return np.array([radius / 2**0.5, radius / 2**0.5, radius**2 / 2**0.5])
 
 
-def test_root_and_derivatives_are_exact():
-    radius = 2.3
+@pytest.mark.parametrize("linear", [False, True])
+def test_root_and_derivatives_are_exact(linear):
+    """A circle is not linear: one pass is then not all, whatever was said."""
+    meeting, radius = partial(meeting_of, linear=linear), 2.3
     np.testing.assert_allclose(meeting(radius), exact(radius), rtol=1e-13)
     slope = np.array([2**-0.5, 2**-0.5, 2**0.5 * radius])
     np.testing.assert_allclose(jax.jacfwd(meeting)(radius), slope, rtol=1e-12)
@@ -43,26 +53,40 @@ def test_root_of_a_batch_is_that_of_its_members():
 
 
 def test_root_has_no_derivative_by_its_start():
-    start = jnp.array([1.0, 0.5, 0.0])
-    assert not jax.jacfwd(lambda s: root(circle, s, 2.3, TOLERANCE)[0])(start).any()
+    sensitivity = jax.jacfwd(lambda s: root(circle, s, None, jnp.asarray(2.3), TOLERANCE, False)[0])(START)
+    assert not np.any(sensitivity)
 
 
 def test_root_reports_members_without_one_and_harms_no_other():
     radii = jnp.asarray([1.0, jnp.nan, 2.0])
-    _, solved = jax.vmap(lambda r: root(circle, jnp.array([1.0, 0.5, 0.0]), r, TOLERANCE))(radii)
+    _, solved = jax.vmap(lambda r: root(circle, START, None, r, TOLERANCE, False))(radii)
     assert solved.tolist() == [True, False, True]
-    nowhere = root(lambda y, a: y**2 + a, jnp.array([1.0]), 1.0, TOLERANCE)
+    nowhere = root(lambda y, _, a: (y[0] ** 2 + a,), START[:1], None, jnp.asarray(1.0), TOLERANCE, False)
     assert not nowhere[1]
 
 
 def test_root_derivative_is_zero_where_the_linearisation_is_singular():
-    def flat(y, a):  # every y[1] is a root
-        return jnp.stack([y[0] - a, 0.0 * y[1]])
+    def flat(y, _, a):  # every y[1] is a root
+        return y[0] - a, 0.0 * y[1]
 
     def at(a):
-        return root(flat, jnp.array([0.0, 0.0]), a, TOLERANCE)[0]
+        return jnp.stack(root(flat, START[1:], None, a, TOLERANCE, False)[0])
 
     assert jax.jacfwd(at)(1.0).tolist() == jax.jacrev(at)(1.0).tolist() == [0.0, 0.0]
+
+
+def test_root_takes_data_shared_by_a_batch_or_of_its_members():
+    def line(y, slope, height):
+        return (slope * y[0] - height,)
+
+    def crossing(slope, height):
+        return root(line, START[:1], slope, height, TOLERANCE, True)[0][0]
+
+    slope, heights = jnp.asarray(2.0), jnp.asarray([1.0, -3.0])
+    np.testing.assert_allclose(jax.vmap(crossing, (None, 0))(slope, heights), heights / 2, rtol=1e-15)
+    by_slope, by_height = jax.vmap(jax.grad(crossing, (0, 1)), (None, 0))(slope, heights)
+    np.testing.assert_allclose(by_slope, -heights / 4, rtol=1e-15)
+    np.testing.assert_allclose(by_height, [0.5, 0.5], rtol=1e-15)
 
 
 # --- programs that the compilation cache keeps --------------------------------------------------------

@@ -50,13 +50,3 @@ def substitute(factors: Factors, vector: Float[Array, " n"]) -> Float[Array, " n
             x[i] = x[i] - rows[i][j] * x[j]
         x[i] = x[i] / rows[i][i]
     return jnp.stack(x)
-
-
-def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The inverse; zeros where it is not finite (a singular matrix), so that one member of a batch harms no other.
-
-    Whoever uses it has to look at its residual.
-    """
-    factors = factorise(matrix)
-    columns = jnp.stack([substitute(factors, column) for column in jnp.eye(len(matrix), dtype=matrix.dtype)], axis=1)
-    return jnp.where(jnp.all(jnp.isfinite(columns)), columns, 0.0)

@@ -2,77 +2,124 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Bool
 
-from mmrjax.fidelities.linear import factorise, inverse, substitute
+from mmrjax.fidelities.elimination import Entry, Matrix, Vector, factorise, regular, substitute
 
-Residual = Callable[[Array, Any], Array]
+#: f(y, shared, own): as many numbers as there are unknowns, each a scalar, so that a batch of them is an array each.
+Residual = Callable[[Vector, Any, Any], Vector]
 
 #: Linearisations after which a search has failed.
 MAX_STEPS = 40
 
 
-def _linearised(residual: Residual, y: Float[Array, " n"], args: Any) -> tuple[Array, Array]:
-    """∂f/∂y, and f."""
+def _linearised(residual: Residual, y: Vector, shared: Any, own: Any) -> tuple[Matrix, Vector]:
+    """∂f/∂y by its rows, and f; by one unknown after another, so that what does not depend on it costs nothing."""
+    columns: list[list[Entry]] = []
+    value = y
+    for k in range(len(y)):
+        moved: set[int] = set()
 
-    def twice(y: Float[Array, " n"]) -> tuple[Array, Array]:
-        value = residual(y, args)
-        return value, value
+        def along(x: Array, k: int = k, moved: set[int] = moved) -> Vector:
+            values = residual((*y[:k], x, *y[k + 1 :]), shared, own)
+            return tuple(_watched(v, i, moved) for i, v in enumerate(values))
 
-    return jax.jacfwd(twice, has_aux=True)(y)
+        value, column = jax.jvp(along, (y[k],), (jnp.ones_like(y[k]),))
+        columns.append([x if i in moved else None for i, x in enumerate(column)])
+    return list(zip(*columns, strict=True)), value
+
+
+def _watched(value: Array, index: int, moved: set[int]) -> Array:
+    """`value`; while it is differentiated, `index` is added to `moved` if it has a derivative at all."""
+
+    @jax.custom_jvp
+    def watched(x: Array) -> Array:
+        return x
+
+    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Any]:
+        if not isinstance(tangents[0], SymbolicZero):
+            moved.add(index)
+        return primals[0], tangents[0]
+
+    watched.defjvp(rule, symbolic_zeros=True)
+    return watched(value)
+
+
+def _small(value: Vector, tolerance: float) -> Bool[Array, ""]:
+    return functools.reduce(jnp.logical_and, [jnp.abs(x) < tolerance for x in value])
+
+
+def _step(residual: Residual, y: Vector, shared: Any, own: Any) -> tuple[Vector, Vector]:
+    """y - J⁻¹ f, each unknown as it was where that is no number; and J⁻¹ f."""
+    jacobian, value = _linearised(residual, y, shared, own)
+    step = tuple(jnp.zeros(()) if x is None else x for x in substitute(factorise(jacobian), value))
+    return tuple(jnp.where(jnp.isfinite(b), a - b, a) for a, b in zip(y, step, strict=True)), step
 
 
 @eqx.filter_custom_jvp
 def root(
-    residual: Residual, start: Float[Array, " n"], args: Any, tolerance: float
-) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-    """y with f(y, args) = 0, by y ← y - J⁻¹ f(y), ended as soon as max |f| < tolerance.
+    residual: Residual, start: Vector, shared: Any, own: Any, tolerance: float, linear: bool
+) -> tuple[Vector, Bool[Array, ""]]:
+    """y with f(y) = 0, by y ← y - J⁻¹ f(y), until every member of a batch is there.
 
-    It stops on the residual that it has just computed, not when two iterates agree, which takes a linearisation
-    more. The balances without effects are linear in the unknowns: one linearisation and one look at the residual
-    are then all, which is what a sweep of millions of points spends its time on.
+    A member is there once |f| < `tolerance`, or after a step so small that what it leaves is. A linear f needs one
+    pass, which stands outside the loop, where XLA fuses it over a batch with what comes before and after; the loop
+    then turns for members that crossed into another branch of f, and seldom at all.
 
     Args:
-        residual: f, scaled to the order of one; pure, with no data of its own that is differentiated.
+        residual: f, scaled to the order of one; pure, with no data of its own that is differentiated. Equation k
+            determines unknown k (see `factorise`).
         start: first guess; no derivative passes through it.
-        args: what f depends on beside y; derivatives by it are implicit, dy = -(∂f/∂y)⁻¹ ∂f/∂args dargs, forward
-            and reverse, zero where ∂f/∂y is singular. The program holds no host callback.
+        shared, own: what f depends on beside y: data of all members of a batch and of each. Derivatives by both
+            are implicit, dy = -(∂f/∂y)⁻¹ (∂f/∂shared dshared + ∂f/∂own down), forward and reverse, zero where ∂f/∂y
+            is singular. The program holds no host callback.
+        linear: whether f is linear in y but for branches; right for any f, fast for such.
 
     Returns:
-        y, and whether the residual got below `tolerance` in `MAX_STEPS`; one that is not finite does not.
+        y, and whether it was there within `MAX_STEPS` turns; one whose residual is not finite is not.
     """
 
-    def going(search: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+    def going(search: tuple[Array, Vector, Array]) -> Bool[Array, ""]:
         count, _, solved = search
         return (count < MAX_STEPS) & ~solved
 
-    def improve(search: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, y, _ = search
-        jacobian, value = _linearised(residual, y, args)
-        factors = factorise(jacobian)
-        step = substitute(factors, value)
-        y = y - jnp.where(jnp.all(jnp.isfinite(step)), step, 0.0)
-        value = residual(y, args)
-        solved = jnp.max(jnp.abs(value)) < tolerance
-        # What rounding left over is taken off with the same factors: a shaft that stands still has speed 0.
-        y = jnp.where(solved, y - substitute(factors, value), y)
-        return count + 1, y, solved
+    def turn(search: tuple[Array, Vector, Array]) -> tuple[Array, Vector, Array]:
+        count, y, solved = search
+        here = own
+        if linear:
+            # Members that are there count for nothing. Were this not said, the compiler would compute and store
+            # what the turns have in common before the first of them, also where there is none.
+            here = jax.tree.map(lambda x: jnp.where(solved, jnp.ones_like(x), x), own)
+        # A step so small leaves an error of its square.
+        y, step = _step(residual, y, shared, here)
+        return count + 1, y, _small(step, tolerance**0.7)
 
-    _, y, solved = jax.lax.while_loop(going, improve, (jnp.asarray(0), start, jnp.asarray(False)))
+    y, solved = start, jnp.asarray(False)
+    if linear:
+        y, _ = _step(residual, start, shared, own)
+        solved = _small(residual(y, shared, own), tolerance)
+    _, y, solved = jax.lax.while_loop(going, turn, (jnp.asarray(0, jnp.int8), y, solved))
     return y, solved
 
 
 @root.def_jvp
-def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tuple[Array, None]]:
-    residual, start, args, tolerance = primals
-    y, solved = root(residual, start, args, tolerance)
-    moved = eqx.filter_jvp(lambda args: residual(y, args), (args,), (tangents[2],))[1]
-    if moved is None:
-        return (y, solved), (jnp.zeros_like(y), None)
-    return (y, solved), (-inverse(_linearised(residual, y, args)[0]) @ moved, None)
+def _implicit(primals: tuple, tangents: tuple) -> tuple[tuple[Vector, Array], tuple[Any, None]]:
+    residual, start, shared, own, tolerance, linear = primals
+    y, solved = root(residual, start, shared, own, tolerance, linear)
+    moved = eqx.filter_jvp(lambda *given: residual(y, *given), (shared, own), tangents[2:4])[1]
+    if moved is None or all(m is None for m in moved):
+        return (y, solved), (tuple(jnp.zeros_like(x) for x in y), None)
+    factors, own_factors = regular(factorise(_linearised(residual, y, shared, own)[0]))
+    step = substitute(factors, moved)
+    change = tuple(
+        jnp.zeros_like(a) if b is None else jnp.where(own_factors, -b, 0.0) for a, b in zip(y, step, strict=True)
+    )
+    return (y, solved), (change, None)

@@ -3,39 +3,48 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+import operator
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, outputs
+from mmrjax import balances, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
+from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Result, Signals, State
 
 # Units of the unknowns and of the torque residual, so that all are of the order of one.
-_CURRENT, _SPEED_MOTOR, _SPEED, _VOLTAGE, _TORQUE = 10.0, 1000.0, 1.0, 10.0, 100.0
+_SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0
 
 
-def _state(unknowns: Float[Array, " 3"], discharge: Float[Array, ""]) -> State:
-    return State(_CURRENT * unknowns[0], _SPEED_MOTOR * unknowns[1], _SPEED * unknowns[2], discharge)
+def _state(unknowns: Vector, discharge: Float[Array, ""]) -> State:
+    """Of speed, current and motor speed, in the order in which the balances are eliminated: the slip determines the
+    speed and the voltage the current, whatever the robot; the torque what is left, the motor speed."""
+    speed, current, speed_motor = unknowns
+    return State(_CURRENT * current, _SPEED_MOTOR * speed_motor, _SPEED * speed, discharge)
 
 
 _balanced = eqx.filter_jit(balances.settled)
 
 
 @eqx.filter_jit
-def _residual(unknowns: Float[Array, " 3"], run: tuple[Robot, Conditions]) -> Float[Array, " 3"]:
-    robot, conditions = run
+def _residual(unknowns: Vector, robot: Robot, conditions: Conditions) -> Vector:
+    _, conditions = _sound(robot, conditions)
     signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge))
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
-    torque = jnp.minimum(unknowns[1], -signals.torque_net / _TORQUE)
-    return jnp.stack([signals.voltage_left / _VOLTAGE, torque, signals.speed_sliding - creep])
+    lacking = -signals.torque_net / _TORQUE
+    torque = jnp.where(unknowns[2] < lacking, unknowns[2], lacking)
+    slip, voltage = signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE
+    return jnp.asarray(slip), jnp.asarray(voltage), torque
 
 
 def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
@@ -45,39 +54,38 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     """
     stated = conditions.total_mass
     mass = robot.chassis(conditions.configuration).mass + conditions.payload if stated is None else stated
-    sound = jnp.all(jnp.isfinite(jnp.stack([jnp.asarray(x, float) for x in jax.tree.leaves(conditions)]))) & (
-        mass > 0
-    )
+    sound = mass > 0
+    for number in jax.tree.leaves(conditions):
+        sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
     # No adhesion at all: the robot slides, but a share of nothing has no value.
     return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
 
 
-def _start(robot: Robot, conditions: Conditions) -> Float[Array, " 3"]:
+def _start(robot: Robot, conditions: Conditions) -> Vector:
     battery = robot.battery.voltage(0.0, conditions.discharge)
     nominal = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
-    speed = 0.9 * nominal / robot.motor.torque_constant
-    return jnp.stack(
-        [
-            0.1 * nominal / robot.motor.resistance / _CURRENT,
-            speed / _SPEED_MOTOR,
-            robot.chassis(conditions.configuration).radius * speed / robot.gearbox.ratio / _SPEED,
-        ]
+    speed = nominal * (0.9 / robot.motor.torque_constant)
+    return (
+        robot.chassis(conditions.configuration).radius * speed * (1 / robot.gearbox.ratio / _SPEED),
+        nominal * (0.05 / robot.motor.resistance / _CURRENT),
+        speed / _SPEED_MOTOR,
     )
 
 
 def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
     """The state at which the balances close, and whether the search got there; derivatives are implicit."""
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
-    run = (robot, conditions)
-    unknowns, solved = root(_residual, jax.lax.stop_gradient(_start(robot, conditions)), run, tolerance)
-    return _state(unknowns, conditions.discharge), solved
+    sound = _sound(robot, conditions)[1]
+    start = jax.lax.stop_gradient(_start(robot, sound))
+    unknowns, solved = root(_residual, start, robot, conditions, tolerance, not robot.effects)
+    return _state(unknowns, sound.discharge), solved
 
 
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
-    _, conditions = _sound(robot, conditions)
-    return _balanced(robot, conditions, _root(robot, conditions)[0])[0]
+    state, _ = _root(robot, conditions)
+    return _balanced(robot, _sound(robot, conditions)[1], state)[0]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
@@ -113,10 +121,9 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     Returns:
         The result, and whether robot and conditions are sound (see `_sound`).
     """
-    sound, conditions = _sound(robot, conditions)
     state, solved = _root(robot, conditions)
+    sound, conditions = _sound(robot, conditions)
     signals, _ = _balanced(robot, conditions, state)
-    solved = solved & jnp.isfinite(signals.voltage_left + signals.torque_net)
     rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
     stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest
     # Ordered by what a person would say first.
@@ -129,28 +136,121 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     return result(robot, signals, status), sound
 
 
+def _axes(tree: Any) -> Any:
+    """Which numbers have a leading axis of points, for `jax.vmap`."""
+    return jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, tree)
+
+
+#: Most points that a CPU computes at once: what is stored between two steps of a block stays in its cache.
+BLOCK = 32_768
+
+
+def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function` of scalars over the leading axis of whatever numbers have one; on a CPU block by block."""
+    batched = jax.vmap(function, in_axes=_axes(arguments))
+    leaves, tree = jax.tree.flatten(arguments)
+    points = max((len(x) for x in leaves if jnp.ndim(x)), default=0)
+    # Blocks of one size, so that one is compiled; points that have no such divisor go together.
+    block = next((size for size in range(BLOCK, BLOCK // 8, -1) if points % size == 0), points)
+    if points <= BLOCK or block == points or jax.default_backend() != "cpu":
+        return batched(*arguments)
+
+    def of_block(rows: list[Array | None]) -> Any:
+        own = [x if row is None else row for x, row in zip(leaves, rows, strict=True)]
+        return batched(*jax.tree.unflatten(tree, own))
+
+    found = jax.lax.map(of_block, [jnp.reshape(x, (-1, block)) if jnp.ndim(x) else None for x in leaves])
+    return jax.tree.map(lambda x: jnp.reshape(x, points), found)
+
+
 @eqx.filter_jit
 def steady_batch(robot: Robot, conditions: Conditions) -> Result:
-    """`steady` over a batch of conditions (leading axis of every field) for one robot, compiled."""
-    return jax.vmap(steady, in_axes=(None, 0))(robot, conditions)
+    """`steady` over a batch, compiled.
+
+    Args:
+        robot: one robot, or parameters of shape (points,) among its numbers.
+        conditions: leading axis of every field.
+    """
+    return _over_points(steady, robot, conditions)
+
+
+#: What `steady_outputs` gives beside the numbers of `outputs.table`.
+_CODES = ("status", "flags")
+
+
+@functools.cache
+def _getters() -> dict[str, Callable[[Result], Array]]:
+    codes = {name: operator.attrgetter(name) for name in _CODES}
+    return {**{output.name: output.get for output in outputs.table()}, **codes}
+
+
+def _check_outputs(names: Iterable[str]) -> None:
+    for name in names:
+        if name not in _getters():
+            raise KeyError(f"no output {name}; there are {', '.join(_getters())}")
 
 
 @eqx.filter_jit
 def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...]) -> dict[str, Array]:
-    """Chosen outputs of `steady` over points of which each may have its own robot, compiled.
+    """`steady` over a batch, of which only what is asked for is computed.
 
     Args:
-        robot: leaves are scalars, or arrays of shape (points,).
+        robot: one robot, or parameters of shape (points,) among its numbers.
         conditions: shape (points,).
-        names: of `outputs.table()`, `status` and `flags`.
+        names: of `outputs.table`, `status` (code into `STATUSES`) and `flags` (bit mask over `FLAGS`).
 
     Returns:
-        By name in SI units, shape (points,).
+        Arrays of shape (points,) by name [SI]; NaN where a point has no such number, see `steady`.
+
+    Raises:
+        KeyError: an unknown name; the message lists those that there are.
     """
-    axes = jax.tree.map(lambda x: 0 if eqx.is_array(x) and x.ndim else None, robot)
-    found = jax.vmap(steady, in_axes=(axes, 0))(robot, conditions)
-    rows = {row.name: row for row in outputs.table()}
-    return {name: rows[name].get(found) if name in rows else getattr(found, name) for name in names}
+    _check_outputs(names)
+
+    def one(robot: Robot, conditions: Conditions) -> dict[str, Array]:
+        answer = steady(robot, conditions)
+        return {name: jnp.asarray(_getters()[name](answer)) for name in names}
+
+    return _over_points(one, robot, conditions)
+
+
+@eqx.filter_jit
+def steady_derivatives(
+    robot: Robot, conditions: Conditions, names: tuple[str, ...], parameters: tuple[str, ...]
+) -> dict[str, dict[str, Float[Array, " points"]]]:
+    """Derivatives of outputs over a batch by parameters of the robot: exact, implicit.
+
+    In reverse, by one output after another: a few outputs by many parameters cost about as much as a run for each
+    output. `jax.jacfwd` carries a tangent of every term for every parameter.
+
+    Args:
+        robot, conditions: as for `steady_outputs`.
+        names: of `outputs.table`.
+        parameters: dotted names as `params.walk` gives them, such as `motor.resistance`.
+
+    Returns:
+        Derivatives [SI of the output / unit of the parameter] by output and parameter, each of shape (points,);
+        zero where a point has no such number.
+
+    Raises:
+        KeyError: an unknown name; the message lists the outputs that there are, or says that the robot has no such
+            parameter.
+    """
+    _check_outputs(names)
+    for name in set(names) & set(_CODES):
+        raise KeyError(f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table())}")
+    values = {p.name: p.value for p in params.walk(robot)}
+    params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have
+
+    def one(robot: Robot, conditions: Conditions, at: tuple[Array, ...]) -> dict[str, dict[str, Array]]:
+        def outcome(at: tuple[Array, ...], name: str) -> Array:
+            given = params.replace(robot, dict(zip(parameters, at, strict=True)))
+            return _getters()[name](steady(given, conditions))
+
+        return {name: dict(zip(parameters, jax.grad(outcome)(at, name), strict=True)) for name in names}
+
+    arguments = robot, conditions, tuple(jnp.asarray(values[name], float) for name in parameters)
+    return jax.vmap(one, in_axes=_axes(arguments))(*arguments)
 
 
 def _settled(robot: Robot, conditions: Conditions) -> Result:

@@ -1,0 +1,222 @@
+# ruff: noqa: E402 (cores and platform are chosen before jax starts)
+"""`steady` against vectorised NumPy of the same balances, side by side: the yardstick of whoever sweeps.
+
+python benchmarks/steady_yardstick.py
+python benchmarks/steady_yardstick.py --platform gpu --batches 4194304,67108864
+
+On a CPU: a closed form without effects (currents and speeds alone; every output), and Newton's method with four
+effects, as NumPy runs them, on one core; `steady` on two. All sides of a ratio are timed in turn, round after round,
+so that other work on the machine meets all alike; the ratios are of the best times, of the medians, and of processor
+times spread evenly over the cores that each side uses, which other work hardly touches. The last line is of JSON.
+On a GPU: points a second, the bytes a point moves, and the shares of the device's bandwidth and arithmetic that is,
+of what XLA counts in the compiled program (the loop's body as one turn).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+options.add_argument("--platform", choices=("cpu", "gpu"), default="cpu")
+options.add_argument("--batches", default="", help="points, comma separated (cpu 262144; gpu 2^22 to 2^26)")
+options.add_argument("--rounds", type=int, default=40, help="timed calls of each side")
+options.add_argument("--cores", type=int, default=2, help="cores that the process may use (cpu)")
+options.add_argument("--bandwidth", type=float, default=4.8e12, help="of the GPU [bytes/s] (H200: 4.8e12)")
+options.add_argument(
+    "--arithmetic", type=float, default=34e12, help="of the GPU, double precision [1/s] (H200: 34e12)"
+)
+arguments = options.parse_args()
+if arguments.platform == "cpu":
+    # Before anything starts a thread.
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.cores])
+
+import jax
+import numpy as np
+from measure import machine, set_precision
+
+set_precision(single=False)
+
+import vectorised
+
+from mmrjax import outputs, robots
+from mmrjax.conditions import Conditions
+from mmrjax.effects import BY_NAME
+from mmrjax.fidelities.steady import steady_derivatives, steady_outputs
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED
+
+THREE = vectorised.NAMES
+ALL = tuple(output.name for output in outputs.table())
+EFFECTS = {"series_resistance": 0.3, "churning": 5e-4, "winding_heating": 1.0, "nonlinear_slip": 0.05}
+PARAMETERS = (
+    "motor.resistance", "motor.torque_constant", "motor.friction_coulomb", "motor.friction_viscous",
+    "gearbox.ratio", "gearbox.efficiency_load", "gearbox.friction_coulomb", "6T2A.track.loss_coulomb",
+    "6T2A.track.loss_viscous", "6T2A.mass", "6T2A.ground.rolling_resistance", "6T2A.ground.friction.static",
+)  # fmt: skip
+
+
+def points(size: int) -> tuple[np.ndarray, ...]:
+    """Configuration, voltage [V], slope [deg] and payload [kg], over what nominal adhesion holds of Table 8."""
+    rng = np.random.default_rng(8)
+    wheeled, slope, payload, voltage = rng.uniform((0, 0, 0, 15), (1, 12, 8, 33), (size, 4)).T.copy()
+    return np.round(wheeled).astype(int), voltage, slope, payload
+
+
+def conditions(size: int) -> Conditions:
+    """The same, on the device."""
+    return jax.block_until_ready(Conditions(*points(size)))
+
+
+def with_effects(robot: Robot) -> Robot:
+    """The robot with the four effects."""
+    return dataclasses.replace(robot, effects=tuple(BY_NAME[k](amplitude=v) for k, v in EFFECTS.items()))
+
+
+def in_turn(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, np.ndarray]:
+    """Wall and processor times [s] of each call, one of each in every round, shape (rounds, 2)."""
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
+    for call in calls.values():
+        jax.block_until_ready(call())
+    for _ in range(rounds):
+        for name, call in calls.items():
+            start, spent = time.perf_counter(), time.process_time()
+            jax.block_until_ready(call())
+            times[name].append((time.perf_counter() - start, time.process_time() - spent))
+    return {name: np.array(t) for name, t in times.items()}
+
+
+def largest_difference(ours: dict[str, Any], theirs: dict[str, np.ndarray]) -> float:
+    """Of any output, over its largest value."""
+    return max(float(np.max(np.abs(np.asarray(ours[k]) - v)) / np.max(np.abs(v))) for k, v in theirs.items())
+
+
+def compared(size: int, rounds: int) -> dict[str, Any]:
+    """Both sides at one number of points: differences, rates and ratios."""
+    robot, runs, given = robots.nominal(), conditions(size), points(size)
+    effects, amplitudes = with_effects(robot), tuple(EFFECTS.values())
+    for one in (robot, effects):
+        assert (np.asarray(steady_outputs(one, runs, ("status",))["status"]) == CONVERGED).all()
+
+    theirs_three = dict(zip(THREE, vectorised.closed_form(*given), strict=True))
+    theirs_all = vectorised.closed_form_all(*given)
+    theirs_newton = dict(zip(THREE, vectorised.newton(*given, *amplitudes), strict=True))
+    assert set(theirs_all) == set(ALL)
+    differences = {
+        "three": largest_difference(steady_outputs(robot, runs, THREE), theirs_three),
+        "all": largest_difference(steady_outputs(robot, runs, ALL), theirs_all),
+        "effects": largest_difference(steady_outputs(effects, runs, THREE), theirs_newton),
+    }
+    assert max(differences.values()) < 1e-9, differences
+
+    times = in_turn(
+        {
+            "numpy_three": lambda: vectorised.closed_form(*given),
+            "steady_three": lambda: steady_outputs(robot, runs, THREE),
+            "numpy_all": lambda: vectorised.closed_form_all(*given),
+            "steady_all": lambda: steady_outputs(robot, runs, (*ALL, "status", "flags")),
+            "numpy_newton": lambda: vectorised.newton(*given, *amplitudes),
+            "steady_effects": lambda: steady_outputs(effects, runs, THREE),
+            "steady_effects_all": lambda: steady_outputs(effects, runs, (*ALL, "status", "flags")),
+            "derivatives": lambda: steady_derivatives(robot, runs, THREE, PARAMETERS),
+        },
+        rounds,
+    )
+    pairs = {
+        "three over NumPy's closed form, three": ("numpy_three", "steady_three", 2.0),
+        "all over NumPy's closed form, three": ("numpy_three", "steady_all", 0.5),
+        "all over NumPy's closed form, all": ("numpy_all", "steady_all", None),
+        "effects over NumPy's Newton": ("numpy_newton", "steady_effects", 1.0),
+    }
+    pairs["derivatives over a run (at most)"] = ("derivatives", "steady_three", 4.0)
+
+    def ratio(a: str, b: str) -> dict[str, float]:
+        wall, spent = times[a] / times[b], times[a][:, 1].min() / times[b][:, 1].min()
+        # NumPy keeps one core busy, XLA all of them.
+        cores = arguments.cores if a.startswith("numpy") else 1
+        best = times[a][:, 0].min() / times[b][:, 0].min()
+        return {"best": best, "median": float(np.median(wall[:, 0])), "processor": spent * cores}
+
+    ratios = {name: {**ratio(a, b), "goal": goal} for name, (a, b, goal) in pairs.items()}
+    return {
+        "points": size,
+        "differences": differences,
+        "per_s": {name: size / t[:, 0].min() for name, t in times.items()},
+        "per_s_median": {name: size / float(np.median(t[:, 0])) for name, t in times.items()},
+        "processor_ms": {name: 1e3 * t[:, 1].min() for name, t in times.items()},
+        "ratios": ratios,
+    }
+
+
+def counted(size: int, rounds: int) -> dict[str, Any]:
+    """Points a second on a GPU, and what XLA counts of the compiled program."""
+    robot, runs = robots.nominal(), conditions(size)
+    rows = {}
+    for name, one, wanted in (
+        ("three", robot, THREE),
+        ("all", robot, (*ALL, "status", "flags")),
+        ("effects", with_effects(robot), THREE),
+    ):
+        compiled = (
+            jax.jit(lambda robot, runs, wanted=wanted: steady_outputs(robot, runs, wanted)).lower(one, runs).compile()
+        )
+        best = float(in_turn({name: lambda: compiled(one, runs)}, rounds)[name][:, 0].min())  # noqa: B023
+        cost, memory = compiled.cost_analysis() or {}, compiled.memory_analysis()
+        least = (memory.argument_size_in_bytes + memory.output_size_in_bytes) / size
+        moved, flops = cost.get("bytes accessed", float("nan")) / size, cost.get("flops", float("nan")) / size
+        rate = size / best
+        rows[name] = {
+            "per_s": rate,
+            "bytes_point_in_and_out": least,
+            "bytes_point_counted": moved,
+            "operations_point_counted": flops,
+            "bandwidth_share_in_and_out": least * rate / arguments.bandwidth,
+            "bandwidth_share_counted": moved * rate / arguments.bandwidth,
+            "arithmetic_share": flops * rate / arguments.arithmetic,
+            "temporary_bytes_point": memory.temp_size_in_bytes / size,
+        }
+    return {"points": size, **rows}
+
+
+def main() -> None:
+    gpu = arguments.platform == "gpu"
+    if gpu and jax.devices()[0].platform != "gpu":
+        sys.exit(f"--platform gpu: jax found {jax.devices()[0].platform}; expected a GPU")
+    batches = arguments.batches or ("4194304,16777216,67108864" if gpu else "262144")
+    record: dict[str, Any] = {"benchmark": "steady_yardstick", "machine": machine(), "rows": []}
+    for size in (int(b) for b in batches.split(",")):
+        record["load_before"] = os.getloadavg()[0]
+        row = (counted if gpu else compared)(size, arguments.rounds)
+        record["rows"].append(row)
+        print(f"{size} points")
+        if gpu:
+            for name in ("three", "all", "effects"):
+                r = row[name]
+                print(
+                    f"  {name:8} {r['per_s']:.3e} points/s; {r['bytes_point_in_and_out']:.0f} bytes a point in and "
+                    f"out, {r['bandwidth_share_in_and_out']:.0%} of the bandwidth (as XLA counts, with what it "
+                    f"stores between: {r['bytes_point_counted']:.0f}, {r['bandwidth_share_counted']:.0%}); "
+                    f"{r['operations_point_counted']:.0f} operations, {r['arithmetic_share']:.0%} of the arithmetic"
+                )
+        else:
+            for name, rate in row["per_s"].items():
+                spent = row["processor_ms"][name]
+                print(
+                    f"  {name:20} best {rate:.3e} points/s, median {row['per_s_median'][name]:.3e}; "
+                    f"{spent:.1f} ms of processor"
+                )
+            for name, r in row["ratios"].items():
+                goal = "" if r["goal"] is None else f" (goal {r['goal']:g})"
+                print(f"  {name}: {r['best']:.2f}, median {r['median']:.2f}, processor {r['processor']:.2f}{goal}")
+    print(json.dumps(record))
+
+
+if __name__ == "__main__":
+    main()
