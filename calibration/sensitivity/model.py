@@ -1,0 +1,196 @@
+"""A robot's outputs as functions of inputs, over many points at once: values, and exact derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from calibration.data.errors import BadConfiguration, choices
+from mmrjax import derived, fidelities
+from mmrjax import outputs as table_of_outputs
+from mmrjax.conditions import Conditions
+from mmrjax.derived import Derived
+from mmrjax.outputs import Output
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED, STATUSES
+from mmrjax.variation import STATUS, Variation, evaluate
+
+#: Points of one call of few, and of many: solves, runs over time, and the derivatives of both. All calls have one of
+#: these shapes, so that every study of the same inputs and outputs shares what is compiled.
+CHUNKS = {"solves": (512, 16_384), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
+#: Shown where no outputs are named.
+DEFAULT = ("total_current", "motor_speed", "speed", "slip", "power_supply", "efficiency_chassis", "steepest_slope")
+
+OutputRow = Output | Derived
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """Outputs of many points.
+
+    Attributes:
+        values: of each output [SI], NaN where its run did not converge; shape (points,).
+        statuses: source (a fidelity, or a module of derived outputs) → codes, shape (points,).
+    """
+
+    values: dict[str, np.ndarray]
+    statuses: dict[str, np.ndarray]
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Source → status → how many points."""
+        return {source: counted(codes) for source, codes in self.statuses.items()}
+
+
+def counted(codes: np.ndarray) -> dict[str, int]:
+    """Status → how many, of those that occur."""
+    each = np.bincount(codes, minlength=len(STATUSES))
+    return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
+
+
+def known_outputs() -> dict[str, OutputRow]:
+    """Every output by name: those of a fidelity, then the derived ones."""
+    return {o.name: o for o in (*table_of_outputs.table(), *derived.TABLE)}
+
+
+def chosen_outputs(words: tuple[str, ...]) -> tuple[OutputRow, ...]:
+    """The outputs of these names, the usual ones for none; `start` stands for all of the start.
+
+    Raises:
+        BadConfiguration: an unknown name; lists the choices.
+    """
+    known, found = known_outputs(), []
+    start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
+    for word in words or DEFAULT:
+        for name in start if word == "start" else (word,):
+            if name not in known:
+                raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
+            found.append(known[name])
+    return tuple(dict.fromkeys(found))
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """Outputs of a robot of which some parameters and conditions vary.
+
+    Attributes:
+        robot: that every point starts from; columns: names of what varies.
+        fidelity, options: that simulate what is not derived.
+        outputs: that are computed.
+    """
+
+    robot: Robot
+    columns: tuple[str, ...]
+    fidelity: str
+    options: Mapping[str, float]
+    outputs: tuple[OutputRow, ...]
+
+    @property
+    def sources(self) -> dict[str, tuple[OutputRow, ...]]:
+        """Outputs by what computes them: the fidelity's name, or the module of derived ones."""
+        found: dict[str, list[OutputRow]] = {}
+        for output in self.outputs:
+            found.setdefault(output.module if isinstance(output, Derived) else self.fidelity, []).append(output)
+        return {source: tuple(rows) for source, rows in found.items()}
+
+    def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
+        """Points of one call, of so many in all."""
+        long = source.endswith(".start") or (source in fidelities.TABLE and fidelities.facts(source).rollout)
+        kind = ("derivatives of runs" if long else "derivatives") if differentiated else "runs" if long else "solves"
+        few, many = CHUNKS[kind]
+        return few if points <= 4 * few else many
+
+    def __call__(self, values: Float[Array, "points columns"], conditions: Conditions) -> Answer:
+        """Outputs of many points.
+
+        Args:
+            values: a row a point, in the order of `columns`.
+            conditions: what does not vary, of shape () or (points,).
+        """
+        found, statuses = {}, {}
+        for source in self.sources:
+            made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
+            there = made[STATUS] == CONVERGED
+            statuses[source] = made.pop(STATUS).astype(int)
+            found |= {name: np.where(there, x, np.nan) for name, x in made.items()}
+        return Answer({o.name: found[o.name] for o in self.outputs}, statuses)
+
+    def derivatives(self, values: Float[Array, "points columns"], conditions: Conditions) -> dict[str, np.ndarray]:
+        """Exact derivatives of every output by every column [SI per unit], shape (points, columns); zeros where a
+        run has no numbers."""
+        found = {}
+        for source in self.sources:
+            size = self.chunk(source, len(values), differentiated=True)
+            made = self._chunked(self._function(source, differentiated=True), size, values, conditions)
+            made.pop(STATUS)
+            found |= made
+        return {o.name: found[o.name] for o in self.outputs}
+
+    def _function(self, source: str, differentiated: bool = False) -> Callable[..., dict[str, Array]]:
+        rows = tuple(o.name for o in self.sources[source])
+        variation = Variation(self.robot, self.columns)
+        options = dict(self.options) if source == self.fidelity else {}
+        run = _derivatives if differentiated else _values
+        return lambda values, conditions: run(variation, source, options, rows, values, conditions)
+
+    def _chunked(
+        self, function: Callable[..., dict[str, Array]], size: int, values: Any, conditions: Conditions
+    ) -> dict[str, np.ndarray]:
+        """A function over chunks of one shape, the last filled up with its last point."""
+        points, values = len(values), np.asarray(values)
+        spread = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (points,)), conditions)
+        parts = []
+        for first in range(0, points, size):
+            rows = np.minimum(np.arange(first, first + size), points - 1)
+            part = function(jnp.asarray(values[rows]), jax.tree.map(lambda x, r=rows: jnp.asarray(x[r]), spread))
+            count = min(size, points - first)
+            parts.append({name: np.asarray(x)[:count] for name, x in part.items()})
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _outputs(
+    variation: Variation,
+    source: str,
+    options: dict[str, float],
+    names: tuple[str, ...],
+    values: Array,
+    conditions: Conditions,
+) -> dict[str, Array]:
+    if source in fidelities.TABLE:
+        return evaluate(variation, source, values, conditions, options, names)
+    compute = derived.compute(source)
+    made = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
+    return {name: made[name] for name in (*names, STATUS)}
+
+
+_values = eqx.filter_jit(_outputs)
+
+
+@eqx.filter_jit
+def _derivatives(
+    variation: Variation,
+    source: str,
+    options: dict[str, float],
+    names: tuple[str, ...],
+    values: Array,
+    conditions: Conditions,
+) -> dict[str, Array]:
+    """Each point's outputs depend on its own row alone: one tangent a column is the Jacobian of all of them."""
+
+    def numbers(values: Array) -> tuple[dict[str, Array], Array]:
+        made = _outputs(variation, source, options, names, values, conditions)
+        status = made.pop(STATUS)
+        return made, status
+
+    def along(direction: Array) -> tuple[dict[str, Array], Array]:
+        _, moved, status = jax.jvp(numbers, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True)
+        return moved, status
+
+    moved, status = jax.vmap(along, out_axes=(-1, None))(jnp.eye(values.shape[1], dtype=values.dtype))
+    return {**moved, STATUS: status}
