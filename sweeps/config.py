@@ -237,6 +237,39 @@ class Loop(RobotPart, InferencePart, OutputPart):
     forbid: tuple[str, ...] = ()
 
 
+class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
+    """A sensitivity study.
+
+    Attributes:
+        method: `local`, `sobol`, `morris`, `derivative` or `shapley`.
+        configurations, voltages_V, payloads_kg, slopes_deg, surface: operating points, as of a grid; None leaves them
+            to the method: Table 8 where gradients do, its corners and middle where a sample is drawn.
+        parameters: uncertain, by dotted name, with their priors; empty takes all that have one.
+        vary: conditions that are uncertain, `name=low:high`.
+        outputs: by name; empty takes the usual ones.
+        evaluations: of the model at least, in all; None takes the default.
+        posterior: whether the inputs are the posterior of a calibrated robot.
+        candidates: CSV of runs that could be made next; empty takes Table 8.
+        runs: how many of them to propose; noise: of their readings, as of `calibrate`.
+    """
+
+    method: str = "sobol"
+    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] | None = None
+    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] | None = None
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = None
+    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
+    parameters: tuple[str, ...] = ()
+    vary: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = None
+    seed: Seed = 0
+    posterior: bool = False
+    candidates: str = ""
+    runs: Annotated[int, Field(ge=1, le=100)] = 5
+    noise: str = ""
+
+
 C = TypeVar("C", bound=Part)
 
 

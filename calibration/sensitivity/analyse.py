@@ -80,12 +80,7 @@ def analyse(
     outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_none_converges(study, study.statuses()))
-    proposed = None
-    if candidates is not None:
-        proposed = next_runs(
-            study, found, candidates.points, candidates.conditions, candidates.noise_share, candidates.noise,
-            candidates.source, candidates.count,
-        )  # fmt: skip
+    proposed = None if candidates is None else next_runs(study, found, candidates)
     return SensitivityResult(
         method=method,
         model=model.fidelity,

@@ -26,41 +26,44 @@ class Candidates:
 
     Attributes:
         points, conditions: of them; source: where they come from.
-        noise_share: sd of each channel as a share of its reading, shape (channels,); noise: in words.
+        noise: channel's place → (number, whether it is a share of the reading), see `calibration.inference.noise`;
+            words: the same for a person.
+        sd: that the candidates state themselves [SI], NaN where they do not; shape (candidates, channels).
+        count: how many to propose.
     """
 
     points: Points
     conditions: Conditions
     source: str
-    noise_share: np.ndarray
-    noise: str
+    noise: dict[int, tuple[float, bool]]
+    words: str
+    sd: np.ndarray
     count: int = RUNS
 
+    def deviations(self, reading: np.ndarray) -> np.ndarray:
+        """Sd of readings [SI], shape (candidates, channels)."""
+        whole = np.empty_like(reading)
+        for k, (size, relative) in self.noise.items():
+            whole[:, k] = size * np.abs(reading[:, k]) if relative else size
+        return np.where(np.isfinite(self.sd), self.sd, whole)
 
-def next_runs(
-    study: Study,
-    found: Local,
-    candidates: Points,
-    conditions: Conditions,
-    sd: np.ndarray,
-    noise: str,
-    source: str,
-    count: int = RUNS,
-) -> NextRuns | None:
+
+def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | None:
     """The candidates that together tell most of the parameters, read with every channel.
 
     Args:
         found: of the study's own points.
-        candidates: runs that could be made; conditions: of them.
-        sd: of the channels' readings as a share of them, shape (channels,); noise, source: in words.
-        count: how many runs.
-    """  # fmt: skip
-    shown = tuple(o for o in (_row(c.name) for c in channels.CHANNELS))
+
+    Returns:
+        None where no candidate travels, or no parameter is uncertain.
+    """
+    points, conditions = candidates.points, candidates.conditions
+    shown = tuple(_row(c.name) for c in channels.CHANNELS)
     model = dataclasses.replace(study.model, outputs=shown, fidelity="steady", options={})
     p = len(study.inputs.parameters)
     if not p:
         return None
-    rows = np.tile(study.inputs.centre, (len(candidates), 1))
+    rows = np.tile(study.inputs.centre, (len(points), 1))
     values = study.values_at(rows)
     # A condition is set as a candidate says, whatever range it has in the study.
     first = len(study.inputs.columns) - len(study.inputs.conditions)
@@ -74,8 +77,8 @@ def next_runs(
     there = np.isfinite(reading).all(1)
     if not there.any():
         return None
-    information_of = information.fisher(jacobian[there], np.abs(reading[there]) * sd)
-    choice = information.choose(information_of, count)
+    information_of = information.fisher(jacobian[there], candidates.deviations(reading)[there])
+    choice = information.choose(information_of, candidates.count)
     picked = np.flatnonzero(there)[list(choice.rows)]
     slope = np.asarray(jax.jacfwd(study.inputs.values)(jnp.asarray(study.inputs.centre)))[study.inputs.places][:, :p]
     after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))
@@ -85,11 +88,10 @@ def next_runs(
         variance = np.einsum("pi,kij,pj->kp", g, choice.covariance, g)
         outputs[name] = np.sqrt(variance.mean(1)) if len(g) else np.full(len(choice.covariance), np.nan)
     whole = np.where(after[0] > 0, after[0], 1.0)
-    chosen = Points(
-        candidates.configuration[picked], candidates.voltage[picked], candidates.payload[picked],
-        candidates.slope_deg[picked],
-    )  # fmt: skip
-    return NextRuns(int(there.sum()), source, chosen, choice.gain, noise, after / whole, outputs)
+    chosen = Points(*(column[picked] for column in points.columns().values()))
+    return NextRuns(
+        int(there.sum()), candidates.source, chosen, choice.gain, candidates.words, after / whole, outputs
+    )
 
 
 def _row(name: str) -> OutputRow:

@@ -207,7 +207,7 @@ class SensitivityResult:
         if not leaders:
             return "None of these inputs changes any of these outputs."
         ordered = sorted(leaders.items(), key=lambda item: -len(item[1]))
-        said = "; ".join(f"{name} decides most of {', '.join(what)}" for name, what in ordered)
+        said = "; ".join(f"{name} matters most for {', '.join(what)}" for name, what in ordered)
         idle = len(self.negligible)
         return (
             f"{said[0].upper() if said[0].islower() and '.' not in said.split(' ')[0] else said[0]}{said[1:]}; "
