@@ -71,6 +71,13 @@ _Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from th
 _Discharge = Annotated[
     float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  \\[default: 0]")
 ]
+_Posterior = Annotated[
+    int | None,
+    typer.Option(
+        "--posterior",
+        help="Give results with ± from so many robots drawn from the posterior.nc beside the calibrated --robot.",
+    ),
+]
 _NoCache = Annotated[
     bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
 ]
@@ -111,6 +118,7 @@ def simulate(
     effects: _Effects = None,
     battery: _Battery = None,
     discharge: _Discharge = None,
+    posterior: _Posterior = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
@@ -125,7 +133,7 @@ def simulate(
 
     options = _options(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
-        discharge_mAh=discharge, report=report,
+        discharge_mAh=discharge, posterior=posterior, report=report,
     )  # fmt: skip
     resolved = _prepared(config.resolve(config.Simulate, None, options), no_cache)
     from sweeps import simulate as room
@@ -162,6 +170,7 @@ def sweep(
     battery: _Battery = None,
     discharge: _Discharge = None,
     chunk: _Chunk = None,
+    posterior: _Posterior = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
@@ -184,6 +193,7 @@ def sweep(
         battery=battery,
         discharge_mAh=discharge,
         chunk=chunk,
+        posterior=posterior,
         report=report,
     ) | {
         "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
@@ -212,6 +222,7 @@ def compare(
     robot: _Robot = None,
     set_: _Set = None,
     effects: _Effects = None,
+    posterior: _Posterior = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
@@ -221,7 +232,14 @@ def compare(
     from sweeps import config
 
     options = _options(
-        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
+        model=model,
+        duration_s=duration,
+        step_s=step,
+        robot=robot,
+        set=set_,
+        effects=effects,
+        posterior=posterior,
+        report=report,
     )
     resolved = _prepared(config.resolve(config.Compare, None, options), no_cache)
     from sweeps import compare as room
@@ -442,7 +460,7 @@ def sensitivity(
     ] = None,
     evaluations: Annotated[
         int | None,
-        typer.Option(help="Model evaluations, at least, in all.  \\[default: 500000; runs over time 100000]"),
+        typer.Option(help="Model evaluations, at least, in all.  \\[default: 1000000; runs over time 100000]"),
     ] = None,
     posterior: Annotated[
         bool | None,

@@ -166,6 +166,16 @@ class InferencePart(Part):
     seed: Seed = 0
 
 
+class PosteriorPart(Part):
+    """Whether results come with the uncertainty of a calibrated robot.
+
+    Attributes:
+        posterior: robots to draw from the posterior.nc beside the robot's file; None for none.
+    """
+
+    posterior: Annotated[int, Field(ge=10, le=100_000)] | None = None
+
+
 class OutputPart(Part):
     """What is written beside the numbers.
 
@@ -176,7 +186,7 @@ class OutputPart(Part):
     report: bool = True
 
 
-class Simulate(RobotPart, FidelityPart, SupplyPart, OutputPart):
+class Simulate(RobotPart, FidelityPart, SupplyPart, PosteriorPart, OutputPart):
     """A few given runs; those over time from standstill."""
 
     @property
@@ -188,11 +198,11 @@ class Simulate(RobotPart, FidelityPart, SupplyPart, OutputPart):
         return options
 
 
-class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, OutputPart):
+class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, PosteriorPart, OutputPart):
     """A grid of runs: every combination of the axes."""
 
 
-class Compare(RobotPart, FidelityPart, OutputPart):
+class Compare(RobotPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from sweeps.figures_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note, short
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
-SHOWN, PANELS = 8, 4
-_MAP = "YlGnBu"
+SHOWN, TALLEST, PANELS = 8, 10, 4
+_MAP = "Blues"
 
 
 def ranked(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
@@ -40,7 +38,7 @@ def overview(found: SensitivityResult) -> Figure:
 def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
     """A heat map of shares, each cell with its percent where there are few columns."""
     ax.grid(False)
-    hidden = np.ma.masked_invalid(shares)
+    hidden = np.ma.masked_invalid(np.where(shares < NEGLIGIBLE, 0.0, shares))
     ax.imshow(np.sqrt(hidden), cmap=_MAP, vmin=0, vmax=1, aspect="auto")
     ax.set_facecolor("#eeeeee")
     for side in ("left", "bottom"):
@@ -70,30 +68,26 @@ def panels(study: OutputStudy, found: SensitivityResult) -> list[int]:
 def tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
     """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
     where = panels(study, found)
-    fig, axes = figure(1, max(len(where), 1), 0.7 + 0.28 * SHOWN)
     unit, factor = study.row.unit, study.row.factor
-    for ax, k in zip(axes[0], where, strict=False):
-        low, high = study.swing[0, k] / factor, study.swing[1, k] / factor
-        middle = study.value[k] / factor
-        reach = np.nanmax(np.abs(np.stack([low, high]) - middle), 0, initial=0.0, where=np.isfinite([low, high]))
-        top = [i for i in np.argsort(-reach, kind="stable")[:SHOWN] if reach[i] > 0.02 * reach.max()][:6]
+    swing, value = study.swing[:, where] / factor, study.value[where] / factor
+    reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
+    relative = (reach / np.maximum(reach.max(1, keepdims=True), 1e-300)).sum(0)
+    top = [i for i in np.argsort(-relative, kind="stable")[:TALLEST] if relative[i] > 0.03]
+    fig, axes = figure(1, max(len(where), 1), 0.9 + 0.26 * len(top), sharey=True)
+    for n, ax in enumerate(axes[0]):
         for place, i in enumerate(top):
-            for end, colour in ((low[i], VERMILION), (high[i], BLUE)):
+            for end, colour in ((swing[0, n, i], VERMILION), (swing[1, n, i], BLUE)):
                 if np.isfinite(end):
-                    ax.barh(-place, end - middle, left=middle, color=colour, height=0.66)
+                    ax.barh(-place, end - value[n], left=value[n], color=colour, height=0.66)
                 else:
-                    ax.text(middle, -place, " × does not travel", va="center", fontsize=7.5, color=FAINT)
-        ax.axvline(middle, color=INK, linewidth=0.9)
-        ax.set_yticks([-p for p in range(len(top))], [short(found.names[i]) for i in top], fontsize=8)
-        ax.set_title(_split(found.points.label(k)), fontsize=8.5)
-        ax.set_xlabel(f"{middle:.{study.row.resolution}g} {unit if unit != '-' else ''}".strip(), fontsize=8.5)
+                    ax.text(value[n], -place, " × does not travel", va="center", fontsize=7.5, color=FAINT)
+        ax.axvline(value[n], color=INK, linewidth=0.9)
+        ax.set_title(_split(found.points.label(where[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)
         ax.locator_params(axis="x", nbins=4)
         ax.grid(axis="y", visible=False)
-    if where:
-        axes[0, 0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}", fontsize=9)
-        for ax in axes[0, 1:]:
-            ax.set_xlabel("")
+    axes[0, 0].set_yticks([-p for p in range(len(top))], [short(found.names[i]) for i in top], fontsize=8.5)
+    axes[0, 0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}", fontsize=9)
     return fig
 
 
@@ -175,28 +169,6 @@ def _range(values: np.ndarray) -> str:
     return f"{values.min():g}-{values.max():g}"
 
 
-def interactions(study: OutputStudy, found: SensitivityResult) -> Figure:
-    """Second-order indices of the inputs that matter, those whose interval leaves zero out in full ink."""
-    second = study.second
-    assert second is not None
-    top = ranked(study.overall_share)
-    fig, axes = figure(1, 1, 0.9 + 0.3 * len(top))
-    ax = axes[0, 0]
-    value = second.value[np.ix_(top, top)].copy()
-    sure = (second.low > 0)[np.ix_(top, top)]
-    value[np.triu_indices(len(top))] = np.nan
-    ax.grid(False)
-    ax.imshow(np.ma.masked_invalid(value), cmap=colormaps["PuOr"], vmin=-0.1, vmax=0.1, aspect="auto")
-    for (i, j), x in np.ndenumerate(value):
-        if np.isfinite(x):
-            strong = {"color": INK, "fontweight": "bold"} if sure[i, j] else {"color": FAINT}
-            ax.text(j, i, f"{100 * x:.1f}", ha="center", va="center", fontsize=8.5, **strong)
-    labels = [short(found.names[k]) for k in top]
-    ax.set_yticks(range(len(top)), labels)
-    ax.set_xticks(range(len(top)), labels, rotation=20, ha="right")
-    return fig
-
-
 def convergence(found: SensitivityResult) -> Figure:
     """The main index of the leading inputs of each output against the model evaluations spent."""
     shown = [s for s in found.outputs.values() if s.convergence][:6]
@@ -244,6 +216,3 @@ def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
     if not moving:
         note(ax, "these runs tell nothing of these inputs")
     return fig
-
-
-__all__ = ["Estimate", "convergence", "indices", "interactions", "next_runs", "overview", "ranked", "tornado"]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.sensitivity.result import METHODS, NEGLIGIBLE, OutputStudy, SensitivityResult
+from calibration.sensitivity.result import METHODS, NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
 from sweeps import figures_sensitivity
 from sweeps.report import Album, named, render
 
@@ -83,18 +83,15 @@ def _sentence(study: OutputStudy, found: SensitivityResult) -> str:
 
 
 def _pairs(study: OutputStudy, found: SensitivityResult) -> list[dict[str, str]]:
-    """Interactions whose interval lies above zero, the strongest first."""
-    if study.second is None:
-        return []
-    second, names = study.second, found.names
-    rows = [
-        (float(second.value[i, j]), float(second.low[i, j]), float(second.high[i, j]), names[i], names[j])
-        for i, j in zip(*np.triu_indices(len(names), 1), strict=True)
-        if second.low[i, j] > 0 and second.value[i, j] >= NEGLIGIBLE / 10
-    ]
+    """Interactions that are sure, the strongest first."""
+    sure = [pair for pair in interactions(study, found.names) if pair.sure and pair.second >= NEGLIGIBLE / 2]
     return [
-        {"pair": f"{a} with {b}", "value": f"{100 * v:.1f} %", "interval": f"{100 * low:.1f} to {100 * high:.1f} %"}
-        for v, low, high, a, b in sorted(rows, reverse=True)[:PAIRS]
+        {
+            "pair": " with ".join(pair.pair),
+            "value": f"{100 * pair.second:.1f} %",
+            "interval": f"{100 * pair.interval[0]:.1f} to {100 * pair.interval[1]:.1f} %",
+        }
+        for pair in sure[:PAIRS]
     ]
 
 

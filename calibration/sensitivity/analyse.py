@@ -21,7 +21,7 @@ from mmrjax import fidelities
 from mmrjax.derived import Derived
 
 #: Model evaluations in all where none are stated: of solves, and where a run over time is among them.
-EVALUATIONS, EVALUATIONS_LONG = 500_000, 100_000
+EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
 #: Fewest that may be asked for.
 LEAST = 1_000
 

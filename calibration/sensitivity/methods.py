@@ -72,8 +72,7 @@ def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, seco
         design = sobol.design(len(which), size, seed, second)
         scores = _sampled(study, design.points, np.array(which))
         base = {"rows": design.size * design.replicates, "blocks": design.blocks}
-        for k in group:
-            made = study.sample(scores, k)
+        for k, made in study.sample(study.values_at(scores), group):
             for name in names:
                 found = sobol.terms(design, made[name])
                 rows = design.size * design.replicates
@@ -125,8 +124,7 @@ def by_morris(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> 
         for j, i in enumerate(which):
             if normal[i]:
                 scores[:, i] = Z95 * (2 * unit[:, j] - 1)
-        for k in group:
-            made = study.sample(scores, k)
+        for k, made in study.sample(study.values_at(scores), group):
             for name in names:
                 effects = morris.effects(unit, made[name])
                 lost[name][k] = 1.0 if effects is None else effects.lost / count
@@ -228,8 +226,7 @@ def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) ->
         z = np.tile(mean, (len(design.points), 1))
         z[:, places] = design.points
         values = np.asarray(_at_coordinates(study.inputs, z))
-        for k in group:
-            made = study.counted_outputs(values, study.at(k))
+        for k, made in study.sample(values, group):
             for name in names:
                 found = shapley.terms(design, made[name])
                 lost[name][k] = 1.0 if found is None else found.lost

@@ -113,13 +113,24 @@ class Model:
             values: a row a point, in the order of `columns`.
             conditions: what does not vary, of shape () or (points,).
         """
-        found, statuses = {}, {}
-        for source in self.sources:
-            made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
-            there = made[STATUS] == CONVERGED
-            statuses[source] = made.pop(STATUS).astype(int)
-            found |= {name: np.where(there, x, np.nan) for name, x in made.items()}
+        return self.joined({source: self.of_source(source, values, conditions) for source in self.sources})
+
+    def of_source(self, source: str, values: Float[Array, "points columns"], conditions: Conditions) -> Answer:
+        """The outputs of one source alone; see `sources`."""
+        made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
+        codes = made.pop(STATUS).astype(int)
+        return Answer({n: np.where(codes == CONVERGED, x, np.nan) for n, x in made.items()}, {source: codes})
+
+    def joined(self, parts: Mapping[str, Answer]) -> Answer:
+        """The outputs of all sources, in order."""
+        found = {name: x for part in parts.values() for name, x in part.values.items()}
+        statuses = {source: codes for part in parts.values() for source, codes in part.statuses.items()}
         return Answer({o.name: found[o.name] for o in self.outputs}, statuses)
+
+    def ignores(self, source: str) -> tuple[str, ...]:
+        """Conditions on which no output of a source depends."""
+        each = [set(o.ignores) if isinstance(o, Derived) else set() for o in self.sources[source]]
+        return tuple(sorted(set.intersection(*each)))
 
     def derivatives(self, values: Float[Array, "points columns"], conditions: Conditions) -> dict[str, np.ndarray]:
         """Exact derivatives of every output by every column [SI per unit], shape (points, columns); zeros where a

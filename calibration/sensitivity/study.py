@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from calibration.sensitivity.inputs import Inputs
-from calibration.sensitivity.model import Model, OutputRow, counted
+from calibration.sensitivity.model import Answer, Model, OutputRow, counted
 from calibration.sensitivity.result import Points
 from mmrjax import fidelities
 from mmrjax.conditions import Conditions
 from mmrjax.robot import Robot
+from mmrjax.signals import STATUSES
 
 Tell = Callable[[str], None]
 
@@ -72,19 +73,32 @@ class Study:
         """Columns of the model at scores of all inputs."""
         return np.asarray(values_of(self.inputs, scores))
 
-    def sample(self, scores: np.ndarray, k: int) -> dict[str, np.ndarray]:
-        """Outputs at scores of all inputs, at one point; counted and timed."""
-        return self.counted_outputs(self.values_at(scores), self.at(k))
+    def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Outputs at the same values of the model's columns, at one point after the other; counted and timed.
 
-    def counted_outputs(self, values: np.ndarray, conditions: Conditions) -> dict[str, np.ndarray]:
-        began = time.perf_counter()
-        answer = self.model(values, conditions)
-        self.seconds += time.perf_counter() - began
-        self.evaluations += len(values)
-        for source, codes in answer.statuses.items():
-            whole = np.bincount(codes, minlength=16)
-            self.sampled[source] = self.sampled.get(source, 0) + whole
-        return answer.values
+        What a source says where only conditions differ that it ignores is not computed again.
+        """
+        kept: dict[tuple[str, tuple[float, ...]], Answer] = {}
+        for k in points:
+            began = time.perf_counter()
+            conditions = self.at(k)
+            parts = {}
+            for source in self.model.sources:
+                ignored = self.model.ignores(source)
+                fields = {f.name: getattr(conditions, f.name) for f in dataclasses.fields(conditions)}
+                mark = tuple(float(x) for name, x in fields.items() if x is not None and name not in ignored)
+                if (source, mark) not in kept:
+                    if not ignored:  # and so for no other point
+                        parts[source] = self.model.of_source(source, values, conditions)
+                        continue
+                    kept[source, mark] = self.model.of_source(source, values, conditions)
+                parts[source] = kept[source, mark]
+            answer = self.model.joined(parts)
+            self.seconds += time.perf_counter() - began
+            self.evaluations += len(values)
+            for source, codes in answer.statuses.items():
+                self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
+            yield k, answer.values
 
     def statuses(self) -> dict[str, dict[str, int]]:
         """Source → status → how many of the sample."""
