@@ -39,7 +39,7 @@ def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
     """A heat map of shares, each cell with its percent where there are few columns."""
     ax.grid(False)
     hidden = np.ma.masked_invalid(np.where(shares < NEGLIGIBLE, 0.0, shares))
-    ax.imshow(np.sqrt(hidden), cmap=_MAP, vmin=0, vmax=1, aspect="auto")
+    ax.imshow(np.sqrt(hidden), cmap=_MAP, vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     ax.set_facecolor("#eeeeee")
     for side in ("left", "bottom"):
         ax.spines[side].set_visible(False)

@@ -12,7 +12,7 @@ from calibration.data.errors import BadConfiguration
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.local import Local, directions, inert, local
-from calibration.sensitivity.methods import MOST_LOST, Part, by_derivative, by_morris, by_shapley, by_sobol
+from calibration.sensitivity.methods import Part, by_derivative, by_morris, by_shapley, by_sobol
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.next_runs import Candidates, next_runs
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
@@ -218,12 +218,11 @@ def _notes(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.
         o, names = group[0], ", ".join(x.row.label for x in group)
         if not o.studied.all():
             out = int((~o.studied).sum())
-            many = "" if method == "local" else f" for more than {100 * MOST_LOST:.0f} % of the sample"
+            who = "the robot does" if method == "local" else "too many robots of the sample do"
             said.append(
-                f"{out} of {len(o.studied)} operating points are left out, since the robot does not travel there"
-                f"{many} ({names})"
+                f"{out} of {len(o.studied)} operating points are left out, since {who} not travel there ({names})"
             )
-        some = o.studied & (o.lost > 0)
+        some = o.studied & (o.lost >= 1e-3)
         if some.any():
             said.append(
                 f"at {int(some.sum())} operating points up to {100 * o.lost[some].max():.1f} % of the sample is left "

@@ -18,7 +18,7 @@ from calibration.sensitivity.study import Study
 #: Largest share of base points that may be without numbers for a point to be studied.
 MOST_LOST = 0.5
 #: Replicates of the derivative method, and points of each.
-GRADIENTS = (8, 16)
+GRADIENTS = (8, 8)
 
 
 @dataclasses.dataclass(frozen=True)

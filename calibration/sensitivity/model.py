@@ -119,7 +119,7 @@ class Model:
         """The outputs of one source alone; see `sources`."""
         made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
         codes = made.pop(STATUS).astype(int)
-        return Answer({n: np.where(codes == CONVERGED, x, np.nan) for n, x in made.items()}, {source: codes})
+        return Answer(made, {source: codes})
 
     def joined(self, parts: Mapping[str, Answer]) -> Answer:
         """The outputs of all sources, in order."""
@@ -155,14 +155,26 @@ class Model:
     ) -> dict[str, np.ndarray]:
         """A function over chunks of one shape, the last filled up with its last point."""
         points, values = len(values), np.asarray(values)
-        spread = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (points,)), conditions)
+        alike = conditions.shape == ()  # the program spreads them
+        spread = conditions if alike else jax.tree.map(np.asarray, conditions)
         parts = []
         for first in range(0, points, size):
-            rows = np.minimum(np.arange(first, first + size), points - 1)
-            part = function(jnp.asarray(values[rows]), jax.tree.map(lambda x, r=rows: jnp.asarray(x[r]), spread))
             count = min(size, points - first)
+            part, rows = values[first : first + count], spread
+            if not alike:
+                rows = jax.tree.map(lambda x, f=first, n=count: _filled(x[f : f + n], size), spread)
+            part = function(jnp.asarray(_filled(part, size)), rows)
             parts.append({name: np.asarray(x)[:count] for name, x in part.items()})
+        if len(parts) == 1:
+            return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _filled(rows: np.ndarray, size: int) -> np.ndarray:
+    """Rows with repeats of the last behind them, up to a size."""
+    if len(rows) == size:
+        return rows
+    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)])
 
 
 def _outputs(
@@ -173,8 +185,19 @@ def _outputs(
     values: Array,
     conditions: Conditions,
 ) -> dict[str, Array]:
+    """Outputs of a source, NaN where the run did not converge, and statuses."""
     if source in fidelities.TABLE:
-        return evaluate(variation, source, values, conditions, options, names)
+        made = evaluate(variation, source, values, conditions, options, names)
+    else:
+        made = _derived(variation, source, names, values, conditions)
+    there = made[STATUS] == CONVERGED
+    return {name: x if name == STATUS else jnp.where(there, x, jnp.nan) for name, x in made.items()}
+
+
+def _derived(
+    variation: Variation, source: str, names: tuple[str, ...], values: Array, conditions: Conditions
+) -> dict[str, Array]:
+    conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
     compute = derived.compute(source)
     made = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
     return {name: made[name] for name in (*names, STATUS)}
