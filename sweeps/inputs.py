@@ -40,7 +40,7 @@ def beside_robot(config: RobotPart, robot: Robot) -> Posterior:
     file = Path(config.robot)
     if file.suffix != ".toml":
         raise BadConfiguration(
-            f"--posterior: {config.robot} has none; expected --robot FOLDER/robot.toml, of calibrate or loop"
+            f"--posterior: {config.robot} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
     path = file.with_name(posterior.FILE)
     found = posterior.read(path)

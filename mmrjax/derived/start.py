@@ -9,20 +9,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.drive import TIME_INRUSH, TIME_SETTLED, drive
+from mmrjax.fidelities.drive import TIME_SETTLED, drive
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED
 
 #: Share of the final speed at which a start is over [-].
 SHARE = 0.95
-#: Instants of the inrush, and of the rest of the run.
-INRUSH, REST = 120, 400
+#: Instants of the inrush, from the first to the last of it [s], and of the rest of the run.
+INRUSH, EARLIEST, LATEST, REST = 250, 2e-5, 0.02, 800
 
 
 def instants() -> np.ndarray:
-    """Times of a start [s], close together while the current rises to its peak, ever wider later."""
-    early = np.linspace(0.0, TIME_INRUSH, INRUSH, endpoint=False)
-    return np.concatenate([early, np.geomspace(TIME_INRUSH, TIME_SETTLED, REST)])
+    """Times of a start [s]: each 3 % after the one before while the current rises to its peak, then 5 ms apart."""
+    early = np.geomspace(EARLIEST, LATEST, INRUSH, endpoint=False)
+    return np.concatenate([[0.0], early, np.linspace(LATEST, TIME_SETTLED, REST)])
 
 
 def peak(x: Float[Array, " times"]) -> Float[Array, ""]:
