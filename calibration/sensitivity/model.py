@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.errors import BadConfiguration, choices
-from mmrjax import derived, fidelities
+from mmrjax import channels, derived, fidelities
 from mmrjax import outputs as table_of_outputs
 from mmrjax.conditions import Conditions
 from mmrjax.derived import Derived
@@ -25,8 +25,8 @@ from mmrjax.variation import STATUS, Variation, evaluate
 #: Points of one call of few, and of many: solves, runs over time, and the derivatives of both. All calls have one of
 #: these shapes, so that every study of the same inputs and outputs shares what is compiled.
 CHUNKS = {"solves": (512, 16_384), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
-#: Shown where no outputs are named.
-DEFAULT = ("total_current", "motor_speed", "speed", "slip", "power_supply", "efficiency_chassis", "steepest_slope")
+#: Studied where no outputs are named, beside every channel.
+DEFAULT = ("slip", "power_supply", "efficiency_chassis", "steepest_slope")
 
 OutputRow = Output | Derived
 
@@ -67,7 +67,7 @@ def chosen_outputs(words: tuple[str, ...]) -> tuple[OutputRow, ...]:
     """
     known, found = known_outputs(), []
     start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
-    for word in words or DEFAULT:
+    for word in words or (*channels.names(), *DEFAULT):
         for name in start if word == "start" else (word,):
             if name not in known:
                 raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
