@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from mmrjax.params import Scalar, parameter
+from mmrjax.tables import COULOMB_PER_MAH
 
-COULOMB_PER_MAH = 3.6
+__all__ = ["COULOMB_PER_MAH", "Battery"]
 
 
 class Battery(eqx.Module):

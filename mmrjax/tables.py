@@ -13,6 +13,9 @@ TEETH_BELT, TEETH_PULLEY, GROUSERS = 168, 48, 24
 PITCH_TOOTH, PITCH_GROUSER = 5e-3, 35e-3
 RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 
+#: Charge that a battery's maker states in mAh, in coulombs.
+COULOMB_PER_MAH = 3.6
+
 #: Axes of Table 8.
 SLOPES_DEG = (0.0, 5.0, 10.0, 15.0, 20.0)
 PAYLOADS_KG = (0.0, 1.5, 3.0, 5.0, 6.5, 8.0)

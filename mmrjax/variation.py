@@ -177,7 +177,8 @@ def _evaluate(
 
         _known(names, table_of_outputs.names())
         robot, each = variation.at(values, conditions)
-        return steady_outputs(robot, jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each), names)
+        each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
+        return steady_outputs(robot, each, (*names, STATUS))
     simulate = fidelities.get(fidelity).run
     if not variation.varies_robot:
         return _picked(simulate(*variation.at(values, conditions), options), names)

@@ -147,6 +147,10 @@ def simulate(
     "--set 6T2A.ground.friction.static=0.6"
 )
 def sweep(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[CONFIG.toml]", help="TOML file with \\[axes] or \\[samples] (docs/sweeps.md)."),
+    ] = None,
     configurations: Annotated[
         str | None, typer.Option(help="Comma-separated, of the robot's.  \\[default: all that it has]")
     ] = None,
@@ -171,6 +175,21 @@ def sweep(
     discharge: _Discharge = None,
     chunk: _Chunk = None,
     posterior: _Posterior = None,
+    zarr: Annotated[
+        bool, typer.Option("--zarr", help="Write a Zarr store, also of the grid of the options.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say points, chunks, bytes and time; write nothing.")
+    ] = False,
+    shard: Annotated[
+        str | None, typer.Option(help="Simulate the i-th of n shares, as 3/8: a process of a job array each.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a dask scheduler whose workers simulate, as tcp://host:8786.")
+    ] = None,
+    export: Annotated[
+        list[str] | None, typer.Option(help="Write the store as csv or parquet too, repeatable.")
+    ] = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
@@ -178,10 +197,11 @@ def sweep(
 ) -> int:
     """Simulate every combination of a grid in vmapped batches: Table 8 in every configuration by default.
 
-    An axis is 0,5,10 or first:last:step as 0:20:0.5. An interrupted sweep goes on with the same command
+    An axis is 0,5,10 or first:last:step as 0:20:0.5. With a CONFIG.toml any parameter or condition varies, as a grid
+    or sampled, and results go to a Zarr store (docs/sweeps.md). An interrupted sweep goes on with the same command
     and the same --out.
     """
-    from sweeps import config
+    from sweeps import config, config_campaign
 
     options = _options(
         model=model,
@@ -202,7 +222,16 @@ def sweep(
         "slopes_deg": config.axis("--slopes", slopes),
         "surface": surface,
     }
-    resolved = _prepared(config.resolve(config.Sweep, config_file, options), no_cache)
+    if file is not None and config_file is not None:
+        raise InputError(f"--config: got {config_file} beside {file}; expected one of them")
+    file = config_file if file is None else file
+    how = config_campaign.how(shard, scheduler, export, dry_run)
+    if zarr or how != config_campaign.How() or config_campaign.is_campaign(file):
+        stored = _prepared(config_campaign.resolve_campaign(file, options), no_cache)
+        from sweeps import campaign
+
+        return campaign.campaign(stored, file.name if file is not None else "options", out, force, how)
+    resolved = _prepared(config.resolve(config.Sweep, file, options), no_cache)
     from sweeps import sweep as room
 
     return room.sweep(resolved, out, force)

@@ -283,18 +283,25 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
 C = TypeVar("C", bound=Part)
 
 
+def read_toml(file: Path) -> dict[str, Any]:
+    """The keys of a TOML file.
+
+    Raises:
+        BadConfiguration: the file cannot be read.
+    """
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadConfiguration(f"{file}: not a readable TOML file ({error})") from error
+
+
 def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
 
     Raises:
         BadConfiguration: unreadable file, unknown key, or a value out of range; one sentence.
     """
-    values: dict[str, Any] = {}
-    if file is not None:
-        try:
-            values = tomllib.loads(file.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise BadConfiguration(f"{file}: not a readable TOML file ({error})") from error
+    values: dict[str, Any] = {} if file is None else read_toml(file)
     given = {k: v for k, v in options.items() if v is not None}
     if "set" in given:
         stated = values.get("set", {})
@@ -383,14 +390,16 @@ def as_toml(config: Part) -> str:
     """The resolved configuration; `--config` accepts it."""
     lines = []
     values = config.model_dump()
-    table = values.pop("set")
+    values["set"] = values.pop("set")  # tables come last
     if isinstance(config, FidelityPart):
         values |= {"duration_s": None, "step_s": None} | {f"{name}_s": v for name, v in config.options.items()}
+    tables = {key: value for key, value in values.items() if isinstance(value, dict)}
     for key, value in values.items():
-        if value is None:  # left to the fidelity or the robot
+        if value is None or key in tables:  # None is left to the fidelity or the robot
             continue
         lines.append(f"{key} = {_toml(value)}")
-    lines += ["", "[set]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
+    for key, table in tables.items():
+        lines += ["", f"[{key}]", *(f'"{name}" = {_toml(value)}' for name, value in table.items())]
     return "\n".join(lines) + "\n"
 
 
@@ -401,4 +410,6 @@ def _toml(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, tuple | list):
         return "[" + ", ".join(_toml(v) for v in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(name)} = {_toml(v)}" for name, v in value.items()) + "}"
     return repr(value)

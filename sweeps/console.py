@@ -8,7 +8,17 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
 
 _WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
 _out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
@@ -25,11 +35,26 @@ def tell(text: str) -> None:
     _err.print(text)
 
 
+class RateColumn(ProgressColumn):
+    """How many a second."""
+
+    def render(self, task: Task) -> Text:
+        """Of the latest minute, and of the whole at the end."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:,.0f}/s")
+
+
 @contextmanager
-def progress(total: int, quiet: bool, doing: str = "simulating") -> Iterator[Callable[[float], None]]:
-    """A bar on stderr; gives a function that is called with how much more is done."""
-    columns = (TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_err, disable=quiet) as bar:
-        task = bar.add_task("", total=total)
+def progress(
+    total: int, quiet: bool, doing: str = "simulating", done: int = 0, rate: bool = False
+) -> Iterator[Callable[[float], None]]:
+    """A bar on stderr; gives a function that is called with how much more is done.
+
+    Args:
+        done: of the total already; rate: whether to show how many are done in a second.
+    """
+    columns = [TextColumn(doing), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()]
+    with Progress(*columns, *([RateColumn()] if rate else []), console=_err, disable=quiet) as bar:
+        task = bar.add_task("", total=total, completed=done)
         # rounded, or the sum of a chunk's shares would end a hair below its runs
         yield lambda count: bar.update(task, completed=round(bar.tasks[task].completed + count, 6))

@@ -54,6 +54,8 @@ class Facts:
         module: that holds its `FIDELITY`.
         description: one line.
         chunk: runs in one vmapped call.
+        chunk_stored: runs in one call of a sweep into a store, a file a chunk: many on a processor, and on an
+            accelerator; None: `chunk`.
         effort: of a calibration through it.
         options: that it has.
         rollout: whether it integrates over time; searches through it then run one by one, and end sooner.
@@ -68,6 +70,7 @@ class Facts:
     chunk: int
     effort: Effort
     options: tuple[Option, ...] = ()
+    chunk_stored: tuple[int, int] | None = None
     rollout: bool = False
     histories: bool = False
     computes: tuple[str, ...] = ()
@@ -109,12 +112,14 @@ TABLE: dict[str, Facts] = {
         "mmrjax.fidelities.steady",
         "the operating point as a root of the balances, with implicit derivatives",
         chunk=16_384,
+        chunk_stored=(262_144, 4_194_304),
         effort=Effort(starts=64, profiles=True, blocks=True),
     ),
     "drive": Facts(
         "mmrjax.fidelities.drive",
         "the ODE of drives and chassis, with slip, inductance and battery",
         chunk=4_096,
+        chunk_stored=(4_096, 65_536),
         effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration(30.0),),
         rollout=True,
@@ -124,6 +129,7 @@ TABLE: dict[str, Facts] = {
         "mmrjax.fidelities.track",
         "half a robot as multibody dynamics in MuJoCo MJX, its contacts resolved one by one",
         chunk=512,
+        chunk_stored=(512, 16_384),
         effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration(1.5), _STEP),
         rollout=True,

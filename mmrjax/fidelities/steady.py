@@ -142,16 +142,15 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
     Args:
         robot: leaves are scalars, or arrays of shape (points,).
         conditions: shape (points,).
-        names: of `outputs.table()`, and `flags`.
+        names: of `outputs.table()`, `status` and `flags`.
 
     Returns:
-        By name in SI units, and `status`; shape (points,).
+        By name in SI units, shape (points,).
     """
     axes = jax.tree.map(lambda x: 0 if eqx.is_array(x) and x.ndim else None, robot)
     found = jax.vmap(steady, in_axes=(axes, 0))(robot, conditions)
     rows = {row.name: row for row in outputs.table()}
-    chosen = {name: found.flags if name == "flags" else rows[name].get(found) for name in names}
-    return {**chosen, "status": found.status}
+    return {name: rows[name].get(found) if name in rows else getattr(found, name) for name in names}
 
 
 def _settled(robot: Robot, conditions: Conditions) -> Result:

@@ -1,0 +1,116 @@
+"""What a sweep into a store is told: its own tables, or the grid of the options, and how it is run."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from calibration.data.errors import BadConfiguration, choices
+from mmrjax.tables import COULOMB_PER_MAH
+from sweeps.config import BatchPart, OutputPart, RobotPart, Sweep, read_toml, resolve
+
+#: Keys that only a sweep into a store has.
+KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression")
+#: Options of a grid, which a file with axes of its own has no use for.
+GRID = (
+    "configurations", "voltages_V", "payloads_kg", "slopes_deg", "surface", "battery", "discharge_mAh",
+)  # fmt: skip
+EXPORTS = ("csv", "parquet")
+
+
+class Campaign(RobotPart, BatchPart, OutputPart):
+    """A sweep of any size over any names, into a Zarr store; `sweeps.axes` reads its tables.
+
+    Attributes:
+        conditions: those that do not vary, by name.
+        axes: of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
+        samples: a sampled design: design, number, seed, over (distributions by name), posterior.
+        outputs: names of `mmrjax.outputs.table()`, of columns of the fidelity, or flags; empty: the channels.
+        storage: type in which outputs are stored.
+        compression: of the store's chunks.
+    """
+
+    conditions: dict[str, Any] = Field(default_factory=dict)
+    axes: dict[str, Any] = Field(default_factory=dict)
+    samples: dict[str, Any] = Field(default_factory=dict)
+    outputs: tuple[str, ...] = ()
+    storage: Literal["float64", "float32"] = "float64"
+    compression: Literal["none", "zstd"] = "none"
+
+
+@dataclasses.dataclass(frozen=True)
+class How:
+    """How a sweep is run, which does not change its numbers.
+
+    Attributes:
+        shard: this process's share of the chunks, k of n; scheduler: address of a dask scheduler.
+        export: further files, of `EXPORTS`; dry_run: say what would be done, and write nothing.
+    """
+
+    shard: tuple[int, int] | None = None
+    scheduler: str | None = None
+    export: tuple[str, ...] = ()
+    dry_run: bool = False
+
+
+def how(shard: str | None, scheduler: str | None, export: Sequence[str] | None, dry_run: bool) -> How:
+    """The options of a sweep, checked.
+
+    Raises:
+        BadConfiguration: a share that is none, an unknown kind of file.
+    """
+    share = None
+    if shard is not None:
+        match = re.fullmatch(r"(\d+)/(\d+)", shard)
+        share = (int(match[1]), int(match[2])) if match else (0, 0)
+        if not 1 <= share[0] <= share[1]:
+            raise BadConfiguration(f"--shard: got {shard}; expected i/n with i from 1 to n, such as 3/8")
+    for kind in export or ():
+        if kind not in EXPORTS:
+            raise BadConfiguration(f"--export: got {kind}; {choices(kind, EXPORTS)}")
+    if share is not None and scheduler is not None:
+        raise BadConfiguration("--shard: got it beside --scheduler, which shares out the chunks itself; expected one")
+    return How(share, scheduler, tuple(dict.fromkeys(export or ())), dry_run)
+
+
+def is_campaign(file: Path | None) -> bool:
+    """Whether a file states axes or samples of its own, or anything else that only a store has.
+
+    Raises:
+        BadConfiguration: the file cannot be read.
+    """
+    return file is not None and not set(KEYS).isdisjoint(read_toml(file))
+
+
+def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign:
+    """The configuration of a sweep into a store: of its file, or the grid of the options (or of such a file).
+
+    Raises:
+        BadConfiguration: as `resolve`; an option of the grid beside a file with axes of its own.
+    """
+    if is_campaign(file):
+        assert file is not None
+        for name in GRID:
+            if options.get(name) is not None:
+                raise BadConfiguration(
+                    f"option {name}: acts with a grid of options only; expected it in {file.name}, among its axes or "
+                    "conditions"
+                )
+        return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID})
+    grid = resolve(Sweep, file, options)
+    axes = {"voltage": grid.voltages_V, "payload": grid.payloads_kg, "slope_deg": grid.slopes_deg}
+    names = "all" if grid.configurations is None else list(grid.configurations)
+    return Campaign(
+        **{key: getattr(grid, key) for key in Sweep.model_fields if key in Campaign.model_fields},
+        axes={"configuration": names, **{name: list(values) for name, values in axes.items()}},
+        conditions={
+            "surface": grid.surface,
+            "battery": grid.battery,
+            "discharge": grid.discharge_mAh * COULOMB_PER_MAH,
+        },
+    )

@@ -1,0 +1,315 @@
+"""The points of a sweep: axes of a grid crossed with a sampled design, each point known from its number alone.
+
+Nothing here depends on chunks, devices or jax: point k of a design is a function of the seed and of k, in NumPy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Int, UInt64
+
+#: Dimension of the sampled points in a store.
+SAMPLE = "sample"
+
+
+class Joint(Protocol):
+    """Several names that are sampled together, from as many independent normal scores as it has coordinates."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What it gives values to."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of coordinates."""
+        ...
+
+    def values(self, normal_scores: Float[np.ndarray, "points coordinates"]) -> Float[np.ndarray, "points names"]:
+        """Values of the names at each point."""
+        ...
+
+
+#: Points of a joint distribution that are computed together: a sum over coordinates may depend on how many there are.
+TOGETHER = 4096
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """A sampled design over some names.
+
+    Attributes:
+        design: one of `DESIGNS`; number: of points; seed: of everything random.
+        marginals: quantile function of each name, from (0, 1) to its unit; names: theirs.
+        joint: further names that are sampled together, a posterior; they take the design's last dimensions.
+    """
+
+    design: str
+    number: int
+    seed: int
+    marginals: dict[str, Callable[[np.ndarray], np.ndarray]]
+    joint: Joint | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is sampled, in order."""
+        return (*self.marginals, *(self.joint.names if self.joint is not None else ()))
+
+    def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
+        """Values of `count` points from number `first` on, a row a name."""
+        if self.joint is not None:
+            begin = first - first % TOGETHER
+            blocks = [self._block(self.joint, k) for k in range(begin, first + count, TOGETHER)]
+            return np.concatenate(blocks, axis=1)[:, first - begin : first - begin + count]
+        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals), first, count)
+        return np.array([quantile(u) for quantile, u in zip(self.marginals.values(), unit, strict=True)])
+
+    def _block(self, joint: Joint, first: int) -> Float[np.ndarray, "names points"]:
+        from scipy.special import ndtri
+
+        single = len(self.marginals)
+        unit = DESIGNS[self.design](self.seed, self.number, single + len(joint), first, TOGETHER)
+        rows = [quantile(u) for quantile, u in zip(self.marginals.values(), unit[:single], strict=True)]
+        with _on_host():
+            return np.array([*rows, *np.asarray(joint.values(ndtri(unit[single:]).T)).T])
+
+
+def _on_host() -> contextlib.AbstractContextManager[object]:
+    """What a distribution computes with jax is the same whatever the sweep runs on."""
+    import jax
+
+    return jax.default_device(jax.local_devices(backend="cpu")[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Design:
+    """Every combination of the axes' values, each crossed with every sampled point.
+
+    Attributes:
+        axes: values of each name, in order; the last varies fastest, the samples faster still.
+        samples: None for a plain grid.
+    """
+
+    axes: dict[str, np.ndarray]
+    samples: Samples | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What varies: axes, then samples."""
+        return (*self.axes, *(self.samples.names if self.samples is not None else ()))
+
+    @property
+    def dimensions(self) -> tuple[str, ...]:
+        """Names of the dimensions of every output."""
+        return (*self.axes, *((SAMPLE,) if self.samples is not None else ()))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of the dimensions."""
+        return (*(len(v) for v in self.axes.values()), *((self.samples.number,) if self.samples is not None else ()))
+
+    @property
+    def points(self) -> int:
+        """How many there are."""
+        return math.prod(self.shape)
+
+    def block(self, box: tuple[slice, ...]) -> Float[np.ndarray, "points names"]:
+        """Values of the points of a box, a row a point, in the order of `names`; laid out a column a name."""
+        sizes = tuple(b.stop - b.start for b in box)
+        values = np.empty((len(self.names), *sizes))
+        for k, axis in enumerate(self.axes.values()):
+            along = (slice(None),) + (None,) * (len(sizes) - k - 1)
+            values[k] = axis[box[k]][along]
+        if self.samples is not None:
+            drawn = self.samples.values(box[-1].start, sizes[-1])
+            for k, row in enumerate(drawn, len(self.axes)):
+                values[k] = row
+        return values.reshape(len(self.names), -1).T
+
+    def at(self, numbers: Int[np.ndarray, " points"]) -> Float[np.ndarray, "points names"]:
+        """Values of single points by their number, the last dimension fastest; for few points."""
+        places = np.array(np.unravel_index(np.asarray(numbers), self.shape)).T
+        return np.concatenate([self.block(tuple(slice(i, i + 1) for i in map(int, place))) for place in places])
+
+
+@dataclasses.dataclass(frozen=True)
+class Blocks:
+    """The chunks of a sweep: equal boxes of consecutive points, those at the end of the split axis smaller.
+
+    Attributes:
+        shape: of all points; size: of one box, 1 along the axes before the split one and whole along those after.
+    """
+
+    shape: tuple[int, ...]
+    size: tuple[int, ...]
+
+    @staticmethod
+    def of(shape: tuple[int, ...], most: int) -> Blocks:
+        """Boxes of at most `most` points, as alike as they can be."""
+        size, inner = [1] * len(shape), 1
+        for k in reversed(range(len(shape))):
+            if inner * shape[k] > most:
+                parts = math.ceil(shape[k] / max(most // inner, 1))
+                size[k] = math.ceil(shape[k] / parts)
+                break
+            size[k] = shape[k]
+            inner *= shape[k]
+        return Blocks(shape, tuple(size))
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Boxes along each axis."""
+        return tuple(math.ceil(n / s) for n, s in zip(self.shape, self.size, strict=True))
+
+    @property
+    def points(self) -> int:
+        """Points of a full box."""
+        return math.prod(self.size)
+
+    def __len__(self) -> int:
+        return math.prod(self.counts)
+
+    def place(self, number: int) -> tuple[int, ...]:
+        """Position of a chunk along each axis."""
+        place = []
+        for count in reversed(self.counts):
+            number, k = divmod(number, count)
+            place.append(k)
+        return tuple(reversed(place))
+
+    def box(self, number: int) -> tuple[slice, ...]:
+        """The points of a chunk along each axis."""
+        at = zip(self.place(number), self.size, self.shape, strict=True)
+        return tuple(slice(k * s, min((k + 1) * s, n)) for k, s, n in at)
+
+    def count(self, number: int) -> int:
+        """Points of a chunk."""
+        return math.prod(b.stop - b.start for b in self.box(number))
+
+
+# --- designs: (seed, number of points, dimensions, first, count) to numbers in (0, 1), shape (dimensions, count) ----
+
+Unit = Float[np.ndarray, "dimensions points"]
+
+
+def _key(seed: int, dimension: int, use: str) -> int:
+    """128 bits that no other dimension or use of the same seed has."""
+    return int.from_bytes(hashlib.blake2b(f"{seed} {dimension} {use}".encode(), digest_size=16).digest(), "little")
+
+
+def uniform(key: int, first: int, count: int) -> Float[np.ndarray, " points"]:
+    """Numbers in (0, 1) of a counter-based generator (Philox 4 x 64, Salmon et al. 2011), from number `first` on."""
+    generator = np.random.Philox(key=key)
+    generator.advance(first // 4)  # each step of its counter gives four words
+    words = generator.random_raw(first % 4 + count)[first % 4 :]
+    return ((words >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
+
+
+def random(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
+    """Independent points."""
+    return np.array([uniform(_key(seed, d, "random"), first, count) for d in range(dimensions)])
+
+
+def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
+    """Points of which each of `number` equal slices of every dimension holds one (McKay et al. 1979).
+
+    The slice of point k is a keyed permutation of k, so that no point needs the others.
+    """
+    unit = np.empty((dimensions, count))
+    for d in range(dimensions):
+        jitter = uniform(_key(seed, d, "jitter"), first, count)
+        points = np.minimum(np.arange(first, first + count, dtype=np.uint64), np.uint64(number - 1))
+        slices = permutation(_key(seed, d, "slices"), number, points)
+        unit[d] = (slices + jitter) / number
+    return np.clip(unit, 2.0**-54, 1 - 2.0**-53)
+
+
+#: Rounds of the network that permutes; four are what Luby and Rackoff (1988) need, the rest for weak round functions.
+ROUNDS = 8
+
+
+def permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) -> UInt64[np.ndarray, " points"]:
+    """A keyed pseudo-random permutation of 0 .. number - 1 at some points.
+
+    A Feistel network on a x b >= number with additions modulo a and b in turn (Black and Rogaway 2002, FE2-like);
+    what falls outside walks the cycle until it is inside, which less than 2 / sqrt(number) of the points do.
+    """
+    if number == 1:
+        return np.zeros_like(points)
+    a = math.isqrt(number - 1) + 1
+    b = -(-number // a)
+    keys = np.random.Philox(key=key).random_raw(ROUNDS)
+    answer, left = np.array(points), np.arange(len(points))
+    while len(left):
+        high, low = np.divmod(answer[left], np.uint64(b))
+        for k in range(0, ROUNDS, 2):
+            high = (high + _mixed(low, keys[k]) % np.uint64(a)) % np.uint64(a)
+            low = (low + _mixed(high, keys[k + 1]) % np.uint64(b)) % np.uint64(b)
+        found = high * np.uint64(b) + low
+        answer[left] = found
+        left = left[found >= number]
+    return answer
+
+
+def _mixed(words: UInt64[np.ndarray, " n"], key: np.uint64) -> UInt64[np.ndarray, " n"]:
+    """The finaliser of splitmix64 (Steele et al. 2014) on words and a key."""
+    with np.errstate(over="ignore"):
+        x = words * np.uint64(0x9E3779B97F4A7C15) + key
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return x ^ (x >> np.uint64(31))
+
+
+#: Bits of a Sobol number, which a double holds beside the half that keeps it off 0.
+BITS = 52
+_LOW = 12  # bits of a point's number whose part is tabulated
+
+
+def sobol(seed: int, number: int, dimensions: int, first: int, count: int) -> Unit:
+    """The scrambled Sobol sequence as `scipy.stats.qmc.Sobol` gives it (Joe and Kuo 2008), point by point.
+
+    The sequence without its first points is reached at once: point k is the sum modulo 2 of those direction numbers
+    that the Gray code of k has. Balanced where the number of points is a power of 2.
+    """
+    directions, shift = _directions(seed, dimensions)
+    table = np.zeros((dimensions, 1), np.uint64)  # of k = 0 .. 2^LOW - 1, in the order of Gray codes
+    for bit in range(_LOW):
+        table = np.concatenate([table, table[:, ::-1] ^ directions[:, bit : bit + 1]], axis=1)
+    unit = np.empty((dimensions, count))
+    size = 1 << _LOW
+    for block in range(first >> _LOW, ((first + count - 1) >> _LOW) + 1):
+        begin, end = max(first, block * size), min(first + count, (block + 1) * size)
+        # Gray code of block * 2^LOW + i is gray(i), its top bit turned over where the block is odd, and gray(block).
+        gray, high = block ^ (block >> 1), shift.copy()
+        for bit in range(gray.bit_length()):
+            if gray >> bit & 1:
+                high ^= directions[:, _LOW + bit]
+        if block & 1:
+            high ^= directions[:, _LOW - 1]
+        words = table[:, begin - block * size : end - block * size] ^ high[:, None]
+        unit[:, begin - first : end - first] = words.astype(float)
+    return (unit + 0.5) * 2.0**-BITS
+
+
+@functools.lru_cache(maxsize=8)
+def _directions(seed: int, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Scrambled direction numbers, shape (dimensions, BITS), and the digital shift, shape (dimensions,)."""
+    from scipy.stats import qmc
+
+    engine = qmc.Sobol(dimensions, scramble=True, bits=BITS, rng=np.random.default_rng(seed))
+    # SciPy keeps them to itself; a test compares with the points that it publishes.
+    return np.asarray(engine._sv, np.uint64), np.asarray(engine._shift, np.uint64)
+
+
+DESIGNS: dict[str, Callable[[int, int, int, int, int], Unit]] = {
+    "latin_hypercube": latin_hypercube,
+    "sobol": sobol,
+    "random": random,
+}

@@ -1,0 +1,250 @@
+"""Sweeps on dask workers: the same store as without, also when a worker is killed; schedulers that do not answer."""
+
+import importlib.util
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from test_cli import MMRJAX
+from test_effect_file import GOOD
+from test_sweep_store import CONFIG, arrays
+
+from calibration.data.errors import BadConfiguration
+from mmrjax import robots
+from sweeps import axes, campaign, cluster, identity
+from sweeps.config_campaign import Campaign
+
+pytest.importorskip("distributed")
+
+
+class Cluster:
+    """A scheduler and workers, processes of their own."""
+
+    def __init__(self, folder: Path, workers: int, nanny: str = "--no-nanny") -> None:
+        self.folder = folder
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONWARNINGS": "ignore"}
+        self.log = (folder / "cluster.log").open("w")
+
+        def start(*words):
+            return subprocess.Popen(words, cwd=folder, env=environment, stdout=self.log, stderr=self.log)
+
+        self.port = free_port()
+        self.address = f"tcp://127.0.0.1:{self.port}"
+        self.scheduler = start(
+            sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(self.port),
+            "--no-dashboard",
+        )  # fmt: skip
+        self.workers = [
+            start(
+                sys.executable, "-m", "distributed.cli.dask_worker", self.address, "--nthreads", "1", "--no-dashboard",
+                nanny, "--local-directory", str(folder / f"worker-{k}"),
+            )
+            for k in range(workers)
+        ]  # fmt: skip
+
+    def close(self) -> None:
+        for process in (*self.workers, self.scheduler):
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        self.log.close()
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+@pytest.fixture
+def two_workers(tmp_path):
+    folder = tmp_path / "cluster"
+    folder.mkdir()
+    running = Cluster(folder, 2)
+    yield running
+    running.close()
+
+
+def command(folder, *options, timeout=300):
+    words = [*MMRJAX, "sweep", "plan.toml", *map(str, options)]
+    return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout)
+
+
+def test_sweep_on_two_workers_leaves_the_same_store(tmp_path, two_workers):
+    (tmp_path / "plan.toml").write_text(CONFIG.replace("chunk = 40", "chunk = 5"))
+    there = command(tmp_path, "--scheduler", two_workers.address, "--out", "there")
+    assert there.returncode == 3, there.stderr
+    here = command(tmp_path, "--out", "here")
+    assert here.returncode == 3, here.stderr
+    assert arrays(tmp_path / "there") == arrays(tmp_path / "here")
+
+
+@pytest.mark.slow
+def test_worker_killed_in_the_middle_changes_nothing(tmp_path, two_workers):
+    """Of two workers one is killed when a third of the chunks is there; the other does the rest."""
+    config = CONFIG.replace("chunk = 40", "chunk = 10").replace("number = 50", "number = 2000")
+    (tmp_path / "plan.toml").write_text(config)
+    killed = []
+
+    def kill():
+        journal = tmp_path / "there.partial" / "journal" / "1-of-1.jsonl"
+        while not journal.exists() or journal.read_text().count("\n") < 400:
+            time.sleep(0.01)
+        two_workers.workers[0].send_signal(signal.SIGKILL)
+        killed.append(journal.read_text().count("\n"))
+
+    thread = threading.Thread(target=kill, daemon=True)
+    thread.start()
+    there = command(tmp_path, "--scheduler", two_workers.address, "--out", "there")
+    assert there.returncode == 3, there.stderr
+    assert killed and killed[0] < 1100  # of 1200: it was in the middle
+    assert two_workers.workers[0].poll() is not None and two_workers.workers[1].poll() is None
+    assert command(tmp_path, "--out", "here").returncode == 3
+    assert arrays(tmp_path / "there") == arrays(tmp_path / "here")
+
+
+def test_scheduler_that_does_not_answer_is_refused_in_ten_seconds(tmp_path):
+    (tmp_path / "plan.toml").write_text(CONFIG)
+    with socket.socket() as silent:  # takes the connection and says nothing
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        begin = time.perf_counter()
+        done = command(tmp_path, "--out", "s", "--scheduler", address, timeout=60)
+        took = time.perf_counter() - begin
+    assert done.returncode == 2 and done.stderr == (
+        f"mmrjax: --scheduler: got {address}; no scheduler answers there within 4 s (silence); expected the address that "
+        "dask scheduler prints, such as tcp://host:8786\n"
+    )
+    assert took < 10 and [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
+
+
+def test_scheduler_without_dask_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(BadConfiguration, match=r"--scheduler: needs dask; install mmrjax\[cluster\]"):
+        cluster.connect("tcp://127.0.0.1:1")
+
+
+def test_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "cluster").mkdir()
+    alone = Cluster(tmp_path / "cluster", 0)
+    monkeypatch.setattr(cluster, "ANSWER", 3.0)
+    try:
+        with pytest.raises(BadConfiguration, match=r"has no workers; start one for each device, as dask worker tcp"):
+            connect_when_up(alone.address)
+    finally:
+        alone.close()
+
+
+def test_worker_with_another_program_is_refused(two_workers, monkeypatch):
+    honest = identity._code()
+    changed = tuple((f, "0" * 16 if f == "mmrjax/motor.py" else h) for f, h in honest)
+    monkeypatch.setattr(identity, "_code", lambda: changed)
+    with pytest.raises(BadConfiguration, match=r"has another program; it differs in code \(mmrjax/motor\.py\)"):
+        connect_when_up(two_workers.address)
+    monkeypatch.undo()
+    pool = cluster.connect(two_workers.address)
+    assert pool.device.startswith("cpu")
+    pool.close()
+
+
+def connect_when_up(address):
+    """The scheduler of a test takes a moment to start."""
+    for _ in range(20):
+        try:
+            pool = cluster.connect(address)
+        except BadConfiguration as error:
+            if "no scheduler answers" not in str(error):
+                raise
+            time.sleep(0.2)
+        else:
+            pool.close()
+            return
+
+
+def test_users_own_effects_travel_to_the_workers(tmp_path, two_workers):
+    (tmp_path / "mine.py").write_text(GOOD)
+    (tmp_path / "sealed.toml").write_text("[effects.seal_drag]\namplitude = 0.05\n")
+    config = 'effects = ["mine.py"]\nrobot = "sealed.toml"\n' + CONFIG.replace("chunk = 40", "chunk = 100")
+    (tmp_path / "plan.toml").write_text(config)
+    done = command(tmp_path, "--scheduler", two_workers.address, "--out", "there")
+    assert done.returncode == 3, done.stderr
+    assert command(tmp_path, "--out", "here").returncode == 3
+    assert arrays(tmp_path / "there") == arrays(tmp_path / "here")
+
+
+@pytest.fixture
+def job():
+    """Ten chunks of one point each."""
+    config = Campaign(axes={"voltage": [*range(15, 25)]}, chunk=1, outputs=("speed",))
+    robot = robots.nominal()
+    return campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
+
+
+@pytest.mark.filterwarnings("ignore")  # of dask, about what it loses here
+@pytest.mark.parametrize(
+    "victim, message", [("workers", "no worker has been there for 1 s; start one"), ("scheduler", "it has gone away")]
+)
+def test_workers_or_scheduler_lost_for_good_end_the_sweep(two_workers, job, monkeypatch, victim, message):
+    monkeypatch.setattr(cluster, "WORKER", 1.0)
+    pool = cluster.connect(two_workers.address)
+    try:
+        pieces = pool.produce(job, range(10))
+        next(pieces)
+        for process in two_workers.workers if victim == "workers" else [two_workers.scheduler]:
+            process.kill()
+        with pytest.raises(cluster.LostWorkers, match=message):
+            list(pieces)
+    finally:
+        pool.client.close(timeout=2)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
+def test_chunk_that_kills_its_workers_ends_the_sweep(tmp_path, job, monkeypatch):
+    (tmp_path / "cluster").mkdir()
+    restarting = Cluster(tmp_path / "cluster", 1, "--nanny")
+    deadly = eval("lambda *_: __import__('os')._exit(1)", {})  # of no module, so that it travels whole
+    monkeypatch.setattr(cluster, "compute", deadly)
+    monkeypatch.setattr(cluster, "RETRIES", 0)
+    pool = cluster.connect(restarting.address)
+    try:
+        with pytest.raises(cluster.LostWorkers, match=r"chunk 3 lost its worker 1 times, perhaps short of memory"):
+            list(pool.produce(job, [3]))
+    finally:
+        pool.client.close(timeout=2)
+        restarting.close()
+
+
+def test_worker_that_comes_later_and_differs_is_refused():
+    expected = {**cluster.program(), "device": {"device": "gpu: another"}}
+    with pytest.raises(BadConfiguration, match=r"a worker that came later has another program or device: device \("):
+        cluster.compute(b"", "x", 0, expected)
+
+
+def test_workers_of_several_kinds_are_refused(monkeypatch):
+    class Client:
+        closed = False
+
+        def wait_for_workers(self, *_, **__):
+            pass
+
+        def run(self, _):
+            return {"tcp://a": (cluster.program(), "cpu: cpu"), "tcp://b": (cluster.program(), "gpu: H200")}
+
+        def close(self):
+            self.closed = True
+
+    client = Client()
+    monkeypatch.setattr(cluster, "_client", lambda _: client)
+    with pytest.raises(
+        BadConfiguration, match=r"workers have different devices, cpu: cpu, gpu: H200; expected one kind"
+    ):
+        cluster.connect("tcp://x:1")
+    assert client.closed

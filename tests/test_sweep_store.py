@@ -1,0 +1,546 @@
+"""Sweeps into a store: what xarray reads, resumption bit by bit, shares, devices, and what is refused."""
+
+import csv
+import dataclasses
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from test_cli import MMRJAX, mmrjax  # noqa: F401
+
+from mmrjax import params, robots
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.steady import steady
+from mmrjax.signals import STATUSES
+from sweeps import campaign, identity, scale, zarr_store
+
+CONFIG = """report = false
+chunk = 40
+[conditions]
+payload = 3
+[axes]
+configuration = "all"
+slope_deg = [0, 5, 20]
+[samples]
+design = "latin_hypercube"
+number = 50
+seed = 7
+[samples.over]
+"motor.resistance" = "prior"
+voltage = {distribution = "uniform", low = 15, high = 33}
+"""
+POINTS, CHUNKS = 300, 12
+
+
+@pytest.fixture
+def sweep(mmrjax, tmp_path):  # noqa: F811
+    """Sweep the configuration above, or another, into a folder; returns exit code, stdout and stderr."""
+    (tmp_path / "plan.toml").write_text(CONFIG)
+
+    def command(out, *options, config=None):
+        if config is not None:
+            (tmp_path / "plan.toml").write_text(config)
+        return mmrjax("sweep", "plan.toml", "--out", out, *options)
+
+    return command
+
+
+def arrays(folder):
+    """Bytes of every file of a store."""
+    store = Path(folder) / zarr_store.STORE
+    return {str(f.relative_to(store)): f.read_bytes() for f in sorted(store.rglob("*")) if f.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The store that the configuration above gives when nothing goes wrong."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "plan.toml").write_text(CONFIG)
+    done = subprocess.run([*MMRJAX, "sweep", "plan.toml", "--out", "s"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 3, done.stderr  # some slide
+    return folder / "s"
+
+
+# --- what is left -------------------------------------------------------------------------------------------
+
+
+def test_store_is_opened_by_xarray_with_units_and_long_names(whole):
+    found = xr.open_zarr(whole / zarr_store.STORE)
+    assert dict(found.sizes) == {"configuration": 2, "slope_deg": 3, "sample": 50}
+    assert found["configuration"].values.tolist() == ["6T2A", "4W2T"]
+    assert found["slope_deg"].values.tolist() == [0, 5, 20]
+    assert {"motor.resistance", "voltage"} <= set(found.coords)
+    units = {name: found[name].attrs.get("units") for name in (*found.data_vars, *found.coords)}
+    assert units == {
+        "total_current": "A", "motor_speed": "rpm", "speed": "mm/s", "status": None, "configuration": None,
+        "slope_deg": "deg", "motor.resistance": "Ohm", "voltage": "V",
+    } | {"motor.resistance": next(p.spec.unit for p in params.walk(robots.nominal()) if p.name == "motor.resistance")}  # fmt: skip
+    assert all(found[name].attrs["long_name"] for name in units)
+    meanings = dict(zip(found.status.attrs["flag_values"], found.status.attrs["flag_meanings"].split(), strict=True))
+    assert [meanings[k] for k in range(len(STATUSES))] == list(STATUSES) and found.status.dtype == np.uint8
+
+
+def test_store_holds_each_point_as_it_is_by_itself(whole):
+    found = xr.open_zarr(whole / zarr_store.STORE).load()
+    for which, slope, sample in [(0, 0, 0), (1, 1, 49), (0, 2, 17)]:
+        at = found.isel(configuration=which, slope_deg=slope, sample=sample)
+        robot = params.replace(robots.nominal(), {"motor.resistance": float(at["motor.resistance"])})
+        alone = steady(robot, Conditions(which, float(at.voltage), float(at.slope_deg), 3.0))
+        assert int(at.status) == int(alone.status)
+        np.testing.assert_allclose(at.total_current, alone.total_current, rtol=1e-12)
+        np.testing.assert_allclose(at.speed, 1e3 * alone.speed, rtol=1e-12)
+    assert not np.isfinite(found.speed.values[found.status.values == 2]).any()
+
+
+def test_result_counts_statuses_and_states_ranges(whole):
+    found = xr.open_zarr(whole / zarr_store.STORE).load()
+    result = json.loads((whole / "result.json").read_text())
+    assert result["schema"] == "mmrjax.sweep_store/1" and result["points"] == POINTS
+    for code, status in enumerate(STATUSES):
+        assert result["statuses"][status] == int((found.status == code).sum())
+    assert result["outputs"]["total_current"] == {
+        "unit": "A", "least": float(found.total_current.min()), "greatest": float(found.total_current.max()),
+    }  # fmt: skip
+    assert result["statuses"]["slides"] > 0
+    manifest = json.loads((whole / "manifest.json").read_text())
+    assert manifest["statuses"] == result["statuses"] and manifest["seed"] == 7
+
+
+def test_store_agrees_with_the_table_of_the_same_grid(mmrjax, tmp_path):  # noqa: F811
+    grid = ["--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--surface", "asphalt", "--no-report"]
+    assert (
+        mmrjax("sweep", *grid, "--out", "table")[0]
+        == mmrjax("sweep", *grid, "--zarr", "--export", "csv", "--out", "z")[0]
+    )
+    with (tmp_path / "table" / "runs.csv").open() as one, (tmp_path / "z" / "runs.csv").open() as other:
+        table, exported = list(csv.DictReader(one)), list(csv.DictReader(other))
+    assert len(table) == len(exported) == 12 and set(exported[0]) < set(table[0])
+    for a, b in zip(table, exported, strict=True):
+        for key, value in b.items():
+            if key in ("configuration", "status"):
+                assert a[key] == value
+            else:
+                assert (a[key] == "") == (value == "")
+                assert not value or float(a[key]) == pytest.approx(float(value), rel=1e-8)
+
+
+def test_exports_hold_the_store_row_by_row(sweep, tmp_path, whole):
+    from pyarrow import csv as arrow
+    from pyarrow import parquet
+
+    code, _, err = sweep("s", "--export", "csv", "--export", "parquet")
+    assert code == 3 and "runs.parquet" in err
+    found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
+    one, other = parquet.read_table(tmp_path / "s" / "runs.parquet"), arrow.read_csv(tmp_path / "s" / "runs.csv")
+    assert one.column_names == other.column_names == [
+        "configuration", "slope_deg", "motor.resistance", "supply_voltage_V",
+        "total_current_A", "motor_speed_rpm", "speed_mm_s", "status",
+    ]  # fmt: skip
+    assert one.num_rows == other.num_rows == POINTS
+    for table in (one, other):
+        speed = table["speed_mm_s"].to_numpy()
+        np.testing.assert_array_equal(speed, found.speed.values.ravel())
+        assert table["status"].to_pylist() == [STATUSES[k] for k in found.status.values.ravel()]
+        np.testing.assert_array_equal(table["supply_voltage_V"].to_numpy()[:50], found.voltage.values)
+        assert table["configuration"].to_pylist() == ["6T2A"] * 150 + ["4W2T"] * 150
+    assert one["speed_mm_s"].null_count > 0  # a run that slides has no speed
+
+
+def test_outputs_storage_and_compression_are_as_stated(sweep, tmp_path, whole):
+    config = 'outputs = ["slip", "efficiency_motor", "flags"]\nstorage = "float32"\ncompression = "zstd"\n' + CONFIG
+    assert sweep("s", config=config)[0] == 3
+    found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
+    assert set(found.data_vars) == {"slip", "efficiency_motor", "flags", "status"}
+    assert found.slip.dtype == np.float32 and found.flags.dtype == np.uint8
+    assert (found.status.values == xr.open_zarr(whole / zarr_store.STORE).status.values).all()
+    assert found.slip.attrs == {"units": "1", "long_name": "slip"}
+    assert found["motor.resistance"].dtype == np.float64
+
+
+def test_resolved_configuration_and_robot_repeat_the_sweep(sweep, whole, tmp_path):
+    assert sweep("s", config=(whole / "config.resolved.toml").read_text())[0] == 3
+    assert sweep("t", "--robot", tmp_path / "s" / "robot.toml")[0] == 3
+    assert arrays("s") == arrays(whole) == arrays("t")
+
+
+@pytest.mark.parametrize("chunk", [7, 50, 1000])
+def test_chunks_change_no_sample_and_results_by_1e_12(sweep, whole, tmp_path, chunk):
+    assert sweep("s", "--chunk", chunk)[0] == 3
+    compare(tmp_path / "s", whole)
+
+
+def compare(one, other, rtol=1e-12):
+    one, other = (xr.open_zarr(f / zarr_store.STORE).load() for f in (one, other))
+    for name in other.coords:
+        assert np.array_equal(one[name], other[name]), name
+    assert np.array_equal(one.status, other.status)
+    for name in other.data_vars:
+        np.testing.assert_allclose(one[name], other[name], rtol=rtol, err_msg=name)
+
+
+def test_finished_sweep_is_not_simulated_again(sweep, monkeypatch, tmp_path):
+    assert sweep("s")[0] == 3
+    monkeypatch.setattr(scale, "Compiled", None)
+    code, out, _ = sweep("s", "--export", "parquet")
+    assert code == 3 and out.splitlines()[-1] == "s" and (tmp_path / "s" / "runs.parquet").is_file()
+    code, _, err = sweep("s", config=CONFIG.replace("seed = 7", "seed = 8"))
+    assert code == 2 and "s holds another sweep, which differs in configuration (samples.seed was 7, is 8)" in err
+
+
+@pytest.mark.parametrize("model, options", [("drive", "duration_s = 0.5"), ("track", "duration_s = 0.01")])
+def test_every_fidelity_is_swept_over_parameters(sweep, tmp_path, model, options):
+    config = (
+        f'model = "{model}"\n{options}\nreport = false\nchunk = 2\n[axes]\n"motor.resistance" = [0.6, 0.9, 1.2]\n'
+        '[conditions]\nslope_deg = 5\nconfiguration = "6T2A"\n'
+    )
+    if model == "track":
+        config = 'outputs = ["speed", "guide_share"]\n' + config
+    sweep("s", config=config)
+    found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
+    assert found.speed.dims == ("motor.resistance",) and np.isfinite(found.speed).all()
+    assert len(set(found.speed.values.tolist())) == 3
+    if model == "track":
+        assert ((found.guide_share > 0) & (found.guide_share < 1)).all()
+
+
+def test_track_step_that_a_corner_cannot_bear_is_refused_before_the_first_run(sweep, tmp_path):
+    config = 'model = "track"\nduration_s = 0.01\nstep_s = 1e-3\n[axes]\nslope_deg = [0, 5]\n'
+    code, _, err = sweep("s", config=config)
+    assert code == 2 and "--model track: at slope_deg 0: step: got 0.001 s" in err
+    assert not list(tmp_path.glob("s*"))
+
+
+# --- resumption ---------------------------------------------------------------------------------------------
+
+
+def stopping(monkeypatch, at, error):
+    """Let the writing of files fail from the `at`-th on."""
+    honest, count = zarr_store.write_file, iter(range(10**9))
+
+    def write(path, content, aside):
+        if next(count) >= at:
+            raise error
+        honest(path, content, aside)
+
+    monkeypatch.setattr(zarr_store, "write_file", write)
+    return lambda: monkeypatch.setattr(zarr_store, "write_file", honest)
+
+
+@pytest.mark.parametrize("at", [2, 5, 6, 7, 20, 33, 40])
+def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, tmp_path, at):
+    heal = stopping(monkeypatch, at, KeyboardInterrupt())
+    code, _, err = sweep("s")
+    assert code == 130 and "goes on where it stopped" in err and not (tmp_path / "s").exists()
+    heal()
+    computed, honest = [], scale.Compiled.__call__
+    monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
+    code, _, err = sweep("s")
+    assert code == 3 and not (tmp_path / "s.partial").exists()
+    done = CHUNKS - len(computed)
+    assert (done > 0) == ("goes on after" in err) == (at > 6)
+    assert arrays("s") == arrays(whole)
+
+
+def test_interrupt_before_a_chunk_is_done_leaves_nothing(sweep, monkeypatch, tmp_path):
+    stopping(monkeypatch, 1, KeyboardInterrupt())
+    assert sweep("s")[0] == 130 and not list(tmp_path.glob("s*"))
+
+
+def test_what_is_half_written_is_not_trusted(sweep, whole, monkeypatch, tmp_path):
+    heal = stopping(monkeypatch, 30, KeyboardInterrupt())
+    assert sweep("s")[0] == 130
+    heal()
+    journal = tmp_path / "s.partial" / "journal" / "1-of-1.jsonl"
+    lines = journal.read_text().splitlines(keepends=True)
+    assert len(lines) > 3
+    chunk = json.loads(lines[-1][9:])[0]
+    journal.write_text("".join(lines[:-1]) + lines[-1][:-9])  # as if killed while it was written
+    place = xr.open_zarr(tmp_path / "s.partial" / zarr_store.STORE).speed.encoding["chunks"]
+    assert place == (1, 1, 25)
+    where = "/".join(map(str, np.unravel_index(chunk, (2, 3, 2))))
+    victim = tmp_path / "s.partial" / zarr_store.STORE / "speed" / "c" / where
+    victim.write_bytes(victim.read_bytes()[:11])
+    assert sweep("s")[0] == 3
+    assert arrays("s") == arrays(whole)
+
+
+def test_full_disk_in_the_middle_ends_with_2_and_goes_on_later(sweep, whole, monkeypatch, tmp_path):
+    heal = stopping(monkeypatch, 25, OSError(errno.ENOSPC, "No space left on device"))
+    code, _, err = sweep("s")
+    assert code == 2 and "s.partial: No space left on device after 5 of 12 chunks; free some space" in err
+    assert not (tmp_path / "s").exists()
+    heal()
+    assert sweep("s")[0] == 3
+    assert arrays("s") == arrays(whole)
+
+
+def test_failing_write_leaves_no_file_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
+    with pytest.raises(OSError, match="full"):
+        zarr_store.write_file(tmp_path / "c", b"abc", tmp_path / "aside")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def begun(sweep, monkeypatch, tmp_path):
+    """A sweep with the robot of a file, stopped in the middle."""
+    assert sweep("first", "--chunk", "300")[0] == 3
+    shutil.copy(tmp_path / "first" / "robot.toml", tmp_path / "robot.toml")
+    heal = stopping(monkeypatch, 30, KeyboardInterrupt())
+    assert sweep("s", "--robot", "robot.toml")[0] == 130
+    heal()
+    return lambda *options: sweep("s", "--robot", "robot.toml", *options)
+
+
+def test_sweep_of_another_configuration_is_refused(begun, sweep, tmp_path):
+    for options, what in (
+        (["--chunk", "50"], r"configuration (chunk was 40, is 50)"),
+        (
+            ["--set", "motor.inductance=2e-4"],
+            "configuration (set.motor.inductance is new, robot motor.inductance was",
+        ),
+    ):
+        code, _, err = begun(*options)
+        assert code == 2 and f"s.partial holds another sweep, which differs in {what}" in err
+        assert "choose another path, or --force to begin anew" in err
+    assert begun()[0] == 3  # nothing was lost
+
+
+def test_sweep_of_other_data_code_or_versions_is_refused_saying_which(begun, monkeypatch, tmp_path):
+    robot = tmp_path / "robot.toml"
+    text = robot.read_text()
+    robot.write_text(text + "\n# another day\n")
+    code, _, err = begun()
+    assert code == 2 and "differs in data (robot.toml);" in err
+    robot.write_text(text)
+    honest = identity._code()
+    changed = tuple((f, "0" * 16 if f == "mmrjax/motor.py" else h) for f, h in honest)
+    monkeypatch.setattr(identity, "_code", lambda: changed)
+    code, _, err = begun()
+    assert code == 2 and "differs in code (mmrjax/motor.py);" in err
+    monkeypatch.setattr(identity, "_code", lambda: honest)
+    real = identity.versions
+    monkeypatch.setattr(identity, "versions", lambda packages: {**real(packages), "jax": "0.9.9"})
+    code, _, err = begun()
+    assert code == 2 and "differs in versions (jax was " in err and ", is 0.9.9);" in err
+    monkeypatch.setattr(identity, "versions", real)
+    monkeypatch.setattr(scale, "device_kind", lambda: "cpu: another")
+    code, _, err = begun()
+    assert code == 2 and "differs in device (device was 'cpu: cpu'" not in err and "differs in device" in err
+    monkeypatch.undo()
+
+
+def test_force_begins_anew(begun, tmp_path):
+    code, _, err = begun("--chunk", "50", "--force")
+    assert code == 3 and "goes on after" not in err
+    compare(tmp_path / "s", tmp_path / "first")
+
+
+def test_identity_differences_are_few_words():
+    old = {"configuration": {"a": "1", "b": "2", "c": "3", "d": "4"}, "code": {"x.py": "0"}}
+    new = {"configuration": {"a": "2", "b": "3", "c": "4", "e": "5"}, "code": {"x.py": "1"}}
+    said = identity.differences(old, new)
+    assert said == "configuration (a was 1, is 2, b was 2, is 3, c was 3, is 4 and 2 more); code (x.py)"
+    assert identity.differences(old, old) == ""
+
+
+@pytest.mark.slow
+def test_killed_at_twenty_random_moments_gives_twenty_equal_stores(tmp_path):
+    """SIGKILL at a random moment (after some number of chunks and a few milliseconds), and the same command again."""
+    config = CONFIG.replace("number = 50", "number = 20000").replace("chunk = 40", "chunk = 500")
+    (tmp_path / "plan.toml").write_text(config)
+    command = [*MMRJAX, "sweep", "plan.toml", "--out"]
+    done = subprocess.run([*command, "whole"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 3, done.stderr
+    expected, rng, chunks = arrays(tmp_path / "whole"), np.random.default_rng(12), 240
+    for k in range(20):
+        journal = tmp_path / f"s{k}.partial" / "journal" / "1-of-1.jsonl"
+        process = subprocess.Popen(
+            [*command, f"s{k}"], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        reached = rng.integers(0, chunks - 20)
+        while process.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < reached):
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0, 0.02))
+        process.kill()
+        process.wait()
+        assert journal.exists() and journal.read_bytes().count(b"\n") < chunks  # it was in the middle
+        again = subprocess.run([*command, f"s{k}"], cwd=tmp_path, capture_output=True, text=True)
+        assert again.returncode == 3, again.stderr
+        assert arrays(tmp_path / f"s{k}") == expected, k
+        shutil.rmtree(tmp_path / f"s{k}")
+
+
+# --- shares -------------------------------------------------------------------------------------------------------
+
+
+def test_shares_make_the_same_store_in_any_order(sweep, whole, tmp_path):
+    for k in (3, 1):
+        code, out, _ = sweep("s", "--shard", f"{k}/3")
+        assert code == 0 and "chunks of s.partial are done; the last share finishes the sweep" in out
+    assert not (tmp_path / "s").exists()
+    code, out, _ = sweep("s", "--shard", "2/3")
+    assert code == 3 and out.splitlines()[-1] == "s"
+    assert arrays("s") == arrays(whole)
+    assert sweep("s", "--shard", "1/3")[0] == 3  # a job of the array that comes late
+
+
+def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
+    assert sweep("s", "--shard", "2/5")[0] == 0
+    code, _, err = sweep("s")
+    assert code == 3 and "goes on after" in err and arrays("s") == arrays(whole)
+
+
+def test_shares_hold_every_chunk_once():
+    for chunks, n in ((12, 5), (3, 8), (7, 7), (1000, 3)):
+        held = [c for k in range(1, n + 1) for c in campaign.share((k, n), chunks)]
+        assert held == list(range(chunks))
+
+
+def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_path):
+    assert sweep("s", "--shard", "1/3")[0] == 0
+    import fcntl
+
+    with (tmp_path / "s.partial" / "journal" / "2-of-3.jsonl").open("a") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        code, _, err = sweep("s", "--shard", "2/3")
+    assert code == 2 and "another process is at work on s.partial, share 2 of 3" in err
+    assert sweep("s", "--shard", "2/3")[0] == 0
+
+
+# --- devices --------------------------------------------------------------------------------------------------------
+
+
+def test_four_devices_give_the_same_samples_and_results_to_1e_12(whole, tmp_path):
+    (tmp_path / "plan.toml").write_text(CONFIG)
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    command = [*MMRJAX, "sweep", "plan.toml", "--chunk", "27", "--out", "s"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 3, done.stderr
+    assert len(json.loads((tmp_path / "s" / "manifest.json").read_text())["devices"]) == 4
+    compare(tmp_path / "s", whole)
+
+
+def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
+    probe = (
+        "import numpy as np, jax, mmrjax\n"
+        "from sweeps import axes, scale\n"
+        "from sweeps.config_campaign import Campaign\n"
+        "from sweeps.design import Blocks\n"
+        "robot = mmrjax.nominal()\n"
+        "plan = axes.plan(Campaign(axes={'voltage': [15, 20, 24, 28, 33]}), robot, 'x')\n"
+        "job = scale.Job(robot, 'steady', {}, plan, ('speed',), 'float64', Blocks.of((5,), 5))\n"
+        "compiled = scale.Compiled(job)\n"
+        "found = compiled(compiled.points(0))['speed']\n"
+        "print(len(found.sharding.device_set), [s.data.shape for s in found.addressable_shards], tuple(found.sharding.spec))"
+    )
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True)
+    assert done.stdout.strip() == "4 [(2,), (2,), (2,), (2,)] ('points',)", done.stderr
+
+
+def test_chunks_share_one_compilation(sweep, compilations):
+    assert sweep("s", "--chunk", "40")[0] == 3
+    compilations.clear()
+    jax.clear_caches()
+    assert sweep("t", "--chunk", "40")[0] == 3
+    once = len(compilations)
+    compilations.clear()
+    jax.clear_caches()
+    assert sweep("u", "--chunk", "40", config=CONFIG.replace("number = 50", "number = 500"))[0] == 3
+    assert len(compilations) <= once
+
+
+# --- before it starts ---------------------------------------------------------------------------------------------
+
+
+def test_dry_run_states_points_chunks_bytes_and_time_and_writes_nothing(sweep, tmp_path):
+    code, out, _ = sweep("s", "--dry-run")
+    words = " ".join(out.split())
+    assert code == 0 and "300 (2 configuration x 3 slope_deg x 50 sample)" in words
+    assert "12 of 25 points on 1 x cpu" in words and "about" in words and "points/s (timed here on" in words
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
+
+
+def test_grid_too_large_for_the_disk_is_refused_with_figures(sweep, monkeypatch, tmp_path):
+    usage = shutil.disk_usage(tmp_path)._replace(free=10**9)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+    many = CONFIG.replace("number = 50", "number = 20000000").replace("chunk = 40", "chunk = 100000")
+    for dry in ([], ["--dry-run"]):
+        code, _, err = sweep("s", *dry, config=many)
+        assert code == 2 and "the results would take 3.39 GB (uncompressed)" in err and "has 1 GB free" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
+
+
+def test_size_of_a_store_is_what_it_takes(whole):
+    layout_bytes = 300 * (3 * 8 + 1) + 2 * 50 * 8 + 8 * 5
+    taken = sum(len(b) for name, b in arrays(whole).items() if "/c/" in name and "configuration" not in name)
+    assert abs(taken - layout_bytes) < 30
+
+
+REFUSED = {
+    "unknown output": ('outputs = ["currant"]\n' + CONFIG, [], r"plan.toml, outputs: got currant; did you mean"),
+    "output twice": ('outputs = ["slip", "slip"]\n' + CONFIG, [], "plan.toml, outputs: got slip twice"),
+    "output that varies": ('outputs = ["voltage"]\n' + CONFIG, [], "plan.toml, outputs: got voltage, which varies"),
+    "unknown key": ("axis = 3\n" + CONFIG, [], "plan.toml, axis: no such key; did you mean axes?"),
+    "unknown storage": ('storage = "float16"\n' + CONFIG, [], "plan.toml, storage: got 'float16'"),
+    "unknown name": (CONFIG.replace("slope_deg", "slope"), [], "axes.slope: neither a parameter of the robot nor a"),
+    "zero shares": (CONFIG, ["--shard", "1/0"], "--shard: got 1/0; expected i/n with i from 1 to n"),
+    "share zero": (CONFIG, ["--shard", "0/3"], "--shard: got 0/3; expected i/n"),
+    "share in words": (CONFIG, ["--shard", "first"], "--shard: got first; expected i/n"),
+    "shares of a cluster": (CONFIG, ["--shard", "1/2", "--scheduler", "tcp://x:1"], "--shard: got it beside --scheduler"),
+    "unknown export": (CONFIG, ["--export", "xls"], "--export: got xls; allowed: csv, parquet"),
+    "option of a grid": (CONFIG, ["--slopes", "3"], "option slopes_deg: acts with a grid of options only"),
+    "two configurations": (CONFIG, ["--config", "plan.toml"], "--config: got plan.toml beside plan.toml"),
+    "not a scheduler": (CONFIG, ["--scheduler", "nonsense"], "--scheduler: got nonsense; no scheduler answers there"),
+    "axes are no table": ("axes = 3\nreport = false\n", [], "plan.toml, axes: got 3"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_sweeps_end_with_2_and_one_sentence_and_leave_nothing(sweep, tmp_path, case):
+    config, options, message = REFUSED[case]
+    code, out, err = sweep("s", *options, config=config)
+    assert code == 2 and message in err and out == "" and err.count("\n") == 1, err
+    assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
+
+
+def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
+    (tmp_path / "s.partial").mkdir()
+    (tmp_path / "s.partial" / "thesis.txt").write_text("years of work")
+    code, _, err = sweep("s")
+    assert code == 2 and "is in the way and is no sweep of ours" in err
+    (tmp_path / "t").mkdir()
+    (tmp_path / "t" / "thesis.txt").write_text("years of work")
+    for force in ([], ["--force"]):
+        code, _, err = sweep("t", *force)
+        assert code == 2 and "t exists already" in err
+    assert (tmp_path / "s.partial" / "thesis.txt").is_file() and (tmp_path / "t" / "thesis.txt").is_file()
+
+
+def test_layout_counts_its_bytes_without_writing(whole):
+    config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
+    robot = robots.nominal()
+    from sweeps import axes
+
+    job = campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
+    layout = campaign.laid_out(config, job)
+    assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up
+    assert dataclasses.replace(layout, variables=()).size == 3 * 8
+
+
+def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):  # noqa: F811
+    page = (Path(__file__).resolve().parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    code, out, err = mmrjax("sweep", "plan.toml", "--dry-run", "--chunk", "1000")
+    assert code == 0, err
+    assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out
