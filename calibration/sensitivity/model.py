@@ -24,7 +24,7 @@ from mmrjax.variation import STATUS, Variation, evaluate
 
 #: Points of one call of few, and of many: solves, runs over time, and the derivatives of both. All calls have one of
 #: these shapes, so that every study of the same inputs and outputs shares what is compiled.
-CHUNKS = {"solves": (512, 16_384), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
+CHUNKS = {"solves": (512, 32_768), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
 #: Studied where no outputs are named, beside every channel.
 DEFAULT = ("slip", "power_supply", "efficiency_chassis", "steepest_slope")
 
