@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
 from sweeps.figures_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note, short
 
@@ -116,7 +117,8 @@ _WORDS = {
 
 
 def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
-    shown = {key: e for key, e in study.overall.items() if key in _WORDS} or {"": None}
+    shown: dict[str, Estimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
+    shown = shown or {"": None}
     height = 0.8 / len(shown)
     for j, (key, estimate) in enumerate(shown.items()):
         at = -np.arange(len(top)) + 0.4 - height * (j + 0.5)
@@ -143,7 +145,7 @@ def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np
     points = found.points
     names = np.array(list(map(str, points.configuration)))
     kinds = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    order = np.lexsort((points.payload, points.voltage, points.slope_deg, [kinds[n] for n in names]))
+    order = np.lexsort((points.payload, points.voltage, points.slope_deg, np.array([kinds[n] for n in names])))
     _cells(ax, study.share[order][:, top].T, 24)
     ax.set_yticks([])
     ticks, labels = [], []

@@ -191,3 +191,25 @@ def test_saved_calibration_has_its_posterior(tmp_path):
         if name in found.parameters:
             assert sd == pytest.approx(found.parameters[name].sd, rel=1e-9)
     assert set(found.tied) == set(again.names[len(again) :])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("names", "verdict"), [(["churning"], "named"), ([], "none")])
+def test_posterior_of_the_loop_has_what_it_found(names, verdict):
+    import generator as g
+    from synthetic import SETTLED, table
+
+    from calibration.discovery.discover import finished
+    from mmrjax.effects import BY_NAME
+
+    runs = table(g.case(names, 10.0, seed=4) if names else g.case(seed=2))
+    traced = SETTLED.trace(runs)
+    found = finished(traced, runs, None, SETTLED.settings, BY_NAME, lambda text: None)
+    assert (found.verdict == "none") == (verdict == "none")
+    found.posterior.check(found.robot, "the loop's")
+    sd = dict(zip(found.posterior.names, found.posterior.sd, strict=True))
+    for effect in found.effects:
+        for word, estimate in effect.parameters.items():
+            assert sd[f"effects.{effect.name}.{word}"] == pytest.approx(estimate.sd, rel=0.02)
+    for name, shift in found.base_shift.items():
+        assert sd[name] == pytest.approx(shift.sd_after, rel=0.02)

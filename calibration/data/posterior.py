@@ -145,7 +145,9 @@ def write(posterior: Posterior, path: Path | str) -> None:
         "value": (np.asarray(p.at(p.mean))[: len(p)], "parameter at the mean [SI]"),
         "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
     }
-    data = {key: (names, np.asarray(x, float), {"long_name": words}) for key, (x, words) in columns.items()}
+    data: dict[str, Any] = {
+        key: (names, np.asarray(x, float), {"long_name": words}) for key, (x, words) in columns.items()
+    }
     square = ("coordinate", "coordinate_2")
     data["covariance"] = (square, np.asarray(p.covariance, float), {"long_name": "covariance of z"})
     data["kind"] = (names, np.asarray(p.kinds, "S16"), {"long_name": "transformation of u"})

@@ -73,8 +73,7 @@ def _parts(
         amplitude = amplitude_of(effect)
         sd = float(coordinates.sd[coordinates.names.index(name)])
         of_amplitude = _cut((f"effects.{name}.amplitude",), [amplitude.spec], np.array([sd * z[p + slot]]))
-        scaled = {"mean": z[p + slot, None], "spread": np.array([sd])}
-        parts.append(_with(of_amplitude, **scaled))
+        parts.append(dataclasses.replace(of_amplitude, mean=z[p + slot, None], spread=np.array([sd])))
         kept.append(p + slot)
         shape = shape_of(effect)
         if shape is None:
@@ -84,7 +83,7 @@ def _parts(
         of_shape = _cut((f"effects.{name}.{shape.name}",), [shape.spec], np.zeros(1))
         bounds = (math.log(low) if low > 0 else -math.inf, math.log(high)) if log else (-math.inf, math.inf)
         parts.append(
-            _with(
+            dataclasses.replace(
                 of_shape, mean=z[p + slots + slot, None], location=np.array([math.log(value) if log else value]),
                 spread=np.array([spread if log else turned]), low=np.array([bounds[0]]), high=np.array([bounds[1]]),
                 kinds=(LOG if log else ANGLE,),
@@ -102,7 +101,3 @@ def _cut(names: tuple[str, ...], specs: list[Spec], mean: np.ndarray) -> Posteri
         location=np.zeros(size), spread=np.ones(size), low=np.array([s.bounds[0] for s in specs], float),
         high=np.array([s.bounds[1] for s in specs], float), softness=np.zeros(size), kinds=(NORMAL,) * size,
     )  # fmt: skip
-
-
-def _with(posterior: Posterior, **changes: object) -> Posterior:
-    return dataclasses.replace(posterior, **changes)  # type: ignore[arg-type]

@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from calibration.data.errors import BadConfiguration, choices, number
@@ -42,7 +41,7 @@ TIED = (
 SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
 
 
-def held_within(u: ArrayLike, low: ArrayLike, high: ArrayLike, width: ArrayLike) -> Array:
+def held_within(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
     """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high; w = 0 cuts there."""
     w = jnp.where(jnp.asarray(width) > 0, width, 1.0)
     soft = u + w * jax.nn.softplus((low - u) / w) - w * jax.nn.softplus((u - high) / w)

@@ -27,6 +27,13 @@ EDGE = 1e-9
 TAIL = 0.025
 
 
+#: The distribution of no parameter.
+NOTHING = Posterior(
+    coordinates=(), units=(), mean=np.zeros(0), covariance=np.zeros((0, 0)), location=np.zeros(0), spread=np.zeros(0),
+    low=np.zeros(0), high=np.zeros(0), softness=np.zeros(0), kinds=(),
+)  # fmt: skip
+
+
 @dataclasses.dataclass(frozen=True)
 class Inputs:
     """Parameters, normal in their coordinates, and conditions, uniform in their ranges.
@@ -176,9 +183,8 @@ def of_priors(robot: Robot, words: Sequence[str], ranges: Mapping[str, tuple[flo
         coordinates = priors.coordinates(robot, names) if names else None
     except BadConfiguration as error:
         raise BadConfiguration(str(error).replace("--prior", "--parameters")) from None
-    empty = Posterior((), (), *(np.zeros(s) for s in (0, (0, 0), 0, 0, 0, 0, 0)), ())  # type: ignore[arg-type]
     size = len(names)
-    parameters = empty if coordinates is None else of_coordinates(coordinates, np.zeros(size), np.eye(size))
+    parameters = of_coordinates(coordinates, np.zeros(size), np.eye(size)) if coordinates else NOTHING
     return _inputs(robot, parameters, ranges, posterior=False)
 
 

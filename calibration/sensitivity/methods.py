@@ -186,7 +186,7 @@ def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part
         lost = 1 - np.isfinite(y).mean(1)
         whole: derivative.Terms | None = None
         studied = np.zeros(points, bool)
-        for k in np.flatnonzero(lost <= MOST_LOST):
+        for k in map(int, np.flatnonzero(lost <= MOST_LOST)):
             found = derivative.terms(scores, y[k], g[k], normal, replicates)
             if found is None:
                 continue

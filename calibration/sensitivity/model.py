@@ -56,7 +56,8 @@ def counted(codes: np.ndarray) -> dict[str, int]:
 
 def known_outputs() -> dict[str, OutputRow]:
     """Every output by name: those of a fidelity, then the derived ones."""
-    return {o.name: o for o in (*table_of_outputs.table(), *derived.TABLE)}
+    rows: tuple[OutputRow, ...] = (*table_of_outputs.table(), *derived.TABLE)
+    return {o.name: o for o in rows}
 
 
 def chosen_outputs(words: tuple[str, ...]) -> tuple[OutputRow, ...]:
@@ -106,7 +107,7 @@ class Model:
         few, many = CHUNKS[kind]
         return few if points <= 4 * few else many
 
-    def __call__(self, values: Float[Array, "points columns"], conditions: Conditions) -> Answer:
+    def __call__(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
         """Outputs of many points.
 
         Args:
@@ -115,7 +116,7 @@ class Model:
         """
         return self.joined({source: self.of_source(source, values, conditions) for source in self.sources})
 
-    def of_source(self, source: str, values: Float[Array, "points columns"], conditions: Conditions) -> Answer:
+    def of_source(self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
         """The outputs of one source alone; see `sources`."""
         made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
         codes = made.pop(STATUS).astype(int)
@@ -132,10 +133,12 @@ class Model:
         each = [set(o.ignores) if isinstance(o, Derived) else set() for o in self.sources[source]]
         return tuple(sorted(set.intersection(*each)))
 
-    def derivatives(self, values: Float[Array, "points columns"], conditions: Conditions) -> dict[str, np.ndarray]:
+    def derivatives(
+        self, values: Float[np.ndarray, "points columns"], conditions: Conditions
+    ) -> dict[str, np.ndarray]:
         """Exact derivatives of every output by every column [SI per unit], shape (points, columns); zeros where a
         run has no numbers."""
-        found = {}
+        found: dict[str, np.ndarray] = {}
         for source in self.sources:
             size = self.chunk(source, len(values), differentiated=True)
             made = self._chunked(self._function(source, differentiated=True), size, values, conditions)

@@ -9,6 +9,7 @@ are, each of them scrambled anew (Owen, Monte Carlo variance of scrambled net qu
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -31,8 +32,8 @@ class Estimate:
     low: np.ndarray
     high: np.ndarray
 
-    def __getitem__(self, k: object) -> Estimate:
-        return Estimate(self.value[k], self.low[k], self.high[k])  # type: ignore[index]
+    def __getitem__(self, k: Any) -> Estimate:
+        return Estimate(self.value[k], self.low[k], self.high[k])
 
 
 def ratio(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:

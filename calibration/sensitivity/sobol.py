@@ -111,9 +111,10 @@ class Terms:
         first, total = (np.zeros((len(self.variance), inputs)) for _ in range(2))
         first[:, places], total[:, places] = self.first, self.total
         second = None
+        at = np.asarray(places)
         if self.second is not None:
             second = first[:, :, None] + first[:, None, :]  # what two do that do nothing together
-            second[np.ix_(np.arange(len(second)), places, places)] = self.second
+            second[np.ix_(np.arange(len(second)), at, at)] = self.second
         return dataclasses.replace(self, first=first, total=total, second=second)
 
 
@@ -131,7 +132,7 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     """
     d = design.inputs
     by = np.reshape(values, (design.replicates, design.size, design.blocks))
-    there = np.isfinite(by).all(-1)
+    there = np.asarray(np.isfinite(by).all(-1))
     count = there.sum(1)
     if count.min() < 2:
         return None

@@ -74,13 +74,15 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """
     times = jnp.asarray(instants())
     run = drive(robot, conditions, times)
-    speed, power = run.signals.speed, run.signals.voltage * run.signals.total_current
-    k, share = crossing(times, speed, run.signals.acceleration, SHARE * speed[-1])
+    signals = run.signals
+    speed, rate, current = (jnp.asarray(x) for x in (signals.speed, signals.acceleration, signals.total_current))
+    power = jnp.asarray(signals.voltage) * current
+    k, share = crossing(times, speed, rate, SHARE * speed[-1])
     width = jnp.diff(times)
     whole = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
     here = power[k] + share * (power[k + 1] - power[k])
     found = {
-        "peak_current": peak(run.signals.total_current),
+        "peak_current": peak(current),
         "time_to_speed": times[k] + share * width[k],
         "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
     }
