@@ -489,7 +489,9 @@ def sensitivity(
     ] = None,
     evaluations: Annotated[
         int | None,
-        typer.Option(help="Model evaluations, at least, in all.  \\[default: 1000000; runs over time 100000]"),
+        typer.Option(
+            help="Model evaluations, at least, in all.  \\[default: 1000000; shapley 300000; runs over time 100000]"
+        ),
     ] = None,
     posterior: Annotated[
         bool | None,

@@ -191,6 +191,8 @@ def convergence(found: SensitivityResult) -> Figure:
                 label=short(found.names[k]),
             )
         ax.set_xscale("log")
+        ax.set_xticks(counts, [f"{count / 1000:.0f}k" for count in counts])
+        ax.minorticks_off()
         ax.set_ylim(bottom=0)
         ax.set_title(study.row.label)
         ax.legend(fontsize=7.5, loc="best")

@@ -131,7 +131,7 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
             unit = "" if row.unit == "-" else f" {row.unit}"
             before, after = sds[0] / row.factor, sds[-1] / row.factor
             outputs.append(
-                {"label": row.label, "before": f"±{before:.2g}{unit}", "after": f"±{after:.2g}{unit}",
+                {"label": row.label, "before": f"±{_two(before)}{unit}", "after": f"±{_two(after)}{unit}",
                  "left": f"{100 * after / before:.0f} %"}
             )  # fmt: skip
     points = n.points
@@ -145,6 +145,11 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
         ],
         "candidates": n.candidates, "source": n.source, "noise": n.noise, "outputs": outputs,
     }  # fmt: skip
+
+
+def _two(sd: float) -> str:
+    """Two digits of an sd, without an exponent."""
+    return f"{sd:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 6))}f}"
 
 
 def _ranges(found: SensitivityResult) -> str:

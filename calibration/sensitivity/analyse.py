@@ -20,18 +20,19 @@ from calibration.sensitivity.study import Study
 from mmrjax import fidelities
 from mmrjax.derived import Derived
 
-#: Model evaluations in all where none are stated: of solves, and where a run over time is among them.
-EVALUATIONS, EVALUATIONS_LONG = 1_000_000, 100_000
+#: Model evaluations in all where none are stated: of solves, of solves for Shapley effects, whose design costs as much
+#: again, and where a run over time is among the outputs.
+EVALUATIONS, EVALUATIONS_SHAPLEY, EVALUATIONS_LONG = 1_000_000, 300_000, 100_000
 #: Fewest that may be asked for.
 LEAST = 1_000
 
 
-def default_evaluations(outputs: tuple[OutputRow, ...], model: str) -> int:
+def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str) -> int:
     """Model evaluations where none are stated."""
     long = fidelities.facts(model).rollout or any(
         isinstance(o, Derived) and o.module.endswith(".start") for o in outputs
     )
-    return EVALUATIONS_LONG if long else EVALUATIONS
+    return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
 
 
 def analyse(
@@ -57,7 +58,7 @@ def analyse(
             f"--method {method}: takes inputs for independent, and those of a posterior are not; "
             "expected shapley, or local"
         )
-    usual = default_evaluations(model.outputs, model.fidelity)
+    usual = default_evaluations(model.outputs, model.fidelity, method)
     evaluations = usual if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
