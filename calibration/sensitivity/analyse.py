@@ -20,8 +20,8 @@ from calibration.sensitivity.study import Study
 from mmrjax import fidelities
 from mmrjax.derived import Derived
 
-#: Model evaluations in all where none are stated: of solves, of solves for Shapley effects, whose design costs as much
-#: again, and where a run over time is among the outputs.
+#: Model evaluations in all where none are stated: of solves, of solves for Shapley effects, whose design costs as
+#: much again, and where a run over time is among the outputs.
 EVALUATIONS, EVALUATIONS_SHAPLEY, EVALUATIONS_LONG = 1_000_000, 300_000, 100_000
 #: Fewest that may be asked for.
 LEAST = 1_000

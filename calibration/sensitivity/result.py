@@ -167,7 +167,7 @@ class SensitivityResult:
         points: operating points; outputs: by name.
         statuses: source → status → points, at the medians; sampled: the same over the sample.
         next_runs: None where there is no candidate that converges.
-        evaluations: of the model, in all; seconds: that these took, after compiling.
+        evaluations: of the model, in all; seconds: that these took, with what was compiled for them.
         comparison: of bounds with sampled indices, by output; empty for other methods.
         notes: sentences worth reading.
     """

@@ -19,6 +19,8 @@ from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 
 Tell = Callable[[str], None]
+#: After so long a time it says how far it is [s].
+SILENCE = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +61,7 @@ class Study:
             adhesion=supply.adhesion,
         )
         self.evaluations, self.seconds = 0, 0.0
+        self.told = time.perf_counter()
         self.sampled: dict[str, np.ndarray] = {}
 
     def at(self, k: int) -> Conditions:
@@ -98,6 +101,10 @@ class Study:
             self.evaluations += len(values)
             for source, codes in answer.statuses.items():
                 self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
+            if time.perf_counter() - self.told > SILENCE:
+                self.told = time.perf_counter()
+                rate = self.evaluations / max(self.seconds, 1e-9)
+                self.tell(f"{self.evaluations:,} model evaluations so far, {rate:,.0f} a second")
             yield k, answer.values
 
     def statuses(self) -> dict[str, dict[str, int]]:
