@@ -71,6 +71,13 @@ _Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from th
 _Discharge = Annotated[
     float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  \\[default: 0]")
 ]
+_Posterior = Annotated[
+    int | None,
+    typer.Option(
+        "--posterior",
+        help="Give results with ± from so many robots drawn from the posterior.nc beside the calibrated --robot.",
+    ),
+]
 _NoCache = Annotated[
     bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
 ]
@@ -111,6 +118,7 @@ def simulate(
     effects: _Effects = None,
     battery: _Battery = None,
     discharge: _Discharge = None,
+    posterior: _Posterior = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
@@ -125,7 +133,7 @@ def simulate(
 
     options = _options(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
-        discharge_mAh=discharge, report=report,
+        discharge_mAh=discharge, posterior=posterior, report=report,
     )  # fmt: skip
     resolved = _prepared(config.resolve(config.Simulate, None, options), no_cache)
     from sweeps import simulate as room
@@ -166,6 +174,7 @@ def sweep(
     battery: _Battery = None,
     discharge: _Discharge = None,
     chunk: _Chunk = None,
+    posterior: _Posterior = None,
     zarr: Annotated[
         bool, typer.Option("--zarr", help="Write a Zarr store, also of the grid of the options.")
     ] = False,
@@ -204,6 +213,7 @@ def sweep(
         battery=battery,
         discharge_mAh=discharge,
         chunk=chunk,
+        posterior=posterior,
         report=report,
     ) | {
         "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
@@ -241,6 +251,7 @@ def compare(
     robot: _Robot = None,
     set_: _Set = None,
     effects: _Effects = None,
+    posterior: _Posterior = None,
     out: _Out = None,
     force: _Force = False,
     report: _Report = None,
@@ -250,7 +261,14 @@ def compare(
     from sweeps import config
 
     options = _options(
-        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
+        model=model,
+        duration_s=duration,
+        step_s=step,
+        robot=robot,
+        set=set_,
+        effects=effects,
+        posterior=posterior,
+        report=report,
     )
     resolved = _prepared(config.resolve(config.Compare, None, options), no_cache)
     from sweeps import compare as room
@@ -440,6 +458,101 @@ def loop(
     from sweeps import loop as room
 
     return room.loop(resolved, data, out, force)
+
+
+@app.command(epilog="Example: mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000")
+def sensitivity(
+    method: Annotated[
+        str | None,
+        typer.Option(
+            "--method",
+            help="local, sobol, morris, derivative, or shapley (of a posterior).  "
+            "\\[default: sobol; with --posterior shapley]",
+        ),
+    ] = None,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Uncertain parameters, comma-separated, motor.* a group.  \\[default: all that have a prior]"
+        ),
+    ] = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(help="A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5."),
+    ] = None,
+    outputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Outputs, comma-separated: those of a run, steepest_slope, start for the three of a start.  "
+            "\\[default: current, speeds, slip, power, efficiency, steepest slope]"
+        ),
+    ] = None,
+    evaluations: Annotated[
+        int | None,
+        typer.Option(
+            help="Model evaluations, at least, in all.  \\[default: 1000000; shapley 300000; runs over time 100000]"
+        ),
+    ] = None,
+    posterior: Annotated[
+        bool | None,
+        typer.Option("--posterior", help="The inputs are the posterior.nc beside the calibrated --robot."),
+    ] = None,
+    configurations: Annotated[
+        str | None, typer.Option(help="Comma-separated, of the robot's.  \\[default: all that it has]")
+    ] = None,
+    voltages: Annotated[str | None, typer.Option(help="Supply voltages (V).  \\[default: of Table 8]")] = None,
+    payloads: Annotated[
+        str | None, typer.Option(help="Additional load masses (kg).  \\[default: of Table 8]")
+    ] = None,
+    slopes: Annotated[
+        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: of Table 8]")
+    ] = None,
+    surface: Annotated[str | None, typer.Option(help="Surface of Table 5.  \\[default: lacquered_wood]")] = None,
+    candidates: Annotated[
+        Path | None, typer.Option(help="CSV of runs that could be made next.  \\[default: Table 8]")
+    ] = None,
+    runs: Annotated[int | None, typer.Option(help="How many of them to propose.  \\[default: 5]")] = None,
+    noise: Annotated[
+        str | None,
+        typer.Option(help="Sd of their readings: current=2%,motor_speed=0.5%,speed=1%.  \\[default: these]"),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the sample.  \\[default: 0]")] = None,
+    model: _Model = None,
+    duration: _Duration = None,
+    step: _Step = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    battery: _Battery = None,
+    discharge: _Discharge = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+    no_cache: _NoCache = False,
+) -> int:
+    """Say which parameters matter where, which do not matter at all, and which runs would tell more of them.
+
+    Writes result.json, report.html, points.csv and indices.csv. Local derivatives and elasticities at every
+    operating point come with every method.
+    """
+    from sweeps import config
+
+    options = _options(
+        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
+        discharge_mAh=discharge, report=report,
+    ) | {
+        "method": method or ("shapley" if posterior else None), "parameters": config.words(parameters),
+        "vary": config.words(vary), "outputs": config.words(outputs), "evaluations": evaluations,
+        "posterior": posterior,
+        "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
+        "voltages_V": config.axis("--voltages", voltages), "payloads_kg": config.axis("--payloads", payloads),
+        "slopes_deg": config.axis("--slopes", slopes), "surface": surface,
+        "candidates": None if candidates is None else str(candidates), "runs": runs, "noise": noise, "seed": seed,
+    }  # fmt: skip
+    resolved = _prepared(config.resolve(config.Sensitivity, None, options), no_cache)
+    from sweeps import sensitivity as room
+
+    return room.sensitivity(resolved, out, force)
 
 
 @app.command()

@@ -15,9 +15,9 @@ from calibration.inference.ranges import check_ranges
 from mmrjax import channels
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
-from sweeps import run
+from sweeps import run, uncertainty
 from sweeps.console import say
-from sweeps.inputs import load_robot, read_runs
+from sweeps.inputs import beside_robot, load_robot, read_runs
 from sweeps.store import open_folder
 
 #: Group → channel → rows, rms_percent, max_percent, r2, missing.
@@ -31,12 +31,22 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     said = check_ranges(runs, robot)
+    drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)
         comparison, summary = compared(stated, table)
         folder.write_table("comparison.csv", comparison)
         notes = [*missing(comparison), *said]
         print_comparison(comparison, summary, notes)
+        if drawn is not None and config.posterior is not None:
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            uncertainty.say_intervals(table, found)
+            table |= found.columns
+            ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
+            kept = [c.column + end for c in channels.CHANNELS for end in ends]
+            folder.write_table(
+                "comparison.csv", comparison | {f"simulated_{key}": found.columns[key] for key in kept}
+            )
         if config.report:
             from sweeps import report_comparison
 

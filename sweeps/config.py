@@ -166,6 +166,16 @@ class InferencePart(Part):
     seed: Seed = 0
 
 
+class PosteriorPart(Part):
+    """Whether results come with the uncertainty of a calibrated robot.
+
+    Attributes:
+        posterior: robots to draw from the posterior.nc beside the robot's file; None for none.
+    """
+
+    posterior: Annotated[int, Field(ge=10, le=100_000)] | None = None
+
+
 class OutputPart(Part):
     """What is written beside the numbers.
 
@@ -176,7 +186,7 @@ class OutputPart(Part):
     report: bool = True
 
 
-class Simulate(RobotPart, FidelityPart, SupplyPart, OutputPart):
+class Simulate(RobotPart, FidelityPart, SupplyPart, PosteriorPart, OutputPart):
     """A few given runs; those over time from standstill."""
 
     @property
@@ -188,11 +198,11 @@ class Simulate(RobotPart, FidelityPart, SupplyPart, OutputPart):
         return options
 
 
-class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, OutputPart):
+class Sweep(RobotPart, BatchPart, SupplyPart, GridPart, PosteriorPart, OutputPart):
     """A grid of runs: every combination of the axes."""
 
 
-class Compare(RobotPart, FidelityPart, OutputPart):
+class Compare(RobotPart, FidelityPart, PosteriorPart, OutputPart):
     """The runs of a measured table."""
 
 
@@ -235,6 +245,39 @@ class Loop(RobotPart, InferencePart, OutputPart):
     replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
     prefer: Literal["fit", "held-out"] = "fit"
     forbid: tuple[str, ...] = ()
+
+
+class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
+    """A sensitivity study.
+
+    Attributes:
+        method: `local`, `sobol`, `morris`, `derivative` or `shapley`.
+        configurations, voltages_V, payloads_kg, slopes_deg, surface: operating points, as of a grid; None leaves them
+            to the method: Table 8 where gradients do, its corners and middle where a sample is drawn.
+        parameters: uncertain, by dotted name, with their priors; empty takes all that have one.
+        vary: conditions that are uncertain, `name=low:high`.
+        outputs: by name; empty takes the usual ones.
+        evaluations: of the model at least, in all; None takes the default.
+        posterior: whether the inputs are the posterior of a calibrated robot.
+        candidates: CSV of runs that could be made next; empty takes Table 8.
+        runs: how many of them to propose; noise: of their readings, as of `calibrate`.
+    """
+
+    method: str = "sobol"
+    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] | None = None
+    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] | None = None
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = None
+    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
+    parameters: tuple[str, ...] = ()
+    vary: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = None
+    seed: Seed = 0
+    posterior: bool = False
+    candidates: str = ""
+    runs: Annotated[int, Field(ge=1, le=100)] = 5
+    noise: str = ""
 
 
 C = TypeVar("C", bound=Part)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
-from calibration.data import effect_file, robot_file
+from calibration.data import effect_file, posterior, robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, choices
+from calibration.data.posterior import Posterior
 from mmrjax.robot import Robot
 from sweeps.config import RobotPart
 from sweeps.console import tell
@@ -26,6 +28,24 @@ def load_robot(config: RobotPart) -> Robot:
     for note in notes:
         tell(note)
     return robot
+
+
+def beside_robot(config: RobotPart, robot: Robot) -> Posterior:
+    """The posterior that lies beside the file of a calibrated robot.
+
+    Raises:
+        BadConfiguration: the robot is none of a file.
+        BadData: there is none, it cannot be read, or it is of another robot.
+    """
+    file = Path(config.robot)
+    if file.suffix != ".toml":
+        raise BadConfiguration(
+            f"--posterior: {config.robot} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
+        )
+    path = file.with_name(posterior.FILE)
+    found = posterior.read(path)
+    found.check(robot, str(path))
+    return found
 
 
 def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> None:

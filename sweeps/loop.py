@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from calibration.data import effect_file, robot_file
+from calibration.data import effect_file, posterior, robot_file
 from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.result import DiscoveryResult
@@ -43,6 +43,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
         folder.write_text("config.resolved.toml", configuration.as_toml(config))
         note = f"found by the loop from {config.robot} with {runs.source}: {found.statement}"
         robot_file.write(found.robot, folder.partial / "robot.toml", note=note)
+        posterior.write(found.posterior, folder.partial / posterior.FILE)
         print_discovery(found)
         if config.report:
             from sweeps import report_loop

@@ -16,9 +16,9 @@ from mmrjax.fidelities.base import History, Run
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
-from sweeps import run, words
+from sweeps import run, uncertainty, words
 from sweeps.console import progress, say
-from sweeps.inputs import load_robot, one_run, read_runs
+from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
@@ -37,9 +37,17 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
+    drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         table, histories = _simulated(folder, robot, runs, config)
+        found = None
+        if drawn is not None and config.posterior is not None:
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            table |= found.columns
         print_runs({key: value[:_SHOWN] for key, value in table.items()})
+        if found is not None:
+            say(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in runs.csv")
+            uncertainty.say_lost(found)
         if len(runs) > _SHOWN:
             say(f"... and {len(runs) - _SHOWN} more in runs.csv")
         if config.report:
@@ -122,7 +130,11 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
     }  # fmt: skip
     shown = Table(show_header=False)
     for key, (heading, form) in rows.items():
-        cells = (str(v).replace(";", "\n") if not form else "-" if v != v else format(v, form) for v in table[key])
+        cells = [str(v).replace(";", "\n") if not form else "-" if v != v else format(v, form) for v in table[key]]
+        if form and key + uncertainty.SD in table:
+            digits = int(form.strip(".f"))
+            pairs = zip(table[key], table[key + uncertainty.SD], strict=True)
+            cells = ["-" if v != v else uncertainty.with_sd(v, sd, digits) for v, sd in pairs]
         shown.add_row(heading, *cells)
     say(shown)
     for status in dict.fromkeys(table["status"]):

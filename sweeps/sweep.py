@@ -8,10 +8,10 @@ import numpy as np
 from rich.table import Table
 
 from sweeps import config as configuration
-from sweeps import run, words
+from sweeps import run, uncertainty, words
 from sweeps.console import say
 from sweeps.grid import configurations, grid
-from sweeps.inputs import load_robot
+from sweeps.inputs import beside_robot, load_robot
 from sweeps.store import open_folder
 
 
@@ -20,9 +20,14 @@ def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
     robot = load_robot(config)
     config = config.model_copy(update={"configurations": configurations(config, robot)})
     runs = grid(config, robot)
+    drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("sweep", config, robot, out, force) as folder:
         table = run.evaluate(robot, runs, config, folder)
         print_counts(table)
+        if drawn is not None and config.posterior is not None:
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            uncertainty.say_intervals(table, found)
+            table |= found.columns
         if config.report:
             from sweeps import report_sweep
 

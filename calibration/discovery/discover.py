@@ -25,6 +25,7 @@ from calibration.discovery.discrepancy import Location, diagnosis_beside, fit_di
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.hidden import hidden
 from calibration.discovery.outliers import Screening, screen, screen_beside
+from calibration.discovery.posterior import of_curve, of_fit
 from calibration.discovery.result import (
     DiscoveryResult,
     FoundEffect,
@@ -422,10 +423,12 @@ def finished(
     before = findings.Fitted(space.equipped, base.z, space.library.indices(empty(settings)))
     after, robot, z, sd = None, findings.proposed_robot(space, best), best.z, best.sd
     cost, converged = best.cost, best.converged
+    posterior = of_fit(space, best.active, best.z, ends.linear)
     if curve is not None:
         after = findings.Fitted(curve.problem, curve.z, None)
         ends = diagnosis_beside(space, curve, screened.bases, left)
         robot, z, sd = curve.robot, curve.z, np.sqrt(np.diag(curve.covariance))
+        posterior = of_curve(space, best.active, curve)
         cost, converged = curve.chi2[1] / 2, curve.converged
     elif best is not base:
         after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
@@ -463,6 +466,7 @@ def finished(
         statement=_statement(traced),
         robot=robot,
         converged=converged,
+        posterior=posterior,
         runs=runs,
         numbers=numbers,
         included=included,

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import robot_file
+from calibration.data import posterior, robot_file
+from calibration.data.posterior import Posterior
 from calibration.data.runs import CONDITIONS, WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
@@ -301,7 +302,7 @@ class DiscoveryResult:
 
     Attributes:
         verdict: `none`, `named`, `class` or `unnamed`; statement: in one sentence.
-        robot: the proposed one; converged: whether its fit is an optimum.
+        robot: the proposed one; converged: whether its fit is an optimum; posterior: of all that was fitted.
         runs: the table; numbers: of its rows, as messages call them.
         included: whether a row counts; outliers, unusable: numbers of rows set aside.
         effects: found; unnamed: the discrepancy of that verdict; remains: what the effects leave.
@@ -333,6 +334,7 @@ class DiscoveryResult:
     statement: str
     robot: Robot
     converged: bool
+    posterior: Posterior
     runs: Runs
     numbers: np.ndarray
     included: np.ndarray
@@ -453,13 +455,14 @@ class DiscoveryResult:
         return table
 
     def save(self, folder: Path | str) -> None:
-        """Write `result.json`, `rows.csv` and `robot.toml` into a folder."""
+        """Write `result.json`, `rows.csv`, `posterior.nc` and `robot.toml` into a folder."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table())
         note = f"found by the loop with {self.runs.source}: {self.statement}"
         robot_file.write(self.robot, folder / "robot.toml", note=note)
+        posterior.write(self.posterior, folder / posterior.FILE)
 
 
 @dataclasses.dataclass(frozen=True)

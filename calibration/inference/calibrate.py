@@ -20,6 +20,7 @@ from calibration.inference.foreign import foreign_priors
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
+from calibration.inference.posterior import of_coordinates
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
 from calibration.inference.result import CalibrationResult
@@ -153,6 +154,7 @@ def calibrate(
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
         adequacy=lack_of_fit.adequacy(left, known=not known.estimated.any()),
         identifiability=about,
+        posterior=of_coordinates(posed.coordinates, z, about.covariance),
         notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
     )
     return dataclasses.replace(result, notes=(*result.notes, *remarks(result)))

@@ -47,7 +47,14 @@ SURFACE = {
     "ground.friction.speed_dynamic": 3.0,
 }
 
-_SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
+SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
+
+
+def held_within(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
+    """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high; w = 0 cuts there."""
+    w = jnp.where(jnp.asarray(width) > 0, width, 1.0)
+    soft = u + w * jax.nn.softplus((low - u) / w) - w * jax.nn.softplus((u - high) / w)
+    return jnp.clip(jnp.where(jnp.asarray(width) > 0, soft, u), low, high)  # also of rounding, far outside
 
 
 class Coordinates(eqx.Module):
@@ -85,9 +92,7 @@ class Coordinates(eqx.Module):
     def value(self, z: Float[Array, "... parameters"]) -> Float[Array, "... parameters"]:
         """Parameters θ [SI] at coordinates z."""
         u = self.location + self.spread * z
-        w = _SOFTNESS * self.spread
-        u = u + w * jax.nn.softplus((self.low - u) / w) - w * jax.nn.softplus((u - self.high) / w)
-        u = jnp.clip(u, self.low, self.high)  # of rounding, far outside
+        u = held_within(u, self.low, self.high, SOFTNESS * self.spread)
         return jnp.where(jnp.asarray(self.scale), jnp.exp(u), u)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
@@ -198,8 +203,8 @@ def choose(
     everything = list(known(robot))
     chosen: list[str] = []
     for word in free:
-        chosen += default if word == "default" else _expand(word, everything, "--free")
-    fixed = [n for word in fix for n in _expand(word, everything, "--fix")]
+        chosen += default if word == "default" else expand(word, everything, "--free")
+    fixed = [n for word in fix for n in expand(word, everything, "--fix")]
     both = [word for word in free if word in fix]
     if both:
         raise BadConfiguration(f"--free and --fix both name {both[0]}; name it once")
@@ -209,7 +214,12 @@ def choose(
     return tuple(names)
 
 
-def _expand(word: str, everything: list[str], option: str) -> list[str]:
+def expand(word: str, everything: list[str], option: str) -> list[str]:
+    """The parameters that a word names: one, or with `.*` at its end all below it.
+
+    Raises:
+        BadConfiguration: none of that name; says the option and lists the choices.
+    """
     if word.endswith(".*"):
         below = [n for n in everything if n.startswith(word[:-1])]
         if below:

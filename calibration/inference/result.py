@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.data import writing
+from calibration.data import posterior, writing
+from calibration.data.posterior import Posterior
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
@@ -257,7 +258,7 @@ class CalibrationResult:
         objective: at the optimum [½σ²]; converged: whether the search did.
         starts: how all searches ended.
         chi_square: of the readings that are there; adequacy: whether they are what noise leaves.
-        identifiability: the linear analysis.
+        identifiability: the linear analysis; posterior: of the free parameters.
         notes: sentences worth reading before it is used.
     """
 
@@ -284,6 +285,7 @@ class CalibrationResult:
     chi_square: ChiSquare
     adequacy: Adequacy
     identifiability: Identifiability
+    posterior: Posterior
     notes: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -371,7 +373,7 @@ class CalibrationResult:
             yield f"error_{channel.name}_sigma", r.sigma
 
     def save(self, folder: Path | str, robot_name: str = "a robot") -> None:
-        """Write robot.toml, result.json and rows.csv into a folder, which is made if it is not there.
+        """Write robot.toml, posterior.nc, result.json and rows.csv into a folder, which is made if it is not there.
 
         Args:
             robot_name: of the robot that was calibrated, for the head of robot.toml.
@@ -384,6 +386,7 @@ class CalibrationResult:
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows())
+        posterior.write(self.posterior, folder / posterior.FILE)
 
 
 def _by_name(values: dict[str, Any]) -> dict[str, dict[str, Any]]:

@@ -1,0 +1,235 @@
+"""The posterior of a calibrated robot: what a fit leaves open, and the file `posterior.nc` that holds it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.data.errors import BadData, choices
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+SCHEMA = "mmrjax.posterior/1"
+FILE = "posterior.nc"
+#: How a coordinate u becomes a parameter: as it is, its exponential, or as an angle within half a turn.
+NORMAL, LOG, ANGLE = "normal", "log-normal", "angle"
+#: Largest difference, in posterior sds, between the centre of a posterior and the robot beside it.
+APART = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Posterior:
+    """A normal distribution of coordinates z, and what parameters they are.
+
+    u = location + spread · z, held within low and high (softly over `softness` of the spread, as in
+    `calibration.inference.priors.Coordinates`; 0 cuts), and θ = u, exp u, or u within half a turn.
+
+    Attributes:
+        coordinates: names of the parameters that have a coordinate each; units: of them.
+        mean, covariance: of z, shape (coordinates,) and (coordinates, coordinates).
+        location, spread, low, high: of u, in the parameter's unit or its logarithm; softness: [-].
+        kinds: `NORMAL`, `LOG` or `ANGLE`, of each.
+        tied: (follower, index of the coordinate that it follows, ratio).
+    """
+
+    coordinates: tuple[str, ...]
+    units: tuple[str, ...]
+    mean: np.ndarray
+    covariance: np.ndarray
+    location: np.ndarray
+    spread: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    softness: np.ndarray
+    kinds: tuple[str, ...]
+    tied: tuple[tuple[str, int, float], ...] = ()
+
+    def __len__(self) -> int:
+        """How many coordinates there are: columns of normal scores."""
+        return len(self.coordinates)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every parameter that it sets: those of its coordinates, then those tied to one."""
+        return (*self.coordinates, *(follower for follower, _, _ in self.tied))
+
+    @property
+    def root(self) -> np.ndarray:
+        """L with L Lᵀ = covariance, also where a coordinate does not vary."""
+        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
+
+    def at(self, z: Any) -> Any:
+        """Parameters [SI] in the order of `names` at coordinates z, shape (..., coordinates); traceable."""
+        import jax.numpy as jnp
+
+        from calibration.inference.priors import held_within
+
+        u = jnp.asarray(self.location) + jnp.asarray(self.spread) * z
+        u = held_within(u, self.low, self.high, self.softness * self.spread)
+        kinds = np.asarray(self.kinds)
+        theta = jnp.where(jnp.asarray(kinds == LOG), jnp.exp(jnp.where(kinds == LOG, u, 0.0)), u)
+        theta = jnp.where(jnp.asarray(kinds == ANGLE), jnp.remainder(u + jnp.pi, 2 * jnp.pi) - jnp.pi, theta)
+        followers = [ratio * theta[..., k] for _, k, ratio in self.tied]
+        return jnp.concatenate([theta, jnp.stack(followers, -1)], -1) if followers else theta
+
+    def values(self, normal_scores: Any) -> Any:
+        """Parameters [SI] of draws.
+
+        Args:
+            normal_scores: independent standard normal numbers, shape (draws, coordinates).
+
+        Returns:
+            Shape (draws, names).
+        """
+        return self.at(np.asarray(self.mean) + normal_scores @ self.root.T)
+
+    def draw(self, draws: int, seed: int) -> np.ndarray:
+        """Parameters [SI] of so many random draws, shape (draws, names)."""
+        return np.asarray(self.values(np.random.default_rng(seed).standard_normal((draws, len(self)))))
+
+    def check(self, robot: Robot, where: str) -> None:
+        """Refuse a posterior that is not this robot's.
+
+        Args:
+            where: opens the message.
+
+        Raises:
+            BadData: a parameter that the robot does not have, or whose value is not where the posterior is.
+        """
+        from mmrjax import params
+
+        known = {p.name: float(p.value) for p in params.walk(robot)}
+        for name in self.names:
+            if name not in known:
+                raise BadData(
+                    f"{where}: a posterior of {name}, which this robot does not have, so it is of another robot; "
+                    f"{choices(name, [n for n in known if n.rpartition('.')[2] == name.rpartition('.')[2]] or known)}"
+                )
+        at = np.asarray(self.at(np.asarray(self.mean)))
+        sd = np.asarray(self.sd)
+        for name, value, width in zip(self.names, at, sd, strict=True):
+            if abs(known[name] - value) > APART * width + 1e-6 * abs(value):
+                raise BadData(
+                    f"{where}: {name} is {known[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
+                    "posterior: take the robot.toml beside it, without changes to what was fitted"
+                )
+
+    @property
+    def sd(self) -> np.ndarray:
+        """Standard deviation of each parameter of `names` to first order [SI]."""
+        import jax
+
+        slopes = np.asarray(jax.jacfwd(self.at)(np.asarray(self.mean)))
+        return np.sqrt(np.einsum("ij,jk,ik->i", slopes, self.covariance, slopes))
+
+
+def write(posterior: Posterior, path: Path | str) -> None:
+    """Write a posterior as NetCDF 3, which `xarray.open_dataset` reads with units and long names."""
+    import xarray as xr
+
+    p = posterior
+    names = ("coordinate",)
+    columns = {
+        "mean": (p.mean, "of z"),
+        "location": (p.location, "u at z = 0, the parameter or its logarithm"),
+        "spread": (p.spread, "du/dz"),
+        "low": (p.low, "least u"),
+        "high": (p.high, "greatest u"),
+        "softness": (p.softness, "width over which bounds are rounded off, as a share of the spread"),
+        "value": (np.asarray(p.at(p.mean))[: len(p)], "parameter at the mean [SI]"),
+        "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
+    }
+    data: dict[str, Any] = {
+        key: (names, np.asarray(x, float), {"long_name": words}) for key, (x, words) in columns.items()
+    }
+    square = ("coordinate", "coordinate_2")
+    data["covariance"] = (square, np.asarray(p.covariance, float), {"long_name": "covariance of z"})
+    data["kind"] = (names, np.asarray(p.kinds, "S16"), {"long_name": "transformation of u"})
+    data["units"] = (names, np.asarray([u.encode() for u in p.units]), {"long_name": "of the parameter"})
+    if p.tied:
+        data["tied"] = (("follower",), np.asarray([t[0].encode() for t in p.tied]), {"long_name": "follows another"})
+        data["tied_to"] = (("follower",), np.asarray([t[1] for t in p.tied], np.int32), {"long_name": "its index"})
+        data["tied_ratio"] = (("follower",), np.asarray([t[2] for t in p.tied]), {"long_name": "ratio to that"})
+    coordinates = {"coordinate": np.asarray([n.encode() for n in p.coordinates])}
+    about = {"schema": SCHEMA, "title": "posterior of a calibrated robot, normal in z: u = location + spread z"}
+    xr.Dataset(data, coordinates, about).to_netcdf(path, engine="scipy", format="NETCDF3_64BIT")
+
+
+def read(path: Path | str) -> Posterior:
+    """Read `posterior.nc`.
+
+    Raises:
+        BadData: no such file, not a posterior, or one that is damaged.
+    """
+    import xarray as xr
+
+    path = Path(path)
+    if not path.is_file():
+        raise BadData(f"{path}: no such file; expected the {FILE} that calibrate and loop leave beside robot.toml")
+    try:
+        with xr.open_dataset(path, engine="scipy") as data:
+            data.load()
+        found = _of(data)
+    except Exception as error:  # whatever a damaged file makes the reader raise
+        raise BadData(f"{path}: not a posterior that can be read ({type(error).__name__}: {error})") from error
+    size = len(found)
+    sound = (
+        found.covariance.shape == (size, size)
+        and np.isfinite(found.covariance).all()
+        and np.isfinite(found.mean).all()
+        and np.linalg.eigvalsh(found.covariance).min() >= -1e-9 * max(np.abs(found.covariance).max(), 1e-300)
+        and set(found.kinds) <= {NORMAL, LOG, ANGLE}
+    )
+    if not sound:
+        raise BadData(f"{path}: the covariance is not one, or a number is missing; write the file anew")
+    return found
+
+
+def _words(values: Any) -> tuple[str, ...]:
+    return tuple(v.decode() if isinstance(v, bytes) else str(v) for v in np.asarray(values).tolist())
+
+
+def _of(data: Any) -> Posterior:
+    if data.attrs.get("schema") != SCHEMA:
+        raise ValueError(f"schema {data.attrs.get('schema')}, expected {SCHEMA}")
+    tied: tuple[tuple[str, int, float], ...] = ()
+    if "tied" in data:
+        parts = (_words(data["tied"]), data["tied_to"].values.tolist(), data["tied_ratio"].values.tolist())
+        tied = tuple(zip(*parts, strict=True))
+    columns = ("mean", "location", "spread", "low", "high", "softness")
+    numbers = {k: np.asarray(data[k].values, float) for k in columns}
+    return Posterior(
+        coordinates=_words(data["coordinate"]),
+        units=_words(data["units"]),
+        covariance=np.asarray(data["covariance"].values, float),
+        kinds=_words(data["kind"]),
+        tied=tied,
+        **numbers,
+    )
+
+
+def joined(parts: Sequence[Posterior], covariance: np.ndarray) -> Posterior:
+    """Several sets of coordinates as one, of which `covariance` is that of all."""
+    fields = {
+        f: np.concatenate([getattr(p, f) for p in parts])
+        for f in ("mean", "location", "spread", "low", "high", "softness")
+    }
+    tied: list[tuple[str, int, float]] = []
+    first = 0
+    for p in parts:
+        tied += [(name, first + k, ratio) for name, k, ratio in p.tied]
+        first += len(p)
+    return Posterior(
+        coordinates=tuple(n for p in parts for n in p.coordinates),
+        units=tuple(u for p in parts for u in p.units),
+        covariance=covariance,
+        kinds=tuple(k for p in parts for k in p.kinds),
+        tied=tuple(tied),
+        **fields,
+    )

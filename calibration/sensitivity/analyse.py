@@ -1,0 +1,238 @@
+"""A whole sensitivity study: what matters where, and what would tell more."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.errors import BadConfiguration
+from calibration.inference.identifiability import Z95
+from calibration.sensitivity.inputs import Inputs
+from calibration.sensitivity.local import Local, directions, inert, local
+from calibration.sensitivity.methods import Part, by_derivative, by_morris, by_shapley, by_sobol
+from calibration.sensitivity.model import OutputRow
+from calibration.sensitivity.next_runs import Candidates, next_runs
+from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
+from calibration.sensitivity.study import Study
+from mmrjax import fidelities
+from mmrjax.derived import Derived
+
+#: Model evaluations in all where none are stated: of solves, of solves for Shapley effects, whose design costs as
+#: much again, and where a run over time is among the outputs.
+EVALUATIONS, EVALUATIONS_SHAPLEY, EVALUATIONS_LONG = 1_000_000, 300_000, 100_000
+#: Fewest that may be asked for.
+LEAST = 1_000
+
+
+def default_evaluations(outputs: tuple[OutputRow, ...], model: str, method: str) -> int:
+    """Model evaluations where none are stated."""
+    long = fidelities.facts(model).rollout or any(
+        isinstance(o, Derived) and o.module.endswith(".start") for o in outputs
+    )
+    return EVALUATIONS_LONG if long else EVALUATIONS_SHAPLEY if method == "shapley" else EVALUATIONS
+
+
+def analyse(
+    study: Study, method: str, evaluations: int | None = None, seed: int = 0, candidates: Candidates | None = None
+) -> SensitivityResult:
+    """A whole study.
+
+    Args:
+        method: one of `METHODS`.
+        evaluations: at least so many of the model, in all; None takes the default.
+        seed: random seed.
+        candidates: runs that could be made; None proposes none.
+
+    Raises:
+        BadConfiguration: a method that is not known or that needs independent inputs, too few evaluations, inputs
+            none of which changes an output, or points none of which can be studied.
+    """
+    inputs, model = study.inputs, study.model
+    if method not in METHODS:
+        raise BadConfiguration(f"--method: got {method}; expected one of {', '.join(METHODS)}")
+    if inputs.is_posterior and method in ("sobol", "morris", "derivative"):
+        raise BadConfiguration(
+            f"--method {method}: takes inputs for independent, and those of a posterior are not; "
+            "expected shapley, or local"
+        )
+    usual = default_evaluations(model.outputs, model.fidelity, method)
+    evaluations = usual if evaluations is None else evaluations
+    if evaluations < LEAST:
+        raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
+    study.tell("derivatives at every operating point")
+    found = local(study)
+    if not any(np.isfinite(x).any() for x in found.value.values()):
+        raise BadConfiguration(_none_converges(study, found.statuses))
+    idle = inert(study, found, seed)
+    if idle.all():
+        raise BadConfiguration(
+            "--parameters: the derivative of every output by every input is zero; choose others, or other --outputs"
+        )
+    parts = _by_method(study, method, ~idle, evaluations, seed)
+    comparison: dict[str, dict[str, Any]] = {}
+    if method == "derivative":
+        spent = study.evaluations, study.seconds
+        study.tell("Sobol indices of the same points, to compare the bounds with")
+        comparison = _compared(study, parts, by_sobol(study, ~idle, evaluations, seed, second=False))
+        study.evaluations, study.seconds = spent
+    outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
+    if method != "local" and not any(s.studied.any() for s in outputs.values()):
+        raise BadConfiguration(_none_converges(study, study.statuses()))
+    proposed = None if candidates is None else next_runs(study, found, candidates)
+    return SensitivityResult(
+        method=method,
+        model=model.fidelity,
+        seed=seed,
+        inputs=_described(inputs, idle),
+        correlated=inputs.is_posterior,
+        points=study.points,
+        outputs=outputs,
+        statuses=found.statuses,
+        sampled=study.statuses(),
+        next_runs=proposed,
+        evaluations=study.evaluations,
+        seconds=round(study.seconds, 3),
+        comparison=comparison,
+        notes=_notes(study, method, outputs, idle),
+    )
+
+
+def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
+    if method == "local":
+        return {}
+    study.tell(f"{METHODS[method]}, over {len(study.points)} operating points")
+    if method == "sobol":
+        return by_sobol(study, moving, evaluations, seed)
+    if method == "morris":
+        return by_morris(study, moving, evaluations, seed)
+    if method == "derivative":
+        return by_derivative(study, moving, seed)
+    return by_shapley(study, moving, evaluations, seed)
+
+
+def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:
+    slope = np.asarray(jax.jacfwd(inputs.values)(jnp.asarray(inputs.centre)))[inputs.places]
+    uniform = np.arange(len(inputs)) >= len(inputs.parameters)
+    sd = np.where(uniform, np.abs(slope).sum(1) / np.sqrt(12), np.sqrt(np.sum(slope**2, 1)))
+    along = directions(inputs)
+    p = len(inputs.parameters)
+    rows = {q: np.tile(inputs.centre, (len(inputs), 1)) for q in (-1, 0, 1)}
+    for side in (-1, 1):
+        rows[side][:, :p] += side * Z95 * along[:, :p]
+        for k in range(p, len(inputs)):
+            rows[side][k] = inputs.centre
+            rows[side][k, k] = 0.5 + side * 0.475
+    at = {
+        q: np.asarray(inputs.values(jnp.asarray(x)))[:, inputs.places][np.arange(len(inputs)), np.arange(len(inputs))]
+        for q, x in rows.items()
+    }
+    found = {}
+    for k, name in enumerate(inputs.names):
+        kind = "uniform" if uniform[k] else "posterior" if inputs.is_posterior else inputs.parameters.kinds[k]
+        axis = inputs.axes[name]
+        interval = (float(at[-1][k]), float(at[1][k]))
+        found[name] = Input(axis.unit, axis.meaning, kind, float(at[0][k]), interval, float(sd[k]), bool(idle[k]))
+    return found
+
+
+def _study_of(row: OutputRow, study: Study, found: Local, part: Part | None) -> OutputStudy:
+    name, points = row.name, len(study.points)
+    value, slopes, scores = found.value[name], found.derivative[name], found.by_score[name]
+    median = np.asarray(study.inputs.values(jnp.asarray(study.inputs.centre)))[study.inputs.places]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        elasticity = slopes * median / value[:, None]
+    elasticity = np.where(np.isfinite(elasticity), elasticity, np.nan)
+    # A condition's score is uniform in 0..1, of variance 1/12.
+    weight = np.where(np.arange(len(study.inputs)) < len(study.inputs.parameters), 1.0, 1 / 12)
+    along = directions(study.inputs)
+    moved = (scores @ along.T) ** 2 * weight if study.inputs.is_posterior else scores**2 * weight
+    variance = np.sum(scores**2 * weight, 1)
+    linear = moved / np.where(variance > 0, variance, 1.0)[:, None]
+    there = np.isfinite(value)
+    share = np.where(there[:, None], linear, np.nan)
+    sd = np.where(there, np.sqrt(variance), np.nan)
+    if part is None:
+        nothing = np.zeros(points)
+        return OutputStudy(
+            row, value, slopes, elasticity, found.swing[name], sd, share, {}, {}, None, (), nothing, there
+        )
+    return OutputStudy(
+        row,
+        value,
+        slopes,
+        elasticity,
+        found.swing[name],
+        sd if part.sd is None else part.sd,
+        np.full_like(share, np.nan) if part.share is None else part.share,
+        part.overall,
+        part.at_points,
+        part.second,
+        part.convergence,
+        part.lost,
+        part.studied,
+    )
+
+
+def _compared(study: Study, bounds: dict[str, Part], sampled: dict[str, Part]) -> dict[str, dict[str, Any]]:
+    """How the bounds of derivatives compare with Sobol indices of the same points, by output."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, bound in bounds.items():
+        beside = sampled[name]
+        if not bound.overall or not beside.overall:
+            continue
+        total, first = beside.overall["total"], beside.overall["first"]
+        upper, lower = bound.overall["upper"], bound.overall["lower"]
+        found[name] = {
+            "inputs": {
+                n: {
+                    "lower": float(lower.value[k]),
+                    "first": float(first.value[k]),
+                    "total": float(total.value[k]),
+                    "upper": float(upper.value[k]),
+                }
+                for k, n in enumerate(study.inputs.names)
+            },
+            "upper_holds": bool(np.all(upper.high >= total.low - 1e-12)),
+            "lower_holds": bool(np.all(lower.low <= first.high + 1e-12)),
+            "largest_excess": float(np.max(upper.value - total.value)),
+        }
+    return found
+
+
+def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
+    said = "; ".join(f"{s}: " + ", ".join(f"{n} {w}" for w, n in by.items()) for s, by in statuses.items())
+    return (
+        f"no operating point can be studied, since too many robots do not travel there ({said}); choose gentler "
+        "--slopes, another --voltages, or state what is known of the adhesion with --set or by calibrating"
+    )
+
+
+def _notes(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray) -> tuple[str, ...]:
+    said = []
+    alike: dict[tuple[bytes, bytes], list[OutputStudy]] = {}
+    for o in outputs.values():
+        alike.setdefault((o.studied.tobytes(), o.lost.tobytes()), []).append(o)
+    for group in alike.values():
+        o, names = group[0], ", ".join(x.row.label for x in group)
+        if not o.studied.all():
+            out = int((~o.studied).sum())
+            who = "the robot does" if method == "local" else "too many robots of the sample do"
+            said.append(
+                f"{out} of {len(o.studied)} operating points are left out, since {who} not travel there ({names})"
+            )
+        some = o.studied & (o.lost >= 1e-3)
+        if some.any():
+            said.append(
+                f"at {int(some.sum())} operating points up to {100 * o.lost[some].max():.1f} % of the sample is left "
+                f"out, since the robot does not travel there: the indices are of robots that do ({names})"
+            )
+    if idle.any():
+        names = ", ".join(n for n, k in zip(study.inputs.names, idle, strict=True) if k)
+        said.append(f"not sampled, since every derivative by them is exactly zero where one was taken: {names}")
+    if study.inputs.parameters.tied:
+        followers = ", ".join(f for f, _, _ in study.inputs.parameters.tied)
+        said.append(f"kept at their ratio to another input, and part of what it does: {followers}")
+    return tuple(said)

@@ -1,0 +1,99 @@
+"""Exact derivatives at the medians of the inputs, what each input alone does, and which do nothing at all."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.inference.identifiability import Z95
+from calibration.sensitivity import derivative
+from calibration.sensitivity.inputs import Inputs
+from calibration.sensitivity.study import Study, jacobian_of, source_words
+
+#: Random robots at which derivatives are looked at before an input is taken for inert, and at how many points.
+LOOKS, PLACES = 4, 12
+
+
+@dataclasses.dataclass(frozen=True)
+class Local:
+    """At the medians of the inputs; arrays over (points, inputs), NaN at points without numbers.
+
+    Attributes:
+        value: [SI], shape (points,); derivative: by each input [SI per unit]; by_score: by its score [SI].
+        swing: with each input alone at the ends of its 95 % interval [SI], shape (2, points, inputs).
+    """
+
+    value: dict[str, np.ndarray]
+    derivative: dict[str, np.ndarray]
+    by_score: dict[str, np.ndarray]
+    swing: dict[str, np.ndarray]
+    statuses: dict[str, dict[str, int]]
+
+
+def directions(inputs: Inputs) -> np.ndarray:
+    """Directions in scores along which each input moves by one sd, the others following as they are correlated with
+    it; rows, each of length 1 (conditions: along their own score)."""
+    p = len(inputs.parameters)
+    whole = np.eye(len(inputs))
+    root = inputs.parameters.root
+    length = np.linalg.norm(root, axis=1, keepdims=True)
+    whole[:p, :p] = root / np.where(length > 0, length, 1.0)
+    return whole
+
+
+def local(study: Study) -> Local:
+    """Values, exact derivatives and swings at every point."""
+    inputs, points = study.inputs, len(study.points)
+    d, centre = len(inputs), np.tile(study.inputs.centre, (points, 1))
+    values = study.values_at(centre)
+    answer = study.model(values, study.conditions)
+    by_columns = study.model.derivatives(values, study.conditions)
+    inner = np.asarray(jacobian_of(inputs, centre))
+    places, tied = inputs.places, inputs.parameters.tied
+    first_tied = len(inputs.parameters)
+    derivative, by_score, swing = {}, {}, {}
+    for name, moved in by_columns.items():
+        there = np.isfinite(answer.values[name])[:, None]
+        own = moved[:, places].copy()
+        for j, (_, leader, ratio) in enumerate(tied):  # what follows a parameter goes with it
+            own[:, leader] += ratio * moved[:, first_tied + j]
+        derivative[name] = np.where(there, own, np.nan)
+        by_score[name] = np.where(there, np.einsum("pc,pci->pi", moved, inner), np.nan)
+    along = directions(inputs)
+    p = len(inputs.parameters)
+    ends = []
+    for side in (-1, 1):
+        scores = np.tile(centre[:, None], (1, d, 1))
+        scores[:, :p] += side * Z95 * along[:p]
+        for k in range(p, d):
+            scores[:, k, k] = 0.5 + side * 0.475
+        rows = scores.reshape(-1, d)
+        spread = jax.tree.map(lambda x: jnp.repeat(x, d), study.conditions)
+        ends.append({n: x.reshape(points, d) for n, x in study.model(study.values_at(rows), spread).values.items()})
+    for name in by_columns:
+        swing[name] = np.stack([end[name] for end in ends])
+    return Local(answer.values, derivative, by_score, swing, _in_words(answer.counts()))
+
+
+def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
+    return {source_words(source): by for source, by in counts.items()}
+
+
+def inert(study: Study, found: Local, seed: int) -> np.ndarray:
+    """Inputs by which the derivative of every output is exactly zero wherever it was taken, shape (inputs,)."""
+    scores = study.inputs.scores(jnp.asarray(derivative.design(len(study.inputs), 1, seed, LOOKS)))
+    moving = np.zeros(len(study.inputs), bool)
+    for g in found.by_score.values():
+        moving |= (np.nan_to_num(g) != 0).any(0)
+    if moving.all():
+        return ~moving
+    points = np.unique(np.linspace(0, len(study.points) - 1, PLACES).astype(int))
+    rows = np.repeat(np.asarray(scores), len(points), 0)
+    conditions = jax.tree.map(lambda x: jnp.tile(x[points], len(scores)), study.conditions)
+    _, gradients = study.gradients(rows, conditions)
+    for g in gradients.values():
+        moving |= (np.nan_to_num(g) != 0).any(0)
+    return ~moving

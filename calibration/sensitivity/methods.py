@@ -1,0 +1,267 @@
+"""The methods, over all operating points of a study: each gives a part of what is said of every output."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.inference.identifiability import Z95
+from calibration.sensitivity import derivative, morris, shapley, sobol
+from calibration.sensitivity.inputs import Inputs
+from calibration.sensitivity.replicates import REPLICATES, Estimate
+from calibration.sensitivity.study import Study
+
+#: Largest share of base points that may be without numbers for a point to be studied.
+MOST_LOST = 0.5
+#: Replicates of the derivative method, and points of each.
+GRADIENTS = (8, 8)
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """What a method found of one output: as fields of `OutputStudy`."""
+
+    overall: dict[str, Estimate]
+    at_points: dict[str, Estimate]
+    share: np.ndarray | None
+    sd: np.ndarray | None
+    second: Estimate | None
+    convergence: tuple[tuple[int, Estimate], ...]
+    lost: np.ndarray
+    studied: np.ndarray
+
+
+def _sampled(study: Study, unit: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Scores of all inputs at points of the unit cube of some of them."""
+    whole = np.full((len(unit), len(study.inputs)), 0.5)
+    whole[:, which] = unit
+    return np.asarray(study.inputs.scores(jnp.asarray(whole)))
+
+
+def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]:
+    """Points by the inputs that act there."""
+    found: dict[tuple[int, ...], list[int]] = {}
+    for k in range(len(study.points)):
+        which = tuple(i for i in study.acting(k) if moving[i])
+        if which:
+            found.setdefault(which, []).append(k)
+    return found
+
+
+def _blank(points: int, size: int) -> Estimate:
+    return Estimate(*(np.full((points, size), np.nan) for _ in range(3)))
+
+
+def _put(into: Estimate, k: int, found: Estimate) -> None:
+    into.value[k], into.low[k], into.high[k] = found.value, found.low, found.high
+
+
+def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, second: bool = True) -> dict[str, Part]:
+    """First, total and second-order indices at every point, and over all of them."""
+    points, d = len(study.points), len(study.inputs)
+    names = [o.name for o in study.model.outputs]
+    terms: dict[str, dict[int, sobol.Terms]] = {name: {} for name in names}
+    lost = {name: np.zeros(points) for name in names}
+    base = {}
+    for which, group in groups(study, moving).items():
+        size = sobol.size_of(evaluations / points, len(which), second)
+        design = sobol.design(len(which), size, seed, second)
+        scores = _sampled(study, design.points, np.array(which))
+        base = {"rows": design.size * design.replicates, "blocks": design.blocks}
+        for k, made in study.sample(study.values_at(scores), group):
+            for name in names:
+                found = sobol.terms(design, made[name])
+                rows = design.size * design.replicates
+                lost[name][k] = 1.0 if found is None else found.lost / rows
+                if found is not None and lost[name][k] <= MOST_LOST:
+                    terms[name][k] = found.widened(which, d)
+    answer = {}
+    for name in names:
+        first, total, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
+        whole: sobol.Terms | None = None
+        for k, found in terms[name].items():
+            at = sobol.indices(found)
+            _put(first, k, at.first)
+            _put(total, k, at.total)
+            sd[k] = np.sqrt(at.variance)
+            whole = found if whole is None else whole + found
+        studied = np.array([k in terms[name] for k in range(points)])
+        if whole is None:
+            answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
+            continue
+        overall = sobol.indices(whole)
+        stages = [(r, sobol.indices(whole, r).total) for r in sobol.STAGES]
+        count = base["rows"] * base["blocks"] * int(studied.sum())
+        answer[name] = Part(
+            {"first": overall.first, "total": overall.total},
+            {"first": first, "total": total},
+            np.where(np.isfinite(total.value), np.clip(total.value, 0.0, 1.0), np.nan),
+            sd,
+            overall.second,
+            tuple((count * r // REPLICATES, e) for r, e in stages),
+            lost[name],
+            studied,
+        )
+    return answer
+
+
+def by_morris(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
+    """Elementary effects over the 95 % range of every input, at every point."""
+    points, d = len(study.points), len(study.inputs)
+    names = [o.name for o in study.model.outputs]
+    found: dict[str, dict[int, tuple[morris.Effects, tuple[int, ...]]]] = {name: {} for name in names}
+    lost = {name: np.zeros(points) for name in names}
+    for which, group in groups(study, moving).items():
+        count = max(int(np.ceil(evaluations / points / (len(which) + 1))), 10)
+        unit = morris.design(len(which), count, seed)
+        scores = np.array(_sampled(study, 0.025 + 0.95 * unit, np.array(which)))
+        # Trajectories go in equal steps of the scores, whose ends are those of the 95 % interval.
+        normal = np.arange(d) < len(study.inputs.parameters)
+        for j, i in enumerate(which):
+            if normal[i]:
+                scores[:, i] = Z95 * (2 * unit[:, j] - 1)
+        for k, made in study.sample(study.values_at(scores), group):
+            for name in names:
+                effects = morris.effects(unit, made[name])
+                lost[name][k] = 1.0 if effects is None else effects.lost / count
+                if effects is not None and lost[name][k] <= MOST_LOST:
+                    found[name][k] = effects, which
+    answer = {}
+    for name in names:
+        size, mean, spread = _blank(points, d), np.full((points, d), np.nan), np.full((points, d), np.nan)
+        for k, (effects, which) in found[name].items():
+            places = list(which)
+            for whole, part in (
+                (size.value, effects.size.value),
+                (size.low, effects.size.low),
+                (size.high, effects.size.high),
+                (mean, effects.mean),
+                (spread, effects.spread),
+            ):
+                whole[k] = 0.0
+                whole[k, places] = part  # fmt: skip
+        studied = np.array([k in found[name] for k in range(points)])
+        if not studied.any():
+            answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
+            continue
+        square = size.value**2
+        share = square / np.where(square.sum(1, keepdims=True) > 0, square.sum(1, keepdims=True), 1.0)
+        rows = np.flatnonzero(studied)
+        overall = {
+            "mean_absolute_effect": Estimate(*(x[rows].mean(0) for x in (size.value, size.low, size.high))),
+            "mean_effect": Estimate(*(mean[rows].mean(0),) * 3),
+            "sd_effect": Estimate(*(spread[rows].mean(0),) * 3),
+        }
+        at_points = {
+            "mean_absolute_effect": size,
+            "mean_effect": Estimate(mean, mean, mean),
+            "sd_effect": Estimate(spread, spread, spread),
+        }
+        answer[name] = Part(overall, at_points, share, None, None, (), lost[name], studied)
+    return answer
+
+
+def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part]:
+    """Bounds of first-order and total indices from exact gradients, at every point."""
+    points, d = len(study.points), len(study.inputs)
+    names = [o.name for o in study.model.outputs]
+    normal = np.arange(d) < len(study.inputs.parameters)
+    replicates, size = GRADIENTS
+    unit = derivative.design(d, size, seed, replicates)
+    scores = np.asarray(study.inputs.scores(jnp.asarray(unit)))
+    rows = np.tile(scores, (points, 1))
+    conditions = jax.tree.map(lambda x: jnp.repeat(x, len(scores)), study.conditions)
+    began = time.perf_counter()
+    values, gradients = study.gradients(rows, conditions)
+    study.seconds += time.perf_counter() - began
+    study.evaluations += len(rows)
+    answer = {}
+    for name in names:
+        lower, upper, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
+        y, g = values[name].reshape(points, -1), gradients[name].reshape(points, len(scores), d)
+        lost = 1 - np.isfinite(y).mean(1)
+        whole: derivative.Terms | None = None
+        studied = np.zeros(points, bool)
+        for k in map(int, np.flatnonzero(lost <= MOST_LOST)):
+            found = derivative.terms(scores, y[k], g[k], normal, replicates)
+            if found is None:
+                continue
+            at = derivative.bounds(found)
+            _put(lower, k, at.lower)
+            _put(upper, k, at.upper)
+            sd[k] = np.sqrt(at.variance)
+            studied[k] = True
+            whole = found if whole is None else whole + found
+        if whole is None:
+            answer[name] = Part({}, {}, None, None, None, (), lost, studied)
+            continue
+        overall = derivative.bounds(whole)
+        share = np.where(np.isfinite(upper.value), np.clip(upper.value, 0.0, 1.0), np.nan)
+        answer[name] = Part(
+            {"lower": overall.lower, "upper": overall.upper},
+            {"lower": lower, "upper": upper},
+            share, sd, None, (), lost, studied,
+        )  # fmt: skip
+    return answer
+
+
+def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
+    """Shapley effects at every point, and over all of them."""
+    points, d = len(study.points), len(study.inputs)
+    names = [o.name for o in study.model.outputs]
+    p = len(study.inputs.parameters)
+    covariance = np.eye(d)
+    covariance[:p, :p] = study.inputs.parameters.covariance
+    mean = np.concatenate([study.inputs.parameters.mean, np.zeros(d - p)])
+    terms: dict[str, dict[int, tuple[shapley.Terms, tuple[int, ...]]]] = {name: {} for name in names}
+    lost = {name: np.zeros(points) for name in names}
+    for which, group in groups(study, moving).items():
+        places = np.array(which)
+        pairs = shapley.pairs_of(evaluations / points, len(which))
+        design = shapley.design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
+        z = np.tile(mean, (len(design.points), 1))
+        z[:, places] = design.points
+        values = np.asarray(_at_coordinates(study.inputs, z))
+        for k, made in study.sample(values, group):
+            for name in names:
+                found = shapley.terms(design, made[name])
+                lost[name][k] = 1.0 if found is None else found.lost
+                if found is not None and lost[name][k] <= MOST_LOST:
+                    terms[name][k] = found, which
+    answer = {}
+    for name in names:
+        shown, sd = _blank(points, d), np.full(points, np.nan)
+        studied = np.zeros(points, bool)
+        sums, variance = [], 0.0
+        for k, (found, which) in terms[name].items():
+            wide = np.zeros((len(found.parts), d))
+            wide[:, list(which)] = found.parts
+            _put(shown, k, shapley.effects(dataclasses.replace(found, parts=wide)))
+            sd[k], studied[k] = np.sqrt(found.variance), True
+            sums.append(wide)
+            variance += found.variance
+        if not studied.any():
+            answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
+            continue
+        fewest = min(map(len, sums))
+        total = np.sum([s[:fewest] for s in sums], 0)
+        overall = shapley.effects(shapley.Terms(variance, total, 0.0))
+        answer[name] = Part(
+            {"shapley": overall},
+            {"shapley": shown},
+            np.where(np.isfinite(shown.value), np.clip(shown.value, 0.0, 1.0), np.nan),
+            sd, None, (), lost[name], studied,
+        )  # fmt: skip
+    return answer
+
+
+def _at_coordinates(inputs: Inputs, z: np.ndarray) -> jax.Array:
+    """Columns of the model at coordinates: of the posterior, and normal scores of conditions."""
+    p = len(inputs.parameters)
+    theta = inputs.parameters.at(jnp.asarray(z[:, :p]))
+    share = jax.scipy.stats.norm.cdf(jnp.asarray(z[:, p:]))
+    return jnp.concatenate([theta, jnp.asarray(inputs.low) + jnp.asarray(inputs.high - inputs.low) * share], -1)

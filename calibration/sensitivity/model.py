@@ -1,0 +1,233 @@
+"""A robot's outputs as functions of inputs, over many points at once: values, and exact derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from calibration.data.errors import BadConfiguration, choices
+from mmrjax import channels, derived, fidelities
+from mmrjax import outputs as table_of_outputs
+from mmrjax.conditions import Conditions
+from mmrjax.derived import Derived
+from mmrjax.outputs import Output
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED, STATUSES
+from mmrjax.variation import STATUS, Variation, evaluate
+
+#: Points of one call of few, and of many: solves, runs over time, and the derivatives of both. All calls have one of
+#: these shapes, so that every study of the same inputs and outputs shares what is compiled.
+CHUNKS = {"solves": (512, 32_768), "runs": (64, 2_048), "derivatives": (512, 512), "derivatives of runs": (64, 64)}
+#: Studied where no outputs are named, beside every channel.
+DEFAULT = ("slip", "power_supply", "efficiency_chassis", "steepest_slope")
+
+OutputRow = Output | Derived
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """Outputs of many points.
+
+    Attributes:
+        values: of each output [SI], NaN where its run did not converge; shape (points,).
+        statuses: source (a fidelity, or a module of derived outputs) → codes, shape (points,).
+    """
+
+    values: dict[str, np.ndarray]
+    statuses: dict[str, np.ndarray]
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Source → status → how many points."""
+        return {source: counted(codes) for source, codes in self.statuses.items()}
+
+
+def counted(codes: np.ndarray) -> dict[str, int]:
+    """Status → how many, of those that occur."""
+    each = np.bincount(codes, minlength=len(STATUSES))
+    return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
+
+
+def known_outputs() -> dict[str, OutputRow]:
+    """Every output by name: those of a fidelity, then the derived ones."""
+    rows: tuple[OutputRow, ...] = (*table_of_outputs.table(), *derived.TABLE)
+    return {o.name: o for o in rows}
+
+
+def chosen_outputs(words: tuple[str, ...]) -> tuple[OutputRow, ...]:
+    """The outputs of these names, the usual ones for none; `start` stands for all of the start.
+
+    Raises:
+        BadConfiguration: an unknown name; lists the choices.
+    """
+    known, found = known_outputs(), []
+    start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
+    for word in words or (*channels.names(), *DEFAULT):
+        for name in start if word == "start" else (word,):
+            if name not in known:
+                raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")
+            found.append(known[name])
+    return tuple(dict.fromkeys(found))
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """Outputs of a robot of which some parameters and conditions vary.
+
+    Attributes:
+        robot: that every point starts from; columns: names of what varies.
+        fidelity, options: that simulate what is not derived.
+        outputs: that are computed.
+    """
+
+    robot: Robot
+    columns: tuple[str, ...]
+    fidelity: str
+    options: Mapping[str, float]
+    outputs: tuple[OutputRow, ...]
+
+    @property
+    def sources(self) -> dict[str, tuple[OutputRow, ...]]:
+        """Outputs by what computes them: the fidelity's name, or the module of derived ones."""
+        found: dict[str, list[OutputRow]] = {}
+        for output in self.outputs:
+            found.setdefault(output.module if isinstance(output, Derived) else self.fidelity, []).append(output)
+        return {source: tuple(rows) for source, rows in found.items()}
+
+    def chunk(self, source: str, points: int, differentiated: bool = False) -> int:
+        """Points of one call, of so many in all."""
+        long = source.endswith(".start") or (source in fidelities.TABLE and fidelities.facts(source).rollout)
+        kind = ("derivatives of runs" if long else "derivatives") if differentiated else "runs" if long else "solves"
+        few, many = CHUNKS[kind]
+        return few if points <= 4 * few else many
+
+    def __call__(self, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
+        """Outputs of many points.
+
+        Args:
+            values: a row a point, in the order of `columns`.
+            conditions: what does not vary, of shape () or (points,).
+        """
+        return self.joined({source: self.of_source(source, values, conditions) for source in self.sources})
+
+    def of_source(self, source: str, values: Float[np.ndarray, "points columns"], conditions: Conditions) -> Answer:
+        """The outputs of one source alone; see `sources`."""
+        made = self._chunked(self._function(source), self.chunk(source, len(values)), values, conditions)
+        codes = made.pop(STATUS).astype(int)
+        return Answer(made, {source: codes})
+
+    def joined(self, parts: Mapping[str, Answer]) -> Answer:
+        """The outputs of all sources, in order."""
+        found = {name: x for part in parts.values() for name, x in part.values.items()}
+        statuses = {source: codes for part in parts.values() for source, codes in part.statuses.items()}
+        return Answer({o.name: found[o.name] for o in self.outputs}, statuses)
+
+    def ignores(self, source: str) -> tuple[str, ...]:
+        """Conditions on which no output of a source depends."""
+        each = [set(o.ignores) if isinstance(o, Derived) else set() for o in self.sources[source]]
+        return tuple(sorted(set.intersection(*each)))
+
+    def derivatives(
+        self, values: Float[np.ndarray, "points columns"], conditions: Conditions
+    ) -> dict[str, np.ndarray]:
+        """Exact derivatives of every output by every column [SI per unit], shape (points, columns); zeros where a
+        run has no numbers."""
+        found: dict[str, np.ndarray] = {}
+        for source in self.sources:
+            size = self.chunk(source, len(values), differentiated=True)
+            made = self._chunked(self._function(source, differentiated=True), size, values, conditions)
+            made.pop(STATUS)
+            found |= made
+        return {o.name: found[o.name] for o in self.outputs}
+
+    def _function(self, source: str, differentiated: bool = False) -> Callable[..., dict[str, Array]]:
+        rows = tuple(o.name for o in self.sources[source])
+        variation = Variation(self.robot, self.columns)
+        options = dict(self.options) if source == self.fidelity else {}
+        run = _derivatives if differentiated else _values
+        return lambda values, conditions: run(variation, source, options, rows, values, conditions)
+
+    def _chunked(
+        self, function: Callable[..., dict[str, Array]], size: int, values: Any, conditions: Conditions
+    ) -> dict[str, np.ndarray]:
+        """A function over chunks of one shape, the last filled up with its last point."""
+        points, values = len(values), np.asarray(values)
+        alike = conditions.shape == ()  # the program spreads them
+        spread = conditions if alike else jax.tree.map(np.asarray, conditions)
+        parts = []
+        for first in range(0, points, size):
+            count = min(size, points - first)
+            part, rows = values[first : first + count], spread
+            if not alike:
+                rows = jax.tree.map(lambda x, f=first, n=count: _filled(x[f : f + n], size), spread)
+            part = function(jnp.asarray(_filled(part, size)), rows)
+            parts.append({name: np.asarray(x)[:count] for name, x in part.items()})
+        if len(parts) == 1:
+            return parts[0]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _filled(rows: np.ndarray, size: int) -> np.ndarray:
+    """Rows with repeats of the last behind them, up to a size."""
+    if len(rows) == size:
+        return rows
+    return np.concatenate([rows, np.repeat(rows[-1:], size - len(rows), 0)])
+
+
+def _outputs(
+    variation: Variation,
+    source: str,
+    options: dict[str, float],
+    names: tuple[str, ...],
+    values: Array,
+    conditions: Conditions,
+) -> dict[str, Array]:
+    """Outputs of a source, NaN where the run did not converge, and statuses."""
+    if source in fidelities.TABLE:
+        made = evaluate(variation, source, values, conditions, options, names)
+    else:
+        made = _derived(variation, source, names, values, conditions)
+    there = made[STATUS] == CONVERGED
+    return {name: x if name == STATUS else jnp.where(there, x, jnp.nan) for name, x in made.items()}
+
+
+def _derived(
+    variation: Variation, source: str, names: tuple[str, ...], values: Array, conditions: Conditions
+) -> dict[str, Array]:
+    conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
+    compute = derived.compute(source)
+    made = jax.vmap(lambda v, c: compute(*variation.at(v, c)))(values, conditions)
+    return {name: made[name] for name in (*names, STATUS)}
+
+
+_values = eqx.filter_jit(_outputs)
+
+
+@eqx.filter_jit
+def _derivatives(
+    variation: Variation,
+    source: str,
+    options: dict[str, float],
+    names: tuple[str, ...],
+    values: Array,
+    conditions: Conditions,
+) -> dict[str, Array]:
+    """Each point's outputs depend on its own row alone: one tangent a column is the Jacobian of all of them."""
+
+    def numbers(values: Array) -> tuple[dict[str, Array], Array]:
+        made = _outputs(variation, source, options, names, values, conditions)
+        status = made.pop(STATUS)
+        return made, status
+
+    def along(direction: Array) -> tuple[dict[str, Array], Array]:
+        _, moved, status = jax.jvp(numbers, (values,), (jnp.broadcast_to(direction, values.shape),), has_aux=True)
+        return moved, status
+
+    moved, status = jax.vmap(along, out_axes=(-1, None))(jnp.eye(values.shape[1], dtype=values.dtype))
+    return {**moved, STATUS: status}

@@ -1,0 +1,99 @@
+"""Screening by elementary effects: how much an output changes when one input alone moves (Morris 1991).
+
+μ* is the mean size of the change per whole range of the input (Campolongo et al., Environ. Model. Softw. 22 (2007)),
+σ how much it changes from place to place: non-linear, or together with others. Trajectories and measures are SALib's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import stats
+
+from calibration.sensitivity.replicates import LEVEL, Estimate
+
+#: Levels of the grid on which trajectories go.
+LEVELS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects:
+    """Elementary effects of every input on an output [its unit per range of the input], shape (inputs,) each.
+
+    Attributes:
+        mean: μ; size: μ* with its interval; spread: σ.
+        trajectories: that count; lost: those left out, because the model has no number at one of their points.
+    """
+
+    mean: np.ndarray
+    size: Estimate
+    spread: np.ndarray
+    trajectories: int
+    lost: int
+
+
+def design(inputs: int, trajectories: int, seed: int) -> np.ndarray:
+    """Points of the unit cube, shape (trajectories · (inputs + 1), inputs)."""
+    from SALib.sample import morris as sampling
+
+    # The sampler draws from NumPy's global generator, whatever seed it is given; its state is put back.
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        return sampling.sample(_problem(inputs), trajectories, num_levels=LEVELS, seed=seed)
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
+def effects(points: np.ndarray, values: np.ndarray) -> Effects | None:
+    """Elementary effects of an output.
+
+    Args:
+        points: from `design`; values: of the output there.
+
+    Returns:
+        None where fewer than two trajectories have numbers all along.
+    """
+    from SALib.analyze.morris import analyze
+
+    count, steps = len(points) // (points.shape[1] + 1), points.shape[1] + 1
+    by = values.reshape(count, steps)
+    there = np.isfinite(by).all(1)
+    kept = np.repeat(there, steps)
+    if there.sum() < 2:
+        return None
+    state = np.random.get_state()  # noqa: NPY002
+    try:
+        found = analyze(_problem(points.shape[1]), points[kept], values[kept], num_levels=LEVELS, seed=0)
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+    size = np.asarray(found["mu_star"], float)
+    elementary = _elementary(points[kept].reshape(-1, steps, points.shape[1]), by[there])
+    width = float(stats.t.ppf(0.5 + LEVEL / 2, int(there.sum()) - 1)) / np.sqrt(there.sum())
+    error = width * np.abs(elementary).std(0, ddof=1)
+    return Effects(
+        np.asarray(found["mu"], float),
+        Estimate(size, size - error, size + error),
+        np.asarray(found["sigma"], float),
+        int(there.sum()),
+        int(count - there.sum()),
+    )
+
+
+def _elementary(points: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Change of the output over that of the input that moved, shape (trajectories, inputs)."""
+    moved = np.diff(points, axis=1)
+    which = np.abs(moved).argmax(-1)
+    change = np.diff(values, axis=1) / np.take_along_axis(moved, which[..., None], -1)[..., 0]
+    found = np.zeros_like(change)
+    np.put_along_axis(found, which, change, 1)
+    return found
+
+
+def _problem(inputs: int) -> dict[str, object]:
+    return {
+        "num_vars": inputs,
+        "names": [str(k) for k in range(inputs)],
+        "bounds": [[0.0, 1.0]] * inputs,
+        "groups": None,
+    }

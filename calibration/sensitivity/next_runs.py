@@ -1,0 +1,98 @@
+"""Which of a list of runs would tell most of the inputs of a study."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.sensitivity import information
+from calibration.sensitivity.local import Local
+from calibration.sensitivity.model import OutputRow, known_outputs
+from calibration.sensitivity.result import NextRuns, Points
+from calibration.sensitivity.study import Study, jacobian_of
+from mmrjax import channels
+from mmrjax.conditions import Conditions
+
+#: Runs proposed.
+RUNS = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidates:
+    """Runs that could be made.
+
+    Attributes:
+        points, conditions: of them; source: where they come from.
+        noise: channel's place → (number, whether it is a share of the reading), see `calibration.inference.noise`;
+            words: the same for a person.
+        sd: that the candidates state themselves [SI], NaN where they do not; shape (candidates, channels).
+        count: how many to propose.
+    """
+
+    points: Points
+    conditions: Conditions
+    source: str
+    noise: dict[int, tuple[float, bool]]
+    words: str
+    sd: np.ndarray
+    count: int = RUNS
+
+    def deviations(self, reading: np.ndarray) -> np.ndarray:
+        """Sd of readings [SI], shape (candidates, channels)."""
+        whole = np.empty_like(reading)
+        for k, (size, relative) in self.noise.items():
+            whole[:, k] = size * np.abs(reading[:, k]) if relative else size
+        return np.where(np.isfinite(self.sd), self.sd, whole)
+
+
+def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | None:
+    """The candidates that together tell most of the parameters, read with every channel.
+
+    Args:
+        found: of the study's own points.
+
+    Returns:
+        None where no candidate travels, or no parameter is uncertain.
+    """
+    points, conditions = candidates.points, candidates.conditions
+    shown = tuple(_row(c.name) for c in channels.CHANNELS)
+    model = dataclasses.replace(study.model, outputs=shown, fidelity="steady", options={})
+    p = len(study.inputs.parameters)
+    if not p:
+        return None
+    rows = np.tile(study.inputs.centre, (len(points), 1))
+    values = study.values_at(rows)
+    # A condition is set as a candidate says, whatever range it has in the study.
+    first = len(study.inputs.columns) - len(study.inputs.conditions)
+    for j, name in enumerate(study.inputs.conditions):
+        values[:, first + j] = np.asarray(getattr(conditions, name))
+    answer = model(values, conditions)
+    moved = model.derivatives(values, conditions)
+    inner = np.asarray(jacobian_of(study.inputs, rows))[:, :, :p]
+    jacobian = np.stack([np.einsum("pc,pci->pi", moved[o.name], inner) for o in shown], 1)
+    reading = np.stack([answer.values[o.name] for o in shown], 1)
+    there = np.isfinite(reading).all(1)
+    if not there.any():
+        return None
+    information_of = information.fisher(jacobian[there], candidates.deviations(reading)[there])
+    choice = information.choose(information_of, candidates.count)
+    picked = np.flatnonzero(there)[list(choice.rows)]
+    slope = np.asarray(jax.jacfwd(study.inputs.values)(jnp.asarray(study.inputs.centre)))[study.inputs.places][:, :p]
+    after = np.sqrt(np.einsum("ij,kjl,il->ki", slope, choice.covariance, slope))
+    outputs = {}
+    for name, g in found.by_score.items():
+        g = g[np.isfinite(g).all(1)][:, :p]
+        variance = np.einsum("pi,kij,pj->kp", g, choice.covariance, g)
+        outputs[name] = np.sqrt(variance.mean(1)) if len(g) else np.full(len(choice.covariance), np.nan)
+    whole = np.where(after[0] > 0, after[0], 1.0)
+    chosen = Points(*(column[picked] for column in points.columns().values()))
+    return NextRuns(
+        int(there.sum()), candidates.source, chosen, choice.gain, candidates.words, after / whole, outputs
+    )
+
+
+def _row(name: str) -> OutputRow:
+    return known_outputs()[name]

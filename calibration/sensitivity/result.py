@@ -1,0 +1,375 @@
+"""What a sensitivity study found: typed, by name; JSON, tables, terminal and report only read it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from calibration.sensitivity.model import OutputRow
+from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
+
+SCHEMA = "mmrjax.sensitivity/1"
+#: Methods, and what each says of an input in one line.
+METHODS = {
+    "local": "exact derivatives at the robot's own values",
+    "sobol": "shares of the variance, alone and with others",
+    "morris": "screening by elementary effects",
+    "derivative": "bounds of those shares from exact gradients",
+    "shapley": "shares of the variance of correlated inputs",
+}
+#: Share of an output's variance below which an input does not matter, whatever the output and the point [-].
+NEGLIGIBLE = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """Operating points; arrays of shape (points,)."""
+
+    configuration: np.ndarray
+    voltage: np.ndarray
+    payload: np.ndarray
+    slope_deg: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.voltage)
+
+    def label(self, k: int) -> str:
+        """A point in words."""
+        return f"{self.configuration[k]}, {self.voltage[k]:g} V, {self.payload[k]:g} kg, {self.slope_deg[k]:g}°"
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """As in tables of runs."""
+        return {
+            "configuration": self.configuration,
+            "supply_voltage_V": self.voltage,
+            "payload_kg": self.payload,
+            "slope_deg": self.slope_deg,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Input:
+    """An uncertain input.
+
+    Attributes:
+        unit, meaning: of its field; distribution: log-normal, normal, uniform or posterior.
+        median: [unit]; interval: that holds 95 % [unit]; sd: to first order [unit].
+        inert: whether every output's derivative by it was exactly zero wherever one was taken, so that it was left
+            out of the sampling.
+    """
+
+    unit: str
+    meaning: str
+    distribution: str
+    median: float
+    interval: tuple[float, float]
+    sd: float
+    inert: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class OutputStudy:
+    """What was found for one output; arrays over (points, inputs), NaN at points without numbers.
+
+    Attributes:
+        row: name, unit, label.
+        value: at the medians of the inputs [SI], shape (points,).
+        derivative: by each input [SI per its unit]; elasticity: (x / y) ∂y/∂x [-].
+        swing: the output with each input alone at the lower and upper end of its 95 % interval [SI], shape
+            (2, points, inputs).
+        sd: of the output over all inputs [SI], shape (points,): to first order, or of the sample where there is one.
+        share: of the variance that an input has a part in, as the method measures it [-].
+        overall: what the method says of each input over all points together, name → Estimate of shape (inputs,).
+        at_points: the same at each point, name → Estimate of shape (points, inputs).
+        second: interactions over all points, Estimate of shape (inputs, inputs); None without.
+        convergence: (model evaluations, Estimate of the main index) at stages.
+        lost: share of base points left out at each point, shape (points,); studied: whether the point counts.
+    """
+
+    row: OutputRow
+    value: np.ndarray
+    derivative: np.ndarray
+    elasticity: np.ndarray
+    swing: np.ndarray
+    sd: np.ndarray
+    share: np.ndarray
+    overall: dict[str, Estimate]
+    at_points: dict[str, Estimate]
+    second: Estimate | None
+    convergence: tuple[tuple[int, Estimate], ...]
+    lost: np.ndarray
+    studied: np.ndarray
+
+    @property
+    def overall_share(self) -> np.ndarray:
+        """Share over all points together, shape (inputs,): that of the method, else the mean of the points."""
+        main = next((self.overall[k].value for k in ("total", "shapley", "upper") if k in self.overall), None)
+        if main is not None and np.isfinite(main).any():
+            return np.clip(np.nan_to_num(main), 0.0, 1.0)
+        there = np.isfinite(self.share).any(1)
+        weight = np.where(there, np.nan_to_num(self.sd) ** 2, 0.0)
+        if not weight.sum() > 0:
+            return np.zeros(self.share.shape[1])
+        return np.einsum("p,pk->k", weight, np.nan_to_num(self.share)) / weight.sum()
+
+
+@dataclasses.dataclass(frozen=True)
+class Interaction:
+    """What two inputs do together beyond what each does: second-order index with its own 95 % interval; sure: whether
+    it is above zero also with an interval that allows for all pairs that were looked at."""
+
+    pair: tuple[str, str]
+    second: float
+    interval: tuple[float, float]
+    sure: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {
+            "pair": list(self.pair),
+            "second": self.second,
+            "second_interval": list(self.interval),
+            "sure": self.sure,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class NextRuns:
+    """Runs that would tell most of the inputs.
+
+    Attributes:
+        candidates: how many were looked at; source: where they come from.
+        points: those chosen, in order; gain: bits that each adds, shape (runs,).
+        noise: channel → sd as a share of the reading [-], and words for a person.
+        sd: of each input after so many runs, over that before any; shape (runs + 1, inputs).
+        output_sd: output → its sd, root mean square over the points, after so many runs [SI]; shape (runs + 1,).
+    """
+
+    candidates: int
+    source: str
+    points: Points
+    gain: np.ndarray
+    noise: str
+    sd: np.ndarray
+    output_sd: dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class SensitivityResult:
+    """A finished study.
+
+    Attributes:
+        method: one of `METHODS`; model: fidelity; seed: random seed.
+        inputs: by name, in order; correlated: whether they are a posterior.
+        points: operating points; outputs: by name.
+        statuses: source → status → points, at the medians; sampled: the same over the sample.
+        next_runs: None where there is no candidate that converges.
+        evaluations: of the model, in all; seconds: that these took, with what was compiled for them.
+        comparison: of bounds with sampled indices, by output; empty for other methods.
+        notes: sentences worth reading.
+    """
+
+    method: str
+    model: str
+    seed: int
+    inputs: dict[str, Input]
+    correlated: bool
+    points: Points
+    outputs: dict[str, OutputStudy]
+    statuses: dict[str, dict[str, int]]
+    sampled: dict[str, dict[str, int]]
+    next_runs: NextRuns | None
+    evaluations: int
+    seconds: float
+    comparison: dict[str, dict[str, Any]]
+    notes: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the inputs."""
+        return tuple(self.inputs)
+
+    def importance(self) -> np.ndarray:
+        """Largest share of each input over all outputs and points, upper ends of intervals; shape (inputs,)."""
+        most = np.zeros(len(self.inputs))
+        for study in self.outputs.values():
+            ends = [study.overall_share]
+            if study.at_points:
+                main = study.at_points.get("total") or study.at_points.get("shapley")
+                if main is not None:
+                    ends.append(np.nanmax(np.where(np.isfinite(main.high), main.high, 0.0), axis=0))
+            shares = np.where(np.isfinite(study.share), study.share, 0.0)
+            ends.append(shares.max(0, initial=0.0))
+            most = np.maximum(most, np.max(np.stack(ends), 0))
+        return np.clip(most, 0.0, 1.0)
+
+    @property
+    def negligible(self) -> tuple[str, ...]:
+        """Inputs that have less than `NEGLIGIBLE` of the variance of every output at every point."""
+        return tuple(n for n, x in zip(self.names, self.importance(), strict=True) if x < NEGLIGIBLE)
+
+    @property
+    def studied(self) -> bool:
+        """Whether every output has a number at every point."""
+        return all(o.studied.all() for o in self.outputs.values())
+
+    def statement(self) -> str:
+        """What decides these outputs, in one sentence."""
+        leaders: dict[str, list[str]] = {}
+        for study in self.outputs.values():
+            share = study.overall_share
+            if not share.max(initial=0.0) > 0:
+                continue
+            k = int(np.argmax(share))
+            leaders.setdefault(self.names[k], []).append(f"{study.row.label} ({100 * share[k]:.0f} %)")
+        if not leaders:
+            return "None of these inputs changes any of these outputs."
+        ordered = sorted(leaders.items(), key=lambda item: -len(item[1]))
+        said = "; ".join(f"{name} matters most for {', '.join(what)}" for name, what in ordered)
+        idle = len(self.negligible)
+        return (
+            f"{said[0].upper() if said[0].islower() and '.' not in said.split(' ')[0] else said[0]}{said[1:]}; "
+            + (f"{idle} of {len(self.inputs)} inputs do not matter." if idle else "every input matters somewhere.")
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json, docs/schemas/sensitivity.schema.json."""
+        names = self.names
+        return {
+            "schema": SCHEMA,
+            "method": self.method,
+            "model": self.model,
+            "seed": self.seed,
+            "statement": self.statement(),
+            "inputs": {name: dataclasses.asdict(x) for name, x in self.inputs.items()},
+            "correlated": self.correlated,
+            "points": [
+                {key: column[k].item() for key, column in self.points.columns().items()}
+                for k in range(len(self.points))
+            ],
+            "outputs": {name: _output(study) for name, study in self.outputs.items()},
+            "indices": {name: self._indices(study) for name, study in self.outputs.items()},
+            "interactions": {
+                name: [pair.to_json() for pair in interactions(study, names)]
+                for name, study in self.outputs.items()
+                if study.second is not None
+            },
+            "convergence": {
+                name: [
+                    {"evaluations": count, "indices": _by_input(names, {"index": estimate})}
+                    for count, estimate in study.convergence
+                ]
+                for name, study in self.outputs.items()
+                if study.convergence
+            },
+            "comparison": self.comparison,
+            "negligible": list(self.negligible),
+            "statuses": self.statuses,
+            "statuses_sampled": self.sampled,
+            "next_runs": None if self.next_runs is None else _next_runs(self.next_runs, names),
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+            "notes": list(self.notes),
+        }
+
+    def _indices(self, study: OutputStudy) -> dict[str, Any]:
+        if self.method == "local":
+            return {
+                name: {"derivative": study.derivative[:, k].tolist(), "elasticity": study.elasticity[:, k].tolist()}
+                for k, name in enumerate(self.names)
+            }
+        return _by_input(self.names, study.overall)
+
+    def tables(self) -> dict[str, dict[str, np.ndarray]]:
+        """CSV tables by file name: derivatives and swings at every point, indices over all and at every point."""
+        names = np.array(self.names)
+        found: dict[str, list[dict[str, np.ndarray]]] = {"points.csv": [], "indices.csv": []}
+        for name, study in self.outputs.items():
+            points, size = study.derivative.shape
+            where = {key: np.repeat(x, size) for key, x in self.points.columns().items()}
+            table = {
+                "output": np.full(points * size, name),
+                "unit": np.full(points * size, study.row.unit),
+                **where,
+                "input": np.tile(names, points),
+                "value": np.repeat(study.value, size) / study.row.factor,
+                "derivative": study.derivative.ravel() / study.row.factor,
+                "elasticity": study.elasticity.ravel(),
+                "at_low": study.swing[0].ravel() / study.row.factor,
+                "at_high": study.swing[1].ravel() / study.row.factor,
+                "share": study.share.ravel(),
+            }
+            for key, estimate in study.at_points.items():
+                table |= {key: estimate.value.ravel()}
+                table |= {f"{key}_low": estimate.low.ravel(), f"{key}_high": estimate.high.ravel()}
+            found["points.csv"].append(table)
+            if study.overall:
+                overall = {"output": np.full(size, name), "input": names}
+                for key, estimate in study.overall.items():
+                    overall |= {key: estimate.value, f"{key}_low": estimate.low, f"{key}_high": estimate.high}
+                found["indices.csv"].append(overall)
+        return {
+            file: {key: np.concatenate([t[key] for t in tables]) for key in tables[0]}
+            for file, tables in found.items()
+            if tables
+        }
+
+
+def _output(study: OutputStudy) -> dict[str, Any]:
+    return {
+        "label": study.row.label,
+        "unit": study.row.unit,
+        "factor": study.row.factor,
+        "value": study.value.tolist(),
+        "sd": study.sd.tolist(),
+        "share": study.share.tolist(),
+        "studied": study.studied.tolist(),
+        "lost": study.lost.tolist(),
+    }
+
+
+def _by_input(names: tuple[str, ...], estimates: dict[str, Estimate]) -> dict[str, Any]:
+    return {
+        name: {
+            key: value
+            for word, e in estimates.items()
+            for key, value in ((word, float(e.value[k])), (f"{word}_interval", [float(e.low[k]), float(e.high[k])]))
+        }
+        for k, name in enumerate(names)
+    }
+
+
+def interactions(study: OutputStudy, names: tuple[str, ...]) -> list[Interaction]:
+    """Pairs of the inputs that have a part in an output, the strongest first."""
+    second = study.second
+    if second is None:
+        return []
+    part = np.flatnonzero(np.nan_to_num(study.overall["total"].value) >= NEGLIGIBLE / 10)
+    pairs = [(int(i), int(j)) for n, i in enumerate(part) for j in part[n + 1 :]]
+    wider = 1.0
+    if pairs:  # so that of all pairs none is called sure by chance, in 95 of 100 studies (Bonferroni)
+        one, all_ = (stats.t.ppf(1 - (1 - LEVEL) / 2 / n, REPLICATES - 1) for n in (1, len(pairs)))
+        wider = float(all_ / one)
+    found = []
+    for i, j in pairs:
+        value, low, high = float(second.value[i, j]), float(second.low[i, j]), float(second.high[i, j])
+        found.append(Interaction((names[i], names[j]), value, (low, high), value - wider * (value - low) > 0))
+    return sorted(found, key=lambda pair: -pair.second)
+
+
+def _next_runs(runs: NextRuns, names: tuple[str, ...]) -> dict[str, Any]:
+    columns = runs.points.columns()
+    return {
+        "candidates": runs.candidates,
+        "source": runs.source,
+        "noise": runs.noise,
+        "runs": [
+            {**{key: column[k].item() for key, column in columns.items()}, "gain_bits": float(runs.gain[k])}
+            for k in range(len(runs.points))
+        ],
+        "sd_ratio": {name: runs.sd[:, k].tolist() for k, name in enumerate(names)},
+        "output_sd": {name: x.tolist() for name, x in runs.output_sd.items()},
+    }

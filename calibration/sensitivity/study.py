@@ -1,0 +1,139 @@
+"""What is studied: one robot, its uncertain inputs, operating points and outputs."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.sensitivity.inputs import Inputs
+from calibration.sensitivity.model import Answer, Model, OutputRow, counted
+from calibration.sensitivity.result import Points
+from mmrjax import fidelities
+from mmrjax.conditions import Conditions
+from mmrjax.robot import Robot
+from mmrjax.signals import STATUSES
+
+Tell = Callable[[str], None]
+#: After so long a time it says how far it is [s].
+SILENCE = 10.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Supply:
+    """What feeds the motors at every point: the battery (1) or not (0), charge taken [C], adhesion ratio at each."""
+
+    battery: float = 0.0
+    discharge: float = 0.0
+    adhesion: np.ndarray | float = 1.0
+
+
+class Study:
+    """One robot, its uncertain inputs, operating points and outputs; methods are functions of it."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        inputs: Inputs,
+        points: Points,
+        outputs: tuple[OutputRow, ...],
+        model: str = "steady",
+        options: Mapping[str, float] | None = None,
+        supply: Supply | None = None,
+        tell: Tell = lambda text: None,
+    ) -> None:
+        supply = Supply() if supply is None else supply
+        self.robot, self.inputs, self.points, self.tell = robot, inputs, points, tell
+        options = fidelities.facts(model).resolved() if options is None else options
+        self.model = Model(robot, inputs.columns, model, options, outputs)
+        names = robot.configurations.names
+        self.conditions = Conditions(
+            np.array([names.index(str(c)) for c in points.configuration]),
+            points.voltage,
+            points.slope_deg,
+            points.payload,
+            battery=supply.battery,
+            discharge=supply.discharge,
+            adhesion=supply.adhesion,
+        )
+        self.evaluations, self.seconds = 0, 0.0
+        self.told = time.perf_counter()
+        self.sampled: dict[str, np.ndarray] = {}
+
+    def at(self, k: int) -> Conditions:
+        """Conditions of one point."""
+        return jax.tree.map(lambda x: x[k], self.conditions)
+
+    def acting(self, k: int) -> np.ndarray:
+        """Inputs that are not of another configuration than that of a point."""
+        return self.inputs.acting(str(self.points.configuration[k]), self.robot.configurations.names)
+
+    def values_at(self, scores: np.ndarray) -> np.ndarray:
+        """Columns of the model at scores of all inputs."""
+        return np.asarray(values_of(self.inputs, scores))
+
+    def sample(self, values: np.ndarray, points: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Outputs at the same values of the model's columns, at one point after the other; counted and timed.
+
+        What a source says where only conditions differ that it ignores is not computed again.
+        """
+        kept: dict[tuple[str, tuple[float, ...]], Answer] = {}
+        for k in points:
+            began = time.perf_counter()
+            conditions = self.at(k)
+            parts = {}
+            for source in self.model.sources:
+                ignored = self.model.ignores(source)
+                fields = {f.name: getattr(conditions, f.name) for f in dataclasses.fields(conditions)}
+                mark = tuple(float(x) for name, x in fields.items() if x is not None and name not in ignored)
+                if (source, mark) not in kept:
+                    if not ignored:  # and so for no other point
+                        parts[source] = self.model.of_source(source, values, conditions)
+                        continue
+                    kept[source, mark] = self.model.of_source(source, values, conditions)
+                parts[source] = kept[source, mark]
+            answer = self.model.joined(parts)
+            self.seconds += time.perf_counter() - began
+            self.evaluations += len(values)
+            for source, codes in answer.statuses.items():
+                self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
+            if time.perf_counter() - self.told > SILENCE:
+                self.told = time.perf_counter()
+                rate = self.evaluations / max(self.seconds, 1e-9)
+                self.tell(f"{self.evaluations:,} model evaluations so far, {rate:,.0f} a second")
+            yield k, answer.values
+
+    def statuses(self) -> dict[str, dict[str, int]]:
+        """Source → status → how many of the sample."""
+        return {
+            source_words(source): counted(np.repeat(np.arange(len(whole)), whole))
+            for source, whole in self.sampled.items()
+        }
+
+    def gradients(self, scores: np.ndarray, conditions: Conditions) -> tuple[dict[str, np.ndarray], ...]:
+        """Outputs, and their derivatives by the scores of all inputs; each row has its own conditions, or all one."""
+        values = self.values_at(scores)
+        answer = self.model(values, conditions)
+        by_columns = self.model.derivatives(values, conditions)
+        inner = np.asarray(jacobian_of(self.inputs, scores))
+        moved = {name: np.einsum("pc,pci->pi", x, inner) for name, x in by_columns.items()}
+        there = {name: np.isfinite(x)[:, None] for name, x in answer.values.items()}
+        return answer.values, {name: np.where(there[name], g, np.nan) for name, g in moved.items()}
+
+
+def values_of(inputs: Inputs, scores: np.ndarray) -> jax.Array:
+    return inputs.values(jnp.asarray(scores))
+
+
+def jacobian_of(inputs: Inputs, scores: np.ndarray) -> jax.Array:
+    """d columns / d scores of each row, shape (rows, columns, inputs)."""
+    return jax.vmap(jax.jacfwd(inputs.values))(jnp.asarray(scores))
+
+
+def source_words(source: str) -> str:
+    """What computes outputs, in words: the fidelity, or the derived output's module."""
+    return source.rpartition(".")[2].replace("_", " ") if "." in source else source

@@ -1,0 +1,70 @@
+"""The registry of derived outputs: what is solved for beyond one operating point. Importable without jax.
+
+A new one is a module with `compute(robot, conditions)`, a pure function of one run that returns its numbers [SI] by
+name and a `status`, and a line of `TABLE`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Derived:
+    """One derived output.
+
+    Attributes:
+        name: noun; column: in tables, with the unit in the name.
+        unit: of the column; factor: the SI value of one such unit.
+        label: words of tables and reports.
+        module: that computes it, with others it may share a computation with.
+        resolution: digits after the point that a person wants to see [unit].
+        ignores: conditions that it does not depend on, because it solves for them.
+    """
+
+    name: str
+    column: str
+    unit: str
+    factor: float
+    label: str
+    module: str
+    resolution: int = 3
+    ignores: tuple[str, ...] = ()
+
+
+_SLOPE, _START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start"
+
+#: Read through the module, so that a line more is an output more everywhere.
+TABLE: tuple[Derived, ...] = (
+    Derived(
+        "steepest_slope", "steepest_slope_deg", "deg", 1.0, "steepest slope held", _SLOPE, 2, ignores=("slope_deg",)
+    ),
+    Derived("peak_current", "peak_current_A", "A", 1.0, "peak current of the start", _START, 2),
+    Derived("time_to_speed", "time_to_speed_s", "s", 1.0, "time to 95 % of speed", _START, 3),
+    Derived("energy_start", "energy_start_J", "J", 1.0, "electrical energy of the start", _START, 2),
+)
+
+
+def names() -> tuple[str, ...]:
+    """Names of all derived outputs, in order."""
+    return tuple(d.name for d in TABLE)
+
+
+def get(name: str) -> Derived:
+    """A derived output by its name.
+
+    Raises:
+        KeyError: no such output; the message lists those that there are.
+    """
+    for derived in TABLE:
+        if derived.name == name:
+            return derived
+    raise KeyError(f"no derived output {name}; there are {', '.join(names())}")
+
+
+def compute(module: str) -> Callable[..., dict[str, Any]]:
+    """The function of a module that computes derived outputs of one run."""
+    return importlib.import_module(module).compute

@@ -1,0 +1,64 @@
+"""The steepest slope on which a robot still travels uphill: it neither slides nor stalls there."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.steady import operating_point
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED
+from mmrjax.tables import CONDITION_LIMITS
+
+#: The steepest slope that is looked at [deg]; a robot that holds it is said to hold this.
+STEEPEST = CONDITION_LIMITS["slope_deg"][1]
+#: Halvings of the bracket; what they leave, 3e-6 of a degree, one step of Newton's method takes off.
+HALVINGS = 24
+
+
+def margin(robot: Robot, conditions: Conditions, slope_deg: Scalar) -> Float[Array, ""]:
+    """What is left of the limit that is nearer [-]: of adhesion, 1 - demand / limit, or of speed, V / (V_s / 10) - 1.
+
+    Positive where `steady` says `converged`; continuous through the edge, whichever it is.
+    """
+    conditions = dataclasses.replace(conditions, slope_deg=jnp.asarray(slope_deg))
+    point, _ = operating_point(robot, conditions)
+    rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
+    slowest = point.theoretical_speed * jnp.minimum(1.0, 1.0 - point.slip)
+    return jnp.minimum(1.0 - point.adhesion_used, slowest / rest - 1.0)
+
+
+@eqx.filter_jit
+def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
+    """Steepest slope held by one run's voltage and payload; its own slope does not matter.
+
+    The root of `margin` between the flat and `STEEPEST`, by bisection. Derivatives are implicit,
+    dα = -(∂margin/∂α)⁻¹ ∂margin/∂θ dθ, forward and reverse.
+
+    Returns:
+        `steepest_slope` [deg], NaN where not even the flat is held; `STEEPEST` where that is held, with zero
+        derivatives. `status` is that of the flat.
+    """
+    flat = operating_point(robot, dataclasses.replace(conditions, slope_deg=jnp.zeros_like(conditions.slope_deg)))[0]
+    still_robot, still = jax.lax.stop_gradient((robot, conditions))
+
+    def halve(bracket: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        low, high = bracket
+        middle = (low + high) / 2
+        holds = margin(still_robot, still, middle) > 0
+        return (jnp.where(holds, middle, low), jnp.where(holds, high, middle)), None
+
+    zero = jnp.zeros_like(conditions.slope_deg)
+    (low, high), _ = jax.lax.scan(halve, (zero, zero + STEEPEST), None, length=HALVINGS)
+    at = jax.lax.stop_gradient((low + high) / 2)
+    slope = jax.lax.stop_gradient(jax.jvp(lambda a: margin(still_robot, still, a), (at,), (jnp.ones_like(at),))[1])
+    found = at - margin(robot, conditions, at) / slope
+    holds_all = margin(still_robot, still, zero + STEEPEST) > 0
+    found = jnp.where(holds_all, STEEPEST, jnp.clip(found, 0.0, STEEPEST))
+    return {"steepest_slope": jnp.where(flat.status == CONVERGED, found, jnp.nan), "status": flat.status}

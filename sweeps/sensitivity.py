@@ -1,0 +1,162 @@
+"""The command `sensitivity`: which parameters matter where, and which runs would tell more of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
+from calibration.data.runs import Runs
+from calibration.inference import noise
+from calibration.sensitivity import inputs as room
+from calibration.sensitivity.analyse import analyse
+from calibration.sensitivity.inputs import Inputs
+from calibration.sensitivity.model import chosen_outputs
+from calibration.sensitivity.next_runs import Candidates
+from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
+from calibration.sensitivity.study import Study, Supply
+from mmrjax.power import COULOMB_PER_MAH
+from mmrjax.robot import Robot
+from mmrjax.tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
+from sweeps import config as configuration
+from sweeps.config import GridPart
+from sweeps.console import say, tell
+from sweeps.figures_style import short
+from sweeps.grid import configurations, grid
+from sweeps.inputs import beside_robot, load_robot, read_runs
+from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
+
+#: Operating points where a sample is drawn at each: corners and middle of Table 8.
+CORNERS = {
+    "voltages_V": (VOLTAGES_V[0], VOLTAGES_V[-1]),
+    "payloads_kg": (PAYLOADS_KG[0], PAYLOADS_KG[-1]),
+    "slopes_deg": SLOPES_DEG[::2],
+}
+WHOLE = {"voltages_V": VOLTAGES_V, "payloads_kg": PAYLOADS_KG, "slopes_deg": SLOPES_DEG}
+#: Condition that may vary → the axis of operating points that it takes the place of.
+AXES = {"voltage": "voltages_V", "payload": "payloads_kg", "slope_deg": "slopes_deg"}
+
+
+def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
+    """Study a robot and leave a run folder; returns the exit code.
+
+    0 done; 3 done, but some operating points have no numbers.
+    """
+    robot = load_robot(config)
+    if config.method not in METHODS:
+        raise BadConfiguration(f"option method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
+    outputs = chosen_outputs(config.outputs)
+    ranges = _ranges(config.vary)
+    runs = _operating_points(config, robot, ranges)
+    inputs = _inputs(config, robot, runs, ranges)
+    candidates = _candidates(config, robot)
+    conditions = runs.conditions(robot)
+    supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
+    study = Study(robot, inputs, _points(runs), outputs, config.model, config.options, supply, tell)
+    with open_folder("sensitivity", config, robot, out, force, runs) as folder:
+        found = analyse(study, config.method, config.evaluations, config.seed, candidates)
+        folder.write_json("result.json", found.to_json())
+        for name, table in found.tables().items():
+            folder.write_table(name, table)
+        folder.write_text("config.resolved.toml", configuration.as_toml(config))
+        robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this study, from {config.robot}")
+        print_sensitivity(found)
+        if config.report:
+            from sweeps import report_sensitivity
+
+            report_sensitivity.write(folder.partial, found, robot=robot, robot_name=config.robot)
+        path = folder.finish({"seed": found.seed, "statuses": found.statuses}, runs)
+        say(str(path))
+        return DONE if found.studied else SOME_NOT_CONVERGED
+
+
+def _ranges(vary: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """`name=low:high` of every varied condition."""
+    found: dict[str, tuple[float, float]] = {}
+    for text in vary:
+        name, _, ends = text.partition("=")
+        low, _, high = ends.partition(":")
+        if name in found:
+            raise BadConfiguration(f"--vary {name}: given twice; give it once")
+        try:
+            found[name] = float(low), float(high)
+        except ValueError:
+            raise BadConfiguration(
+                f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
+            ) from None
+    return found
+
+
+def _operating_points(
+    config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
+) -> Runs:
+    """The grid of operating points; an axis that varies has one value, the middle of its range."""
+    usual = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+    axes = {key: getattr(config, key) or values for key, values in usual.items()}
+    for name, (low, high) in ranges.items():
+        if name in AXES:
+            if getattr(config, AXES[name]) is not None:
+                option = AXES[name].partition("_")[0]
+                raise BadConfiguration(f"--vary {name}: --{option} states it too; give one of them")
+            axes[AXES[name]] = ((low + high) / 2,)
+    try:
+        stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
+    except ValueError:
+        raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range leaves what a run may have") from None
+    names = configurations(stated, robot)
+    return grid(stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot)
+
+
+def _points(runs: Runs) -> Points:
+    return Points(*(runs[c] for c in ("configuration", "supply_voltage_V", "payload_kg", "slope_deg")))
+
+
+def _inputs(
+    config: configuration.Sensitivity, robot: Robot, runs: Runs, ranges: dict[str, tuple[float, float]]
+) -> Inputs:
+    present = tuple(dict.fromkeys(map(str, runs["configuration"])))
+    if config.posterior:
+        if config.parameters:
+            raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
+        return room.of_posterior(robot, beside_robot(config, robot), ranges)
+    names = config.parameters or room.default_names(robot, present, config.battery)
+    return room.of_priors(robot, names, ranges)
+
+
+def _candidates(config: configuration.Sensitivity, robot: Robot) -> Candidates:
+    """Runs of a table, or of Table 8 in every configuration."""
+    if config.candidates:
+        runs = read_runs(config.candidates, robot, measured=False)
+        source = runs.source
+    else:
+        runs = grid(GridPart(surface=config.surface), robot)
+        source = "Table 8"
+    words = config.noise or noise.default()
+    stated = {**noise.parse(noise.default()), **(noise.parse(config.noise) if config.noise else {})}
+    return Candidates(_points(runs), runs.conditions(robot), source, stated, words, runs.deviations(), config.runs)
+
+
+def print_sensitivity(found: SensitivityResult) -> None:
+    """What decides which output, what does not matter, what to measure next; for a person."""
+    say(found.statement())
+    title = f"{METHODS[found.method]}, {len(found.points)} operating points"
+    shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for heading in ("", "first", "second", "third"):
+        shown.add_column(heading)
+    for study in found.outputs.values():
+        share = study.overall_share
+        top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
+        shown.add_row(study.row.label, *(f"{short(found.names[k])} {100 * share[k]:.0f} %" for k in top))
+    say(shown)
+    idle = found.negligible
+    if idle:
+        say(f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(idle)}")
+    if found.next_runs is not None:
+        n = found.next_runs
+        labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
+        say(f"next runs, of {n.candidates} ({n.source}), read to {n.noise}: {labels}")
+    for note in found.notes:
+        say(f"- {note}")

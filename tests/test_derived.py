@@ -1,0 +1,146 @@
+"""Derived outputs: the steepest slope and the start, against closed forms, other searches and finite differences."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import derived, params
+from mmrjax.conditions import Conditions
+from mmrjax.derived import start, steepest_slope
+from mmrjax.fidelities.drive import drive
+from mmrjax.fidelities.steady import steady
+from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
+
+NAMES = ("motor.resistance", "motor.torque_constant", "6T2A.ground.friction.static", "6T2A.ground.rolling_resistance")
+
+
+def changed(robot, **values):
+    return params.replace(robot, {k.replace("__", "."): jnp.asarray(v) for k, v in values.items()})
+
+
+def value(robot, name):
+    return float(next(p.value for p in params.walk(robot) if p.name == name))
+
+
+def function(robot, conditions, compute):
+    theta = jnp.asarray([value(robot, n) for n in NAMES])
+    return theta, jax.jit(lambda t: compute(params.replace(robot, dict(zip(NAMES, t, strict=True))), conditions))
+
+
+def differences(f, theta, step):
+    rows = []
+    for k in range(len(theta)):
+        up, down = (f(theta.at[k].multiply(1 + s * step)) for s in (1, -1))
+        rows.append({n: (up[n] - down[n]) / (2 * step * theta[k]) for n in up if n != "status"})
+    return {n: np.array([row[n] for row in rows]) for n in rows[0]}
+
+
+def test_table_names_modules_that_compute_them(robot):
+    for module in dict.fromkeys(d.module for d in derived.TABLE):
+        made = jax.eval_shape(derived.compute(module), robot, Conditions(0, 24.0))
+        assert {d.name for d in derived.TABLE if d.module == module} | {"status"} == set(made)
+    with pytest.raises(KeyError, match="no derived output top_speed; there are steepest_slope, peak_current"):
+        derived.get("top_speed")
+    assert derived.get("steepest_slope").ignores == ("slope_deg",)
+
+
+# --- the steepest slope -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("configuration", [0, 1])
+def test_steepest_slope_that_sliding_ends_is_where_adhesion_is_used_up(robot, configuration):
+    found = steepest_slope.compute(robot, Conditions(configuration, 24.0, slope_deg=17.0, payload=3.0))
+    ground = robot.configurations.members[configuration].ground
+    closed = math.degrees(math.atan(float(ground.friction.static - ground.rolling_resistance)))
+    assert float(found["steepest_slope"]) == pytest.approx(closed, abs=1e-9)
+
+
+def test_steepest_slope_that_the_motors_end_is_where_the_robot_comes_to_stand(robot):
+    weak = changed(robot, **{"6T2A__ground__friction__static": 2.5})
+    conditions = Conditions(0, 2.0, payload=8.0)
+    found = float(steepest_slope.compute(weak, conditions)["steepest_slope"])
+    status = [
+        int(steady(weak, dataclasses.replace(conditions, slope_deg=jnp.asarray(found + d))).status)
+        for d in (-1e-6, 1e-6)
+    ]
+    assert status == [CONVERGED, STALLED] and 0 < found < 45
+
+
+def test_steepest_slope_ends_at_the_limit_and_is_missing_where_the_flat_is_not_held(robot):
+    sticky = changed(robot, **{"6T2A__ground__friction__static": 2.5})
+    at = steepest_slope.compute(sticky, Conditions(0, 33.0))
+    assert float(at["steepest_slope"]) == steepest_slope.STEEPEST
+    icy = changed(robot, **{"6T2A__ground__friction__static": 0.02})
+    none = steepest_slope.compute(icy, Conditions(0, 24.0))
+    assert np.isnan(none["steepest_slope"]) and int(none["status"]) == SLIDES
+
+
+@pytest.mark.parametrize(("static", "voltage"), [(0.32, 24.0), (2.5, 2.0)])
+def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltage):
+    tuned = changed(robot, **{"6T2A__ground__friction__static": static})
+    theta, f = function(tuned, Conditions(0, voltage, payload=5.0), steepest_slope.compute)
+    exact = jax.jacfwd(lambda t: f(t)["steepest_slope"])(theta)
+    twice = differences(f, theta, 1e-6)["steepest_slope"]
+    np.testing.assert_allclose(exact, twice, rtol=1e-5, atol=1e-4 * np.abs(twice).max())
+    np.testing.assert_allclose(jax.jacrev(lambda t: f(t)["steepest_slope"])(theta), exact, rtol=1e-9, atol=1e-9)
+    assert np.abs(exact).max() > 1
+
+
+def test_steepest_slope_of_a_batch_is_that_of_each(robot):
+    conditions = Conditions(np.array([0, 1, 0]), np.array([15.0, 24.0, 6.0]), payload=np.array([0.0, 3.0, 8.0]))
+    batch = jax.vmap(lambda c: steepest_slope.compute(robot, c))(conditions)
+    each = [steepest_slope.compute(robot, jax.tree.map(lambda x, k=k: x[k], conditions)) for k in range(3)]
+    np.testing.assert_allclose(batch["steepest_slope"], [float(e["steepest_slope"]) for e in each], rtol=1e-12)
+
+
+# --- the start ----------------------------------------------------------------------------------------------------
+
+CONDITIONS = Conditions(0, 24.0, slope_deg=5.0, payload=3.0)
+
+
+def test_start_is_that_of_a_run_kept_at_many_instants(robot):
+    found = {k: float(v) for k, v in start.compute(robot, CONDITIONS).items()}
+    times = np.concatenate([np.linspace(0, 0.05, 5000, endpoint=False), np.linspace(0.05, 4.0, 40_000)])
+    run = drive(robot, CONDITIONS, jnp.asarray(times), tolerance=1e-9)
+    current, speed = np.asarray(run.signals.total_current), np.asarray(run.signals.speed)
+    power = np.asarray(run.signals.voltage) * current
+    after = np.interp(0.95 * speed[-1], speed[times > 0.05], times[times > 0.05])
+    rows = times <= after
+    assert found["peak_current"] == pytest.approx(current.max(), rel=2e-4)
+    assert found["time_to_speed"] == pytest.approx(after, rel=5e-4)
+    assert found["energy_start"] == pytest.approx(np.trapezoid(power[rows], times[rows]), rel=1e-3)
+
+
+def test_start_derivatives_are_finite_differences(robot):
+    theta, f = function(robot, CONDITIONS, start.compute)
+    exact = jax.jacfwd(f)(theta)
+    twice = differences(f, theta, 3e-3)
+    for name, by in twice.items():
+        scale = np.abs(by * theta).max() / np.abs(theta)  # what matters, parameter by parameter
+        np.testing.assert_allclose(exact[name], by, rtol=3e-3, atol=2e-3 * scale.min(), err_msg=name)
+        assert np.abs(exact[name]).max() > 0
+
+
+def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
+    steep = dataclasses.replace(CONDITIONS, slope_deg=jnp.asarray(25.0))
+    found = start.compute(robot, steep)
+    assert STATUSES[int(found["status"])] == "slides"
+    assert all(np.isnan(found[n]) for n in ("peak_current", "time_to_speed", "energy_start"))
+
+
+def test_peak_is_the_top_of_a_parabola():
+    x = np.linspace(0, 1, 12)
+    assert float(start.peak(jnp.asarray(3 - (x - 0.47) ** 2))) == pytest.approx(3.0, abs=1e-12)
+    assert float(start.peak(jnp.asarray(x))) == 1.0  # no top between: the largest sample
+
+
+def test_crossing_is_exact_for_a_cubic():
+    t = jnp.linspace(0.0, 1.0, 6)
+    k, share = start.crossing(t, t**3, 3 * t**2, jnp.asarray(0.3))
+    assert float(t[k] + share * (t[k + 1] - t[k])) == pytest.approx(0.3 ** (1 / 3), abs=1e-9)

@@ -1,0 +1,215 @@
+"""Posteriors: the file, draws against the linear analysis, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration.data import posterior as room
+from calibration.data import robot_file
+from calibration.data.errors import BadData
+from calibration.data.posterior import ANGLE, LOG, NORMAL, Posterior
+from calibration.data.runs import read
+from calibration.inference import priors
+from calibration.inference.posterior import of_coordinates
+from mmrjax import params
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.variation import Variation
+from sweeps import config, uncertainty
+
+NAMES = ("motor.resistance", "6T2A.track.guide_share", "6T2A.ground.friction.static", "motor.temperature_ambient")
+
+
+@pytest.fixture
+def coordinates(robot):
+    return priors.coordinates(robot, NAMES)
+
+
+@pytest.fixture
+def posterior(coordinates):
+    a = np.array([[0.3, 0, 0, 0], [-0.2, 0.25, 0, 0], [0.05, 0.02, 0.1, 0], [0, 0.1, 0, 0.9]])
+    return of_coordinates(coordinates, np.array([0.4, 0.2, 1.2, 0.0]), a @ a.T)
+
+
+@pytest.fixture
+def fitted(robot, posterior):
+    values = np.asarray(posterior.at(posterior.mean))
+    return params.replace(robot, {n: jnp.asarray(v) for n, v in zip(posterior.names, values, strict=True)})
+
+
+def test_coordinates_of_a_posterior_are_those_of_the_fit(coordinates, posterior):
+    z = np.random.default_rng(0).normal(size=(20, 4)) * 2
+    np.testing.assert_allclose(posterior.at(z)[:, :4], coordinates.value(jnp.asarray(z)), rtol=1e-14)
+    np.testing.assert_allclose(posterior.at(z)[:, 4], 0.8 * posterior.at(z)[:, 2], rtol=1e-12)  # μ_d follows μ_s
+    assert posterior.names[4:] == ("6T2A.ground.friction.dynamic", "6T2A.ground.friction.speed_dynamic")[:1]
+
+
+def test_file_holds_all_of_a_posterior(posterior, tmp_path):
+    room.write(posterior, tmp_path / room.FILE)
+    again = room.read(tmp_path / room.FILE)
+    for field in dataclasses.fields(Posterior):
+        a, b = getattr(posterior, field.name), getattr(again, field.name)
+        if isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b)
+        else:
+            assert a == b, field.name
+
+
+def test_file_is_a_dataset_with_units_and_names(posterior, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    room.write(posterior, tmp_path / room.FILE)
+    with xarray.open_dataset(tmp_path / room.FILE) as data:
+        data.load()
+    assert data.attrs["schema"] == room.SCHEMA
+    assert [str(n.decode() if isinstance(n, bytes) else n) for n in data["coordinate"].values] == list(NAMES)
+    assert data["covariance"].shape == (4, 4) and data["covariance"].attrs["long_name"] == "covariance of z"
+    units = [str(u.decode() if isinstance(u, bytes) else u) for u in data["units"].values]
+    assert units[0] == "ohm" and units[3] == "°C"
+    assert float(data["value"][0]) == pytest.approx(float(posterior.at(posterior.mean)[0]))
+
+
+def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
+    values = posterior.draw(20_000, 0)
+    assert values.shape == (20_000, 5)
+    z = np.log(values[:, 0] / 0.611) / posterior.spread[0]  # the first is a scale
+    assert z.mean() == pytest.approx(0.4, abs=0.01) and z.std() == pytest.approx(0.3, rel=0.02)
+    guide = (values[:, 1] - 0.3) / 0.2
+    assert np.corrcoef(z, guide)[0, 1] == pytest.approx(-0.06 / (0.3 * 0.32), abs=0.02)
+    np.testing.assert_array_equal(values, posterior.draw(20_000, 0))
+
+
+def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted):
+    runs = read("measured").where(np.array([0, 1, 5, 6]))
+    found = uncertainty.intervals(fitted, posterior, runs, config.Compare(), 2000)
+    conditions = runs.conditions(fitted)
+
+    def readings(z):
+        return steady_batch(
+            Variation(fitted, posterior.names).at(posterior.at(z), conditions)[0], conditions
+        ).total_current
+
+    slopes = np.asarray(jax.jacfwd(readings)(jnp.asarray(posterior.mean)))
+    linear = np.sqrt(np.einsum("ij,jk,ik->i", slopes, posterior.covariance, slopes))
+    column = "total_current_A"
+    np.testing.assert_allclose(found.sd(column), linear, rtol=0.1)
+    middle = np.asarray(readings(jnp.asarray(posterior.mean)))
+    np.testing.assert_allclose(found.columns[column + "_upper"] - middle, 1.96 * linear, rtol=0.2)
+    assert np.all(found.columns[uncertainty.SHARE] == 1)
+
+
+def test_draws_that_do_not_travel_are_counted_and_leave_the_rest(robot):
+    names = ("6T2A.ground.friction.static",)
+    coordinates = priors.coordinates(robot, names)
+    wide = of_coordinates(coordinates, np.zeros(1), np.eye(1))
+    runs = read("measured").where(np.array([0, 2]))  # flat, and 10°, where one in seven slides
+    found = uncertainty.intervals(robot, wide, runs, config.Compare(), 300)
+    share = found.columns[uncertainty.SHARE]
+    assert share[0] == 1 and 0.7 < share[1] < 0.95
+    assert np.isfinite(found.sd("speed_mm_s")).all()
+
+
+def test_a_coordinate_that_does_not_vary_is_drawn_at_its_mean(posterior):
+    fixed = posterior.covariance.copy()
+    fixed[0], fixed[:, 0] = 0, 0
+    values = dataclasses.replace(posterior, covariance=fixed).draw(50, 0)
+    assert np.ptp(values[:, 0]) < 1e-12 and np.ptp(values[:, 1]) > 0
+
+
+def test_an_angle_stays_within_half_a_turn():
+    one = np.ones(1)
+    angle = Posterior(
+        ("x",), ("rad",), one * 3, np.eye(1), 0 * one, one, -np.inf * one, np.inf * one, 0 * one, (ANGLE,)
+    )
+    values = angle.draw(500, 0)
+    assert np.all(np.abs(values) <= np.pi) and (values < 0).any() and (values > 0).any()
+
+
+def test_cut_bounds_hold_and_soft_ones_are_not_cut_twice():
+    one = np.ones(2)
+    cut = Posterior(
+        ("a", "b"), ("", ""), 0 * one, np.eye(2), 0 * one, one, 0 * one, 0.5 * one, 0 * one, (NORMAL, LOG)
+    )
+    values = cut.draw(500, 0)
+    assert values[:, 0].min() == 0 and values[:, 0].max() == 0.5
+    assert values[:, 1].min() == 1 and values[:, 1].max() == pytest.approx(np.exp(0.5))
+
+
+# --- what is refused --------------------------------------------------------------------------------------------
+
+
+def test_posterior_of_another_robot_is_refused(robot, posterior, fitted):
+    posterior.check(fitted, "here")
+    with pytest.raises(BadData, match=r"here: motor.resistance is 0.611 in the robot; expected 0.62\d+, the centre"):
+        posterior.check(robot, "here")
+    other = dataclasses.replace(posterior, coordinates=("8W8T.mass", *posterior.coordinates[1:]))
+    with pytest.raises(BadData, match=r"here: a posterior of 8W8T.mass, which this robot does not have.*6T2A.mass"):
+        other.check(fitted, "here")
+
+
+def test_missing_and_damaged_files_are_refused(posterior, tmp_path):
+    path = tmp_path / room.FILE
+    with pytest.raises(BadData, match=r"no such file; expected the posterior\.nc that calibrate and loop leave"):
+        room.read(path)
+    path.write_text("nothing of the kind")
+    with pytest.raises(BadData, match="not a posterior that can be read"):
+        room.read(path)
+    skew = posterior.covariance.copy()
+    skew[0, 1] = skew[1, 0] = 5.0  # more than their sds allow
+    room.write(dataclasses.replace(posterior, covariance=skew), path)
+    with pytest.raises(BadData, match="the covariance is not one"):
+        room.read(path)
+
+
+def test_file_of_another_schema_is_refused(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    xarray.Dataset({"x": 1.0}).to_netcdf(tmp_path / room.FILE, engine="scipy")
+    with pytest.raises(BadData, match=r"not a posterior that can be read \(ValueError: schema None"):
+        room.read(tmp_path / room.FILE)
+
+
+@pytest.mark.parametrize(("value", "sd", "most", "said"), [
+    (4.1932, 0.0612, 3, "4.193 ± 0.061"), (5243.2, 12.3, 1, "5243 ± 12"), (2.0, 0.0, 2, "2.00 ± 0.00"),
+    (0.5, 0.000012, 3, "0.500 ± 0.000"),
+])  # fmt: skip
+def test_a_value_is_said_to_two_digits_of_its_sd(value, sd, most, said):
+    assert uncertainty.with_sd(value, sd, most) == said
+
+
+def test_saved_calibration_has_its_posterior(tmp_path):
+    import calibration
+
+    runs = calibration.read_runs("measured")
+    found = calibration.calibrate(runs, calibration.read_robot("nominal"), starts=4, profiles=False, blocks=False)
+    found.save(tmp_path)
+    again = room.read(tmp_path / room.FILE)
+    again.check(robot_file.load(str(tmp_path / "robot.toml")), "saved")
+    for name, sd in zip(again.names, again.sd, strict=True):
+        if name in found.parameters:
+            assert sd == pytest.approx(found.parameters[name].sd, rel=1e-9)
+    assert set(found.tied) == set(again.names[len(again) :])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("names", "verdict"), [(["churning"], "named"), ([], "none")])
+def test_posterior_of_the_loop_has_what_it_found(names, verdict):
+    import generator as g
+    from synthetic import SETTLED, table
+
+    from calibration.discovery.discover import finished
+    from mmrjax.effects import BY_NAME
+
+    runs = table(g.case(names, 10.0, seed=4) if names else g.case(seed=2))
+    traced = SETTLED.trace(runs)
+    found = finished(traced, runs, None, SETTLED.settings, BY_NAME, lambda text: None)
+    assert (found.verdict == "none") == (verdict == "none")
+    found.posterior.check(found.robot, "the loop's")
+    sd = dict(zip(found.posterior.names, found.posterior.sd, strict=True))
+    for effect in found.effects:
+        for word, estimate in effect.parameters.items():
+            assert sd[f"effects.{effect.name}.{word}"] == pytest.approx(estimate.sd, rel=0.02)
+    for name, shift in found.base_shift.items():
+        assert sd[name] == pytest.approx(shift.sd_after, rel=0.02)

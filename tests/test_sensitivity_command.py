@@ -1,0 +1,312 @@
+"""The command `sensitivity` and its study: against finite differences and the model itself, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+
+from calibration.data import posterior as posteriors
+from calibration.data import robot_file
+from calibration.inference import priors
+from calibration.inference.posterior import of_coordinates
+from calibration.sensitivity import inputs as room
+from calibration.sensitivity.analyse import analyse
+from calibration.sensitivity.local import local
+from calibration.sensitivity.model import chosen_outputs
+from calibration.sensitivity.result import Points
+from calibration.sensitivity.study import Study
+from mmrjax import params
+from mmrjax.fidelities.steady import steady_batch
+from sweeps import cli
+from tests.pages import Tables
+
+ROOT = Path(__file__).parents[1]
+SCHEMA = json.loads((ROOT / "docs" / "schemas" / "sensitivity.schema.json").read_text(encoding="utf-8"))
+NAMES = ("motor.torque_constant", "6T2A.track.guide_share", "4W2T.track.loss_coulomb", "motor.inductance")
+SMALL = (
+    "sensitivity", "--parameters", ",".join(NAMES), "--voltages", "24", "--payloads", "3", "--slopes", "0,5",
+    "--outputs", "total_current,speed,steepest_slope", "--evaluations", "3000",
+)  # fmt: skip
+
+
+@pytest.fixture
+def mmrjax(monkeypatch, capsys, tmp_path):
+    """Run a command in this process; returns exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments):
+        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        out = capsys.readouterr()
+        return end.value.code, out.out, out.err
+
+    return command
+
+
+@pytest.fixture(scope="module")
+def study(robot):
+    inputs = room.of_priors(robot, NAMES, {})
+    points = Points(
+        np.array(["6T2A", "4W2T", "6T2A", "6T2A"]), np.array([24.0, 15, 33, 24]), np.array([3.0, 0, 8, 0]),
+        np.array([0.0, 5, 0, 25]),
+    )  # fmt: skip
+    return Study(robot, inputs, points, chosen_outputs(("total_current", "speed")))
+
+
+def table(path):
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+# --- the study ----------------------------------------------------------------------------------------------------
+
+
+def test_local_derivatives_are_finite_differences_and_zero_across_configurations(study, robot):
+    found = local(study)
+    step = 1e-6
+    fields = priors.known(robot)
+    for k, name in enumerate(NAMES):
+        value = float(fields[name].value)
+        up, down = (
+            steady_batch(params.replace(robot, {name: jnp.asarray(value * (1 + s))}), study.conditions).total_current
+            for s in (step, -step)
+        )
+        twice = np.asarray(up - down) / (2 * step * value)
+        np.testing.assert_allclose(found.derivative["total_current"][:3, k], twice[:3], rtol=1e-6, atol=1e-7)
+    assert np.isnan(found.derivative["total_current"][3]).all()  # it slides at 25°
+    assert found.derivative["speed"][1, 1] == 0 and found.derivative["speed"][0, 2] == 0
+    assert found.statuses == {"steady": {"converged": 3, "slides": 1}}
+
+
+def test_swings_are_runs_at_the_ends_of_the_intervals(study, robot):
+    found = local(study)
+    coordinates = priors.coordinates(robot, NAMES)
+    for side, z in enumerate((-1.959963984540054, 1.959963984540054)):
+        value = coordinates.value(jnp.zeros(4).at[1].set(z))[1]
+        run = steady_batch(params.replace(robot, {NAMES[1]: value}), study.conditions)
+        np.testing.assert_allclose(found.swing["speed"][side, :3, 1], run.speed[:3], rtol=1e-9)
+
+
+def test_inputs_are_those_of_the_priors(robot, study):
+    coordinates = priors.coordinates(robot, NAMES)
+    u = np.random.default_rng(0).uniform(size=(50, 4))
+    from scipy.stats import norm
+
+    np.testing.assert_allclose(
+        study.inputs.values(study.inputs.scores(jnp.asarray(u)))[:, :4], coordinates.value(norm.ppf(u)), rtol=1e-9
+    )
+
+
+def test_conditions_vary_uniformly_beside_parameters(robot):
+    inputs = room.of_priors(robot, NAMES[:1], {"voltage": (20.0, 28.0)})
+    values = np.asarray(inputs.values(inputs.scores(jnp.asarray([[0.5, 0.25]]))))
+    assert inputs.columns == (NAMES[0], "voltage")
+    np.testing.assert_allclose(values, [[0.0259, 22.0]], rtol=1e-3)
+
+
+def test_default_inputs_are_what_has_a_prior_and_acts_here(robot):
+    names = room.default_names(robot, ("4W2T",), battery=False)
+    assert "motor.resistance" in names and "4W2T.mass" in names
+    assert not any(n.startswith(("6T2A.", "battery.")) for n in names)
+    assert "4W2T.track.guide_share" not in names  # it has no guides
+    assert "battery.resistance" in room.default_names(robot, ("4W2T",), battery=True)
+
+
+def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
+    shares = {method: analyse(study, method, 40_000).outputs["speed"] for method in ("local", "sobol")}
+    linear, sampled = shares["local"].share[:2], shares["sobol"].at_points["total"]
+    np.testing.assert_allclose(sampled.value[:2], linear, atol=0.03)
+    assert np.all(sampled.low[:2] <= linear + 0.01) and np.all(linear - 0.01 <= sampled.high[:2])
+    assert not shares["sobol"].studied[3] and np.isnan(sampled.value[3]).all()
+
+
+def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, study):
+    from calibration.sensitivity import shapley
+
+    coordinates = priors.coordinates(robot, NAMES[:2])
+    covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
+    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), covariance), {})
+    points = Points(*(x[:1] for x in study.points.columns().values()))
+    one = Study(robot, inputs, points, chosen_outputs(("total_current",)))
+    found = analyse(one, "shapley", 20_000)
+    z_slopes = local(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
+    truth = shapley.linear(z_slopes, covariance)
+    estimate = found.outputs["total_current"].overall["shapley"]
+    half = (estimate.high - estimate.low) / 2
+    assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
+
+
+# --- the command ------------------------------------------------------------------------------------------------
+
+
+def test_command_leaves_indices_tables_and_a_page(mmrjax, tmp_path):
+    code, out, _ = mmrjax(*SMALL, "--out", "s")
+    assert code == 0 and out.rstrip().splitlines()[-1] == "s"
+    folder = tmp_path / "s"
+    document = json.loads((folder / "result.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    jsonschema.validate(document, SCHEMA)
+    assert document["evaluations"] >= 3000 and len(document["points"]) == 4
+    index = document["indices"]["speed"]["motor.torque_constant"]
+    assert set(index) == {"first", "total", "first_interval", "total_interval"}
+    assert index["total"] > 0.5 and index["total_interval"][0] < index["total"] < index["total_interval"][1]
+    assert document["inputs"]["motor.inductance"]["inert"] and document["negligible"] == ["motor.inductance"]
+    assert "motor.inductance" in " ".join(document["notes"])
+    runs = document["next_runs"]
+    assert len(runs["runs"]) == 5 and runs["sd_ratio"]["motor.torque_constant"][-1] < 0.5
+    rows = table(folder / "points.csv")
+    assert len(rows) == 3 * 4 * 4 and {"derivative", "elasticity", "at_low", "at_high", "total_low"} <= set(rows[0])
+    assert len(table(folder / "indices.csv")) == 12
+    page = (folder / "report.html").read_text()
+    assert "http://" not in page.replace("http://www.w3.org", "") and document["statement"] in page
+    assert len(Tables(page).tables["next-runs"]) == 6
+    config = tomllib.loads((folder / "config.resolved.toml").read_text())
+    assert config["method"] == "sobol" and config["evaluations"] == 3000
+
+
+def test_local_command_says_derivatives_and_elasticities_of_every_point(mmrjax, tmp_path):
+    code, _, _ = mmrjax(*SMALL, "--method", "local", "--no-report", "--out", "l")
+    document = json.loads((tmp_path / "l" / "result.json").read_text())
+    jsonschema.validate(document, SCHEMA)
+    assert code == 0 and document["evaluations"] == 0
+    index = document["indices"]["total_current"]["6T2A.track.guide_share"]
+    assert len(index["derivative"]) == len(index["elasticity"]) == 4 and index["derivative"][3] == 0
+    value = document["outputs"]["total_current"]["value"][0]
+    assert index["elasticity"][0] == pytest.approx(index["derivative"][0] * 0.3 / value)
+
+
+@pytest.mark.parametrize(("method", "keys"), [
+    ("morris", {"mean_absolute_effect", "mean_effect", "sd_effect"}), ("derivative", {"lower", "upper"}),
+])  # fmt: skip
+def test_other_methods_have_indices_of_their_own(mmrjax, tmp_path, method, keys):
+    code, _, _ = mmrjax(*SMALL, "--method", method, "--no-report", "--out", "m")
+    document = json.loads((tmp_path / "m" / "result.json").read_text())
+    jsonschema.validate(document, SCHEMA)
+    index = document["indices"]["speed"]["motor.torque_constant"]
+    assert code == 0 and keys <= set(index)
+    if method == "derivative":
+        compared = document["comparison"]["speed"]
+        assert compared["upper_holds"] and compared["lower_holds"]
+
+
+def test_schema_can_fail():
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({"schema": "mmrjax.sensitivity/1"}, SCHEMA)
+
+
+def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmrjax, tmp_path, robot):
+    coordinates = priors.coordinates(robot, NAMES[:2])
+    found = of_coordinates(coordinates, np.zeros(2), 0.01 * np.eye(2))
+    values = np.asarray(found.at(np.zeros(2)))
+    fitted = params.replace(robot, {n: jnp.asarray(v) for n, v in zip(found.names, values, strict=True)})
+    robot_file.write(fitted, tmp_path / "robot.toml", note="of a test")
+    posteriors.write(found, tmp_path / posteriors.FILE)
+    code, out, _ = mmrjax(
+        "sensitivity", "--robot", "robot.toml", "--posterior", "--voltages", "24", "--payloads", "3", "--slopes", "0",
+        "--configurations", "6T2A", "--outputs", "speed", "--evaluations", "6000", "--no-report", "--out", "p",
+    )  # fmt: skip
+    document = json.loads((tmp_path / "p" / "result.json").read_text())
+    jsonschema.validate(document, SCHEMA)
+    assert code == 0 and document["method"] == "shapley" and document["correlated"]
+    assert sum(x["shapley"] for x in document["indices"]["speed"].values()) == pytest.approx(1)
+
+    code, out, _ = mmrjax(
+        "simulate", "--robot", "robot.toml", "--posterior", "60", "--voltage", "24", "--no-report", "--out", "u"
+    )
+    assert code == 0 and re.search(r"total current \[A\] +│ \d\.\d+ ± 0\.\d+", out)
+    (row,) = table(tmp_path / "u" / "runs.csv")
+    low, high = float(row["speed_mm_s_lower"]), float(row["speed_mm_s_upper"])
+    assert low < float(row["speed_mm_s"]) < high
+    assert float(row["speed_mm_s_sd"]) == pytest.approx((high - low) / 3.92, rel=0.3)
+    code, out, _ = mmrjax(
+        "sweep", "--robot", "robot.toml", "--posterior", "20", "--slopes", "0", "--voltages", "24",
+        "--configurations", "6T2A", "--no-report", "--out", "w",
+    )  # fmt: skip
+    assert code == 0 and "speed_mm_s_sd" in table(tmp_path / "w" / "runs.csv")[0] and " ± " in out
+    code, _, err = mmrjax("simulate", "--robot", "robot.toml", "--set", f"{NAMES[0]}=0.03", "--posterior", "20")
+    assert code == 4 and f"{NAMES[0]} is 0.03 in the robot; expected" in err
+
+
+# --- what is refused ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("options", "code", "says"), [
+    (["--method", "guess"], 2, "option method: got 'guess'; input should be one of local, sobol, morris"),
+    (["--parameters", "motor.resistence"], 2, "--parameters motor.resistence: no such parameter; did you mean motor.res"),
+    (["--parameters", "moter.*"], 2, "--parameters moter.*: no parameters below it; did you mean motor.*?"),
+    (["--outputs", "sped"], 2, "--outputs sped: no such output; did you mean speed? allowed: total_current"),
+    (["--evaluations", "10"], 2, "--evaluations: got 10; expected 1000 or more"),
+    (["--vary", "voltage=28:20"], 2, "--vary voltage: got 28 to 20; expected a range within 0 to 100 V"),
+    (["--vary", "voltage"], 2, "--vary: got voltage; expected name=low:high with numbers, such as voltage=22:26"),
+    (["--vary", "tension=1:2"], 2, "--vary tension: no such condition; "),
+    (["--vary", "voltage=20:28", "--voltages", "24"], 2, "--vary voltage: --voltages states it too; give one of them"),
+    (["--configurations", "8W"], 2, "configurations: got 8W; the robot has no such configuration"),
+    (["--noise", "curent=1%"], 2, "--noise curent=1%: no such channel; did you mean current?"),
+    (["--candidates", "none.csv"], 4, "none.csv: no such file"),
+    (["--posterior"], 2, "--posterior: nominal has none; expected --robot FOLDER/robot.toml of calibrate or loop"),
+    (["--slopes", "40", "--outputs", "speed"], 2, "no operating point can be studied, since too many"),
+    (["--parameters", "motor.inductance"], 2, "the derivative of every output by every input is zero"),
+])  # fmt: skip
+def test_what_is_refused(mmrjax, tmp_path, options, code, says):
+    points = [] if "--slopes" in options else ["--slopes", "0"]
+    points += (
+        [] if any(o in ("--voltages", "voltage=20:28", "voltage=28:20") for o in options) else ["--voltages", "24"]
+    )
+    got, _, err = mmrjax("sensitivity", "--payloads", "3", *points, *options, "--out", "x")
+    assert got == code and says in err, err
+    assert not (tmp_path / "x").exists() and not (tmp_path / "x.partial").exists()
+
+
+def test_a_parameter_without_a_prior_of_some_width_is_refused(mmrjax, tmp_path):
+    got, _, err = mmrjax(
+        "sensitivity", "--parameters", "motor.friction_viscous", "--set", "motor.friction_viscous=0", "--out", "x"
+    )
+    assert got == 2 and "--parameters motor.friction_viscous: its prior has no width" in err
+
+
+def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
+    (tmp_path / "bad.csv").write_text("configuration,supply_voltage_V,payload_kg\n6T2A,24,3\n")
+    got, _, err = mmrjax(*SMALL, "--candidates", "bad.csv")
+    assert got == 4 and "bad.csv: column slope_deg is missing" in err
+    (tmp_path / "two.csv").write_text(
+        "configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,3,0\n4W2T,33,8,5\n"
+    )
+    got, _, _ = mmrjax(*SMALL, "--method", "local", "--candidates", "two.csv", "--no-report", "--out", "c")
+    runs = json.loads((tmp_path / "c" / "result.json").read_text())["next_runs"]
+    assert got == 0 and runs["candidates"] == 2 and runs["source"] == "two.csv" and len(runs["runs"]) == 2
+
+
+def test_points_that_are_not_held_are_said_and_end_with_3(mmrjax, tmp_path):
+    code, out, _ = mmrjax(
+        "sensitivity", "--parameters", NAMES[0], "--voltages", "24", "--payloads", "0", "--slopes", "0,25",
+        "--configurations", "6T2A", "--outputs", "speed", "--evaluations", "2000", "--no-report", "--out", "h",
+    )  # fmt: skip
+    assert code == 3 and "1 of 2 operating points are left out" in out
+    document = json.loads((tmp_path / "h" / "result.json").read_text())
+    assert document["outputs"]["speed"]["studied"] == [True, False]
+    low, high = document["indices"]["speed"][NAMES[0]]["total_interval"]
+    assert low < 1 < high  # the only input
+
+
+def test_start_outputs_are_studied_by_drive(mmrjax, tmp_path):
+    code, _, _ = mmrjax(
+        "sensitivity", "--method", "local", "--parameters", "motor.resistance,6T2A.ground.friction.dynamic", "--voltages", "24",
+        "--payloads", "0", "--slopes", "0", "--configurations", "6T2A", "--outputs", "start", "--no-report",
+        "--out", "t",
+    )  # fmt: skip
+    document = json.loads((tmp_path / "t" / "result.json").read_text())
+    assert code == 0 and set(document["outputs"]) == {"peak_current", "time_to_speed", "energy_start"}
+    peak, time = (document["indices"][n] for n in ("peak_current", "time_to_speed"))
+    assert peak["motor.resistance"]["elasticity"][0] < -0.5  # U / R before the motor turns
+    # the tracks slip as the robot starts, so that its acceleration is μ_d g whatever its mass
+    assert time["6T2A.ground.friction.dynamic"]["elasticity"][0] < -0.3
