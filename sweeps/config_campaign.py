@@ -104,9 +104,12 @@ def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign:
         return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID})
     grid = resolve(Sweep, file, options)
     axes = {"voltage": grid.voltages_V, "payload": grid.payloads_kg, "slope_deg": grid.slopes_deg}
+    # every run of the grid with every robot drawn, which the store keeps along its last dimension
+    drawn = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
     names = "all" if grid.configurations is None else list(grid.configurations)
     return Campaign(
         **{key: getattr(grid, key) for key in Sweep.model_fields if key in Campaign.model_fields},
+        samples=drawn if grid.posterior is not None else {},
         axes={"configuration": names, **{name: list(values) for name, values in axes.items()}},
         conditions={
             "surface": grid.surface,
