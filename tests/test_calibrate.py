@@ -103,7 +103,8 @@ def test_estimated_noise_is_that_of_the_misfit(found):
 
 def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_path):
     found.save(tmp_path / "fitted")
-    assert sorted(p.name for p in (tmp_path / "fitted").iterdir()) == ["result.json", "robot.toml", "rows.csv"]
+    files = ["posterior.nc", "result.json", "robot.toml", "rows.csv"]
+    assert sorted(p.name for p in (tmp_path / "fitted").iterdir()) == files
     jsonschema.validate(json.loads((tmp_path / "fitted" / "result.json").read_text()), SCHEMA)
     again = robot_file.read(tmp_path / "fitted" / "robot.toml")
     answer = steady_batch(again, measured.conditions(again))

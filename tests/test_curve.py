@@ -100,7 +100,8 @@ def _driven(amplitudes):
 
 def test_settled_travel_shows_nothing_of_a_wave():
     waves = robot(jnp.asarray([laws.size(w) for w in WAVES.values()]), WAVES)
-    np.testing.assert_array_equal(jax.jit(_steady)(waves), jax.jit(_steady)(robots.nominal()))
+    # but for rounding: a program with effects sums in another order
+    np.testing.assert_allclose(jax.jit(_steady)(waves), jax.jit(_steady)(robots.nominal()), rtol=4e-15)
 
 
 @pytest.mark.slow

@@ -113,7 +113,7 @@ def test_command_ends_well_and_says_what_it_found(done):
     assert "fitting the base model" in done.answer.err and "fitting the base model" not in done.answer.out
     names = {p.name for p in (done.folder / "found").iterdir()}
     assert names == {
-        "config.resolved.toml", "figures", "manifest.json", "report.html", "result.json", "robot.toml", "rows.csv",
+        "config.resolved.toml", "figures", "manifest.json", "posterior.nc", "report.html", "result.json", "robot.toml", "rows.csv",
     }  # fmt: skip
 
 

@@ -39,6 +39,9 @@ from mmrjax.robot import Robot
 STARTS = 8
 #: Points of a curve that are shown.
 POINTS = 61
+#: Evidence by which a curve over the supply's voltage, which acts by way of currents and speeds, has to be the better
+#: one [σ²].
+INDIRECT = 6.0
 #: Most instants between which the ends of a window are looked for.
 INSTANTS = 200
 #: How much less improbable a balance's best curve may be for it to act alike [normal deviate].
@@ -114,7 +117,8 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in over if names[i][1] in bases_room.VARIABLES]
-        j = max(smoothly, key=lambda i: smooth(left.linear, *names[i], included).evidence)
+        evidence = {i: smooth(left.linear, *names[i], included).evidence for i in smoothly}
+        j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
     places = dict.fromkeys(names[i][0] for i in those)
     best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in places}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
