@@ -112,22 +112,22 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
     # What a balance does as well is not put down to an instrument; it is listed beside it.
     lacks = [j for j in those if not bases_room.in_readings(names[j][0]) and deviate[j] > deviate[k] - ALIKE]
     k = max(lacks, key=lambda j: deviate[j]) if lacks else k
-    balance = names[k][0]
-    over = [j for j in those if names[j][0] == balance and names[j][1] != bases_room.CONDITIONS]
+    place = names[k][0]
+    over = [j for j in those if names[j][0] == place and names[j][1] != bases_room.CONDITIONS]
     j = k if for_a_while else max(over, key=lambda j: deviate[j])
     if names[j][1] in bases_room.VARIABLES:
         smoothly = [i for i in over if names[i][1] in bases_room.VARIABLES]
         evidence = {i: smooth(left.linear, *names[i], included).evidence for i in smoothly}
         j = max(smoothly, key=lambda i: evidence[i] - INDIRECT * (names[i][1] == "voltage"))
-    places = dict.fromkeys(names[i][0] for i in those)
-    best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in places}
+    every = dict.fromkeys(names[i][0] for i in those)
+    best = {b: max(deviate[i] for i in those if names[i][0] == b) for b in every}
     alike = [(b, *bases_room.STANDS_FOR.get(b, ())) for b, d in best.items() if d > deviate[k] - ALIKE]
     variable, strength = names[j][1], float(explained[j])
     happening = bases_room.window(variable)
     if happening is not None and happening.axis in bases_room.AXES:
-        happening, strength = refined(left.linear, balance, happening.axis, included)
+        happening, strength = refined(left.linear, place, happening.axis, included)
         variable = str(happening)
-    return Location(balance, variable, tuple(itertools.chain(*alike)), strength, max(strength, float(explained[k])))
+    return Location(place, variable, tuple(itertools.chain(*alike)), strength, max(strength, float(explained[k])))
 
 
 def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) -> tuple[bases_room.Window, float]:
