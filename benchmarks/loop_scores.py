@@ -117,9 +117,7 @@ def family_right(x: dict) -> bool:
 
     truth = x["truth"][0]
     if x["verdict"] in ("named", "class"):
-        return contains(x) or (
-            len(x["classes"]) == 1 and BY_NAME[truth["class"]].family() in (x.get("families") or ())
-        )
+        return len(x["classes"]) == 1 and BY_NAME[truth["class"]].family() in (x.get("families") or ())
     return placed(x) and x["where"][1] in DRIVEN.get(truth["class"], ())
 
 

@@ -60,6 +60,14 @@ def variables(found):
     return [v for _, v in names(found)]
 
 
+def test_curves_of_channels_are_over_their_reading_and_what_order_brings():
+    for columns, over in ((table(), set()), (shuffled(table()), {"order"})):
+        of = {c: {v for p, v in names(families(columns, COUNTS)) if p == c} for c in channels.names()}
+        assert of == {
+            "total_current": {"current"} | over, "motor_speed": {"speed_motor"} | over, "speed": {"speed"} | over,
+        }  # fmt: skip
+
+
 def test_curves_over_the_order_where_it_says_something_new():
     assert "order" in variables(families(shuffled(table()), COUNTS))
     assert "order" not in variables(families(table(), COUNTS))

@@ -152,13 +152,15 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
         over[variable] = variable, basis
     names = [(balance, variable) for variable, _ in over.values() for balance in BALANCES]
     bases = [basis for _, basis in over.values() for _ in BALANCES]
-    read = [
-        ((c.name, over[v][0]), over[v][1])
+    shown = [
+        (c.name, v)
         for c in channels.CHANNELS
         for v in over
-        if v in AXES or VARIABLES[v] == c.column
-        if f"curve_{c.name}_{v}" in UNNAMED
+        if (v in AXES or VARIABLES[v] == c.column) and f"curve_{c.name}_{v}" in UNNAMED
     ]
+    new = [n for n in shown if over[n[1]][0] == n[1]]
+    # As above: what is left out makes room for another of its channel, or of the first that has one.
+    read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
     axes = [scaled(columns[c], weight) for c in ("supply_voltage_V", "slope_deg", "payload_kg")]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(axes)) if sum(p) <= DEGREE]
     terms = [
@@ -170,7 +172,7 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
     groups = [
         (names, bases),
         ([(b, CONDITIONS) for b in BALANCES], [wide] * len(BALANCES)),
-        ([n for n, _ in read], [b for _, b in read]),
+        (read, [over[v][1] for _, v in read]),
     ]
     return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
 
