@@ -72,9 +72,14 @@ def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     return State(y[0], y[1], y[2], y[4], memory)
 
 
+#: The signals of an instant, traced once for each kind of robot however often a program asks for them.
+moving = eqx.filter_jit(balances.moving)
+
+
+@eqx.filter_jit
 def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]."""
-    signals = balances.moving(robot, conditions, state_of(robot, y))
+    signals = moving(robot, conditions, state_of(robot, y))
     current_battery = robot.battery.current(signals.total_current) * (conditions.battery > 0.5)  # eq. (11)
     rates = [
         signals.voltage_left / signals.inductance,

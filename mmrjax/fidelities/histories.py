@@ -17,9 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import balances
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.drive import rates, start, state_of
+from mmrjax.fidelities.drive import moving, rates, start, state_of
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -159,4 +158,4 @@ def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"
     y0 = start(robot, conditions)
     _, nodes = states(robot, conditions, times)
     ys = jnp.concatenate([y0[None], nodes])
-    return jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
+    return jax.vmap(lambda y: moving(robot, conditions, state_of(robot, y)))(ys)
