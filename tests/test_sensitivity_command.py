@@ -298,6 +298,18 @@ def test_points_that_are_not_held_are_said_and_end_with_3(mmrjax, tmp_path):
     assert low < 1 < high  # the only input
 
 
+@pytest.mark.parametrize("vary", ["voltage=22:26", "total_mass=12:16"])
+def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(mmrjax, tmp_path, vary):
+    code, _, err = mmrjax(
+        "sensitivity", "--method", "local", "--parameters", NAMES[0], "--payloads", "3", "--slopes", "0",
+        "--configurations", "6T2A", "--outputs", "speed", "--vary", vary, "--no-report", "--out", "v",
+        *(() if "voltage" in vary else ("--voltages", "24")),
+    )  # fmt: skip
+    assert code == 0, err
+    document = json.loads((tmp_path / "v" / "result.json").read_text())
+    assert vary.partition("=")[0] in document["inputs"] and len(document["next_runs"]["runs"]) == 5
+
+
 def test_start_outputs_are_studied_by_drive(mmrjax, tmp_path):
     code, _, _ = mmrjax(
         "sensitivity", "--method", "local", "--parameters", "motor.resistance,6T2A.ground.friction.dynamic", "--voltages", "24",
