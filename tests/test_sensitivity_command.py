@@ -21,6 +21,7 @@ from calibration.inference.posterior import of_coordinates
 from calibration.sensitivity import inputs as room
 from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.local import local
+from calibration.sensitivity.methods import by_shapley
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
@@ -144,6 +145,34 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     estimate = found.outputs["total_current"].overall["shapley"]
     half = (estimate.high - estimate.low) / 2
     assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
+
+
+def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pairs(robot, study, monkeypatch):
+    coordinates = priors.coordinates(robot, NAMES[:2])
+    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.array([[1, 0.5], [0.5, 1.0]])), {})
+    points = Points(*(x[[0, 3]] for x in study.points.columns().values()))
+    two = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    edge = np.inf
+
+    def sample(values, group):
+        """The same output at both points, but for robots that do not travel at the second."""
+        y = np.log(values[:, 0]) + 0.2 * values[:, 1]
+        for k in group:
+            yield k, {"speed": np.where((k == 1) & (values[:, 1] > edge), np.nan, y)}
+
+    monkeypatch.setattr(two, "sample", sample)
+    whole = by_shapley(two, np.ones(2, bool), 6000, 0)["speed"]
+    edge = 2.2 * float(inputs.parameters.at(inputs.parameters.mean)[1])
+    some = by_shapley(two, np.ones(2, bool), 6000, 0)["speed"]
+    assert 0 < some.lost[1] < 0.1 and some.lost[0] == 0
+    width = [np.ptp([p.overall["shapley"].low, p.overall["shapley"].high], axis=0) for p in (whole, some)]
+    np.testing.assert_allclose(
+        width[0], np.ptp([whole.at_points["shapley"].low[0], whole.at_points["shapley"].high[0]], axis=0)
+    )
+    # what is the same at both points is known no better for being there twice
+    assert np.all(width[1] > 0.95 * width[0])
+    at, variance = some.at_points["shapley"].value, some.sd**2
+    np.testing.assert_allclose(some.overall["shapley"].value, variance @ at / variance.sum())
 
 
 # --- the command ------------------------------------------------------------------------------------------------

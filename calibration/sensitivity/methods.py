@@ -236,20 +236,17 @@ def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) ->
     for name in names:
         shown, sd = _blank(points, d), np.full(points, np.nan)
         studied = np.zeros(points, bool)
-        sums, variance = [], 0.0
+        widened = []
         for k, (found, which) in terms[name].items():
             wide = np.zeros((len(found.parts), d))
             wide[:, list(which)] = found.parts
-            _put(shown, k, shapley.effects(dataclasses.replace(found, parts=wide)))
+            widened.append(dataclasses.replace(found, parts=wide))
+            _put(shown, k, shapley.effects(widened[-1]))
             sd[k], studied[k] = np.sqrt(found.variance), True
-            sums.append(wide)
-            variance += found.variance
         if not studied.any():
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue
-        fewest = min(map(len, sums))
-        total = np.sum([s[:fewest] for s in sums], 0)
-        overall = shapley.effects(shapley.Terms(variance, total, 0.0))
+        overall = shapley.effects(shapley.together(widened))
         answer[name] = Part(
             {"shapley": overall},
             {"shapley": shown},
