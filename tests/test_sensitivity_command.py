@@ -20,7 +20,7 @@ from calibration.inference import priors
 from calibration.inference.posterior import of_coordinates
 from calibration.sensitivity import inputs as room
 from calibration.sensitivity.analyse import analyse
-from calibration.sensitivity.local import local
+from calibration.sensitivity.local import inert, local
 from calibration.sensitivity.methods import by_shapley
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import Points
@@ -145,6 +145,15 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     estimate = found.outputs["total_current"].overall["shapley"]
     half = (estimate.high - estimate.low) / 2
     assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
+
+
+@pytest.mark.parametrize("variances", [(0.02, 0.01), (0.01, 0.02)])
+def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance(robot, study, variances):
+    coordinates = priors.coordinates(robot, (NAMES[0], NAMES[3]))
+    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.diag(variances)), {})
+    points = Points(*(x[:1] for x in study.points.columns().values()))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    np.testing.assert_array_equal(inert(one, local(one), 0), [False, True])
 
 
 def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pairs(robot, study, monkeypatch):
