@@ -19,9 +19,10 @@ from calibration.data import robot_file
 from calibration.inference import priors
 from calibration.inference.posterior import of_coordinates
 from calibration.sensitivity import inputs as room
+from calibration.sensitivity import shapley
 from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.local import inert, local
-from calibration.sensitivity.methods import by_shapley
+from calibration.sensitivity.methods import by_shapley, correlated
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
@@ -132,8 +133,6 @@ def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
 
 
 def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, study):
-    from calibration.sensitivity import shapley
-
     coordinates = priors.coordinates(robot, NAMES[:2])
     covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), covariance), {})
@@ -145,6 +144,27 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     estimate = found.outputs["total_current"].overall["shapley"]
     half = (estimate.high - estimate.low) / 2
     assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
+
+
+def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlations(robot, study):
+    # The torque constant acts; the inductance does nothing, and the other two act in one configuration each. The
+    # guides' share is linked with the inductance through the 4W2T's loss alone.
+    names = (NAMES[0], NAMES[2], NAMES[3], NAMES[1])
+    covariance = 0.02 * np.array([[1, 0.6, 0, 0], [0.6, 1, 0.5, 0], [0, 0.5, 1, 0], [0, 0, 0, 1.0]])
+    inputs = room.of_posterior(robot, of_coordinates(priors.coordinates(robot, names), np.zeros(4), covariance), {})
+    points = Points(*(x[:2] for x in study.points.columns().values()))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    found = analyse(one, "shapley", 40_000)
+    slopes = local(one).by_score["speed"] @ np.linalg.inv(inputs.parameters.root)
+    at = found.outputs["speed"].at_points["shapley"]
+    assert abs(slopes[0, 1]) < 1e-9 and np.all(np.abs(slopes[:, 2]) < 1e-9)
+    for k in range(2):
+        truth, half = shapley.linear(slopes[k], covariance), (at.high[k] - at.low[k]) / 2
+        assert np.all(np.abs(at.value[k] - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
+    assert at.value[0, 1] > 0.05 and at.value[0, 2] > 0.01
+    assert found.inputs["motor.inductance"].inert and "motor.inductance" not in found.negligible
+    assert [n for n in found.notes if "correlated with: motor.inductance" in n]
+    assert correlated(inputs, [3]) == (3,) and correlated(inputs, [2, 3]) == (0, 1, 2, 3)
 
 
 @pytest.mark.parametrize("variances", [(0.02, 0.01), (0.01, 0.02)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ from calibration.sensitivity.study import Study
 MOST_LOST = 0.5
 #: Replicates of the derivative method, and points of each.
 GRADIENTS = (8, 8)
+#: Correlation above which inputs are drawn together.
+LINKED = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +53,23 @@ def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]
         if which:
             found.setdefault(which, []).append(k)
     return found
+
+
+def correlated(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
+    """These inputs and all that are correlated with one of them, directly or through others.
+
+    Knowing any of them tells something of what these do, so that by definition it has a Shapley effect, also where
+    it does nothing itself.
+    """
+    p = len(inputs.parameters)
+    covariance = inputs.parameters.covariance
+    sd = np.sqrt(np.diagonal(covariance))
+    linked = np.eye(len(inputs), dtype=bool)
+    linked[:p, :p] |= np.abs(covariance) > LINKED * np.outer(sd, sd)
+    found = np.asarray(np.isin(np.arange(len(inputs)), which))
+    while (more := np.asarray(linked[found].any(0))).sum() > found.sum():
+        found = more
+    return tuple(map(int, np.flatnonzero(found)))
 
 
 def _blank(points: int, size: int) -> Estimate:
@@ -210,7 +230,10 @@ def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part
 
 
 def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Shapley effects at every point, and over all of them."""
+    """Shapley effects at every point, and over all of them.
+
+    Inputs that do nothing at a point are drawn with those that they are correlated with; the others have no effect.
+    """
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     p = len(study.inputs.parameters)
@@ -219,7 +242,8 @@ def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) ->
     mean = np.concatenate([study.inputs.parameters.mean, np.zeros(d - p)])
     terms: dict[str, dict[int, tuple[shapley.Terms, tuple[int, ...]]]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    for which, group in groups(study, moving).items():
+    for acting, group in groups(study, moving).items():
+        which = correlated(study.inputs, acting)
         places = np.array(which)
         pairs = shapley.pairs_of(evaluations / points, len(which))
         design = shapley.design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
