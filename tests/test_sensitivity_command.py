@@ -204,6 +204,16 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
     np.testing.assert_allclose(some.overall["shapley"].value, variance @ at / variance.sum())
 
 
+@pytest.mark.parametrize("method", ["sobol", "morris", "derivative", "shapley"])
+def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
+    inputs = room.of_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
+    points = Points(*(x[:2] for x in study.points.columns().values()))
+    found = analyse(Study(robot, inputs, points, chosen_outputs(("speed",))), method, 3000)
+    assert sum(found.sampled["steady"].values()) == found.evaluations > 0
+    if method == "sobol":
+        assert found.outputs["speed"].convergence[-1][0] == found.evaluations
+
+
 # --- the command ------------------------------------------------------------------------------------------------
 
 

@@ -74,10 +74,10 @@ def analyse(
     parts = _by_method(study, method, ~idle, evaluations, seed)
     comparison: dict[str, dict[str, Any]] = {}
     if method == "derivative":
-        spent = study.evaluations, study.seconds
+        spent = study.evaluations, study.seconds, dict(study.sampled)
         study.tell("Sobol indices of the same points, to compare the bounds with")
         comparison = _compared(study, parts, by_sobol(study, ~idle, evaluations, seed, second=False))
-        study.evaluations, study.seconds = spent
+        study.evaluations, study.seconds, study.sampled = spent
     outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_none_converges(study, study.statuses()))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Sequence
 
 import jax
@@ -86,13 +85,13 @@ def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, seco
     names = [o.name for o in study.model.outputs]
     terms: dict[str, dict[int, sobol.Terms]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    base = {}
+    spent = {}
     for which, group in groups(study, moving).items():
         size = sobol.size_of(evaluations / points, len(which), second)
         design = sobol.design(len(which), size, seed, second)
         scores = _sampled(study, design.points, np.array(which))
-        base = {"rows": design.size * design.replicates, "blocks": design.blocks}
         for k, made in study.sample(study.values_at(scores), group):
+            spent[k] = len(design.points)
             for name in names:
                 found = sobol.terms(design, made[name])
                 rows = design.size * design.replicates
@@ -115,7 +114,7 @@ def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, seco
             continue
         overall = sobol.indices(whole)
         stages = [(r, sobol.indices(whole, r).total) for r in sobol.STAGES]
-        count = base["rows"] * base["blocks"] * int(studied.sum())
+        count = sum(spent[k] for k in terms[name])
         answer[name] = Part(
             {"first": overall.first, "total": overall.total},
             {"first": first, "total": total},
@@ -195,10 +194,7 @@ def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part
     scores = np.asarray(study.inputs.scores(jnp.asarray(unit)))
     rows = np.tile(scores, (points, 1))
     conditions = jax.tree.map(lambda x: jnp.repeat(x, len(scores)), study.conditions)
-    began = time.perf_counter()
     values, gradients = study.gradients(rows, conditions)
-    study.seconds += time.perf_counter() - began
-    study.evaluations += len(rows)
     answer = {}
     for name in names:
         lower, upper, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
