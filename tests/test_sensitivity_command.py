@@ -19,8 +19,10 @@ from calibration.data import robot_file
 from calibration.inference import priors
 from calibration.inference.posterior import of_coordinates
 from calibration.sensitivity import inputs as room
+from calibration.sensitivity import shapley
 from calibration.sensitivity.analyse import analyse
-from calibration.sensitivity.local import local
+from calibration.sensitivity.local import inert, local
+from calibration.sensitivity.methods import by_shapley, correlated
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
@@ -131,8 +133,6 @@ def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
 
 
 def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, study):
-    from calibration.sensitivity import shapley
-
     coordinates = priors.coordinates(robot, NAMES[:2])
     covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), covariance), {})
@@ -144,6 +144,74 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     estimate = found.outputs["total_current"].overall["shapley"]
     half = (estimate.high - estimate.low) / 2
     assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
+
+
+def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlations(robot, study):
+    # The torque constant acts; the inductance does nothing, and the other two act in one configuration each. The
+    # guides' share is linked with the inductance through the 4W2T's loss alone.
+    names = (NAMES[0], NAMES[2], NAMES[3], NAMES[1])
+    covariance = 0.02 * np.array([[1, 0.6, 0, 0], [0.6, 1, 0.5, 0], [0, 0.5, 1, 0], [0, 0, 0, 1.0]])
+    inputs = room.of_posterior(robot, of_coordinates(priors.coordinates(robot, names), np.zeros(4), covariance), {})
+    points = Points(*(x[:2] for x in study.points.columns().values()))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    found = analyse(one, "shapley", 40_000)
+    slopes = local(one).by_score["speed"] @ np.linalg.inv(inputs.parameters.root)
+    at = found.outputs["speed"].at_points["shapley"]
+    assert abs(slopes[0, 1]) < 1e-9 and np.all(np.abs(slopes[:, 2]) < 1e-9)
+    for k in range(2):
+        truth, half = shapley.linear(slopes[k], covariance), (at.high[k] - at.low[k]) / 2
+        assert np.all(np.abs(at.value[k] - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
+    assert at.value[0, 1] > 0.05 and at.value[0, 2] > 0.01
+    assert found.inputs["motor.inductance"].inert and "motor.inductance" not in found.negligible
+    assert [n for n in found.notes if "correlated with: motor.inductance" in n]
+    assert correlated(inputs, [3]) == (3,) and correlated(inputs, [2, 3]) == (0, 1, 2, 3)
+
+
+@pytest.mark.parametrize("variances", [(0.02, 0.01), (0.01, 0.02)])
+def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance(robot, study, variances):
+    coordinates = priors.coordinates(robot, (NAMES[0], NAMES[3]))
+    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.diag(variances)), {})
+    points = Points(*(x[:1] for x in study.points.columns().values()))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    np.testing.assert_array_equal(inert(one, local(one), 0), [False, True])
+
+
+def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pairs(robot, study, monkeypatch):
+    coordinates = priors.coordinates(robot, NAMES[:2])
+    inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.array([[1, 0.5], [0.5, 1.0]])), {})
+    points = Points(*(x[[0, 3]] for x in study.points.columns().values()))
+    two = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    edge = np.inf
+
+    def sample(values, group):
+        """The same output at both points, but for robots that do not travel at the second."""
+        y = np.log(values[:, 0]) + 0.2 * values[:, 1]
+        for k in group:
+            yield k, {"speed": np.where((k == 1) & (values[:, 1] > edge), np.nan, y)}
+
+    monkeypatch.setattr(two, "sample", sample)
+    whole = by_shapley(two, np.ones(2, bool), 6000, 0)["speed"]
+    edge = 2.2 * float(inputs.parameters.at(inputs.parameters.mean)[1])
+    some = by_shapley(two, np.ones(2, bool), 6000, 0)["speed"]
+    assert 0 < some.lost[1] < 0.1 and some.lost[0] == 0
+    width = [np.ptp([p.overall["shapley"].low, p.overall["shapley"].high], axis=0) for p in (whole, some)]
+    np.testing.assert_allclose(
+        width[0], np.ptp([whole.at_points["shapley"].low[0], whole.at_points["shapley"].high[0]], axis=0)
+    )
+    # what is the same at both points is known no better for being there twice
+    assert np.all(width[1] > 0.95 * width[0])
+    at, variance = some.at_points["shapley"].value, some.sd**2
+    np.testing.assert_allclose(some.overall["shapley"].value, variance @ at / variance.sum())
+
+
+@pytest.mark.parametrize("method", ["sobol", "morris", "derivative", "shapley"])
+def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
+    inputs = room.of_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
+    points = Points(*(x[:2] for x in study.points.columns().values()))
+    found = analyse(Study(robot, inputs, points, chosen_outputs(("speed",))), method, 3000)
+    assert sum(found.sampled["steady"].values()) == found.evaluations > 0
+    if method == "sobol":
+        assert found.outputs["speed"].convergence[-1][0] == found.evaluations
 
 
 # --- the command ------------------------------------------------------------------------------------------------
@@ -296,6 +364,18 @@ def test_points_that_are_not_held_are_said_and_end_with_3(mmrjax, tmp_path):
     assert document["outputs"]["speed"]["studied"] == [True, False]
     low, high = document["indices"]["speed"][NAMES[0]]["total_interval"]
     assert low < 1 < high  # the only input
+
+
+@pytest.mark.parametrize("vary", ["voltage=22:26", "total_mass=12:16"])
+def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(mmrjax, tmp_path, vary):
+    code, _, err = mmrjax(
+        "sensitivity", "--method", "local", "--parameters", NAMES[0], "--payloads", "3", "--slopes", "0",
+        "--configurations", "6T2A", "--outputs", "speed", "--vary", vary, "--no-report", "--out", "v",
+        *(() if "voltage" in vary else ("--voltages", "24")),
+    )  # fmt: skip
+    assert code == 0, err
+    document = json.loads((tmp_path / "v" / "result.json").read_text())
+    assert vary.partition("=")[0] in document["inputs"] and len(document["next_runs"]["runs"]) == 5
 
 
 def test_start_outputs_are_studied_by_drive(mmrjax, tmp_path):

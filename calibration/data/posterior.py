@@ -114,7 +114,7 @@ class Posterior:
         at = np.asarray(self.at(np.asarray(self.mean)))
         sd = np.asarray(self.sd)
         for name, value, width in zip(self.names, at, sd, strict=True):
-            if abs(known[name] - value) > APART * width + 1e-6 * abs(value):
+            if not abs(known[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
                 raise BadData(
                     f"{where}: {name} is {known[name]:.6g} in the robot; expected {value:.6g}, the centre of its "
                     "posterior: take the robot.toml beside it, without changes to what was fitted"
@@ -181,13 +181,17 @@ def read(path: Path | str) -> Posterior:
     size = len(found)
     sound = (
         found.covariance.shape == (size, size)
-        and np.isfinite(found.covariance).all()
-        and np.isfinite(found.mean).all()
+        and all(np.isfinite(x).all() for x in (found.covariance, found.mean, found.location, found.spread))
+        and np.isfinite(found.softness).all()
+        and not (np.isnan(found.low).any() or np.isnan(found.high).any())
+        and all(0 <= k < size and np.isfinite(ratio) for _, k, ratio in found.tied)
         and np.linalg.eigvalsh(found.covariance).min() >= -1e-9 * max(np.abs(found.covariance).max(), 1e-300)
         and set(found.kinds) <= {NORMAL, LOG, ANGLE}
     )
     if not sound:
-        raise BadData(f"{path}: the covariance is not one, or a number is missing; write the file anew")
+        raise BadData(
+            f"{path}: the covariance is not one, or a number is missing or out of range; write the file anew"
+        )
     return found
 
 

@@ -12,7 +12,7 @@ from calibration.data.errors import BadConfiguration
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.local import Local, directions, inert, local
-from calibration.sensitivity.methods import Part, by_derivative, by_morris, by_shapley, by_sobol
+from calibration.sensitivity.methods import Part, by_derivative, by_morris, by_shapley, by_sobol, correlated
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.next_runs import Candidates, next_runs
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
@@ -74,10 +74,10 @@ def analyse(
     parts = _by_method(study, method, ~idle, evaluations, seed)
     comparison: dict[str, dict[str, Any]] = {}
     if method == "derivative":
-        spent = study.evaluations, study.seconds
+        spent = study.evaluations, study.seconds, dict(study.sampled)
         study.tell("Sobol indices of the same points, to compare the bounds with")
         comparison = _compared(study, parts, by_sobol(study, ~idle, evaluations, seed, second=False))
-        study.evaluations, study.seconds = spent
+        study.evaluations, study.seconds, study.sampled = spent
     outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
         raise BadConfiguration(_none_converges(study, study.statuses()))
@@ -229,9 +229,17 @@ def _notes(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.
                 f"at {int(some.sum())} operating points up to {100 * o.lost[some].max():.1f} % of the sample is left "
                 f"out, since the robot does not travel there: the indices are of robots that do ({names})"
             )
-    if idle.any():
-        names = ", ".join(n for n, k in zip(study.inputs.names, idle, strict=True) if k)
+    drawn = correlated(study.inputs, np.flatnonzero(~idle)) if method == "shapley" else ()
+    unsampled = [n for k, n in enumerate(study.inputs.names) if idle[k] and k not in drawn]
+    followed = [n for k, n in enumerate(study.inputs.names) if idle[k] and k in drawn]
+    if unsampled:
+        names = ", ".join(unsampled)
         said.append(f"not sampled, since every derivative by them is exactly zero where one was taken: {names}")
+    if followed:
+        said.append(
+            "every derivative by them is exactly zero where one was taken, so that what effect they have is that of "
+            f"inputs they are correlated with: {', '.join(followed)}"
+        )
     if study.inputs.parameters.tied:
         followers = ", ".join(f for f, _, _ in study.inputs.parameters.tied)
         said.append(f"kept at their ratio to another input, and part of what it does: {followers}")

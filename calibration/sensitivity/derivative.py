@@ -42,16 +42,6 @@ class Terms:
             self.lost + other.lost,
         )
 
-    def widened(self, places: np.ndarray, inputs: int) -> Terms:
-        """Of more inputs, of which these are at `places`; the others do nothing."""
-
-        def wide(x: np.ndarray) -> np.ndarray:
-            whole = np.zeros((len(x), inputs))
-            whole[:, places] = x
-            return whole
-
-        return dataclasses.replace(self, lower=wide(self.lower), upper=wide(self.upper))
-
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
@@ -23,9 +22,6 @@ from mmrjax.variation import CONDITIONS, Axis, Variation
 
 #: Nearest to an end of the unit interval that a normal score is taken of: 6 sds.
 EDGE = 1e-9
-#: Quantiles between which an input's range is shown and screened: those of the 95 % interval.
-TAIL = 0.025
-
 
 #: The distribution of no parameter.
 NOTHING = Posterior(
@@ -87,13 +83,6 @@ class Inputs:
         """Scores in the middle: medians."""
         return np.concatenate([np.zeros(len(self.parameters)), np.full(len(self.conditions), 0.5)])
 
-    def quantile(self, share: float) -> np.ndarray:
-        """Values of the inputs at a quantile of each, the others at their medians; shape (inputs,)."""
-        at = np.full(len(self), share)
-        rows = np.tile(self.centre, (len(self), 1))
-        rows[np.arange(len(self)), np.arange(len(self))] = np.asarray(self.scores(jnp.asarray(at)))
-        return np.diagonal(np.asarray(self.values(jnp.asarray(rows)))[:, self.places])
-
     @property
     def places(self) -> np.ndarray:
         """Which of `columns` each input is."""
@@ -104,45 +93,6 @@ class Inputs:
         """Indices of the inputs that are not of another configuration."""
         foreign = tuple(f"{name}." for name in others if name != configuration)
         return np.array([k for k, name in enumerate(self.names) if not name.startswith(foreign)], int)
-
-    def only(self, which: Sequence[int]) -> Inputs:
-        """Of these inputs alone, the parameters still independent."""
-        p = len(self.parameters)
-        kept = [k for k in which if k < p]
-        q = self.parameters
-        places = {old: new for new, old in enumerate(kept)}
-        fields = {f: getattr(q, f)[kept] for f in ("mean", "location", "spread", "low", "high", "softness")}
-        some = dataclasses.replace(
-            q,
-            coordinates=tuple(q.coordinates[k] for k in kept),
-            units=tuple(q.units[k] for k in kept),
-            kinds=tuple(q.kinds[k] for k in kept),
-            covariance=q.covariance[np.ix_(kept, kept)],
-            tied=tuple((name, places[k], ratio) for name, k, ratio in q.tied if k in places),
-            **fields,
-        )
-        rest = [k - p for k in which if k >= p]
-        return dataclasses.replace(
-            self,
-            parameters=some,
-            conditions=tuple(self.conditions[k] for k in rest),
-            low=self.low[rest],
-            high=self.high[rest],
-        )
-
-    def distribution(self, k: int) -> dict[str, object]:
-        """An input's distribution in words and numbers, as in result.json."""
-        low, middle, high = (float(self.quantile(q)[k]) for q in (TAIL, 0.5, 1 - TAIL))
-        axis = self.axes[self.names[k]]
-        p = len(self.parameters)
-        kind = "uniform" if k >= p else self.parameters.kinds[k]
-        return {
-            "unit": axis.unit,
-            "meaning": axis.meaning,
-            "distribution": "posterior" if self.is_posterior and k < p else kind,
-            "median": middle,
-            "interval": [low, high],
-        }
 
 
 def default_names(robot: Robot, configurations: Sequence[str], battery: bool) -> tuple[str, ...]:
@@ -213,9 +163,3 @@ def _inputs(
             )
     ends = np.array(list(ranges.values()), float).reshape(-1, 2)
     return Inputs(parameters, tuple(ranges), ends[:, 0], ends[:, 1], axes, posterior)
-
-
-def slopes(inputs: Inputs) -> np.ndarray:
-    """d value / d score of each input at the medians, shape (inputs,)."""
-    jacobian = np.asarray(jax.jacfwd(inputs.values)(jnp.asarray(inputs.centre)))
-    return jacobian[inputs.places, np.arange(len(inputs))]

@@ -52,15 +52,10 @@ def local(study: Study) -> Local:
     answer = study.model(values, study.conditions)
     by_columns = study.model.derivatives(values, study.conditions)
     inner = np.asarray(jacobian_of(inputs, centre))
-    places, tied = inputs.places, inputs.parameters.tied
-    first_tied = len(inputs.parameters)
     derivative, by_score, swing = {}, {}, {}
     for name, moved in by_columns.items():
         there = np.isfinite(answer.values[name])[:, None]
-        own = moved[:, places].copy()
-        for j, (_, leader, ratio) in enumerate(tied):  # what follows a parameter goes with it
-            own[:, leader] += ratio * moved[:, first_tied + j]
-        derivative[name] = np.where(there, own, np.nan)
+        derivative[name] = np.where(there, _by_inputs(inputs, moved), np.nan)
         by_score[name] = np.where(there, np.einsum("pc,pci->pi", moved, inner), np.nan)
     along = directions(inputs)
     p = len(inputs.parameters)
@@ -78,6 +73,14 @@ def local(study: Study) -> Local:
     return Local(answer.values, derivative, by_score, swing, _in_words(answer.counts()))
 
 
+def _by_inputs(inputs: Inputs, by_columns: np.ndarray) -> np.ndarray:
+    """Derivatives by inputs, shape (points, inputs), from those by columns: what follows a parameter goes with it."""
+    own = by_columns[:, inputs.places].copy()
+    for j, (_, leader, ratio) in enumerate(inputs.parameters.tied):
+        own[:, leader] += ratio * by_columns[:, len(inputs.parameters) + j]
+    return own
+
+
 def _in_words(counts: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
     return {source_words(source): by for source, by in counts.items()}
 
@@ -86,14 +89,13 @@ def inert(study: Study, found: Local, seed: int) -> np.ndarray:
     """Inputs by which the derivative of every output is exactly zero wherever it was taken, shape (inputs,)."""
     scores = study.inputs.scores(jnp.asarray(derivative.design(len(study.inputs), 1, seed, LOOKS)))
     moving = np.zeros(len(study.inputs), bool)
-    for g in found.by_score.values():
+    for g in found.derivative.values():  # not by scores: those of a posterior mix its parameters
         moving |= (np.nan_to_num(g) != 0).any(0)
     if moving.all():
         return ~moving
     points = np.unique(np.linspace(0, len(study.points) - 1, PLACES).astype(int))
     rows = np.repeat(np.asarray(scores), len(points), 0)
     conditions = jax.tree.map(lambda x: jnp.tile(x[points], len(scores)), study.conditions)
-    _, gradients = study.gradients(rows, conditions)
-    for g in gradients.values():
-        moving |= (np.nan_to_num(g) != 0).any(0)
+    for g in study.model.derivatives(study.values_at(rows), conditions).values():
+        moving |= (np.nan_to_num(_by_inputs(study.inputs, g)) != 0).any(0)
     return ~moving

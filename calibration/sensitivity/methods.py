@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import time
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,8 @@ from calibration.sensitivity.study import Study
 MOST_LOST = 0.5
 #: Replicates of the derivative method, and points of each.
 GRADIENTS = (8, 8)
+#: Correlation above which inputs are drawn together.
+LINKED = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +54,23 @@ def groups(study: Study, moving: np.ndarray) -> dict[tuple[int, ...], list[int]]
     return found
 
 
+def correlated(inputs: Inputs, which: Sequence[int] | np.ndarray) -> tuple[int, ...]:
+    """These inputs and all that are correlated with one of them, directly or through others.
+
+    Knowing any of them tells something of what these do, so that by definition it has a Shapley effect, also where
+    it does nothing itself.
+    """
+    p = len(inputs.parameters)
+    covariance = inputs.parameters.covariance
+    sd = np.sqrt(np.diagonal(covariance))
+    linked = np.eye(len(inputs), dtype=bool)
+    linked[:p, :p] |= np.abs(covariance) > LINKED * np.outer(sd, sd)
+    found = np.asarray(np.isin(np.arange(len(inputs)), which))
+    while (more := np.asarray(linked[found].any(0))).sum() > found.sum():
+        found = more
+    return tuple(map(int, np.flatnonzero(found)))
+
+
 def _blank(points: int, size: int) -> Estimate:
     return Estimate(*(np.full((points, size), np.nan) for _ in range(3)))
 
@@ -66,13 +85,13 @@ def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, seco
     names = [o.name for o in study.model.outputs]
     terms: dict[str, dict[int, sobol.Terms]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    base = {}
+    spent = {}
     for which, group in groups(study, moving).items():
         size = sobol.size_of(evaluations / points, len(which), second)
         design = sobol.design(len(which), size, seed, second)
         scores = _sampled(study, design.points, np.array(which))
-        base = {"rows": design.size * design.replicates, "blocks": design.blocks}
         for k, made in study.sample(study.values_at(scores), group):
+            spent[k] = len(design.points)
             for name in names:
                 found = sobol.terms(design, made[name])
                 rows = design.size * design.replicates
@@ -95,7 +114,7 @@ def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, seco
             continue
         overall = sobol.indices(whole)
         stages = [(r, sobol.indices(whole, r).total) for r in sobol.STAGES]
-        count = base["rows"] * base["blocks"] * int(studied.sum())
+        count = sum(spent[k] for k in terms[name])
         answer[name] = Part(
             {"first": overall.first, "total": overall.total},
             {"first": first, "total": total},
@@ -175,10 +194,7 @@ def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part
     scores = np.asarray(study.inputs.scores(jnp.asarray(unit)))
     rows = np.tile(scores, (points, 1))
     conditions = jax.tree.map(lambda x: jnp.repeat(x, len(scores)), study.conditions)
-    began = time.perf_counter()
     values, gradients = study.gradients(rows, conditions)
-    study.seconds += time.perf_counter() - began
-    study.evaluations += len(rows)
     answer = {}
     for name in names:
         lower, upper, sd = _blank(points, d), _blank(points, d), np.full(points, np.nan)
@@ -210,7 +226,10 @@ def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part
 
 
 def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
-    """Shapley effects at every point, and over all of them."""
+    """Shapley effects at every point, and over all of them.
+
+    Inputs that do nothing at a point are drawn with those that they are correlated with; the others have no effect.
+    """
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
     p = len(study.inputs.parameters)
@@ -219,7 +238,8 @@ def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) ->
     mean = np.concatenate([study.inputs.parameters.mean, np.zeros(d - p)])
     terms: dict[str, dict[int, tuple[shapley.Terms, tuple[int, ...]]]] = {name: {} for name in names}
     lost = {name: np.zeros(points) for name in names}
-    for which, group in groups(study, moving).items():
+    for acting, group in groups(study, moving).items():
+        which = correlated(study.inputs, acting)
         places = np.array(which)
         pairs = shapley.pairs_of(evaluations / points, len(which))
         design = shapley.design(mean[places], covariance[np.ix_(places, places)], pairs, seed)
@@ -236,20 +256,17 @@ def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) ->
     for name in names:
         shown, sd = _blank(points, d), np.full(points, np.nan)
         studied = np.zeros(points, bool)
-        sums, variance = [], 0.0
+        widened = []
         for k, (found, which) in terms[name].items():
             wide = np.zeros((len(found.parts), d))
             wide[:, list(which)] = found.parts
-            _put(shown, k, shapley.effects(dataclasses.replace(found, parts=wide)))
+            widened.append(dataclasses.replace(found, parts=wide))
+            _put(shown, k, shapley.effects(widened[-1]))
             sd[k], studied[k] = np.sqrt(found.variance), True
-            sums.append(wide)
-            variance += found.variance
         if not studied.any():
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue
-        fewest = min(map(len, sums))
-        total = np.sum([s[:fewest] for s in sums], 0)
-        overall = shapley.effects(shapley.Terms(variance, total, 0.0))
+        overall = shapley.effects(shapley.together(widened))
         answer[name] = Part(
             {"shapley": overall},
             {"shapley": shown},

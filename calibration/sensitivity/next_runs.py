@@ -64,11 +64,14 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
     if not p:
         return None
     rows = np.tile(study.inputs.centre, (len(points), 1))
-    values = study.values_at(rows)
-    # A condition is set as a candidate says, whatever range it has in the study.
+    values = np.array(study.values_at(rows))
+    # A condition is set as a candidate says, whatever range it has in the study; what it leaves open stays in the
+    # middle of that range.
     first = len(study.inputs.columns) - len(study.inputs.conditions)
     for j, name in enumerate(study.inputs.conditions):
-        values[:, first + j] = np.asarray(getattr(conditions, name))
+        stated = getattr(conditions, name)
+        if stated is not None:
+            values[:, first + j] = np.asarray(stated)
     answer = model(values, conditions)
     moved = model.derivatives(values, conditions)
     inner = np.asarray(jacobian_of(study.inputs, rows))[:, :, :p]

@@ -58,7 +58,7 @@ class Input:
         unit, meaning: of its field; distribution: log-normal, normal, uniform or posterior.
         median: [unit]; interval: that holds 95 % [unit]; sd: to first order [unit].
         inert: whether every output's derivative by it was exactly zero wherever one was taken, so that it was left
-            out of the sampling.
+            out of the sampling; Shapley effects draw it still where it is correlated with inputs that act.
     """
 
     unit: str

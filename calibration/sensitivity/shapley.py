@@ -9,6 +9,7 @@ reverse, and the cost E[Var(y | all but J)] by three draws of x_J at one of the 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from math import factorial
 
 import numpy as np
@@ -41,16 +42,13 @@ class Terms:
     """What effects are ratios of: parts of the variance [output's unit²].
 
     Attributes:
-        variance: of the output; parts: shape (pairs, inputs).
+        variance: of the output; parts: shape (pairs, inputs), NaN in rows of pairs that are left out.
         lost: share of points at which the model has no number [-].
     """
 
     variance: float
     parts: np.ndarray
     lost: float
-
-    def __add__(self, other: Terms) -> Terms:
-        return Terms(self.variance + other.variance, self.parts + other.parts, max(self.lost, other.lost))
 
 
 def pairs_of(evaluations: float, inputs: int) -> int:
@@ -119,14 +117,35 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     cost = rest[there].var(-1, ddof=1)  # (pairs, 2, prefixes)
     edge = (*cost.shape[:2], 1)
     ladder = np.concatenate([np.zeros(edge), cost, np.full(edge, variance)], -1)
-    parts = np.zeros((len(cost), 2, size))
-    np.put_along_axis(parts, design.orders[there], np.diff(ladder, axis=-1), -1)
-    return Terms(variance, parts.mean(1), float(1 - np.isfinite(values).mean()))
+    of_orders = np.zeros((len(cost), 2, size))
+    np.put_along_axis(of_orders, design.orders[there], np.diff(ladder, axis=-1), -1)
+    parts = np.full((pairs, size), np.nan)
+    parts[there] = of_orders.mean(1)
+    return Terms(variance, parts, float(1 - np.isfinite(values).mean()))
+
+
+def together(found: Sequence[Terms]) -> Terms:
+    """Of several outputs, as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014)), whose pairs of orders are the
+    same, row by row.
+
+    A pair that one output lacks counts there as the mean of those it has, which weigh so much more that the mean over
+    all rows and its variance are those of the output's own.
+    """
+    rows = max(len(terms.parts) for terms in found)
+    whole = np.zeros((rows, found[0].parts.shape[1]))
+    for terms in found:
+        there = np.isfinite(terms.parts).all(1)
+        kept = terms.parts[there]
+        middle = kept.mean(0)
+        whole += middle
+        whole[: len(there)][there] += rows / len(kept) * (kept - middle)
+    return Terms(sum(t.variance for t in found), whole, max(t.lost for t in found))
 
 
 def effects(terms: Terms) -> Estimate:
     """Shapley effects [-], shape (inputs,)."""
-    return ratio(terms.parts, np.full(len(terms.parts), terms.variance))
+    kept = terms.parts[np.isfinite(terms.parts).all(1)]
+    return ratio(kept, np.full(len(kept), terms.variance))
 
 
 def linear(mean_slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:

@@ -97,15 +97,18 @@ class Study:
                     kept[source, mark] = self.model.of_source(source, values, conditions)
                 parts[source] = kept[source, mark]
             answer = self.model.joined(parts)
-            self.seconds += time.perf_counter() - began
-            self.evaluations += len(values)
-            for source, codes in answer.statuses.items():
-                self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
+            self._count(answer, len(values), began)
             if time.perf_counter() - self.told > SILENCE:
                 self.told = time.perf_counter()
                 rate = self.evaluations / max(self.seconds, 1e-9)
                 self.tell(f"{self.evaluations:,} model evaluations so far, {rate:,.0f} a second")
             yield k, answer.values
+
+    def _count(self, answer: Answer, rows: int, began: float) -> None:
+        self.seconds += time.perf_counter() - began
+        self.evaluations += rows
+        for source, codes in answer.statuses.items():
+            self.sampled[source] = self.sampled.get(source, 0) + np.bincount(codes, minlength=len(STATUSES))
 
     def statuses(self) -> dict[str, dict[str, int]]:
         """Source → status → how many of the sample."""
@@ -115,13 +118,18 @@ class Study:
         }
 
     def gradients(self, scores: np.ndarray, conditions: Conditions) -> tuple[dict[str, np.ndarray], ...]:
-        """Outputs, and their derivatives by the scores of all inputs; each row has its own conditions, or all one."""
+        """Outputs, and their derivatives by the scores of all inputs; each row has its own conditions, or all one.
+
+        Counted and timed.
+        """
+        began = time.perf_counter()
         values = self.values_at(scores)
         answer = self.model(values, conditions)
         by_columns = self.model.derivatives(values, conditions)
         inner = np.asarray(jacobian_of(self.inputs, scores))
         moved = {name: np.einsum("pc,pci->pi", x, inner) for name, x in by_columns.items()}
         there = {name: np.isfinite(x)[:, None] for name, x in answer.values.items()}
+        self._count(answer, len(scores), began)
         return answer.values, {name: np.where(there[name], g, np.nan) for name, g in moved.items()}
 
 
