@@ -104,6 +104,7 @@ class SweepStore:
         self.layout = layout
         self.finished = False
         self._journal: TextIO | None = None
+        self._share: Path | None = None
         self._lock: TextIO | None = None
         self._identity = identity
         self._aside = self.partial / ASIDE / "identity"
@@ -121,24 +122,44 @@ class SweepStore:
                 f"--out: {self.partial} is in the way and is no sweep of ours; choose another path"
             )
         try:
-            self.partial.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.partial / "lock").open("a")
-        except OSError as error:
-            raise BadConfiguration(
-                f"--out: {path} cannot be written ({error.strerror}); choose another path"
-            ) from error
-        try:
-            with self._locked():
-                self._begin_or_take_up(force)
+            while not self._enter(force):
+                self.close()
         except BaseException:
             self.close()
             raise
 
+    def _enter(self, force: bool) -> bool:
+        """Begin the store or take it up; False where another process has removed it while this one waited for it."""
+        try:
+            self.partial.mkdir(parents=True, exist_ok=True)
+            self._lock = (self.partial / "lock").open("a")
+        except OSError as error:
+            raise BadConfiguration(
+                f"--out: {self.path} cannot be written ({error.strerror}); choose another path"
+            ) from error
+        with self._locked():
+            if not self._present():
+                return self._finished_by_another(force)
+            self._begin_or_take_up(force)
+        return True
+
+    def _present(self) -> bool:
+        """Whether the folder is the one that this process has opened, and not removed or moved meanwhile."""
+        assert self._lock is not None
+        try:
+            return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / "lock").stat())
+        except FileNotFoundError:
+            return False
+
+    def _finished_by_another(self, force: bool = False) -> bool:
+        if not (self.path / "identity.json").is_file() or (force and self._differs(self.path)):
+            return False
+        self._same(self.path)
+        self.finished = True
+        return True
+
     def _begin_or_take_up(self, force: bool) -> None:
-        if not (self.partial / "lock").is_file():  # another process has just finished
-            self._same(self.path)
-            self.finished = True
-        elif (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
+        if (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
             self._same(self.partial)
         elif not force and (self.path / "identity.json").is_file():  # finished between our looking and our coming
             self._same(self.path)
@@ -195,19 +216,37 @@ class SweepStore:
         """
         name = f"{shard[0]}-of-{shard[1]}"
         file, self._aside = self.partial / "journal" / f"{name}.jsonl", self.partial / ASIDE / name
-        self._journal = file.open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(self._journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._journal.close()
-            self._journal = None
-            raise BadConfiguration(
-                f"--out: another process is at work on {self.partial}, share {shard[0]} of {shard[1]}; wait for it, "
-                "or choose another path"
-            ) from None
+        with self._locked():
+            if not self._present():
+                if self._finished_by_another():
+                    return
+                raise BadConfiguration(
+                    f"--out: another process has removed {self.partial}; the same command begins anew"
+                )
+            self._same(self.partial)
+            journal = file.open("a+", encoding="utf-8")
+            if not _lockable(journal):
+                journal.close()
+                raise self._busy(name)
+            self._journal, self._share = journal, file
         if file.stat().st_size:  # a line cut short by a kill must not swallow the next
             self._journal.write("\n")
             self._journal.flush()
+
+    def _at_work(self) -> str | None:
+        """A share that another process works on, of those that have one; to be called within `_locked`."""
+        for file in sorted((self.partial / "journal").glob("*.jsonl")):
+            if file != self._share:
+                with file.open("a") as journal:
+                    if not _lockable(journal):
+                        return file.stem
+        return None
+
+    def _busy(self, name: str) -> BadConfiguration:
+        return BadConfiguration(
+            f"--out: another process is at work on {self.partial}, share {name.replace('-', ' ')}; wait for it, or "
+            "choose another path"
+        )
 
     def done(self) -> dict[int, Done]:
         """Finished chunks by number."""
@@ -265,7 +304,7 @@ class SweepStore:
     def last(self) -> Iterator[bool]:
         """Whether this process is the one that finishes the sweep: every chunk is done, and nobody has finished."""
         with self._locked():
-            if not self.partial.exists():
+            if not self._present():
                 self.finished = True
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
@@ -285,12 +324,25 @@ class SweepStore:
             if file is not None:
                 with contextlib.suppress(OSError):  # of a line that found no room, which has been said
                     file.close()
-        self._journal = self._lock = None
+        self._journal = self._share = self._lock = None
 
     def abandon(self) -> None:
-        """Leave nothing behind, where no chunk is done and nobody else is at work."""
-        if not self.finished and self.partial.exists() and not self.done():
-            shutil.rmtree(self.partial, ignore_errors=True)
+        """Leave nothing behind, where this process has begun, no chunk is done and nobody else is at work."""
+        if self.finished or self._share is None:
+            return
+        with self._locked(), contextlib.suppress(OSError):
+            if self._present() and not self.done() and self._at_work() is None:
+                self._clear()  # the lock last: a folder without one would be somebody else's
+                shutil.rmtree(self.partial)
+
+
+def _lockable(journal: TextIO) -> bool:
+    """Lock a journal until it is closed; False where another process has."""
+    try:
+        fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def write_file(path: Path, content: Any, aside: Path) -> None:

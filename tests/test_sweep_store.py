@@ -17,11 +17,12 @@ import pytest
 import xarray as xr
 from test_cli import MMRJAX, mmrjax  # noqa: F401
 
+from calibration.data.errors import BadConfiguration
 from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
 from mmrjax.signals import STATUSES
-from sweeps import campaign, identity, scale, zarr_store
+from sweeps import axes, campaign, identity, scale, zarr_store
 
 CONFIG = """report = false
 chunk = 40
@@ -475,6 +476,65 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
     assert sweep("s", "--shard", "2/3")[0] == 0
 
 
+@pytest.fixture(scope="module")
+def layout():
+    """Three chunks of one point each."""
+    config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
+    robot = robots.nominal()
+    return campaign.laid_out(config, campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x"))
+
+
+@pytest.fixture
+def opened(layout, tmp_path):
+    """Open the store `s` as one more process would; `seed` is its identity."""
+    stores = []
+
+    def open_store(seed=0, force=False):
+        identity = {"configuration": {"seed": str(seed)}}
+        stores.append(zarr_store.SweepStore(tmp_path / "s", identity, layout, force=force))
+        return stores[-1]
+
+    yield open_store
+    for store in stores:
+        store.close()
+
+
+def written(store, *chunks, speed=1.0):
+    for chunk in chunks:
+        store.write(chunk, {"speed": np.array([speed]), "status": np.array([0])}, None)
+
+
+def test_refused_second_process_leaves_the_store_of_the_first(opened, tmp_path):
+    first, second = opened(), opened()
+    first.begin()
+    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 1 of 1; wait"):
+        second.begin()
+    second.abandon()
+    written(first, 0)
+    assert set(opened().done()) == {0}
+
+
+def test_store_is_not_abandoned_while_a_share_is_at_work(opened, tmp_path):
+    share, rest = opened(), opened()
+    share.begin((2, 3))
+    rest.begin()
+    rest.abandon()
+    assert (tmp_path / "s.partial" / "identity.json").is_file()
+    share.close()
+    rest.abandon()
+    assert not list(tmp_path.iterdir())
+
+
+def test_process_whose_store_was_abandoned_meanwhile_is_told(opened):
+    early, other = opened(), opened()
+    other.begin()
+    other.abandon()
+    with pytest.raises(
+        BadConfiguration, match=r"another process has removed \S*s\.partial; the same command begins anew"
+    ):
+        early.begin()
+
+
 # --- devices --------------------------------------------------------------------------------------------------------
 
 
@@ -588,8 +648,6 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
 def test_layout_counts_its_bytes_without_writing(whole):
     config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
     robot = robots.nominal()
-    from sweeps import axes
-
     job = campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
     layout = campaign.laid_out(config, job)
     assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up
