@@ -95,8 +95,8 @@ class SweepStore:
         """Begin a store, or take up one with the same identity.
 
         Raises:
-            BadConfiguration: `path` holds something else, or a sweep of another identity; the message says where they
-                differ.
+            BadConfiguration: `path` holds something else, or a sweep of another identity (the message says where they
+                differ), or another process is at work on what `force` would replace.
         """
         if not path.name:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
@@ -199,7 +199,14 @@ class SweepStore:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
     def _create(self) -> None:
-        """Metadata and axes, and the identity last: what has one is whole."""
+        """Metadata and axes, and the identity last: what has one is whole.
+
+        Raises:
+            BadConfiguration: another process is writing to what would be replaced.
+        """
+        share = self._at_work()
+        if share is not None:
+            raise self._busy(share)
         self._clear()
         (self.partial / "journal").mkdir()
         (self.partial / ASIDE).mkdir()
@@ -212,10 +219,10 @@ class SweepStore:
         """Open the journal of a share of the chunks; from now on no other process may work on it.
 
         Raises:
-            BadConfiguration: another process does.
+            BadConfiguration: another process does, or has removed the store or begun another one in its place.
         """
         name = f"{shard[0]}-of-{shard[1]}"
-        file, self._aside = self.partial / "journal" / f"{name}.jsonl", self.partial / ASIDE / name
+        file, self._aside = self.partial / "journal" / f"{name}.jsonl", self.partial / ASIDE / f"{name}-{os.getpid()}"
         with self._locked():
             if not self._present():
                 if self._finished_by_another():

@@ -535,6 +535,27 @@ def test_process_whose_store_was_abandoned_meanwhile_is_told(opened):
         early.begin()
 
 
+def test_force_is_refused_while_another_process_writes(opened):
+    first = opened()
+    first.begin((2, 3))
+    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 2 of 3; wait"):
+        opened(seed=1, force=True)
+    written(first, 1)
+    assert set(opened().done()) == {1}
+    first.close()
+    forced = opened(seed=1, force=True)
+    forced.begin()
+    assert not forced.done()
+
+
+def test_process_whose_store_was_replaced_meanwhile_does_not_write_into_the_new_one(opened):
+    early, forced = opened(), opened(seed=1, force=True)
+    with pytest.raises(BadConfiguration, match=r"s\.partial holds another sweep, which differs in configuration"):
+        early.begin()
+    forced.begin()
+    assert str(os.getpid()) in forced._aside.name
+
+
 # --- devices --------------------------------------------------------------------------------------------------------
 
 
