@@ -108,9 +108,9 @@ class SweepStore:
         self._lock: TextIO | None = None
         self._identity = identity
         self._aside = self.partial / ASIDE / "identity"
-        if path.is_dir() and (path / "identity.json").is_file() and not force:
-            self._same(path)
-            self.finished = True
+        cut_short = (path / "lock").is_file()  # killed while the folder was moved into place
+        if (path / "identity.json").is_file() and (not force or (cut_short and not self._differs(path))):
+            self._take_finished()
             return
         taken = path.is_file() or (path.is_dir() and any(path.iterdir()))
         if taken and not (force and (path / "manifest.json").is_file()):
@@ -154,17 +154,20 @@ class SweepStore:
     def _finished_by_another(self, force: bool = False) -> bool:
         if not (self.path / "identity.json").is_file() or (force and self._differs(self.path)):
             return False
-        self._same(self.path)
-        self.finished = True
+        self._take_finished()
         return True
+
+    def _take_finished(self) -> None:
+        self._same(self.path)
+        self._tidy()
+        self.finished = True
 
     def _begin_or_take_up(self, force: bool) -> None:
         if (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
             self._same(self.partial)
         elif not force and (self.path / "identity.json").is_file():  # finished between our looking and our coming
-            self._same(self.path)
+            self._take_finished()
             shutil.rmtree(self.partial)
-            self.finished = True
         else:
             self._create()
 
@@ -316,14 +319,25 @@ class SweepStore:
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
     def move_into_place(self) -> Path:
-        """The finished folder, where it is to appear; to be called within `last`."""
+        """The finished folder, where it is to appear; to be called within `last`.
+
+        The folder that it replaces goes into the new one first, and is deleted there: after a kill between any two
+        steps the same command does the rest.
+        """
         if self.path.is_dir():
-            shutil.rmtree(self.path)
-        (self.partial / "lock").unlink()
-        shutil.rmtree(self.partial / ASIDE)
+            replaced = self.partial / ASIDE / "replaced"
+            shutil.rmtree(replaced, ignore_errors=True)
+            os.replace(self.path, replaced)
         os.replace(self.partial, self.path)
         self.finished = True
+        self._tidy()
         return self.path
+
+    def _tidy(self) -> None:
+        """Delete what a finished folder does not need, the lock last: while there is one, something may be left."""
+        if (self.path / "lock").is_file():
+            shutil.rmtree(self.path / ASIDE, ignore_errors=True)
+            (self.path / "lock").unlink(missing_ok=True)
 
     def close(self) -> None:
         """Let other processes work on what is left."""

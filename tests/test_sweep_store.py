@@ -556,6 +556,49 @@ def test_process_whose_store_was_replaced_meanwhile_does_not_write_into_the_new_
     assert str(os.getpid()) in forced._aside.name
 
 
+@pytest.mark.parametrize("cut", range(4))
+def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatch, tmp_path, cut):
+    def finish(store):
+        with store.last() as last:
+            assert last
+            (store.partial / "manifest.json").write_text("{}")
+            store.move_into_place()
+
+    def simulated(speed, **options):
+        store = opened(**options)
+        store.begin()
+        written(store, 0, 1, 2, speed=speed)
+        return store
+
+    old = simulated(1.0)
+    finish(old)
+    old.close()
+    forced, steps = simulated(2.0, seed=1, force=True), iter(range(100))
+
+    def killed(honest):
+        def step(path, *arguments, **options):
+            if Path(path).parent.name != "writing" and next(steps) == cut:
+                raise KeyboardInterrupt
+            return honest(path, *arguments, **options)
+
+        return step
+
+    with monkeypatch.context() as patch:  # two moves, and two deletions
+        patch.setattr(os, "replace", killed(os.replace))
+        patch.setattr(shutil, "rmtree", killed(shutil.rmtree))
+        patch.setattr(Path, "unlink", killed(Path.unlink))
+        with pytest.raises(KeyboardInterrupt):
+            finish(forced)
+    forced.close()
+    again = opened(seed=1, force=True)
+    assert len(again.done()) == 3  # nothing is simulated again
+    if not again.finished:
+        finish(again)
+    assert [p.name for p in tmp_path.iterdir()] == ["s"]
+    assert not {"lock", "writing"} & {p.name for p in (tmp_path / "s").iterdir()}
+    assert xr.open_zarr(tmp_path / "s" / zarr_store.STORE).speed.values.tolist() == [2.0] * 3
+
+
 # --- devices --------------------------------------------------------------------------------------------------------
 
 
