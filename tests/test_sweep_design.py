@@ -219,6 +219,10 @@ BAD = {
     "unknown condition": ({"axes": {"payload": [1]}, "conditions": {"volts": 3}}, r"conditions\.volts: no such condition; did you mean voltage"),
     "condition out of bounds": ({"axes": {"payload": [1]}, "conditions": {"voltage": 300}}, r"conditions\.voltage: got 300; expected 0 to 100 V"),
     "unknown design": ({"samples": SAMPLES | {"design": "halton"}}, r"samples\.design: got 'halton'; allowed: latin_hypercube, sobol, random"),
+    "list of designs": ({"samples": SAMPLES | {"design": ["sobol"]}}, r"samples\.design: got \['sobol'\]; .*allowed: latin_hypercube"),
+    "list of distributions": ({"samples": SAMPLES | {"over": {"payload": UNIFORM | {"distribution": ["uniform"]}}}}, r"payload\.distribution: got \['uniform'\]; .*"),
+    "list of surfaces": ({"axes": {"payload": [1]}, "conditions": {"surface": ["asphalt"]}}, r"conditions\.surface: got \['asphalt'\]; .*"),
+    "truth of a voltage": ({"axes": {"voltage": [True]}}, r"axes\.voltage: got True; expected a number"),
     "no samples": ({"samples": SAMPLES | {"number": 0}}, r"samples\.number: got 0; expected a whole number from 1"),
     "negative seed": ({"samples": SAMPLES | {"seed": -1}}, r"samples\.seed: got -1; expected a whole number from 0"),
     "nothing sampled": ({"samples": {"design": "sobol", "number": 8}}, r"samples: got no names; expected over, or a posterior"),
@@ -240,6 +244,11 @@ def test_bad_designs_are_refused_with_place_value_and_choices(case, nominal):
     with pytest.raises(BadConfiguration, match=message) as refused:
         planned(nominal, **tables)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("stated, values", [([False, True], [0, 1]), (True, [1]), ([0, 1], [0, 1])])
+def test_battery_is_an_axis_of_truth_values_too(nominal, stated, values):
+    assert planned(nominal, axes={"battery": stated}).design.axes["battery"].tolist() == values
 
 
 def test_more_points_than_numbers_are_refused(nominal):
