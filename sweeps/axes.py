@@ -286,8 +286,24 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         if not axis.prior_sd or axis.value is None:
             others = ", ".join(k for k in DISTRIBUTIONS if k != kind)
             raise BadConfiguration(f"{where}: {name} has no prior; expected one of {others}")
-        kind, numbers = "normal", {"mean": axis.value, "sd": axis.prior_sd}
+        return _prior(name, robot)
     return _cut(kind, numbers, axis.bounds, where)
+
+
+def _prior(name: str, robot: Robot) -> Quantile:
+    """The quantile function of a parameter's prior, the one with which `calibrate` and `sensitivity` work."""
+    from scipy.special import ndtri
+
+    from calibration.inference import priors
+    from sweeps.design import on_host
+
+    coordinates = priors.coordinates(robot, [name])
+
+    def quantile(u: np.ndarray) -> np.ndarray:
+        with on_host():
+            return np.asarray(coordinates.value(ndtri(u)[:, None]))[:, 0]
+
+    return quantile
 
 
 def _cut(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:

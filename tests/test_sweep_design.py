@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 
 from calibration.data.errors import BadConfiguration
-from mmrjax import robots
+from calibration.inference import priors
+from mmrjax import params, robots
 from sweeps import axes, design
 from sweeps.config_campaign import Campaign
 from sweeps.design import Blocks, Design
@@ -107,10 +108,22 @@ def test_distribution_is_that_of_scipy(kind, nominal):
     assert stats.kstest(samples.values(0, 4096)[0], expected.cdf).pvalue > 0.01
 
 
-def test_prior_is_that_of_the_field_cut_off_at_its_bounds(nominal):
-    plan = planned(nominal, samples={"design": "sobol", "number": 4096, "over": {"motor.resistance": "prior"}})
-    axis, values = plan.axes["motor.resistance"], plan.design.samples.values(0, 4096)[0]
-    assert np.isclose(values.mean(), axis.value, rtol=1e-3) and np.isclose(values.std(), axis.prior_sd, rtol=1e-2)
+def test_prior_is_the_one_of_calibrate_and_sensitivity(nominal):
+    found = {p.name: p for p in params.walk(nominal)}
+    name = "6T2A.ground.friction.speed_static"
+    assert found[name].spec.relative_sd is not None  # a scale
+    u = np.linspace(0.01, 0.99, 99)
+    for each in (name, "motor.resistance"):
+        values = sampled(nominal, **{each: "prior"}).samples.marginals[each](u)
+        expected = priors.coordinates(nominal, [each]).value(stats.norm.ppf(u)[:, None])[:, 0]
+        np.testing.assert_allclose(values, expected, rtol=1e-14)
+    median, sd = float(found[name].value), found[name].spec.prior_sd(float(found[name].value))
+    quantile = sampled(nominal, **{name: "prior"}).samples.marginals[name]
+    lognormal = stats.lognorm(np.sqrt(np.log1p((sd / median) ** 2)), scale=median)
+    np.testing.assert_allclose(quantile(u), lognormal.ppf(u), rtol=1e-6)
+
+
+def test_normal_is_cut_off_at_the_bounds(nominal):
     wide = sampled(nominal, "sobol", 4096, slope_deg={"distribution": "normal", "mean": 40, "sd": 30}).samples
     values = wide.values(0, 4096)[0]
     assert -45 <= values.min() < -40 and 44.9 < values.max() <= 45
