@@ -23,11 +23,11 @@ import numpy as np
 
 from calibration.data.errors import BadConfiguration
 from mmrjax.signals import STATUSES
+from mmrjax.variation import STATUS
 from sweeps.design import SAMPLE, Blocks, Design
 from sweeps.identity import Identity, differences
 
 STORE = "results.zarr"
-STATUS = "status"
 #: Folder in which files are written before they are moved into place.
 ASIDE = "writing"
 #: Status of a point that has not been simulated.
