@@ -158,3 +158,7 @@ def quotient(part: Scalar, whole: Scalar) -> Float[Array, "..."]:
     """part / whole, and 0 with a finite derivative where `whole` is 0 (at rest)."""
     moving = jnp.abs(whole) > 1e-9
     return jnp.where(moving, part / jnp.where(moving, whole, 1.0), 0.0)
+
+
+#: Names of what every point has beside its numbers: code into `STATUSES`, bit mask over `FLAGS`.
+CODES = ("status", "flags")

@@ -18,6 +18,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.base import Run
 from mmrjax.robot import Robot
+from mmrjax.signals import CODES
 from mmrjax.tables import CONDITION_LIMITS
 
 #: Every condition of a run in words; `configuration` is an index among the robot's.
@@ -33,7 +34,7 @@ CONDITIONS: dict[str, str] = {
     "total_mass": "total mass of robot and payload",
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
-STATUS, FLAGS = "status", "flags"
+STATUS, FLAGS = CODES
 
 
 @dataclasses.dataclass(frozen=True)

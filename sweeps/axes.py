@@ -105,6 +105,11 @@ def _number(value: Any, where: str) -> float:
     return float(value)
 
 
+def _value(name: str, value: Any, where: str) -> float:
+    """A number; of the battery also true or false."""
+    return float(value) if name == "battery" and isinstance(value, bool) else _number(value, where)
+
+
 def _within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> None:
     low, high = axis.bounds
     for value in values:
@@ -135,10 +140,8 @@ def _axis(name: str, stated: Any, robot: Robot, where: str) -> np.ndarray:
         values = _range(stated, where)
     elif isinstance(stated, str):
         values = np.array(configuration.axis(where, stated))
-    elif isinstance(stated, list):
-        values = np.array([_number(v, where) for v in stated])
     else:
-        values = np.array([_number(stated, where)])
+        values = np.array([_value(name, v, where) for v in (stated if isinstance(stated, list) else [stated])])
     if not len(values):
         raise BadConfiguration(f"{where}: got no values; expected at least one")
     if len(values) > LONGEST:
@@ -196,13 +199,13 @@ def _fixed(stated: Mapping[str, Any], robot: Robot, where: str) -> tuple[dict[st
         if name not in allowed:
             raise BadConfiguration(f"{place}: no such condition; {choices(name, allowed)}")
         if name == SURFACE:
-            if value not in SURFACES:
+            if not isinstance(value, str) or value not in SURFACES:
                 raise BadConfiguration(f"{place}: got {value!r}; {choices(str(value), SURFACES)}")
             surface = str(value)
         elif name == CONFIGURATION:
             fixed[name] = _configuration(value, robot, place)
         else:
-            fixed[name] = float(value) if name == "battery" and isinstance(value, bool) else _number(value, place)
+            fixed[name] = _value(name, value, place)
             _within(np.array([fixed[name]]), _known(name, robot, place), place)
     return fixed, surface
 
@@ -217,7 +220,7 @@ def _samples(stated: Mapping[str, Any], robot: Robot, where: str, data: list[str
         return None
     _keys(stated, _SAMPLES, ("design", "number"), where)
     design = stated["design"]
-    if design not in DESIGNS:
+    if not isinstance(design, str) or design not in DESIGNS:
         raise BadConfiguration(f"{where}.design: got {design!r}; {choices(str(design), DESIGNS)}")
     number = _count(stated["number"], f"{where}.number", 2**52)
     seed = stated.get("seed", 0)
@@ -266,7 +269,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         raise BadConfiguration(f"{where}: cannot be sampled; expected it among axes or conditions")
     table = {"distribution": stated} if isinstance(stated, str) else stated
     kind = table.get("distribution") if isinstance(table, Mapping) else None
-    if kind not in DISTRIBUTIONS:
+    if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
         raise BadConfiguration(f"{where}.distribution: got {kind!r}; {choices(str(kind), DISTRIBUTIONS)}")
     needed = DISTRIBUTIONS[kind]
     _keys(table, ("distribution", *needed), needed, where)
@@ -283,8 +286,24 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         if not axis.prior_sd or axis.value is None:
             others = ", ".join(k for k in DISTRIBUTIONS if k != kind)
             raise BadConfiguration(f"{where}: {name} has no prior; expected one of {others}")
-        kind, numbers = "normal", {"mean": axis.value, "sd": axis.prior_sd}
+        return _prior(name, robot)
     return _cut(kind, numbers, axis.bounds, where)
+
+
+def _prior(name: str, robot: Robot) -> Quantile:
+    """The quantile function of a parameter's prior, the one with which `calibrate` and `sensitivity` work."""
+    from scipy.special import ndtri
+
+    from calibration.inference import priors
+    from sweeps.design import on_host
+
+    coordinates = priors.coordinates(robot, [name])
+
+    def quantile(u: np.ndarray) -> np.ndarray:
+        with on_host():
+            return np.asarray(coordinates.value(ndtri(u)[:, None]))[:, 0]
+
+    return quantile
 
 
 def _cut(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:

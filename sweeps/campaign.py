@@ -23,7 +23,7 @@ from mmrjax import __version__, channels, fidelities, outputs
 from mmrjax.errors import UsageError
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
-from mmrjax.variation import Variation, check_outputs
+from mmrjax.variation import STATUS, Variation, check_outputs
 from sweeps import axes, scale, words
 from sweeps import config as configuration
 from sweeps.config_campaign import Campaign, How
@@ -32,7 +32,7 @@ from sweeps.design import Blocks
 from sweeps.identity import Identity, identity
 from sweeps.inputs import load_robot
 from sweeps.store import DONE, SOME_NOT_CONVERGED, default_path, digest, provenance
-from sweeps.zarr_store import ABSENT, STATUS, STORE, Done, Layout, SweepStore, Variable
+from sweeps.zarr_store import ABSENT, STORE, Done, Layout, SweepStore, Variable
 
 #: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
 ASKED = 48

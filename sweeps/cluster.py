@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import importlib.util
+import itertools
 import pickle
 import sys
 import threading
@@ -77,10 +78,14 @@ class Pool:
             numbers[future.key] = chunk
             return future
 
-        room = max(self._workers(), 1) * (1 + AHEAD)
-        under_way = as_completed(
-            [submit(chunk) for _, chunk in zip(range(room), left, strict=False)], loop=self.client.loop
-        )
+        def fill() -> None:
+            """Give the workers that there are now, some of which may have come later, enough to do."""
+            room = max(self._workers(), 1) * (1 + AHEAD) - len(numbers)
+            for chunk in itertools.islice(left, max(room, 0)):
+                under_way.add(submit(chunk))
+
+        under_way = as_completed(loop=self.client.loop)
+        fill()
         while not under_way.is_empty():
             try:
                 future = self._next(under_way)
@@ -103,9 +108,7 @@ class Pool:
                 continue
             future.release()
             yield Piece(chunk, arrays)
-            following = next(left, None)
-            if following is not None:
-                under_way.add(submit(following))
+            fill()
 
     def _workers(self) -> int:
         """How many there are."""

@@ -77,11 +77,11 @@ class Samples:
         single = len(self.marginals)
         unit = DESIGNS[self.design](self.seed, self.number, single + len(joint), first, TOGETHER)
         rows = [quantile(u) for quantile, u in zip(self.marginals.values(), unit[:single], strict=True)]
-        with _on_host():
+        with on_host():
             return np.array([*rows, *np.asarray(joint.values(ndtri(unit[single:]).T)).T])
 
 
-def _on_host() -> contextlib.AbstractContextManager[object]:
+def on_host() -> contextlib.AbstractContextManager[object]:
     """What a distribution computes with jax is the same whatever the sweep runs on."""
     import jax
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from mmrjax import outputs
 from mmrjax.signals import FLAGS, STATUSES
-from sweeps.zarr_store import STATUS, STORE, Layout
+from mmrjax.variation import STATUS
+from sweeps.zarr_store import STORE, Layout
 
 #: Columns of conditions, as tables of runs have them; what has no such column keeps its name.
 COLUMNS = {

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mmrjax.variation import STATUS
 from sweeps import figures_campaign, words
 from sweeps.figures_campaign import Varied
 from sweeps.report import Album, named, render
-from sweeps.zarr_store import STATUS, STORE, Layout
+from sweeps.zarr_store import STORE, Layout
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import queue
 import threading
@@ -244,8 +245,9 @@ def run(store: SweepStore, job: Job, chunks: Produced, advance: Callable[[float]
         writer.join()
     except BaseException:
         stop.set()
-        while not waiting.empty():
-            waiting.get_nowait()
+        with contextlib.suppress(queue.Empty):  # the writer takes from it too
+            while True:
+                waiting.get_nowait()
         waiting.put(None)
         writer.join(5.0)  # what is written now is finished, what is still computed is not waited for
         raise

@@ -23,11 +23,11 @@ import numpy as np
 
 from calibration.data.errors import BadConfiguration
 from mmrjax.signals import STATUSES
+from mmrjax.variation import STATUS
 from sweeps.design import SAMPLE, Blocks, Design
 from sweeps.identity import Identity, differences
 
 STORE = "results.zarr"
-STATUS = "status"
 #: Folder in which files are written before they are moved into place.
 ASIDE = "writing"
 #: Status of a point that has not been simulated.
@@ -95,8 +95,8 @@ class SweepStore:
         """Begin a store, or take up one with the same identity.
 
         Raises:
-            BadConfiguration: `path` holds something else, or a sweep of another identity; the message says where they
-                differ.
+            BadConfiguration: `path` holds something else, or a sweep of another identity (the message says where they
+                differ), or another process is at work on what `force` would replace.
         """
         if not path.name:
             raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
@@ -104,12 +104,13 @@ class SweepStore:
         self.layout = layout
         self.finished = False
         self._journal: TextIO | None = None
+        self._share: Path | None = None
         self._lock: TextIO | None = None
         self._identity = identity
         self._aside = self.partial / ASIDE / "identity"
-        if path.is_dir() and (path / "identity.json").is_file() and not force:
-            self._same(path)
-            self.finished = True
+        cut_short = (path / "lock").is_file()  # killed while the folder was moved into place
+        if (path / "identity.json").is_file() and (not force or (cut_short and not self._differs(path))):
+            self._take_finished()
             return
         taken = path.is_file() or (path.is_dir() and any(path.iterdir()))
         if taken and not (force and (path / "manifest.json").is_file()):
@@ -121,29 +122,52 @@ class SweepStore:
                 f"--out: {self.partial} is in the way and is no sweep of ours; choose another path"
             )
         try:
-            self.partial.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.partial / "lock").open("a")
-        except OSError as error:
-            raise BadConfiguration(
-                f"--out: {path} cannot be written ({error.strerror}); choose another path"
-            ) from error
-        try:
-            with self._locked():
-                self._begin_or_take_up(force)
+            while not self._enter(force):
+                self.close()
         except BaseException:
             self.close()
             raise
 
+    def _enter(self, force: bool) -> bool:
+        """Begin the store or take it up; False where another process has removed it while this one waited for it."""
+        try:
+            self.partial.mkdir(parents=True, exist_ok=True)
+            self._lock = (self.partial / "lock").open("a")
+        except OSError as error:
+            raise BadConfiguration(
+                f"--out: {self.path} cannot be written ({error.strerror}); choose another path"
+            ) from error
+        with self._locked():
+            if not self._present():
+                return self._finished_by_another(force)
+            self._begin_or_take_up(force)
+        return True
+
+    def _present(self) -> bool:
+        """Whether the folder is the one that this process has opened, and not removed or moved meanwhile."""
+        assert self._lock is not None
+        try:
+            return os.path.samestat(os.fstat(self._lock.fileno()), (self.partial / "lock").stat())
+        except FileNotFoundError:
+            return False
+
+    def _finished_by_another(self, force: bool = False) -> bool:
+        if not (self.path / "identity.json").is_file() or (force and self._differs(self.path)):
+            return False
+        self._take_finished()
+        return True
+
+    def _take_finished(self) -> None:
+        self._same(self.path)
+        self._tidy()
+        self.finished = True
+
     def _begin_or_take_up(self, force: bool) -> None:
-        if not (self.partial / "lock").is_file():  # another process has just finished
-            self._same(self.path)
-            self.finished = True
-        elif (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
+        if (self.partial / "identity.json").is_file() and not (force and self._differs(self.partial)):
             self._same(self.partial)
         elif not force and (self.path / "identity.json").is_file():  # finished between our looking and our coming
-            self._same(self.path)
+            self._take_finished()
             shutil.rmtree(self.partial)
-            self.finished = True
         else:
             self._create()
 
@@ -178,7 +202,14 @@ class SweepStore:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
     def _create(self) -> None:
-        """Metadata and axes, and the identity last: what has one is whole."""
+        """Metadata and axes, and the identity last: what has one is whole.
+
+        Raises:
+            BadConfiguration: another process is writing to what would be replaced.
+        """
+        share = self._at_work()
+        if share is not None:
+            raise self._busy(share)
         self._clear()
         (self.partial / "journal").mkdir()
         (self.partial / ASIDE).mkdir()
@@ -191,23 +222,41 @@ class SweepStore:
         """Open the journal of a share of the chunks; from now on no other process may work on it.
 
         Raises:
-            BadConfiguration: another process does.
+            BadConfiguration: another process does, or has removed the store or begun another one in its place.
         """
         name = f"{shard[0]}-of-{shard[1]}"
-        file, self._aside = self.partial / "journal" / f"{name}.jsonl", self.partial / ASIDE / name
-        self._journal = file.open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(self._journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            self._journal.close()
-            self._journal = None
-            raise BadConfiguration(
-                f"--out: another process is at work on {self.partial}, share {shard[0]} of {shard[1]}; wait for it, "
-                "or choose another path"
-            ) from None
+        file, self._aside = self.partial / "journal" / f"{name}.jsonl", self.partial / ASIDE / f"{name}-{os.getpid()}"
+        with self._locked():
+            if not self._present():
+                if self._finished_by_another():
+                    return
+                raise BadConfiguration(
+                    f"--out: another process has removed {self.partial}; the same command begins anew"
+                )
+            self._same(self.partial)
+            journal = file.open("a+", encoding="utf-8")
+            if not _lockable(journal):
+                journal.close()
+                raise self._busy(name)
+            self._journal, self._share = journal, file
         if file.stat().st_size:  # a line cut short by a kill must not swallow the next
             self._journal.write("\n")
             self._journal.flush()
+
+    def _at_work(self) -> str | None:
+        """A share that another process works on, of those that have one; to be called within `_locked`."""
+        for file in sorted((self.partial / "journal").glob("*.jsonl")):
+            if file != self._share:
+                with file.open("a") as journal:
+                    if not _lockable(journal):
+                        return file.stem
+        return None
+
+    def _busy(self, name: str) -> BadConfiguration:
+        return BadConfiguration(
+            f"--out: another process is at work on {self.partial}, share {name.replace('-', ' ')}; wait for it, or "
+            "choose another path"
+        )
 
     def done(self) -> dict[int, Done]:
         """Finished chunks by number."""
@@ -265,19 +314,30 @@ class SweepStore:
     def last(self) -> Iterator[bool]:
         """Whether this process is the one that finishes the sweep: every chunk is done, and nobody has finished."""
         with self._locked():
-            if not self.partial.exists():
+            if not self._present():
                 self.finished = True
             yield not self.finished and len(self.done()) == len(self.layout.blocks)
 
     def move_into_place(self) -> Path:
-        """The finished folder, where it is to appear; to be called within `last`."""
+        """The finished folder, where it is to appear; to be called within `last`.
+
+        The folder that it replaces goes into the new one first, and is deleted there: after a kill between any two
+        steps the same command does the rest.
+        """
         if self.path.is_dir():
-            shutil.rmtree(self.path)
-        (self.partial / "lock").unlink()
-        shutil.rmtree(self.partial / ASIDE)
+            replaced = self.partial / ASIDE / "replaced"
+            shutil.rmtree(replaced, ignore_errors=True)
+            os.replace(self.path, replaced)
         os.replace(self.partial, self.path)
         self.finished = True
+        self._tidy()
         return self.path
+
+    def _tidy(self) -> None:
+        """Delete what a finished folder does not need, the lock last: while there is one, something may be left."""
+        if (self.path / "lock").is_file():
+            shutil.rmtree(self.path / ASIDE, ignore_errors=True)
+            (self.path / "lock").unlink(missing_ok=True)
 
     def close(self) -> None:
         """Let other processes work on what is left."""
@@ -285,12 +345,25 @@ class SweepStore:
             if file is not None:
                 with contextlib.suppress(OSError):  # of a line that found no room, which has been said
                     file.close()
-        self._journal = self._lock = None
+        self._journal = self._share = self._lock = None
 
     def abandon(self) -> None:
-        """Leave nothing behind, where no chunk is done and nobody else is at work."""
-        if not self.finished and self.partial.exists() and not self.done():
-            shutil.rmtree(self.partial, ignore_errors=True)
+        """Leave nothing behind, where this process has begun, no chunk is done and nobody else is at work."""
+        if self.finished or self._share is None:
+            return
+        with self._locked(), contextlib.suppress(OSError):
+            if self._present() and not self.done() and self._at_work() is None:
+                self._clear()  # the lock last: a folder without one would be somebody else's
+                shutil.rmtree(self.partial)
+
+
+def _lockable(journal: TextIO) -> bool:
+    """Lock a journal until it is closed; False where another process has."""
+    try:
+        fcntl.flock(journal, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def write_file(path: Path, content: Any, aside: Path) -> None:

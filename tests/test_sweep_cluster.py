@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from test_cli import MMRJAX
@@ -220,6 +221,39 @@ def test_chunk_that_kills_its_workers_ends_the_sweep(tmp_path, job, monkeypatch)
     finally:
         pool.client.close(timeout=2)
         restarting.close()
+
+
+def test_workers_that_come_later_get_chunks(job, monkeypatch):
+    import distributed
+
+    class Client:
+        loop, under_way = None, 0
+
+        def submit(self, *_, key, **__):
+            self.under_way += 1
+            return SimpleNamespace(key=key, result=dict, release=lambda: None)
+
+    class Completed(list):
+        def __init__(self, futures=(), loop=None):
+            super().__init__(futures)
+
+        add, is_empty = list.append, lambda self: not self
+
+    client, workers, seen = Client(), [1], []
+
+    def finished(_, under_way):
+        seen.append(len(under_way))
+        return under_way.pop(0)
+
+    monkeypatch.setattr(distributed, "as_completed", Completed)
+    monkeypatch.setattr(cluster.Pool, "_workers", lambda _: workers[0])
+    monkeypatch.setattr(cluster.Pool, "_next", finished)
+    chunks = []
+    for piece in cluster.Pool(client, "cpu: cpu").produce(job, range(10)):
+        chunks.append(piece.chunk)
+        workers[0] = 3 if len(chunks) > 1 else 1
+    assert chunks == [*range(10)] and client.under_way == 10
+    assert seen == [2, 2, 6, 6, 6, 5, 4, 3, 2, 1]
 
 
 def test_worker_that_comes_later_and_differs_is_refused():

@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 
 from calibration.data.errors import BadConfiguration
-from mmrjax import robots
+from calibration.inference import priors
+from mmrjax import params, robots
 from sweeps import axes, design
 from sweeps.config_campaign import Campaign
 from sweeps.design import Blocks, Design
@@ -107,10 +108,22 @@ def test_distribution_is_that_of_scipy(kind, nominal):
     assert stats.kstest(samples.values(0, 4096)[0], expected.cdf).pvalue > 0.01
 
 
-def test_prior_is_that_of_the_field_cut_off_at_its_bounds(nominal):
-    plan = planned(nominal, samples={"design": "sobol", "number": 4096, "over": {"motor.resistance": "prior"}})
-    axis, values = plan.axes["motor.resistance"], plan.design.samples.values(0, 4096)[0]
-    assert np.isclose(values.mean(), axis.value, rtol=1e-3) and np.isclose(values.std(), axis.prior_sd, rtol=1e-2)
+def test_prior_is_the_one_of_calibrate_and_sensitivity(nominal):
+    found = {p.name: p for p in params.walk(nominal)}
+    name = "6T2A.ground.friction.speed_static"
+    assert found[name].spec.relative_sd is not None  # a scale
+    u = np.linspace(0.01, 0.99, 99)
+    for each in (name, "motor.resistance"):
+        values = sampled(nominal, **{each: "prior"}).samples.marginals[each](u)
+        expected = priors.coordinates(nominal, [each]).value(stats.norm.ppf(u)[:, None])[:, 0]
+        np.testing.assert_allclose(values, expected, rtol=1e-14)
+    median, sd = float(found[name].value), found[name].spec.prior_sd(float(found[name].value))
+    quantile = sampled(nominal, **{name: "prior"}).samples.marginals[name]
+    lognormal = stats.lognorm(np.sqrt(np.log1p((sd / median) ** 2)), scale=median)
+    np.testing.assert_allclose(quantile(u), lognormal.ppf(u), rtol=1e-6)
+
+
+def test_normal_is_cut_off_at_the_bounds(nominal):
     wide = sampled(nominal, "sobol", 4096, slope_deg={"distribution": "normal", "mean": 40, "sd": 30}).samples
     values = wide.values(0, 4096)[0]
     assert -45 <= values.min() < -40 and 44.9 < values.max() <= 45
@@ -219,6 +232,10 @@ BAD = {
     "unknown condition": ({"axes": {"payload": [1]}, "conditions": {"volts": 3}}, r"conditions\.volts: no such condition; did you mean voltage"),
     "condition out of bounds": ({"axes": {"payload": [1]}, "conditions": {"voltage": 300}}, r"conditions\.voltage: got 300; expected 0 to 100 V"),
     "unknown design": ({"samples": SAMPLES | {"design": "halton"}}, r"samples\.design: got 'halton'; allowed: latin_hypercube, sobol, random"),
+    "list of designs": ({"samples": SAMPLES | {"design": ["sobol"]}}, r"samples\.design: got \['sobol'\]; .*allowed: latin_hypercube"),
+    "list of distributions": ({"samples": SAMPLES | {"over": {"payload": UNIFORM | {"distribution": ["uniform"]}}}}, r"payload\.distribution: got \['uniform'\]; .*"),
+    "list of surfaces": ({"axes": {"payload": [1]}, "conditions": {"surface": ["asphalt"]}}, r"conditions\.surface: got \['asphalt'\]; .*"),
+    "truth of a voltage": ({"axes": {"voltage": [True]}}, r"axes\.voltage: got True; expected a number"),
     "no samples": ({"samples": SAMPLES | {"number": 0}}, r"samples\.number: got 0; expected a whole number from 1"),
     "negative seed": ({"samples": SAMPLES | {"seed": -1}}, r"samples\.seed: got -1; expected a whole number from 0"),
     "nothing sampled": ({"samples": {"design": "sobol", "number": 8}}, r"samples: got no names; expected over, or a posterior"),
@@ -240,6 +257,11 @@ def test_bad_designs_are_refused_with_place_value_and_choices(case, nominal):
     with pytest.raises(BadConfiguration, match=message) as refused:
         planned(nominal, **tables)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("stated, values", [([False, True], [0, 1]), (True, [1]), ([0, 1], [0, 1])])
+def test_battery_is_an_axis_of_truth_values_too(nominal, stated, values):
+    assert planned(nominal, axes={"battery": stated}).design.axes["battery"].tolist() == values
 
 
 def test_more_points_than_numbers_are_refused(nominal):

@@ -17,11 +17,12 @@ import pytest
 import xarray as xr
 from test_cli import MMRJAX, mmrjax  # noqa: F401
 
+from calibration.data.errors import BadConfiguration
 from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
 from mmrjax.signals import STATUSES
-from sweeps import campaign, identity, scale, zarr_store
+from sweeps import axes, campaign, identity, scale, zarr_store
 
 CONFIG = """report = false
 chunk = 40
@@ -424,6 +425,20 @@ def test_killed_at_twenty_random_moments_gives_twenty_equal_stores(tmp_path):
         shutil.rmtree(tmp_path / f"s{k}")
 
 
+def test_interrupt_is_not_replaced_where_the_writer_empties_the_queue(monkeypatch):
+    class Raced(scale.queue.Queue):
+        def empty(self):
+            return False  # and then the writer takes the last piece
+
+    def interrupted():
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(scale.queue, "Queue", Raced)
+    with pytest.raises(KeyboardInterrupt):
+        scale.run(None, None, interrupted(), print, scale.Times())
+
+
 # --- shares -------------------------------------------------------------------------------------------------------
 
 
@@ -473,6 +488,129 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
         code, _, err = sweep("s", "--shard", "2/3")
     assert code == 2 and "another process is at work on s.partial, share 2 of 3" in err
     assert sweep("s", "--shard", "2/3")[0] == 0
+
+
+@pytest.fixture(scope="module")
+def layout():
+    """Three chunks of one point each."""
+    config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
+    robot = robots.nominal()
+    return campaign.laid_out(config, campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x"))
+
+
+@pytest.fixture
+def opened(layout, tmp_path):
+    """Open the store `s` as one more process would; `seed` is its identity."""
+    stores = []
+
+    def open_store(seed=0, force=False):
+        identity = {"configuration": {"seed": str(seed)}}
+        stores.append(zarr_store.SweepStore(tmp_path / "s", identity, layout, force=force))
+        return stores[-1]
+
+    yield open_store
+    for store in stores:
+        store.close()
+
+
+def written(store, *chunks, speed=1.0):
+    for chunk in chunks:
+        store.write(chunk, {"speed": np.array([speed]), "status": np.array([0])}, None)
+
+
+def test_refused_second_process_leaves_the_store_of_the_first(opened, tmp_path):
+    first, second = opened(), opened()
+    first.begin()
+    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 1 of 1; wait"):
+        second.begin()
+    second.abandon()
+    written(first, 0)
+    assert set(opened().done()) == {0}
+
+
+def test_store_is_not_abandoned_while_a_share_is_at_work(opened, tmp_path):
+    share, rest = opened(), opened()
+    share.begin((2, 3))
+    rest.begin()
+    rest.abandon()
+    assert (tmp_path / "s.partial" / "identity.json").is_file()
+    share.close()
+    rest.abandon()
+    assert not list(tmp_path.iterdir())
+
+
+def test_process_whose_store_was_abandoned_meanwhile_is_told(opened):
+    early, other = opened(), opened()
+    other.begin()
+    other.abandon()
+    with pytest.raises(
+        BadConfiguration, match=r"another process has removed \S*s\.partial; the same command begins anew"
+    ):
+        early.begin()
+
+
+def test_force_is_refused_while_another_process_writes(opened):
+    first = opened()
+    first.begin((2, 3))
+    with pytest.raises(BadConfiguration, match=r"another process is at work on \S*s\.partial, share 2 of 3; wait"):
+        opened(seed=1, force=True)
+    written(first, 1)
+    assert set(opened().done()) == {1}
+    first.close()
+    forced = opened(seed=1, force=True)
+    forced.begin()
+    assert not forced.done()
+
+
+def test_process_whose_store_was_replaced_meanwhile_does_not_write_into_the_new_one(opened):
+    early, forced = opened(), opened(seed=1, force=True)
+    with pytest.raises(BadConfiguration, match=r"s\.partial holds another sweep, which differs in configuration"):
+        early.begin()
+    forced.begin()
+    assert str(os.getpid()) in forced._aside.name
+
+
+@pytest.mark.parametrize("cut", range(4))
+def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatch, tmp_path, cut):
+    def finish(store):
+        with store.last() as last:
+            assert last
+            (store.partial / "manifest.json").write_text("{}")
+            store.move_into_place()
+
+    def simulated(speed, **options):
+        store = opened(**options)
+        store.begin()
+        written(store, 0, 1, 2, speed=speed)
+        return store
+
+    old = simulated(1.0)
+    finish(old)
+    old.close()
+    forced, steps = simulated(2.0, seed=1, force=True), iter(range(100))
+
+    def killed(honest):
+        def step(path, *arguments, **options):
+            if Path(path).parent.name != "writing" and next(steps) == cut:
+                raise KeyboardInterrupt
+            return honest(path, *arguments, **options)
+
+        return step
+
+    with monkeypatch.context() as patch:  # two moves, and two deletions
+        patch.setattr(os, "replace", killed(os.replace))
+        patch.setattr(shutil, "rmtree", killed(shutil.rmtree))
+        patch.setattr(Path, "unlink", killed(Path.unlink))
+        with pytest.raises(KeyboardInterrupt):
+            finish(forced)
+    forced.close()
+    again = opened(seed=1, force=True)
+    assert len(again.done()) == 3  # nothing is simulated again
+    if not again.finished:
+        finish(again)
+    assert [p.name for p in tmp_path.iterdir()] == ["s"]
+    assert not {"lock", "writing"} & {p.name for p in (tmp_path / "s").iterdir()}
+    assert xr.open_zarr(tmp_path / "s" / zarr_store.STORE).speed.values.tolist() == [2.0] * 3
 
 
 # --- devices --------------------------------------------------------------------------------------------------------
@@ -588,8 +726,6 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
 def test_layout_counts_its_bytes_without_writing(whole):
     config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
     robot = robots.nominal()
-    from sweeps import axes
-
     job = campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
     layout = campaign.laid_out(config, job)
     assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up

@@ -1,6 +1,8 @@
 """What varies by name: each point is the robot and the conditions that its values say, in every fidelity."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -129,3 +131,10 @@ def test_unknown_output_is_refused_with_the_choices(variation, model):
 def test_a_fidelitys_own_column_is_an_output(variation):
     options = fidelities.facts("track").resolved(duration=0.002)
     check_outputs(variation, "track", Conditions(), options, ("guide_share", "speed"))
+
+
+def test_status_is_named_in_one_place():
+    root = Path(__file__).resolve().parents[1]
+    files = [f for folder in ("mmrjax", "sweeps") for f in (root / folder).rglob("*.py")]
+    stated = [f.name for f in files if re.search(r'^(STATUS|_?CODES)\b.*= .*"status"', f.read_text(), re.MULTILINE)]
+    assert stated == ["signals.py"]

@@ -20,7 +20,7 @@ from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.robot import Robot
-from mmrjax.signals import BATTERY_EMPTY, CONVERGED, FAILED, SLIDES, STALLED, Result, Signals, State
+from mmrjax.signals import BATTERY_EMPTY, CODES, CONVERGED, FAILED, SLIDES, STALLED, Result, Signals, State
 
 # Units of the unknowns and of the torque residual, so that all are of the order of one.
 _SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0
@@ -174,13 +174,9 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     return _over_points(steady, robot, conditions)
 
 
-#: What `steady_outputs` gives beside the numbers of `outputs.table`.
-_CODES = ("status", "flags")
-
-
 @functools.cache
 def _getters() -> dict[str, Callable[[Result], Array]]:
-    codes = {name: operator.attrgetter(name) for name in _CODES}
+    codes = {name: operator.attrgetter(name) for name in CODES}
     return {**{output.name: output.get for output in outputs.table()}, **codes}
 
 
@@ -237,7 +233,7 @@ def steady_derivatives(
             parameter.
     """
     _check_outputs(names)
-    for name in set(names) & set(_CODES):
+    for name in set(names) & set(CODES):
         raise KeyError(f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table())}")
     values = {p.name: p.value for p in params.walk(robot)}
     params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have
