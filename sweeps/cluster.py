@@ -89,13 +89,12 @@ class Pool:
         while not under_way.is_empty():
             try:
                 future = self._next(under_way)
+                chunk = numbers.pop(future.key)
+                arrays = self._result(future)
             except TimeoutError as error:
                 raise LostWorkers(
                     f"--scheduler: no worker has been there for {WORKER:g} s; start one, and the same command goes on"
                 ) from error
-            chunk = numbers.pop(future.key)
-            try:
-                arrays = future.result()
             except (KilledWorker, CancelledError) as error:
                 if self.client.status != "running":
                     raise LostWorkers(GONE) from error
@@ -142,6 +141,19 @@ class Pool:
         if failed:
             raise failed[0]
         return found[0]
+
+    def _result(self, future: Any) -> Any:
+        """What a finished future holds; where its worker is lost before it is fetched, what another one finds.
+
+        Raises:
+            TimeoutError, LostWorkers: as `_next`.
+        """
+        while True:
+            try:
+                return future.result(timeout=WORKER)
+            except TimeoutError:
+                if not self._workers():
+                    self.client.wait_for_workers(1, timeout=WORKER)
 
 
 def _packed(job: Job) -> bytes:

@@ -282,3 +282,24 @@ def test_workers_of_several_kinds_are_refused(monkeypatch):
     ):
         cluster.connect("tcp://x:1")
     assert client.closed
+
+
+def test_result_whose_worker_is_lost_before_it_is_fetched_does_not_hang(monkeypatch):
+    """A future that is finished and whose data went with its worker never answers."""
+    monkeypatch.setattr(cluster, "WORKER", 0.1)
+
+    class Silent:
+        def result(self, timeout):
+            raise TimeoutError
+
+    class Client:
+        def scheduler_info(self, n_workers):
+            return {"workers": {}}
+
+        def wait_for_workers(self, count, timeout):
+            raise TimeoutError
+
+    pool = cluster.Pool.__new__(cluster.Pool)
+    pool.client = Client()
+    with pytest.raises(TimeoutError):
+        pool._result(Silent())
