@@ -299,7 +299,5 @@ def test_result_whose_worker_is_lost_before_it_is_fetched_does_not_hang(monkeypa
         def wait_for_workers(self, count, timeout):
             raise TimeoutError
 
-    pool = cluster.Pool.__new__(cluster.Pool)
-    pool.client = Client()
     with pytest.raises(TimeoutError):
-        pool._result(Silent())
+        cluster.Pool(Client(), "cpu")._result(Silent())
