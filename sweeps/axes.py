@@ -300,8 +300,11 @@ def _prior(name: str, robot: Robot) -> Quantile:
     coordinates = priors.coordinates(robot, [name])
 
     def quantile(u: np.ndarray) -> np.ndarray:
+        # Filled up to few sizes, each of which is compiled.
+        full = np.full(max(1 << (len(u) - 1).bit_length(), 1024), 0.5)
+        full[: len(u)] = u
         with on_host():
-            return np.asarray(coordinates.value(ndtri(u)[:, None]))[:, 0]
+            return np.asarray(coordinates.value(ndtri(full)[:, None]))[: len(u), 0]
 
     return quantile
 
