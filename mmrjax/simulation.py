@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 
 from mmrjax import fidelities, params
 from mmrjax.conditions import Conditions
-from mmrjax.errors import UsageError
+from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, Run
 from mmrjax.results import Results
 from mmrjax.robot import Robot
@@ -60,7 +59,7 @@ def simulate(
     if not isinstance(conditions, Conditions):
         raise UsageError(f"conditions: got {type(conditions).__name__}; expected mmrjax.Conditions(...)")
     if model not in fidelities.TABLE:
-        raise UsageError(f"model: got {model}; {_choices(str(model), fidelities.TABLE)}")
+        raise UsageError(f"model: got {model}; {choices(str(model), fidelities.TABLE)}")
     try:
         stated = fidelities.facts(model).resolved(duration=duration, step=step, **options)
     except ValueError as error:
@@ -104,12 +103,6 @@ def _traced(tree: Any) -> bool:
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
 
 
-def _choices(word: str, allowed: Iterable[str]) -> str:
-    allowed = list(allowed)
-    near = difflib.get_close_matches(word, allowed, 1)
-    return "".join(f"did you mean {n}? " for n in near) + f"expected one of {', '.join(allowed)}"
-
-
 def _check_robot(robot: Robot) -> None:
     """Refuse parameters out of the bounds that their fields declare."""
     concrete = [p for p in params.walk(robot) if not isinstance(p.value, jax.core.Tracer)]
@@ -130,7 +123,7 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
     if isinstance(which, np.ndarray) and which.dtype.kind == "U":
         for name in np.unique(which):
             if name not in names:
-                raise UsageError(f"configuration: got {name}; {_choices(str(name), names)}")
+                raise UsageError(f"configuration: got {name}; {choices(str(name), names)}")
         return conditions.resolved(robot)
     if not _traced(which):
         wrong = _first_outside(np.asarray(which), 0, len(names) - 1)

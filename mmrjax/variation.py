@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,7 +14,7 @@ from jaxtyping import Array, Float
 from mmrjax import fidelities, params
 from mmrjax import outputs as table_of_outputs
 from mmrjax.conditions import Conditions
-from mmrjax.errors import UsageError
+from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Run
 from mmrjax.robot import Robot
 from mmrjax.signals import CODES
@@ -78,10 +77,12 @@ class Variation(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, robot: Robot, names: tuple[str, ...]) -> None:
-        known = choices(robot)
+        known = variable_names(robot)
         for k, name in enumerate(names):
             if name not in known:
-                raise UsageError(f"{name}: neither a parameter of the robot nor a condition; {near(name, known)}")
+                raise UsageError(
+                    f"{name}: neither a parameter of the robot nor a condition; {choices(name, known, 3)}"
+                )
             if name in names[:k]:
                 raise UsageError(f"{name}: stated twice; expected each name once")
         self.robot, self.names = params.strong(robot), tuple(names)
@@ -122,16 +123,9 @@ class Variation(eqx.Module):
         return robot, dataclasses.replace(conditions, **stated)
 
 
-def choices(robot: Robot) -> tuple[str, ...]:
+def variable_names(robot: Robot) -> tuple[str, ...]:
     """Every name that may vary: conditions, then the robot's parameters."""
     return (*CONDITIONS, *(p.name for p in params.walk(robot)))
-
-
-def near(word: str, known: tuple[str, ...] | list[str]) -> str:
-    """«did you mean X, Y? expected one of ...» for an unknown word."""
-    close = difflib.get_close_matches(word, known, 3)
-    hint = f"did you mean {', '.join(close)}? " if close else ""
-    return f"{hint}expected one of {', '.join(known)}"
 
 
 def evaluate(
@@ -203,7 +197,7 @@ def _picked(run: Run, names: tuple[str, ...]) -> dict[str, Array]:
 def _known(names: tuple[str, ...], known: tuple[str, ...]) -> None:
     for name in names:
         if name not in known and name != FLAGS:
-            raise UsageError(f"outputs: got {name}; {near(name, (*known, FLAGS))}")
+            raise UsageError(f"outputs: got {name}; {choices(name, (*known, FLAGS), 3)}")
 
 
 def check_outputs(

@@ -18,7 +18,7 @@ from mmrjax.tables import SURFACES, adhesion_ratio
 from mmrjax.variation import Axis
 from sweeps import config as configuration
 from sweeps.config_campaign import Campaign
-from sweeps.design import DESIGNS, Design, Joint, Samples
+from sweeps.design import DESIGNS, Design, Joint, Samples, in_blocks
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
@@ -91,10 +91,10 @@ def adhesions(robot: Robot, surface: str) -> tuple[float, ...]:
 
 
 def _known(name: str, robot: Robot, where: str) -> Axis:
-    names = variation.choices(robot)
+    names = variation.variable_names(robot)
     if name not in names:
         raise BadConfiguration(
-            f"{where}: neither a parameter of the robot nor a condition; {variation.near(name, names)}"
+            f"{where}: neither a parameter of the robot nor a condition; {choices(name, names, 3)}"
         )
     return variation.Variation(robot, (name,)).axes[name]
 
@@ -295,16 +295,11 @@ def _prior(name: str, robot: Robot) -> Quantile:
     from scipy.special import ndtri
 
     from calibration.inference import priors
-    from sweeps.design import on_host
 
     coordinates = priors.coordinates(robot, [name])
 
     def quantile(u: np.ndarray) -> np.ndarray:
-        # Filled up to few sizes, each of which is compiled.
-        full = np.full(max(1 << (len(u) - 1).bit_length(), 1024), 0.5)
-        full[: len(u)] = u
-        with on_host():
-            return np.asarray(coordinates.value(ndtri(full)[:, None]))[: len(u), 0]
+        return in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]
 
     return quantile
 

@@ -5,13 +5,12 @@ Nothing here depends on chunks, devices or jax: point k of a design is a functio
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
 import math
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int, UInt64
@@ -37,7 +36,8 @@ class Joint(Protocol):
         ...
 
 
-#: Points of a joint distribution that are computed together: a sum over coordinates may depend on how many there are.
+#: Points that a distribution computes together: with jax each number of them is compiled, and a sum over coordinates
+#: may depend on it.
 TOGETHER = 4096
 
 
@@ -64,28 +64,31 @@ class Samples:
 
     def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
         """Values of `count` points from number `first` on, a row a name."""
-        if self.joint is not None:
-            begin = first - first % TOGETHER
-            blocks = [self._block(self.joint, k) for k in range(begin, first + count, TOGETHER)]
-            return np.concatenate(blocks, axis=1)[:, first - begin : first - begin + count]
-        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals), first, count)
-        return np.array([quantile(u) for quantile, u in zip(self.marginals.values(), unit, strict=True)])
-
-    def _block(self, joint: Joint, first: int) -> Float[np.ndarray, "names points"]:
         from scipy.special import ndtri
 
-        single = len(self.marginals)
-        unit = DESIGNS[self.design](self.seed, self.number, single + len(joint), first, TOGETHER)
-        rows = [quantile(u) for quantile, u in zip(self.marginals.values(), unit[:single], strict=True)]
-        with on_host():
-            return np.array([*rows, *np.asarray(joint.values(ndtri(unit[single:]).T)).T])
+        joint = 0 if self.joint is None else len(self.joint)
+        begin = first - first % TOGETHER
+        whole = first + count + -(first + count) % TOGETHER - begin
+        unit = DESIGNS[self.design](self.seed, self.number, len(self.marginals) + joint, begin, whole)
+        rows = [quantile(u) for quantile, u in zip(self.marginals.values(), unit, strict=False)]
+        if self.joint is not None:
+            rows.extend(in_blocks(self.joint.values, ndtri(unit[len(self.marginals) :]).T).T)
+        return np.array(rows)[:, first - begin : first - begin + count]
 
 
-def on_host() -> contextlib.AbstractContextManager[object]:
-    """What a distribution computes with jax is the same whatever the sweep runs on."""
+def in_blocks(
+    values: Callable[[Any], Any],
+    normal_scores: Float[np.ndarray, "points coordinates"],
+) -> Float[np.ndarray, "points names"]:
+    """What a function that computes with jax gives at many points, on the processor whatever the sweep runs on."""
     import jax
 
-    return jax.default_device(jax.local_devices(backend="cpu")[0])
+    points = len(normal_scores)
+    full = np.zeros((points + -points % TOGETHER, *normal_scores.shape[1:]))
+    full[:points] = normal_scores
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        blocks = [np.asarray(values(full[k : k + TOGETHER])) for k in range(0, len(full), TOGETHER)]
+    return np.concatenate(blocks)[:points]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -280,8 +280,8 @@ WRONG = {
     "total_mass: got 600; expected 0.1 to 500 kg": dict(total_mass=600.0),
     "total_mass: got 8 kg; expected more than the payload, 8 kg": dict(total_mass=8.0, payload=8.0),
     "total_mass[1]: got 8 kg; expected more than the payload, 9 kg": dict(total_mass=8.0, payload=[3.0, 9.0]),
-    "configuration: got 6T2B; did you mean 6T2A? expected one of 6T2A, 4W2T": dict(configuration="6T2B"),
-    "configuration: got legs; expected one of 6T2A, 4W2T": dict(configuration=["6T2A", "legs"]),
+    "configuration: got 6T2B; did you mean 6T2A? allowed: 6T2A, 4W2T": dict(configuration="6T2B"),
+    "configuration: got legs; allowed: 6T2A, 4W2T": dict(configuration=["6T2A", "legs"]),
     "configuration: got 2; expected one of 0 (6T2A), 1 (4W2T)": dict(configuration=2),
     "configuration[1]: got -1; expected one of 0 (6T2A), 1 (4W2T)": dict(configuration=[0, -1]),
 }
@@ -296,8 +296,8 @@ WRONG_ROBOT = {
     "robot: got function; expected a Robot such as mmrjax.nominal()": lambda robot: mm.nominal,
 }
 WRONG_CALL = {
-    "model: got fast; expected one of steady, drive, track": dict(model="fast"),
-    "model: got stedy; did you mean steady? expected one of steady, drive, track": dict(model="stedy"),
+    "model: got fast; allowed: steady, drive, track": dict(model="fast"),
+    "model: got stedy; did you mean steady? allowed: steady, drive, track": dict(model="stedy"),
     "model steady, duration: got 5.0; this fidelity has no such option, its options: none": dict(duration=5.0),
     "model drive, step: got 0.001; this fidelity has no such option, its options: duration": dict(
         model="drive", step=1e-3

@@ -210,7 +210,7 @@ RANGE = {"start": 0, "stop": 20, "number": 5}
 UNIFORM = {"distribution": "uniform", "low": 0, "high": 8}
 SAMPLES = {"design": "sobol", "number": 8, "over": {"payload": UNIFORM}}
 BAD = {
-    "unknown name": ({"axes": {"slope": [1]}}, r"plan\.toml, axes\.slope: neither a parameter of the robot nor a condition; did you mean slope_deg.*expected one of configuration, voltage"),
+    "unknown name": ({"axes": {"slope": [1]}}, r"plan\.toml, axes\.slope: neither a parameter of the robot nor a condition; did you mean slope_deg.*allowed: configuration, voltage"),
     "no values": ({"axes": {"voltage": []}}, r"axes\.voltage: got no values; expected at least one"),
     "range of none": ({"axes": {"voltage": RANGE | {"number": 0}}}, r"axes\.voltage\.number: got 0; expected a whole number from 1"),
     "range upside down": ({"axes": {"slope_deg": RANGE | {"start": 30}}}, r"axes\.slope_deg: got start 30, stop 20, number 5; expected start below stop"),

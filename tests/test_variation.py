@@ -113,7 +113,7 @@ def test_every_condition_has_words_and_limits():
 def test_unknown_and_repeated_names_are_refused_with_those_that_are_near():
     robot = robots.nominal()
     with pytest.raises(
-        UsageError, match=r"motor\.resistanse: .*did you mean motor\.resistance.*expected one of .*slope_deg"
+        UsageError, match=r"motor\.resistanse: .*did you mean motor\.resistance.*allowed: .*slope_deg"
     ):
         Variation(robot, ("motor.resistanse",))
     with pytest.raises(UsageError, match="voltage: stated twice"):

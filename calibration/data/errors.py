@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
+from mmrjax.errors import choices as choices
 
 
 class InputError(Exception):
@@ -22,14 +21,6 @@ class BadData(InputError):
     """A wrong table of runs (exit code 4)."""
 
     exit_code = 4
-
-
-def choices(word: str, allowed: Iterable[str]) -> str:
-    """«did you mean X? allowed: ...» for an unknown `word`."""
-    allowed = list(allowed)
-    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.6)
-    hint = f"did you mean {close[0]}? " if close else ""
-    return f"{hint}allowed: {', '.join(allowed)}"
 
 
 def number(value: float) -> str:
