@@ -52,7 +52,7 @@ EXPERIMENTS = 3
 #: The analyst's prior on the one surface of narrow tables, which Table 5 does not know.
 STATED = {f"{c}.ground.friction.static": (0.6, 0.09) for c in ("6T2A", "4W2T")}
 #: What a result may hold beside its verdict.
-FURTHER = ("families", "events", "noise_factor", "implausible", "hidden", "stands_for")
+FURTHER = ("families", "events", "events_alike", "noise_factor", "implausible", "hidden", "stands_for")
 
 
 # --- cases ------------------------------------------------------------------------------------------
@@ -230,6 +230,7 @@ def verdict(found) -> dict:
         "verdict": found.verdict,
         "classes": [list(members) for members in found.members],
         "where": located(found),
+        "variables_alike": () if found.where is None else found.where.variables_alike,
         "p_value": found.left.test.p_value,
         "outliers": [int(k) for k in found.screened.outliers],
         "chi2": [2 * base.cost, 2 * found.best.cost],

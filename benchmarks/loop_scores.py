@@ -125,17 +125,22 @@ def _equation_of(truth: dict) -> str:
     return EQUATION[truth["balance"]]
 
 
-def in_place(x: dict) -> bool:
+def in_place(x: dict, alike: bool = False) -> bool:
     """Whether a drift, a cluster or an event is placed: over the right variable in the right equation, or by an event
-    that shares half of its rows or of its time with the truth."""
+    that shares half of its rows or of its time with the truth.
+
+    Args:
+        alike: whether variables and events count from which these data cannot tell what is said.
+    """
     truth = x["truth"][0]
     where = truth["where"]
     right = truth["balance"] == "sensor" or _equation(x) == _equation_of(truth)
     over = {"order": ("order", "row"), "time": ("time",)}.get(where.get("variable", ""), (where.get("variable"),))
     over = (*over, truth.get("name", "").split(".")[0])  # of a condition, all of whose rows are shifted
-    if x["verdict"] == "unnamed" and right and x["where"] and x["where"][1] in over:
+    variables = {x["where"][1], *(x.get("variables_alike", ()) if alike else ())} if x["where"] else set()
+    if x["verdict"] == "unnamed" and right and variables & set(over):
         return True
-    for event in x.get("events") or ():
+    for event in (*(x.get("events") or ()), *((x.get("events_alike") or ()) if alike else ())):
         if not isinstance(event, dict):
             continue
         if {"rows", "samples"} & set(event) and where.get("rows"):
@@ -302,7 +307,8 @@ def placed_kinds(f: Figures, kinds: Sequence[str]) -> None:
     """Drifts, clusters, events."""
     for kind in kinds:
         those = [x for x in f.of(kind) if x["truth"][0]["sigmas"] >= 7.5]
-        f.say(f"{kind} >= 8 sigma: found and placed (goal >= 90 %)", those, in_place)
+        f.say(f"{kind} >= 8 sigma: found and placed (goal >= 90 %)", those, lambda x: in_place(x, alike=True))
+        f.say("  and said first, where others are said to act alike", those, in_place)
         f.say("  something found", those, false_finding)
         f.say("  a library name", those, lambda x: x["classes"])
         f.say("  none, and rows or samples set aside", those, lambda x: x["verdict"] == "none" and x["outliers"])

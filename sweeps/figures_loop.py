@@ -269,7 +269,7 @@ def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy) -> Figure:
     low, high = found.value - 1.96 * found.sd, found.value + 1.96 * found.sd
     axes.fill_between(found.at * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
     axes.plot(found.at * scale, found.value, color=GREEN, label="smooth curve")
-    axes.set(xlabel=words, ylabel=f"missing in the {in_words(found.channel or found.balance)} [{found.unit}]")
+    axes.set(xlabel=words, ylabel=f"missing in the {in_words(found.place)} [{found.unit}]")
     axes.legend(loc="best")
     return fig
 

@@ -55,6 +55,16 @@ def test_a_cluster_and_an_event_are_placed_by_rows_and_by_time():
     assert not scores.in_place(line("unnamed", truth=truth, events=[{"start": 0.9, "stop": 1.0}]))
 
 
+def test_what_cannot_be_told_from_the_place_counts_apart():
+    """With three voltages a level is as good as a curve over the motor's speed."""
+    truth = [{"name": "voltage.slip", "balance": "slip", "where": {"rows": [4, 5, 6, 7]}}]
+    said = {"where": ["slip", "speed_motor", []], "truth": truth}
+    for more in ({"variables_alike": ["voltage"]}, {"events_alike": [{"rows": [4, 5, 6, 7, 8]}]}):
+        found = line("unnamed", **said, **more)
+        assert scores.in_place(found, alike=True) and not scores.in_place(found)
+    assert not scores.in_place(line("unnamed", **said, events_alike=[{"rows": [1, 2, 3]}]), alike=True)
+
+
 def test_strata_that_are_too_high_are_marked():
     made = {"surface": {"6T2A": {"adhesion": 0.9, "V_s": 0.01}}, "robot": {"mass": 13.1}, "rows": 90}
     lines = [

@@ -153,6 +153,15 @@ def test_reading_that_stands_alone_is_an_outlier(clean):
     assert not found.included[17] and found.included.sum() == len(clean.runs) - 1
 
 
+def test_outliers_of_a_short_table_are_set_aside(clean):
+    """A tenth of sixteen rows is one; and what one reading shows, a curve over the order shows too."""
+    runs = clean.runs.where(np.linspace(0, len(clean.runs) - 1, 16).astype(int))
+    runs = changed(runs, "speed_mm_s", 3, 9 * runs["speed_sd_mm_s"][3])
+    runs = changed(runs, "motor_speed_rpm", 9, -12 * runs["motor_speed_sd_rpm"][9])
+    found = SETTLED.trace(runs)
+    assert found.verdict == "none" and set(found.screened.outliers) == {3, 9}
+
+
 def test_rows_that_bend_the_fit_are_set_aside(clean):
     wrong = clean.runs.where(np.arange(4))
     wrong.columns["slope_deg"][:2] = 44.0

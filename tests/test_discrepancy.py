@@ -15,7 +15,7 @@ from synthetic import SETTLED, table
 
 from calibration.data import robot_file
 from calibration.discovery import discover, formula
-from calibration.discovery.discrepancy import fit_discrepancy, refined
+from calibration.discovery.discrepancy import alike_variables, fit_discrepancy, refined
 from calibration.discovery.projection import defect
 from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.smooth import smooth
@@ -193,6 +193,17 @@ def test_no_formula_is_proposed_where_nothing_shows(found):
     proposal = formula.propose(blind, found.what.balance, found.space.included, curve)
     assert proposal.formula == "none: no term shows in these data" and proposal.terms == ()
     assert np.isnan(defect(blind, found.what.balance).value).all()
+
+
+def test_variables_over_which_a_curve_is_as_improbable_are_told():
+    """Beside the one that is said, in its own place alone, and along an axis only the best window."""
+    names = [
+        ("slip", v) for v in ("voltage", "speed_motor", "voltage 24 to 24", "voltage 33 to 33", "slope", "conditions")
+    ]
+    names.append(("track", "payload"))
+    deviate = np.array([9.2, 9.0, 9.9, 9.5, 8.8, 9.8, 9.9])
+    assert alike_variables(names, deviate, "slip", "speed_motor") == ("voltage 24 to 24", "voltage")
+    assert alike_variables(names, deviate, "slip", "voltage 24 to 24") == ("voltage", "speed_motor")
 
 
 def test_a_window_is_refined_to_its_rows():

@@ -276,7 +276,7 @@ def test_nothing_is_proposed_where_one_name_is_left(seen):
 def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
     space = seen["mass_error", "tension_friction"][1]
     runs = int(space.included.sum())
-    where = Location("track", "speed", ("track",), 60.0, 60.0)
+    where = Location("track", "speed", ("track",), (), 60.0, 60.0)
     proposal = experiments.denser(space, where, SETTINGS)
     assert "speed" in proposal.name and "track" in proposal.description
     assert proposal.expected_sigma == pytest.approx(np.sqrt(60 * 45 / runs)) and runs == 90

@@ -31,7 +31,6 @@ from calibration.discovery.result import (
     FoundEffect,
     HeldOutAlternative,
     HiddenEffect,
-    Remainder,
     Sensitivity,
 )
 from calibration.discovery.score_tests import bootstrap
@@ -196,7 +195,16 @@ class Traced:
     @property
     def events(self) -> tuple[dict[str, Any], ...]:
         """Where something happens for a while: axis and window, and numbers of the rows in it."""
-        happens = None if self.where is None else bases_room.window(self.where.variable)
+        return () if self.where is None else self._happening(self.where.variable)
+
+    @property
+    def events_alike(self) -> tuple[dict[str, Any], ...]:
+        """The same of what it cannot be told from."""
+        alike = () if self.where is None else self.where.variables_alike
+        return tuple(event for variable in alike for event in self._happening(variable))
+
+    def _happening(self, variable: str) -> tuple[dict[str, Any], ...]:
+        happens = bases_room.window(variable)
         if happens is None:
             return ()
         inside = self.screened.base.space.included & happens.holds(self.left.linear.variable(happens.axis))
@@ -451,9 +459,7 @@ def finished(
     remains = None
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
-        remains = (
-            None if where is None else Remainder(where.balance, where.channel, where.balances_alike, where.variable)
-        )
+        remains = None if where is None else findings.whereabouts(where)
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None:
         ask = not observe.long
@@ -561,10 +567,8 @@ def remarks(found: DiscoveryResult) -> tuple[str, ...]:
             f"each, {wave.score:.0f} with one phase): robot.toml holds the mean; start runs from a mark"
         )
     if found.remains is not None:
-        place, over = found.remains.channel or found.remains.balance, found.remains.variable.replace("_", " ")
-        said.append(
-            f"what was found does not explain everything: the {in_words(place)} still lacks something over {over}"
-        )
+        place, over = in_words(found.remains.place), found.remains.variable.replace("_", " ")
+        said.append(f"what was found does not explain everything: the {place} still lacks something over {over}")
     said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -59,6 +60,8 @@ class Location:
         place: balance in which a curve explains most, or channel whose readings it shifts; variable: over which it
             does.
         alike: places in which one explains as much, or would if it had curves of its own.
+        variables_alike: over which a curve there is as improbable, beside `variable`: the most improbable first, of
+            what happens for a while one along each axis.
         explained: what the curves of that balance and variable explain [σ²]; strongest: what the most improbable
             family does.
     """
@@ -66,6 +69,7 @@ class Location:
     place: str
     variable: str
     alike: tuple[str, ...]
+    variables_alike: tuple[str, ...]
     explained: float
     strongest: float
 
@@ -127,7 +131,28 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
     if happening is not None and happening.axis in bases_room.AXES:
         happening, strength = refined(left.linear, place, happening.axis, included)
         variable = str(happening)
-    return Location(place, variable, tuple(itertools.chain(*alike)), strength, max(strength, float(explained[k])))
+    strongest = max(strength, float(explained[k]))
+    return Location(place, variable, tuple(itertools.chain(*alike)), alike_variables(names, deviate, place, variable),
+                    strength, strongest)  # fmt: skip
+
+
+def alike_variables(
+    names: Sequence[tuple[str, str]], deviate: np.ndarray, place: str, variable: str
+) -> tuple[str, ...]:
+    """Over what else a curve in a place is as improbable, the most improbable first."""
+    there = {names[j][1]: deviate[j] for j in np.argsort(-deviate) if names[j][0] == place}
+    there.pop(bases_room.CONDITIONS, None)
+    found: dict[str, str] = {_axis(variable): variable}
+    for other, d in there.items():
+        if d > max(there.values()) - ALIKE:
+            found.setdefault(_axis(other), other)
+    return tuple(other for other in found.values() if other != variable)
+
+
+def _axis(variable: str) -> str:
+    """What is the same for all windows along an axis, and for a smooth curve over nothing else."""
+    happens = bases_room.window(variable)
+    return variable if happens is None else f"{happens.axis} for a while"
 
 
 def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) -> tuple[bases_room.Window, float]:

@@ -37,6 +37,7 @@ from calibration.discovery.result import (
     ReadingsOfRows,
     StatedValue,
     UnnamedDiscrepancy,
+    Whereabouts,
 )
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.search import own_p, without_each
@@ -140,15 +141,17 @@ def _without_each(
     return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
+def whereabouts(where: Location) -> Whereabouts:
+    """A location in the words of the result."""
+    return Whereabouts(where.balance, where.channel, where.balances_alike, where.variable, where.variables_alike)
+
+
 def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> UnnamedDiscrepancy:
     """The discrepancy of an `unnamed` verdict, over the rows of the table."""
     f, lacks, happens = found.proposal, found.defect, bases_room.window(where.variable)
     return UnnamedDiscrepancy(
-        balance=where.balance,
-        channel=where.channel,
-        variable=where.variable,
+        **dataclasses.asdict(whereabouts(where)),
         unit=found.unit,
-        balances_alike=where.balances_alike,
         families=(where.family,),
         window=None if happens is None else dataclasses.asdict(happens),
         effect=found.effect,
@@ -394,9 +397,11 @@ def statement(
         also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
         what = f": {where.family}" if where.variable in bases_room.VARIABLES else ""
         place = bases_room.in_words(where.place)
+        well = [shown_over(v).removeprefix("best shown ") for v in where.variables_alike]
+        over = shown_over(where.variable) + (f" (as well {', '.join(well)})" if well else "")
         return (
-            f"Something is missing in the {place}{also}, {shown_over(where.variable)}{what}; no effect of the "
-            f"library explains it (family-wise p {said_p(p)})."
+            f"Something is missing in the {place}{also}, {over}{what}; no effect of the library explains it "
+            f"(family-wise p {said_p(p)})."
         )
     names = []
     for k, words in enumerate(classes):

@@ -39,7 +39,8 @@ class Screening:
 
 
 def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
-    """Set aside rows with a reading that stands alone: its own shift explains more than any effect or curve.
+    """Set aside rows with a reading that stands alone: its own shift is less probable by chance
+    than any effect or curve.
 
     Rows that stand together are none: they stay, and `cluster` says where.
 
@@ -79,7 +80,7 @@ def screen_beside(
         left: what could explain what that fit leaves.
     """
     counting = found.base.space.included.sum() + len(found.outliers)
-    allowed = int(settings.outlier_share * counting) - len(found.outliers)
+    allowed = settings.outliers(int(counting)) - len(found.outliers)
     far = _alone(found.base, left, found.bases, allowed, settings)
     if not far.size or found.cluster is not None:
         return None
@@ -91,20 +92,20 @@ def screen_beside(
 
 
 def _alone(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
-    """Indices of rows of which a reading's own shift explains more than any effect or curve, at most so many."""
+    """Indices of rows of which a reading's own shift is less probable by chance than any effect or curve, at most so many."""
     included = base.space.included
     level = stats.norm.isf(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
     alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
     smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.names(bases)]
-    together = max(np.max(np.asarray(scores.single) ** 2), np.max(np.asarray(scores.explained)[smooth]))
+    together = max(np.max(np.abs(np.asarray(scores.single))), np.max(np.asarray(scores.curve)[smooth]))
     count = 1 if base.space.bare.observe.policy.one_by_one else allowed
     far = np.argsort(-alone)[: min(count, max(allowed, 0))]
-    return far[(alone[far] >= level) & (alone[far] ** 2 >= together)]
+    return far[(alone[far] >= level) & (alone[far] >= together)]
 
 
 def _screened(base: BaseFit, bases_at: Callable[[BaseFit], Bases], settings: Settings, where: str) -> Screening:
-    """Rows whose own shift explains more than any effect or curve, set aside."""
-    allowed = int(settings.outlier_share * base.space.included.sum())
+    """Rows whose own shift is less probable by chance than any effect or curve, set aside."""
+    allowed = settings.outliers(int(base.space.included.sum()))
     base, outliers = _set_gross_aside(base, settings, where)
     bases, seen = _look(base, bases_at, settings)
     while len(outliers) < allowed:
@@ -149,6 +150,6 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
         found, seen = search_in_batches(space.equipped, [start] * batch, [robust] * batch, none)
         far, start = off(np.asarray(seen.reading[0])), np.asarray(found.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
-    if not gross.any() or gross.sum() > settings.outlier_share * included.sum():
+    if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):
         return base, ()
     return _again(base, np.flatnonzero(gross), settings, where), tuple(map(int, np.flatnonzero(gross)))

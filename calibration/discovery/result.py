@@ -95,12 +95,33 @@ class Formula:
 
 
 @dataclasses.dataclass(frozen=True)
-class UnnamedDiscrepancy:
+class Whereabouts:
+    """Where something is missing beyond doubt that has no name.
+
+    Attributes:
+        balance, variable: in which, over what; balances_alike: balances in which it acts alike.
+        channel: whose readings are off, where the balance is `sensor`; else "".
+        variables_alike: over which it shows there as well, the plainest first; levels of conditions too.
+    """
+
+    balance: str
+    channel: str
+    balances_alike: tuple[str, ...]
+    variable: str
+    variables_alike: tuple[str, ...]
+
+    @property
+    def place(self) -> str:
+        """The balance, or the channel whose readings are off."""
+        return self.channel or self.balance
+
+
+@dataclasses.dataclass(frozen=True)
+class UnnamedDiscrepancy(Whereabouts):
     """A discrepancy that no effect of the library explains.
 
     Attributes:
-        balance, variable, unit: where, over what, in which unit; balances_alike: balances in which it acts alike.
-        channel: whose readings are off, where the balance is `sensor`; else "".
+        unit: of the balance.
         families: what is missing, in words, as of `FoundEffect`.
         window: axis, first and last place of what happens for a while; None for other discrepancies.
         effect: name of the smooth curve in the proposed robot.
@@ -111,11 +132,7 @@ class UnnamedDiscrepancy:
         proposal: a formula.
     """
 
-    balance: str
-    channel: str
-    variable: str
     unit: str
-    balances_alike: tuple[str, ...]
     families: tuple[str, ...]
     window: dict[str, str | float] | None
     effect: str
@@ -128,16 +145,6 @@ class UnnamedDiscrepancy:
     defect: np.ndarray | None
     defect_sd: np.ndarray | None
     proposal: Formula
-
-
-@dataclasses.dataclass(frozen=True)
-class Remainder:
-    """What the effects of a verdict leave beyond doubt; as of `UnnamedDiscrepancy`."""
-
-    balance: str
-    channel: str
-    balances_alike: tuple[str, ...]
-    variable: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,7 +349,7 @@ class DiscoveryResult:
     unusable: tuple[int, ...]
     effects: tuple[FoundEffect, ...]
     unnamed: UnnamedDiscrepancy | None
-    remains: Remainder | None
+    remains: Whereabouts | None
     next_experiment: NextExperiment | None
     cannot_see: tuple[str, ...]
     needs_histories: tuple[str, ...]
@@ -503,6 +510,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "channel": d.channel,
         "balances_alike": list(d.balances_alike),
         "variable": d.variable,
+        "variables_alike": list(d.variables_alike),
         "window": d.window,
         "unit": d.unit,
         "equation": None,

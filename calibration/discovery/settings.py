@@ -40,7 +40,8 @@ class Settings:
         needed: what each of two effects has to explain, given the other, for both to be named [σ].
         preferred: evidence by which a smooth curve has to be the better explanation for names not to stand [σ²].
         alternative: rise of the objective up to which a candidate is listed [σ²].
-        outlier_share: largest share of rows set aside; outlier_error: family-wise error of that.
+        outlier_share: largest share of rows set aside; outlier_few: how many may be of a short table, up to a fifth
+            of it; outlier_error: family-wise error of that.
         gross: how many times further off than the median row no row can be that was measured as it is stated [σ].
         cauchy: scale of Cauchy's weights [σ]; reweightings: their iterations.
         worth, apart: separation from which an experiment is worth while, and from which it tells two apart [σ].
@@ -71,6 +72,7 @@ class Settings:
     preferred: float = 9.0
     alternative: float = 9.0
     outlier_share: float = 0.1
+    outlier_few: int = 3
     outlier_error: float = 0.01
     gross: float = 12.0
     cauchy: float = 2.4
@@ -82,6 +84,10 @@ class Settings:
     refuted: float = 4.0
     prefer: str = FIT
     forbidden: tuple[str, ...] = ()
+
+    def outliers(self, rows: int) -> int:
+        """How many of so many rows may be set aside."""
+        return max(int(self.outlier_share * rows), min(self.outlier_few, rows // 5))
 
     @property
     def family_wise_error(self) -> float:
