@@ -6,6 +6,7 @@ Each stage is a function of what the stages before it found; none changes anythi
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -24,7 +25,7 @@ from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import Location, diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.hidden import hidden
-from calibration.discovery.outliers import Screening, screen, screen_beside
+from calibration.discovery.outliers import Screening, ahead, screen, screen_beside
 from calibration.discovery.posterior import of_curve, of_fit
 from calibration.discovery.result import (
     DiscoveryResult,
@@ -244,8 +245,10 @@ def trace(
     def look(noise: Noise) -> Screening:
         space = pose(runs, robot, noise.sd, settings, stated, library)
         progress("fitting the base model")
-        fitted = fit_base(space, settings, runs.source)
-        return screen(fitted, lambda base: bases_at(runs, base), runs, settings)
+        at = functools.partial(bases_at, runs)
+        with ahead(space, at, settings):
+            fitted = fit_base(space, settings, runs.source)
+        return screen(fitted, at, runs, settings)
 
     screened = look(noise)
     residuals = residuals_of(screened, runs)

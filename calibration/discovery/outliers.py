@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,8 @@ import numpy as np
 from scipy import stats
 
 from calibration.data.runs import Runs
-from calibration.discovery.candidates import BaseFit, empty, fit_base
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
 from calibration.discovery.clusters import LEVELS, Cluster, cluster
 from calibration.discovery.score_tests import Diagnosed, ScoreTable, diagnosed
 from calibration.discovery.settings import Settings
@@ -36,6 +39,19 @@ class Screening:
     bases: Bases
     diagnosed: Diagnosed
     cluster: Cluster | None = None
+
+
+@contextlib.contextmanager
+def ahead(space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> Iterator[None]:
+    """Beside what is done meanwhile, the base fit, a first look at the prior's mean on another core: what every later
+    look needs is then compiled."""
+    nothing = np.zeros(len(space.coordinates))
+    mean = Candidate(empty(settings), nothing, nothing, np.inf, nothing, nothing, False, False, False)
+    start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
+    with concurrent.futures.ThreadPoolExecutor(1) as other:
+        looked = other.submit(_look, start, bases_at, settings)
+        yield
+    looked.result()
 
 
 def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
@@ -92,7 +108,7 @@ def screen_beside(
 
 
 def _alone(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
-    """Indices of rows of which a reading's own shift is less probable by chance than any effect or curve, at most so many."""
+    """Indices of rows of which a reading's own shift is less probable than any effect or curve, at most so many."""
     included = base.space.included
     level = stats.norm.isf(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
     alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
