@@ -111,7 +111,7 @@ class BatchPart(FidelityPart):
         chunk: runs in one vmapped call; None takes the fidelity's.
     """
 
-    chunk: Annotated[int, Field(ge=1, le=10_000_000)] | None = None
+    chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = None
 
     @property
     def runs_at_once(self) -> int:
