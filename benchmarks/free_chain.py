@@ -17,6 +17,7 @@ not derivatives.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import time
 from functools import partial
@@ -86,9 +87,9 @@ class Chain(NamedTuple):
 
 def chain(gear: RunningGear) -> Chain:
     """The nominal robot's 6T2A on the flat, with `gear`."""
-    robot, run = nominal(), Conditions(voltage=33.0)
+    robot, run = dataclasses.replace(nominal(), running_gear=gear), Conditions(voltage=33.0)
     rest = State(*(jnp.zeros(()) for _ in range(4)))
-    half = mjcf.masses(robot, gear, run, balances.begin(robot, run, rest).mass)
+    half = mjcf.masses(robot, run, balances.begin(robot, run, rest).mass)
     link = (2 * gear.wheelbase + 2 * jnp.pi * robot.configurations["6T2A"].radius) / TEETH_BELT
     radius = link / (2 * jnp.sin(jnp.pi / TEETH_PULLEY))
     return Chain(
@@ -308,7 +309,7 @@ def beside(gears: list[RunningGear]) -> list[dict]:
     runs = Conditions(voltage=np.full(1, 33.0))
     found = []
     for gear in gears:
-        answer = _batch(nominal(), runs, gear, 0.8, 1e-4, 1e-3, True)
+        answer = _batch(dataclasses.replace(nominal(), running_gear=gear), runs, 0.8, 1e-4, 1e-3, True)
         normal, fast = np.asarray(answer.signals.normal[0, -300:]), float(answer.v[0, -300:, 3].mean())
         period = period_pitch(35e-3, fast, float(nominal().radius_pulley))
         periods = int(0.3 / period)

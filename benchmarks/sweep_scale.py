@@ -104,6 +104,8 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
 
     devices = jax.local_devices() if devices is None else devices
     config, job = prepared(arguments, points, len(devices))
+    if arguments.out is not None:
+        Path(arguments.out).mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(dir=arguments.out))
     try:
         compiled = scale.Compiled(job, devices)

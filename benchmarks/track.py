@@ -8,6 +8,7 @@ python benchmarks/track.py --only speed --batches 180,1024
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import resource
 import time
@@ -24,7 +25,6 @@ from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.stability import largest_step
 from mmrjax.fidelities.track import _batch, track
-from mmrjax.running_gear import RunningGear
 from mmrjax.signals import STATUSES
 
 DERIVED = (
@@ -64,12 +64,12 @@ def timed(call) -> tuple[float, float]:
 
 def speed(batches: list[int]) -> dict:
     """Compile and run time of `batches` runs of 1.5 s from standstill."""
-    robot, gear, found = robots.nominal(), RunningGear(), {}
+    robot, found = robots.nominal(), {}
     for size in batches:
         commands = table8(size)
-        first = timed(lambda commands=commands: _batch(robot, commands, gear, 1.5, 1e-4, 1e-3, False))
-        again = timed(lambda commands=commands: _batch(robot, commands, gear, 1.5, 1e-4, 1e-3, False))
-        status = np.asarray(_batch(robot, commands, gear, 1.5, 1e-4, 1e-3, False).result.status)
+        first = timed(lambda commands=commands: _batch(robot, commands, 1.5, 1e-4, 1e-3, False))
+        again = timed(lambda commands=commands: _batch(robot, commands, 1.5, 1e-4, 1e-3, False))
+        status = np.asarray(_batch(robot, commands, 1.5, 1e-4, 1e-3, False).result.status)
         found[size] = {
             "compile_s": first[0] - again[0],
             "run_s": again[0],
@@ -107,15 +107,18 @@ def assumptions() -> dict:
 
     @jax.jit
     def settled(gears):
-        one = lambda gear, run: track(robot, run, gear, duration=0.8, rolling=True)  # noqa: E731
-        answer = jax.vmap(lambda gear: jax.vmap(lambda run: one(gear, run))(runs))(gears)
+        def both(gear):
+            changed = dataclasses.replace(robot, running_gear=gear)
+            return jax.vmap(lambda run: track(changed, run, duration=0.8, rolling=True))(runs)
+
+        answer = jax.vmap(both)(gears)
         normal = answer.signals.normal[..., -300:]
         ripple = (normal.max(-1) - normal.min(-1)) / 2 / normal.mean(-1)
         reading = answer.result.reading
         return answer.steady.guide_share, reading.total_current, reading.speed, ripple, answer.result.status
 
     cases = [(name, value) for name, values in ASSUMED.items() for value in values]
-    gears = [params.replace(RunningGear(), {name: jnp.asarray(value)}) for name, value in cases]
+    gears = [params.replace(robot.running_gear, {name: jnp.asarray(value)}) for name, value in cases]
     answers = settled(jax.tree.map(lambda *x: jnp.stack(x), *gears))
     for k, (name, value) in enumerate(cases):
         share, current, fast, ripple, status = (np.asarray(x[k]) for x in answers)

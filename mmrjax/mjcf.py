@@ -18,7 +18,6 @@ import jax.numpy as jnp
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.running_gear import RunningGear
 from mmrjax.signals import GRAVITY
 from mmrjax.undercarriage import lever_tip
 
@@ -49,13 +48,13 @@ class Masses(eqx.Module):
     inertia_pulley: Scalar
 
 
-def masses(robot: Robot, gear: RunningGear, conditions: Conditions, mass: Scalar) -> Masses:
+def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     """Masses of half a robot whose total with payload is `mass` [kg], as `balances.begin` gives it.
 
     The moment of inertia of Table 7 is the whole robot's in transport posture; from it the levers' share is
     taken there and put back at their angles, and the pulleys' share is taken out.
     """
-    kind = robot.chassis(conditions.configuration)
+    kind, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = kind.on_tracks
     wheeled = 1 - tracked
     lever = gear.lever_mass * tracked
@@ -81,12 +80,13 @@ def masses(robot: Robot, gear: RunningGear, conditions: Conditions, mass: Scalar
     return Masses(chassis, forward, up, inertia, pulley, inertia_pulley)
 
 
-def text(robot: Robot, gear: RunningGear, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
+def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
     """MJCF of half a robot under some conditions (scalar fields); `mass` total [kg], `step` [s].
 
     The shapes are for the eye and show both sides; masses and inertias are stated and are of one side.
     """
-    half = masses(robot, gear, conditions, jnp.asarray(mass))
+    gear = robot.running_gear
+    half = masses(robot, conditions, jnp.asarray(mass))
     m = {name: float(getattr(half, name)) for name in vars(half)}
     chassis = robot.chassis(conditions.configuration)
     wheeled = bool(chassis.on_tracks < 0.5)
@@ -152,7 +152,7 @@ def _template(double: bool) -> tuple[Any, Any]:
     from mmrjax.robots import nominal  # topology only: every number is replaced per member
 
     with jax.ensure_compile_time_eval():
-        model = mujoco.MjModel.from_xml_string(text(nominal(), RunningGear(), Conditions(), 13.1))
+        model = mujoco.MjModel.from_xml_string(text(nominal(), Conditions(), 13.1))
         return mjx.put_model(model), mjx.make_data(model)
 
 
@@ -161,7 +161,7 @@ def template() -> tuple[Any, Any]:
     return _template(jnp.result_type(float) == jnp.float64)
 
 
-def member(model: Any, half: Masses, slope: Scalar, wheelbase: Scalar, step: float) -> Any:
+def member(model: Any, half: Masses, slope: Scalar, wheelbase: Scalar, step: Scalar) -> Any:
     """The MJX `model` with this member's masses, inertias, places, gravity and time step.
 
     Every constant that the smooth dynamics read and that mass decides is set here (mujoco issue 1607); the

@@ -16,7 +16,7 @@ from mmrjax.belt import Path, tips
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.track import Trajectory
 from mmrjax.robot import Robot
-from mmrjax.running_gear import GROUSERS, TEETH_BELT, RunningGear
+from mmrjax.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.signals import GRAVITY
 from mmrjax.undercarriage import lever_tip
 
@@ -62,13 +62,13 @@ class Scene(NamedTuple):
     weight: float
 
 
-def scene(robot: Robot, conditions: Conditions, run: Trajectory, gear: RunningGear | None = None) -> Scene:
+def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
     """Gather one run (scalar conditions, one member of a batch) for drawing.
 
     Raises:
         ValueError: the run holds numbers that are not finite (a failed member).
     """
-    gear = RunningGear() if gear is None else gear
+    gear = robot.running_gear
     if not np.isfinite(np.asarray(run.q)).all():
         raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)

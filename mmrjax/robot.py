@@ -14,6 +14,7 @@ from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
 from mmrjax.params import Index, Scalar, as_float
 from mmrjax.power import Battery
+from mmrjax.running_gear import RunningGear
 from mmrjax.tables import RADIUS_PULLEY
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class Robot(eqx.Module):
         configurations: chassis by name, at least one; given as a mapping.
         effects: terms beyond the paper's model; the empty tuple is the paper's model.
         sides: how many motors are driven alike; all per-side quantities are of one of them (assumption 3).
+        running_gear: of one side, what the track model needs beside the rest.
     """
 
     battery: Battery
@@ -79,6 +81,7 @@ class Robot(eqx.Module):
     configurations: Configurations = eqx.field(converter=_configurations)
     effects: tuple[Effect, ...] = ()
     sides: Scalar = eqx.field(default=2.0, converter=as_float)
+    running_gear: RunningGear = eqx.field(default_factory=RunningGear)
 
     def chassis(self, configuration: Index) -> Chassis:
         """The chassis of the configuration with this index; traceable and batchable."""

@@ -11,6 +11,7 @@ Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of t
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -142,6 +143,21 @@ class Pull(eqx.Module):
         return jnp.sum(self.force)
 
 
+def _sliding(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+    """How fast each contact slides backward over the ground [m/s]; `speed_slip_terms` shifts it."""
+    return -at.speed_x - signals.speed_slip_terms
+
+
+def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> Float[Array, " contacts"]:
+    """How fast the traction of each contact rises with its sliding [N·s/m]."""
+
+    def force(sliding: Array) -> Array:
+        return jnp.asarray(chassis.ground.traction(sliding, at.force, signals.adhesion))
+
+    sliding = _sliding(signals, at)
+    return jax.jvp(force, (sliding,), (jnp.ones_like(sliding),))[1]
+
+
 def pull(path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scalar) -> Pull:
     """Friction of the contacts (25) by Fig. 7, of the guide (26), and all generalized forces.
 
@@ -155,8 +171,7 @@ def pull(path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scal
         at: the contacts.
         height: of the axle line over the ground [m].
     """
-    sliding = -at.speed_x - signals.speed_slip_terms
-    force = jnp.asarray(chassis.ground.traction(sliding, at.force, signals.adhesion))
+    force = jnp.asarray(chassis.ground.traction(_sliding(signals, at), at.force, signals.adhesion))
     guide = chassis.track.guide_friction * at.guided * at.force * signals.direction
     # Power of the contact forces per belt speed, then on the pulleys in the shares of that speed.
     along = force * at.rate_x + at.force * at.rate_z - guide

@@ -44,6 +44,7 @@ FLAGS = {
     "motor_overspeed": "motor faster than it is permitted to turn",
     "gearbox_overspeed": "gearbox input faster than its catalogue permits",
     "winding_hot": "winding hotter than permitted after long running at this current",
+    "slips": "slides faster than V_s on average, though it goes on steadily",
 }
 
 

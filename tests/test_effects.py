@@ -31,7 +31,6 @@ from mmrjax.fidelities.drive import drive, rates
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.params import Scalar, parameter
-from mmrjax.running_gear import RunningGear
 from mmrjax.signals import CONVERGED, STALLED, Signals, State
 
 # --- units --------------------------------------------------------------------------------------------
@@ -938,7 +937,7 @@ def test_instant_of_half_robot_with_all_effects_has_finite_derivatives_by_every_
     """What `track` integrates, at standstill."""
 
     def outputs(robot, run):
-        system = half_robot.system(robot, run, RunningGear(), 1e-4)
+        system = half_robot.system(robot, run, 1e-4)
         signals, _, pulled = half_robot.instant(system, half_robot.stand(system))
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves((signals, pulled)) if x.dtype == THETA.dtype])
 

@@ -10,13 +10,13 @@ import pytest
 from mmrjax import balances, params, undercarriage
 from mmrjax.belt import POLYGON, Path, runs, tension_along, tips, travel
 from mmrjax.conditions import Conditions
-from mmrjax.running_gear import GROUSERS, TEETH_BELT, RunningGear
+from mmrjax.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.signals import State
 
 
 @pytest.fixture(scope="module")
 def path(robot):
-    return Path(robot.configurations["6T2A"].radius, RunningGear())
+    return Path(robot.configurations["6T2A"].radius, robot.running_gear)
 
 
 def test_belt_is_840_mm_with_grousers_every_35(path):

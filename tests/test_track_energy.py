@@ -11,7 +11,6 @@ from mmrjax.belt import travel
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import advance, centre, instant, stand, system
 from mmrjax.fidelities.track import track
-from mmrjax.running_gear import RunningGear
 from mmrjax.signals import GRAVITY
 
 RUNS = Conditions(
@@ -29,8 +28,8 @@ def ledger(robot):
     @jax.jit
     @jax.vmap
     def run(command):
-        setup = system(robot, command, RunningGear(), 1e-4)
-        radius, gear = setup.path.radius, setup.gear
+        setup = system(robot, command, 1e-4)
+        radius, gear = setup.path.radius, setup.path.gear
         chassis = robot.chassis(command.configuration)
 
         def step(motion, _):
@@ -93,7 +92,7 @@ def test_every_loss_takes_energy(ledger):
 
 
 @pytest.fixture(scope="module")
-def averages(robot):
+def averages():
     runs = Conditions(
         voltage=jnp.asarray([33.0, 33.0, 15.0, 33.0]),
         slope_deg=jnp.asarray([0.0, 10.0, 5.0, 10.0]),
@@ -102,28 +101,24 @@ def averages(robot):
     )
 
     @eqx.filter_jit
-    def settled(gear, step):
-        reading = jax.vmap(lambda run: track(robot, run, gear, duration=0.8, step=step, rolling=True).result.reading)(
-            runs
-        )
+    def settled(robot, step):
+        reading = jax.vmap(lambda run: track(robot, run, duration=0.8, step=step, rolling=True).result.reading)(runs)
         return jnp.stack([reading["total_current"], reading["motor_speed"], reading["speed"]])
 
-    return lambda gear, step: np.asarray(settled(gear, step))
+    return lambda robot, step: np.asarray(settled(robot, step))
 
 
 @pytest.mark.slow
-def test_averages_do_not_depend_on_the_step(averages):
+def test_averages_do_not_depend_on_the_step(averages, robot):
     """Halved: less than 0.3 %."""
-    gear = RunningGear()
-    np.testing.assert_allclose(averages(gear, 5e-5), averages(gear, 1e-4), rtol=3e-3)
+    np.testing.assert_allclose(averages(robot, 5e-5), averages(robot, 1e-4), rtol=3e-3)
 
 
 @pytest.mark.slow
-def test_averages_hardly_depend_on_the_contact_stiffness(averages):
+def test_averages_hardly_depend_on_the_contact_stiffness(averages, robot):
     """Doubled: less than 0.3 %."""
-    gear = RunningGear()
-    stiffer = params.replace(gear, {"contact_stiffness": 2 * gear.contact_stiffness})
-    np.testing.assert_allclose(averages(stiffer, 1e-4), averages(gear, 1e-4), rtol=3e-3)
+    stiffer = params.replace(robot, {"running_gear.contact_stiffness": 2 * robot.running_gear.contact_stiffness})
+    np.testing.assert_allclose(averages(stiffer, 1e-4), averages(robot, 1e-4), rtol=3e-3)
 
 
 def test_ledger_can_fail(ledger):

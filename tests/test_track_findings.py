@@ -9,7 +9,6 @@ from mmrjax.belt import Path
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.ripple import period_pitch, ripple, stages, touchdowns
 from mmrjax.fidelities.track import track_batch
-from mmrjax.running_gear import RunningGear
 from mmrjax.signals import STATUSES
 
 #: (wheeled, slope [deg], payload [kg], voltage [V]), from standstill.
@@ -38,7 +37,7 @@ def runs(robot):
     # Not through the door's check of the step, whose own compilation test_track_bad_input pays.
     from mmrjax.fidelities.track import _batch
 
-    return jax.tree.map(np.asarray, _batch(robot, commands, RunningGear(), 1.5, 1e-4, 1e-3, False))
+    return jax.tree.map(np.asarray, _batch(robot, commands, 1.5, 1e-4, 1e-3, False))
 
 
 def series(runs, k, name):
@@ -74,7 +73,7 @@ def test_unpowered_robot_stands_still(runs):
 @pytest.mark.parametrize("name", ["total_current", "speed"])
 def test_tracked_ripple_has_the_grousers_period(runs, robot, k, name):
     """Eq. (34) within 2 %."""
-    path = Path(robot.configurations["6T2A"].radius, RunningGear())
+    path = Path(robot.configurations["6T2A"].radius, robot.running_gear)
     wheel = series(runs, k, "speed_wheel")[TAIL].mean()
     assert tail(runs, k, name).period == pytest.approx(
         period_pitch(float(path.pitch), wheel, float(robot.configurations["6T2A"].radius)), rel=0.02
@@ -186,7 +185,7 @@ def test_fidelities_agree_over_the_climbable_rows_of_table_8(robot, grid):
     rows = grid[grid[:, 1] <= np.where(grid[:, 0] > 0.5, 15.0, 10.0)]
     wheeled, slope, payload, voltage = rows.T
     commands = Conditions(voltage=voltage, slope_deg=slope, payload=payload, configuration=wheeled)
-    ours = _batch(robot, commands, RunningGear(), 0.6, 1e-4, 5e-3, True)
+    ours = _batch(robot, commands, 0.6, 1e-4, 5e-3, True)
     assert {STATUSES[s] for s in np.asarray(ours.result.status)} == {"converged"}
 
     def lumped(share, run):
@@ -206,8 +205,8 @@ def test_batch_is_its_members(robot):
 
     two = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
     twin = jax.tree.map(lambda x: x[::-1], two)
-    a = _batch(robot, two, RunningGear(), 0.05, 1e-4, 1e-3, False)
-    b = _batch(robot, twin, RunningGear(), 0.05, 1e-4, 1e-3, False)
+    a = _batch(robot, two, 0.05, 1e-4, 1e-3, False)
+    b = _batch(robot, twin, 0.05, 1e-4, 1e-3, False)
     np.testing.assert_allclose(a.q, b.q[::-1], rtol=1e-9, atol=1e-12)
 
 
@@ -228,7 +227,7 @@ def test_run_in_parts_is_the_run_in_one(robot):
 
     two = Conditions(voltage=jnp.asarray([33.0, 15.0]), configuration=jnp.asarray([0.0, 1.0]))
     shares = []
-    whole = _batch(robot, two, RunningGear(), 0.047, 1e-4, 1e-3, False)
+    whole = _batch(robot, two, 0.047, 1e-4, 1e-3, False)
     parts = track_batch(robot, two, duration=0.047, progress=shares.append)
     assert shares[-1] == 1.0 and len(shares) <= PARTS and (np.diff(shares) > 0).all()
     assert jax.tree.structure(whole) == jax.tree.structure(parts)

@@ -8,8 +8,7 @@ import pytest
 
 from mmrjax import balances, mjcf, params
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.half_robot import advance, generalized, instant, stand, system
-from mmrjax.running_gear import RunningGear
+from mmrjax.fidelities.half_robot import advance, generalized, instant, resistance, stand, system
 from mmrjax.signals import State
 
 RUNS = {
@@ -19,19 +18,19 @@ RUNS = {
 STEP = 1e-4
 
 
-def native(robot, gear, run):
+def native(robot, run):
     """The same half robot compiled by C MuJoCo from its own MJCF."""
     rest = State(*(jnp.asarray(0.0) for _ in range(4)))
     mass = float(balances.begin(robot, run, rest).mass)
-    return mujoco.MjModel.from_xml_string(mjcf.text(robot, gear, run, mass, STEP))
+    return mujoco.MjModel.from_xml_string(mjcf.text(robot, run, mass, STEP))
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_member_has_the_constants_that_mujoco_compiles(robot, name):
     """Against stale derived constants (mujoco issue 1607): MJX's are replaced, MuJoCo's compiled afresh."""
-    gear = params.replace(RunningGear(), {"lever_front": jnp.asarray(2.5), "centre_offset": jnp.asarray(0.01)})
-    run = Conditions(**RUNS[name])
-    ours, theirs = system(robot, run, gear, STEP).model, native(robot, gear, run)
+    changes = {"running_gear.lever_front": jnp.asarray(2.5), "running_gear.centre_offset": jnp.asarray(0.01)}
+    changed, run = params.replace(robot, changes), Conditions(**RUNS[name])
+    ours, theirs = system(changed, run, STEP).model, native(changed, run)
     for field in ("body_mass", "body_subtreemass", "body_inertia", "body_ipos", "body_pos", "jnt_axis"):
         np.testing.assert_allclose(
             getattr(ours, field), getattr(theirs, field), rtol=1e-12, atol=1e-15, err_msg=field
@@ -44,7 +43,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_masses_make_up_the_robot(robot, name):
     run = Conditions(**RUNS[name])
-    half = system(robot, run, RunningGear(), STEP).half
+    half = system(robot, run, STEP).half
     chassis = robot.chassis(run.configuration)
     assert float(half.chassis + 2 * half.pulley) == pytest.approx(float(chassis.mass + run.payload) / 2)
     assert float(2 * half.inertia_pulley) == pytest.approx(float(chassis.inertia))
@@ -53,38 +52,42 @@ def test_masses_make_up_the_robot(robot, name):
 
 @pytest.fixture(scope="module")
 def step_both(robot):
-    gear = RunningGear()
-
     @jax.jit
     def forces(run, motion):
-        constants = system(robot, run, gear, STEP)
-        signals, _, pulled = instant(constants, motion)
+        constants = system(robot, run, STEP)
+        signals, at, pulled = instant(constants, motion)
         after, _, _ = advance(constants, motion)
-        return generalized(constants, signals, pulled), after
+        return *generalized(constants, signals, pulled), resistance(constants, signals, at), after
 
-    return gear, forces
+    return forces
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
-    """10 000 steps, each engine on its own trajectory; to 1e-6 of every coordinate's and rate's size."""
-    gear, forces = step_both
+    """10 000 steps, each engine on its own trajectory; to 1e-6 of every coordinate's and rate's size.
+
+    What C MuJoCo gives to a step are its mass matrix and its acceleration.
+    """
     run = Conditions(**RUNS[name])
-    model = native(robot, gear, run)
+    model = native(robot, run)
     data = mujoco.MjData(model)
 
     @jax.jit
     def second(motion):
-        return jax.lax.scan(lambda m, _: (forces(run, m)[1], None), motion, None, length=10_000)[0]
+        return jax.lax.scan(lambda m, _: (step_both(run, m)[-1], None), motion, None, length=10_000)[0]
 
-    start = stand(system(robot, run, gear, STEP))
+    start = stand(system(robot, run, STEP))
     end = second(start)
     data.qpos[:], motion = start.q, start
+    mass = np.zeros((model.nv, model.nv))
     for _ in range(10_000):
-        (force, armature), after = forces(run, motion)
+        force, armature, damping, after = step_both(run, motion)
         model.dof_armature[:] = armature
         data.qfrc_applied[:] = force
-        mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass)
+        data.qvel[:] += np.linalg.solve(mass + STEP * np.asarray(damping), STEP * mass @ data.qacc)
+        mujoco.mj_integratePos(model, data.qpos, data.qvel, STEP)
         # the current is ours in both; its next value depends on this instant alone
         motion = type(after)(jnp.asarray(data.qpos), jnp.asarray(data.qvel), after.current, after.discharge)
     scale_q, scale_v = np.array([1.0, 0.05, 0.01, 25.0, 25.0]), np.array([1.0, 1.0, 1.0, 25.0, 25.0])
@@ -95,23 +98,25 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
 
 def test_wrong_mass_is_seen(robot, step_both):
     """The comparison can fail: one gram more, one step."""
-    gear, forces = step_both
     run = Conditions(**RUNS["tracked"])
-    motion = stand(system(robot, run, gear, STEP))
-    (force, armature), after = forces(run, motion)
+    motion = stand(system(robot, run, STEP))
+    force, armature, damping, after = step_both(run, motion)
     heavier = Conditions(**(RUNS["tracked"] | {"payload": 3.002}))
-    model = native(robot, gear, heavier)
+    model = native(robot, heavier)
     data = mujoco.MjData(model)
     data.qpos[:], data.qfrc_applied[:], model.dof_armature[:] = motion.q, force, armature
-    mujoco.mj_step(model, data)
-    assert np.max(np.abs(data.qvel - after.v)) > 1e-8
+    mujoco.mj_forward(model, data)
+    mass = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    gained = np.linalg.solve(mass + STEP * np.asarray(damping), STEP * mass @ data.qacc)
+    assert np.max(np.abs(gained - after.v)) > 1e-8
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_mjcf_shows_a_robot_that_stands_on_its_ground(robot, name):
     """What MuJoCo's viewer draws at the keyframe: wheels touch the ground, pulleys leave room for the grousers."""
-    gear = RunningGear()
-    model = native(robot, gear, Conditions(**RUNS[name]))
+    gear = robot.running_gear
+    model = native(robot, Conditions(**RUNS[name]))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
     mujoco.mj_forward(model, data)

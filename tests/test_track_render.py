@@ -11,14 +11,13 @@ from PIL import Image
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.track import _batch
 from mmrjax.render import render, scene
-from mmrjax.running_gear import RunningGear
 
 RUNS = Conditions(voltage=jnp.asarray([33.0, 24.0, np.nan]), slope_deg=np.degrees(0.1), configuration=[0, 1, 0])
 
 
 @pytest.fixture(scope="module")
 def scenes(robot):
-    runs = _batch(robot, RUNS, RunningGear(), 0.04, 1e-4, 1e-3, True)
+    runs = _batch(robot, RUNS, 0.04, 1e-4, 1e-3, True)
 
     def one(k):
         return scene(robot, *(jax.tree.map(lambda x: x[k], tree) for tree in (RUNS, runs)))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.result import result, withhold
+from mmrjax.fidelities.result import result, slips, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
@@ -139,7 +139,8 @@ def drive(
     Returns:
         The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
         tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
-        when the movers spin beyond V_s and the robot gains no speed; `battery_empty` when the charge has
+        when the movers slide beyond V_s and the robot loses speed or stands (one that holds its speed has
+        `converged`, flagged `slips`); `battery_empty` when the charge has
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
@@ -175,14 +176,14 @@ def drive(
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, done: Array) -> Array:
-    friction = robot.chassis(conditions.configuration).ground.friction
     settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, CONVERGED)
     stands = jnp.minimum(end.direction, end.direction_travel) < 1.0
     status = jnp.where(stands & (end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
-    spinning = jnp.abs(end.speed_sliding) > friction.speed_static
-    gaining = end.acceleration * end.speed_sliding > 1e-3 * jnp.abs(end.speed_sliding)  # 1 mm/s²
-    status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
+    gain = end.acceleration * jnp.sign(end.speed_sliding)
+    gaining, losing = gain > 1e-3, gain < -1e-3  # 1 mm/s²
+    sliding = jnp.where(gaining, NOT_SETTLED, jnp.where(losing | stands, SLIDES, status))
+    status = jnp.where(slips(robot, end), sliding, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)

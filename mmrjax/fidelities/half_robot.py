@@ -23,7 +23,6 @@ from mmrjax.fidelities.steady import steady
 from mmrjax.mjcf import Masses, mjx
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.running_gear import RunningGear
 from mmrjax.signals import CONVERGED, GRAVITY, Signals, State
 from mmrjax.undercarriage import Pull, Touch
 
@@ -50,16 +49,16 @@ class System(eqx.Module):
 
     Attributes:
         model, data: MJX model with this member's constants, and the data whose structure it needs.
+        step: interval of integration [s].
     """
 
     robot: Robot
-    gear: RunningGear
     conditions: Conditions
     path: Path
     half: Masses
     model: Any
     data: Any
-    step: float = eqx.field(static=True)
+    step: Scalar
 
     @property
     def chassis(self) -> Chassis:
@@ -67,14 +66,15 @@ class System(eqx.Module):
         return self.robot.chassis(self.conditions.configuration)
 
 
-def system(robot: Robot, conditions: Conditions, gear: RunningGear, step: float) -> System:
-    """Constants of one run (scalar fields); robot and gear may hold tracers."""
+def system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
+    """Constants of one run (scalar fields); the robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
-    half = mjcf.masses(robot, gear, conditions, mass)
+    half = mjcf.masses(robot, conditions, mass)
     model, data = mjcf.template()
+    gear = robot.running_gear
     model = mjcf.member(model, half, conditions.slope, gear.wheelbase, step)
-    return System(robot, gear, conditions, Path(robot.radius_pulley, gear), half, model, data, step)
+    return System(robot, conditions, Path(robot.radius_pulley, gear), half, model, data, jnp.asarray(step))
 
 
 class _Mover(eqx.Module):
@@ -124,19 +124,40 @@ def current_after(run: System, signals: Signals) -> Scalar:
     return signals.current + run.step / signals.inductance * voltage * jnp.expm1(z) / z
 
 
+def resistance(run: System, signals: Signals, at: Touch) -> Float[Array, "5 5"]:
+    """How the friction of the contacts rises with v: Σ k g gᵀ, by which a step is damped.
+
+    g is the change of a contact's speed over the ground with v, k ≥ 0 how fast its friction rises with that speed;
+    friction that falls, beyond V_s, is an instability of the robot and not of the step, and is left out.
+    """
+    rises = jnp.maximum(undercarriage.friction_rise(run.chassis, signals, at), 0.0)
+    belt, none = at.rate_x * run.path.radius, jnp.zeros_like(rises)
+    along = jnp.stack([none + 1.0, none, at.lever_z, belt * (1 - at.weight), belt * at.weight], axis=1)
+    return (along.T * rises) @ along
+
+
 def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
-    """One step of MJX (semi-implicit Euler) and of the winding; signals are those before the step."""
-    signals, _, pulled = instant(run, motion)
+    """One step of MJX (semi-implicit Euler) and of the winding; signals are those before it.
+
+    Friction of the contacts is taken at the step's end, to first order: (M + Δt K) Δv = Δt M a with MJX's mass matrix
+    M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7). Within V_s the time constant of a
+    contact is m V_s / (μ_s R_z), microseconds for a small V_s.
+    """
+    signals, at, pulled = instant(run, motion)
     force, armature = generalized(run, signals, pulled)
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
-    data = mjx.step(run.model.replace(dof_armature=armature), data)
+    model = run.model.replace(dof_armature=armature)
+    data = mjx.step(model, data)
+    mass = mjx.full_m(model, data)
+    gained = mass @ (data.qvel - motion.v)
+    v = motion.v + jnp.linalg.solve(mass + run.step * resistance(run, signals, at), gained)
     charge = run.robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
     }
     discharge = motion.discharge + run.step * charge
-    after = Motion(data.qpos, data.qvel, current_after(run, signals), discharge, memory)
+    after = Motion(motion.q + run.step * v, v, current_after(run, signals), discharge, memory)
     return after, signals, pulled
 
 
@@ -144,7 +165,7 @@ def margin(run: System) -> Scalar:
     """How far the line of gravity meets the ground inside the outermost contacts [m]; negative: it tips."""
     forward, up, _ = centre(run)
     meets = forward - jnp.tan(run.conditions.slope) * (up + axle_height(run))
-    return run.gear.wheelbase / 2 - jnp.abs(meets)
+    return run.path.gear.wheelbase / 2 - jnp.abs(meets)
 
 
 def centre(run: System) -> tuple[Scalar, Scalar, Scalar]:
@@ -156,7 +177,7 @@ def centre(run: System) -> tuple[Scalar, Scalar, Scalar]:
 
 def axle_height(run: System) -> Scalar:
     """Height of the axles over the ground where the contacts just touch [m]."""
-    tracked = run.path.radius + run.gear.grouser_height
+    tracked = run.path.radius + run.path.gear.grouser_height
     return jnp.where(run.chassis.on_tracks > 0.5, tracked, run.chassis.radius)
 
 

@@ -26,6 +26,7 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         jnp.abs(signals.speed_motor) > robot.motor.speed_limit,
         jnp.abs(signals.speed_motor) > robot.gearbox.speed_limit,
         temperature > robot.motor.temperature_limit,
+        slips(robot, signals),
     )
     flags = sum(jnp.where(o, 1 << k, 0) for k, o in enumerate(over))
     return Result(
@@ -48,6 +49,12 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         status=status,
         flags=jnp.asarray(flags),
     )
+
+
+def slips(robot: Robot, signals: Signals) -> Array:
+    """Whether the movers slide over the ground faster than V_s."""
+    friction = robot.chassis(signals.configuration).ground.friction
+    return jnp.abs(signals.speed_sliding) > friction.speed_static
 
 
 def _efficiency(out: Scalar, into: Scalar) -> Array:

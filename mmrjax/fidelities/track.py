@@ -15,11 +15,10 @@ from mmrjax import contact, fidelities, undercarriage
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
-from mmrjax.fidelities.result import result, withhold
+from mmrjax.fidelities.result import result, slips, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.running_gear import RunningGear
 from mmrjax.signals import (
     BATTERY_EMPTY,
     CONVERGED,
@@ -121,12 +120,12 @@ def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Ar
 
 def _status(run: System, steady: Steady, end: Motion) -> Array:
     robot, conditions, signals = run.robot, run.conditions, steady.signals
-    friction = robot.chassis(conditions.configuration).ground.friction
     status = jnp.where(steady.change > SETTLED, NOT_SETTLED, CONVERGED)
     status = jnp.where(signals.direction < 0.999, STALLED, status)
-    spinning = jnp.abs(signals.speed_sliding) > friction.speed_static
-    gaining = signals.acceleration > 1e-2  # m/s², on average over the window
-    status = jnp.where(spinning, jnp.where(gaining, NOT_SETTLED, SLIDES), status)
+    gaining, losing = signals.acceleration > 1e-2, signals.acceleration < -1e-2  # m/s², on average over the window
+    stands = signals.speed < robot.chassis(conditions.configuration).ground.friction.speed_rest
+    sliding = jnp.where(gaining, NOT_SETTLED, jnp.where(losing | stands, SLIDES, status))
+    status = jnp.where(slips(robot, signals), sliding, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(margin(run) < 0, TIPS, status)
@@ -140,7 +139,6 @@ def _status(run: System, steady: Steady, end: Motion) -> Array:
 def track(
     robot: Robot,
     conditions: Conditions,
-    gear: RunningGear | None = None,
     *,
     duration: float = 1.5,
     step: float = STEP,
@@ -154,32 +152,32 @@ def track(
     Args:
         robot: any robot; its parameters may be tracers. Its `guide_share` is not used: it is an output.
         conditions: one run, scalar fields.
-        gear: running gear; None takes the paper's.
         duration: of the run [s]; step, sample: intervals of integration and of the record [s].
         rolling: start at the steady fidelity's speed, which settles sooner; else from standstill.
 
     Returns:
         The trajectory. Status: `converged` when current and speeds change by less than 0.1 % from one half
         of the averaging window to the other, else `not_settled`; `stalled` the shafts do not turn forward;
-        `slides` the movers spin beyond V_s and the robot gains no speed; `tips` the line of gravity passes
+        `slides` the movers slide beyond V_s and the robot loses speed or stands (one that goes on steadily
+        has `converged`, flagged `slips`); `tips` the line of gravity passes
         outside the contacts; `battery_empty`; `failed` the numbers are no longer finite, or the robot has
         left the ground or turned over though gravity alone would not turn it. `failed` and `tips` withhold
         the result's numbers.
     """
-    run = system(robot, conditions, RunningGear() if gear is None else gear, step)
+    run = system(robot, conditions, step)
     start = roll(run) if rolling else stand(run)
-    end, record = _record(run, start, sample, round(duration / sample))
+    end, record = _record(run, start, round(sample / step), round(duration / sample))
     return _trajectory(run, start, end, record, sample)
 
 
-def _record(run: System, start: Motion, sample: float, samples: int) -> tuple[Motion, Record]:
+def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
     def small(motion: Motion, _: None) -> tuple[Motion, tuple[Signals, Array]]:
         after, signals, pulled = advance(run, motion)
         return after, (signals, pulled.guided)
 
     @jax.checkpoint  # reverse mode keeps one motion a sample and recomputes the steps between
     def interval(motion: Motion, _: None) -> tuple[Motion, Record]:
-        after, every = jax.lax.scan(small, motion, None, length=round(sample / run.step))
+        after, every = jax.lax.scan(small, motion, None, length=steps)
         signals, guided = jax.tree.map(lambda x: jnp.mean(x, axis=0), every)
         at, pulled = instant(run, after)[1:]
         return after, Record(after, signals, guided, undercarriage.reactions(run.path, at, pulled))
@@ -198,9 +196,7 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
     return Trajectory(time[1:], motions.q, motions.v, record.signals, record.reactions, averages, answer)
 
 
-def check(
-    robot: Robot, conditions: Conditions, gear: RunningGear, *, duration: float, step: float, sample: float = SAMPLE
-) -> None:
+def check(robot: Robot, conditions: Conditions, *, duration: float, step: float, sample: float = SAMPLE) -> None:
     """Refuse what some run of a batch cannot bear.
 
     Raises:
@@ -211,15 +207,14 @@ def check(
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
         raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, conditions, gear))):
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, conditions))):
         return  # inside a transformation no number is known
-    refuse(robot, conditions, gear, step, sample)
+    refuse(robot, conditions, step, sample)
 
 
 def track_batch(
     robot: Robot,
     conditions: Conditions,
-    gear: RunningGear | None = None,
     *,
     duration: float = 1.5,
     step: float = STEP,
@@ -236,25 +231,23 @@ def track_batch(
     Raises:
         ValueError: what `check` refuses.
     """
-    gear = RunningGear() if gear is None else gear
-    check(robot, conditions, gear, duration=duration, step=step, sample=sample)
+    check(robot, conditions, duration=duration, step=step, sample=sample)
     if progress is not None:
-        return _in_parts(robot, conditions, gear, duration, step, sample, rolling, progress)
-    return _batch(robot, conditions, gear, duration, step, sample, rolling)
+        return _in_parts(robot, conditions, duration, step, sample, rolling, progress)
+    return _batch(robot, conditions, duration, step, sample, rolling)
 
 
 @eqx.filter_jit
 def _batch(
     robot: Robot,
     conditions: Conditions,
-    gear: RunningGear,
     duration: float,
     step: float,
     sample: float,
     rolling: bool,
 ) -> Trajectory:
     def one(conditions: Conditions) -> Trajectory:
-        return track(robot, conditions, gear, duration=duration, step=step, sample=sample, rolling=rolling)
+        return track(robot, conditions, duration=duration, step=step, sample=sample, rolling=rolling)
 
     return jax.vmap(one)(conditions)
 
@@ -262,7 +255,6 @@ def _batch(
 def _in_parts(
     robot: Robot,
     conditions: Conditions,
-    gear: RunningGear,
     duration: float,
     step: float,
     sample: float,
@@ -272,27 +264,27 @@ def _in_parts(
     # All parts are of one length, for one compilation; what the last one has too many is cut off.
     samples = round(duration / sample)
     length = math.ceil(samples / PARTS)
-    start = motion = _begin(robot, conditions, gear, step, rolling)
+    start = motion = _begin(robot, conditions, step, rolling)
     records = []
     for done in range(0, samples, length):
-        motion, record = jax.block_until_ready(_part(robot, conditions, gear, motion, step, sample, length))
+        motion, record = jax.block_until_ready(_part(robot, conditions, motion, step, sample, length))
         records.append(record)
         progress(min((done + length) / samples, 1.0))
-    return _end(robot, conditions, gear, start, records, step, sample, samples)
+    return _end(robot, conditions, start, records, step, sample, samples)
 
 
 @eqx.filter_jit
-def _begin(robot: Robot, conditions: Conditions, gear: RunningGear, step: float, rolling: bool) -> Motion:
+def _begin(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> Motion:
     begin = roll if rolling else stand
-    return jax.vmap(lambda one: begin(system(robot, one, gear, step)))(conditions)
+    return jax.vmap(lambda one: begin(system(robot, one, step)))(conditions)
 
 
 @eqx.filter_jit
 def _part(
-    robot: Robot, conditions: Conditions, gear: RunningGear, motions: Motion, step: float, sample: float, samples: int
+    robot: Robot, conditions: Conditions, motions: Motion, step: float, sample: float, samples: int
 ) -> tuple[Motion, Record]:
     def one(conditions: Conditions, motion: Motion) -> tuple[Motion, Record]:
-        return _record(system(robot, conditions, gear, step), motion, sample, samples)
+        return _record(system(robot, conditions, step), motion, round(sample / step), samples)
 
     return jax.vmap(one)(conditions, motions)
 
@@ -301,7 +293,6 @@ def _part(
 def _end(
     robot: Robot,
     conditions: Conditions,
-    gear: RunningGear,
     starts: Motion,
     records: list[Record],
     step: float,
@@ -311,7 +302,7 @@ def _end(
     def one(conditions: Conditions, start: Motion, parts: list[Record]) -> Trajectory:
         record = jax.tree.map(lambda *x: jnp.concatenate(x)[:samples], *parts)
         end = jax.tree.map(lambda x: x[-1], record.motions)
-        return _trajectory(system(robot, conditions, gear, step), start, end, record, sample)
+        return _trajectory(system(robot, conditions, step), start, end, record, sample)
 
     return jax.vmap(one)(conditions, starts, records)
 
@@ -336,7 +327,7 @@ def _histories(
 
 
 def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
-    check(robot, conditions, RunningGear(), duration=options["duration"], step=options["step"])
+    check(robot, conditions, duration=options["duration"], step=options["step"])
 
 
 def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
