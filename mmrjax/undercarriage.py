@@ -34,7 +34,7 @@ class Touch(eqx.Module):
         rate_x, rate_z: its velocity per belt speed [-].
         weight: share of the driven pulley in that belt speed [-].
         speed_x: its velocity over the ground, uphill [m/s].
-        force: normal force R_z [N].
+        force: normal force R_z [N]; damped: how fast it falls with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
         belt: tensions of the runs.
     """
@@ -46,6 +46,7 @@ class Touch(eqx.Module):
     weight: Float[Array, " contacts"]
     speed_x: Float[Array, " contacts"]
     force: Float[Array, " contacts"]
+    damped: Float[Array, " contacts"]
     guided: Float[Array, " contacts"]
     place: Float[Array, " 24"]
     belt: Runs
@@ -97,15 +98,13 @@ def touch(path: Path, chassis: Chassis, q: Float[Array, " 5"], v: Float[Array, "
     bears = jnp.concatenate(
         [jnp.full(GROUSERS, 1.0) * chassis.on_tracks, jnp.full(WHEELS, 1.0) * (1 - chassis.on_tracks)]
     )
-    force = force_contact(
-        gap,
-        gap_rate,
-        0.0,
-        gear.contact_stiffness * yields,
-        gear.contact_exponent,
-        gear.contact_damping * yields,
-        gear.contact_depth,
-    )
+
+    def normal(gap_rate: Array) -> Array:
+        stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
+        force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
+        return jnp.asarray(force * bears)
+
+    force, rises = jax.jvp(normal, (gap_rate,), (jnp.ones_like(gap_rate),))
     return Touch(
         lever_x=x,
         lever_z=z,
@@ -113,7 +112,8 @@ def touch(path: Path, chassis: Chassis, q: Float[Array, " 5"], v: Float[Array, "
         rate_z=rate_z,
         weight=weight,
         speed_x=v[0] + v[2] * z + rate_x * speed,
-        force=force * bears,
+        force=force,
+        damped=-rises,
         guided=jnp.concatenate([where.guided, jnp.zeros(WHEELS)]),
         place=place,
         belt=belt,

@@ -122,7 +122,7 @@ def _inputs(
         if config.parameters:
             raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
         return room.of_posterior(robot, beside_robot(config, robot), ranges)
-    names = config.parameters or room.default_names(robot, present, config.battery)
+    names = config.parameters or room.default_names(robot, present, config.battery, config.model)
     return room.of_priors(robot, names, ranges)
 
 

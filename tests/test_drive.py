@@ -12,7 +12,8 @@ from scipy.integrate import cumulative_simpson
 from mmrjax import balances, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects.electrical import ThermalDrift
-from mmrjax.fidelities.drive import drive, drive_batch
+from mmrjax.fidelities.drive import _status, drive, drive_batch
+from mmrjax.fidelities.result import slips
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.signals import CONVERGED, STATUSES, State
 
@@ -237,6 +238,19 @@ def small(robot):
         return drive_batch(other or robot, runs, jnp.linspace(0.0, end, 21))
 
     return robot, go
+
+
+@pytest.mark.parametrize(
+    ("gain", "sliding", "status"),
+    [(0.0, 0.03, "converged"), (-0.1, 0.03, "slides"), (0.1, 0.03, "not_settled"), (0.0, 0.01, "converged")],
+)
+def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
+    """One that slips beyond V_s on average and holds its speed has settled, with a flag that it slips."""
+    run = Conditions()
+    end = balances.moving(robot, run, State(1.0, 900.0, 0.7, 0.0))
+    end = dataclasses.replace(end, speed_sliding=jnp.asarray(sliding), acceleration=jnp.asarray(gain))
+    assert STATUSES[int(_status(robot, run, end, jnp.asarray(True)))] == status
+    assert bool(slips(robot, end)) is (sliding > 0.02)
 
 
 def test_drive_statuses(small):

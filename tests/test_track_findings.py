@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mmrjax import params
 from mmrjax.belt import Path
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.ripple import period_pitch, ripple, stages, touchdowns
-from mmrjax.fidelities.track import track_batch
-from mmrjax.signals import STATUSES
+from mmrjax.fidelities.track import _batch, track_batch
+from mmrjax.signals import FLAGS, STATUSES
 
 #: (wheeled, slope [deg], payload [kg], voltage [V]), from standstill.
 RUNS = [
@@ -59,6 +60,29 @@ def test_broken_member_withholds_its_numbers_and_harms_no_other(runs):
     assert np.isnan(speed[[TIPPING, BROKEN]]).all()
     assert np.isfinite(np.delete(speed, [TIPPING, BROKEN])).all()
     assert np.isfinite(runs.q[[*TRACKED, *WHEELED, SLIDING, UNPOWERED]]).all()
+
+
+@pytest.mark.slow
+def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
+    """Guides recessed by 0.35 mm: the robot shakes on its grousers and slides beyond V_s on 20°."""
+    shaking = params.replace(
+        robot,
+        {
+            "6T2A.ground.friction.static": jnp.asarray(0.59), "6T2A.ground.friction.dynamic": jnp.asarray(0.52),
+            "6T2A.ground.friction.speed_static": jnp.asarray(0.021),
+            "6T2A.ground.friction.speed_dynamic": jnp.asarray(0.21),
+            "6T2A.track.guide_friction": jnp.asarray(0.06), "running_gear.guide_recess": jnp.asarray(3.5e-4),
+            "running_gear.contact_stiffness": jnp.asarray(4.2e7),
+            "running_gear.contact_damping": jnp.asarray(840.0), "running_gear.guide_gap": jnp.asarray(0.012),
+        },
+    )  # fmt: skip
+    commands = Conditions(voltage=jnp.asarray([15.0, 15.0]), slope_deg=jnp.asarray([10.0, 20.0]))
+    answer = _batch(shaking, commands, 1.5, 1e-4, 1e-3, True)
+    assert [STATUSES[s] for s in answer.result.status] == ["converged"] * 2
+    slips = 1 << FLAGS.index("slips")
+    assert [bool(f & slips) for f in np.asarray(answer.result.flags)] == [False, True]
+    # the slip of the search that found this gear, half its step: 1.9 and 4.9 % (with other constants beside)
+    np.testing.assert_allclose(100 * np.asarray(answer.result.slip), [1.9, 5.0], atol=0.15)
 
 
 def test_too_steep_a_slope_slides_it_down(runs):

@@ -57,7 +57,7 @@ def step_both(robot):
         constants = system(robot, run, STEP)
         signals, at, pulled = instant(constants, motion)
         after, _, _ = advance(constants, motion)
-        return *generalized(constants, signals, pulled), resistance(constants, signals, at), after
+        return *generalized(constants, signals, pulled), resistance(constants, motion, signals, at, pulled), after
 
     return forces
 

@@ -90,6 +90,10 @@ def calibrate(
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     default = priors.default_names(present, robot, computed=facts.computes)
     names = priors.choose(robot, default, free, fix)
+    unread = fidelities.unread(model, names)
+    if unread:
+        reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread))
+        raise BadConfiguration(f"--free {unread[0]}: --model {model} does not read it; allowed: --model {reads}")
     base = robot
     of_product: dict[str, tuple[float, float]] = {}
     if priors.GUIDE_SHARE in facts.computes:

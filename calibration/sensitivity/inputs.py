@@ -16,6 +16,7 @@ from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.inference import priors
 from calibration.inference.posterior import of_coordinates
+from mmrjax import fidelities
 from mmrjax.errors import UsageError
 from mmrjax.robot import Robot
 from mmrjax.variation import CONDITIONS, Axis, Variation
@@ -95,19 +96,24 @@ class Inputs:
         return np.array([k for k, name in enumerate(self.names) if not name.startswith(foreign)], int)
 
 
-def default_names(robot: Robot, configurations: Sequence[str], battery: bool) -> tuple[str, ...]:
+def default_names(
+    robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady"
+) -> tuple[str, ...]:
     """The robot's parameters that have a prior of some width, of these configurations and what all share.
 
-    Left out: the battery's where it does not feed the motors, and what guides carry where there are none.
+    Left out: the battery's where it does not feed the motors, what guides carry where there are none, and what the
+    fidelity does not read.
     """
     absent = [name for name in robot.configurations if name not in configurations]
     wheels = [name for name in configurations if float(robot.configurations[name].on_tracks) < 0.5]
     out = tuple(f"{name}." for name in absent) + (() if battery else ("battery.",))
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
+    known = priors.known(robot)
+    left_out = {*guides, *fidelities.unread(model, known)}
     return tuple(
         name
-        for name, p in priors.known(robot).items()
-        if not name.startswith(out) and name not in guides and p.spec.prior_sd(float(p.value)) > 0
+        for name, p in known.items()
+        if not name.startswith(out) and name not in left_out and p.spec.prior_sd(float(p.value)) > 0
     )
 
 

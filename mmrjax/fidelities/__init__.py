@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ class Facts:
         rollout: whether it integrates over time; searches through it then run one by one, and end sooner.
         histories: whether it can keep a run over time.
         computes: parameters of a configuration that are results here and not read, such as `track.guide_share`.
+        resolves: beginnings of names of parameters that it reads and fidelities without them do not.
         slow: whether a batch takes long enough for a bar that shows its progress.
         one_thread: whether XLA has to run on one thread: on two, runs have hung for good (docs/benchmarks.md).
     """
@@ -74,6 +76,7 @@ class Facts:
     rollout: bool = False
     histories: bool = False
     computes: tuple[str, ...] = ()
+    resolves: tuple[str, ...] = ()
     slow: bool = False
     one_thread: bool = False
 
@@ -135,6 +138,7 @@ TABLE: dict[str, Facts] = {
         rollout=True,
         histories=True,
         computes=("track.guide_share",),
+        resolves=("running_gear.",),
         slow=True,
         one_thread=True,
     ),
@@ -152,6 +156,12 @@ def facts(name: str) -> Facts:
     if name not in TABLE:
         raise KeyError(f"no fidelity {name}; there are {', '.join(TABLE)}")
     return TABLE[name]
+
+
+def unread(name: str, parameters: Iterable[str]) -> tuple[str, ...]:
+    """Those of some parameters, by dotted name, that a fidelity does not read and others do."""
+    of_others = {head for other in TABLE.values() for head in other.resolves} - set(facts(name).resolves)
+    return tuple(p for p in parameters if p.startswith(tuple(of_others)))
 
 
 def get(name: str) -> Fidelity:

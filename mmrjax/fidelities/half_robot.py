@@ -93,10 +93,16 @@ class _Mover(eqx.Module):
 def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
     """All signals, contacts and forces of an instant."""
     at = undercarriage.touch(run.path, run.chassis, motion.q, motion.v)
-    state = State(motion.current, run.robot.gearbox.ratio * motion.v[3], motion.v[0], motion.discharge, motion.memory)
-    mover = _Mover(run.path, at, motion.q[1])
-    signals, pulled = balances.resolved(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
+    signals, pulled = _balanced(run, motion, at, motion.v[0], motion.v[3])
     return signals, at, pulled
+
+
+def _balanced(run: System, motion: Motion, at: Touch, speed: Scalar, speed_shaft: Scalar) -> tuple[Signals, Pull]:
+    """Signals and forces with the contacts as they are, the robot [m/s] and the driving shaft [rad/s] at a speed."""
+    ratio = run.robot.gearbox.ratio
+    state = State(motion.current, ratio * speed_shaft, speed, motion.discharge, motion.memory)
+    mover = _Mover(run.path, at, motion.q[1])
+    return balances.resolved(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
 
 
 def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
@@ -124,33 +130,55 @@ def current_after(run: System, signals: Signals) -> Scalar:
     return signals.current + run.step / signals.inductance * voltage * jnp.expm1(z) / z
 
 
-def resistance(run: System, signals: Signals, at: Touch) -> Float[Array, "5 5"]:
-    """How the friction of the contacts rises with v: Σ k g gᵀ, by which a step is damped.
+def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Float[Array, "5 5"]:
+    """How the forces on v fall with v, K, by which a step is damped.
 
-    g is the change of a contact's speed over the ground with v, k ≥ 0 how fast its friction rises with that speed;
-    friction that falls, beyond V_s, is an instability of the robot and not of the step, and is left out.
+    Friction rises with sliding and is in proportion to the normal force, which falls with the rate of the gap:
+    K = Σ k g gᵀ + d (μ g + h) hᵀ, with g and h the change of a contact's speed along the ground and off it with v.
+    Friction that falls with sliding, beyond V_s, is an instability of the robot and not of the step: it is left out.
+    The drive's losses and the resistance of the ground rise steeply from rest: those are on K's diagonal.
     """
+
+    def driven(speeds: Float[Array, " 2"]) -> Float[Array, " 2"]:
+        signals, pulled = _balanced(run, motion, at, *speeds)
+        return jnp.stack([pulled.generalized[0], jnp.asarray(signals.torque_net)])
+
+    which = jnp.asarray([0, 3])
+    losses = jnp.maximum(-jnp.diagonal(jax.jacfwd(driven)(motion.v[which])), 0.0)
     rises = jnp.maximum(undercarriage.friction_rise(run.chassis, signals, at), 0.0)
-    belt, none = at.rate_x * run.path.radius, jnp.zeros_like(rises)
-    along = jnp.stack([none + 1.0, none, at.lever_z, belt * (1 - at.weight), belt * at.weight], axis=1)
-    return (along.T * rises) @ along
+    front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
+    one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
+    along = jnp.stack([one, none, at.lever_z, at.rate_x * front, at.rate_x * rear], axis=1)
+    off = jnp.stack([none, one, -at.lever_x, at.rate_z * front, at.rate_z * rear], axis=1)
+    share = pulled.force / jnp.maximum(at.force, 1e-9)
+    pushes = share[:, None] * along + off
+    contacts = (along.T * rises) @ along + (pushes.T * at.damped) @ off
+    return contacts.at[which, which].add(losses)
 
 
 def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
-    """One step of MJX (semi-implicit Euler) and of the winding; signals are those before it.
+    """One step of MJX (semi-implicit Euler) and of the winding.
 
-    Friction of the contacts is taken at the step's end, to first order: (M + Δt K) Δv = Δt M a with MJX's mass matrix
-    M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7). Within V_s the time constant of a
-    contact is m V_s / (μ_s R_z), microseconds for a small V_s.
+    Signals are those before it; traction, normal load and acceleration those of the step.
+
+    Forces of the contacts are taken at the step's end as far as they depend on v, to first order: (M + Δt K) Δv =
+    Δt M a with MJX's mass matrix M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7). Within
+    V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
     """
     signals, at, pulled = instant(run, motion)
     force, armature = generalized(run, signals, pulled)
     data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
     model = run.model.replace(dof_armature=armature)
     data = mjx.step(model, data)
-    mass = mjx.full_m(model, data)
-    gained = mass @ (data.qvel - motion.v)
-    v = motion.v + jnp.linalg.solve(mass + run.step * resistance(run, signals, at), gained)
+    mass, damping = mjx.full_m(model, data), resistance(run, motion, signals, at, pulled)
+    gained = jnp.linalg.solve(mass + run.step * damping, mass @ (data.qvel - motion.v))
+    v = motion.v + gained
+    fallen = damping @ gained
+    over_step = {
+        "traction": signals.traction - fallen[0],
+        "normal": signals.normal - fallen[1],
+        "acceleration": gained[0] / run.step,
+    }
     charge = run.robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
@@ -158,7 +186,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     }
     discharge = motion.discharge + run.step * charge
     after = Motion(motion.q + run.step * v, v, current_after(run, signals), discharge, memory)
-    return after, signals, pulled
+    return after, dataclasses.replace(signals, **over_step), pulled
 
 
 def margin(run: System) -> Scalar:
