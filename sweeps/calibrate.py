@@ -27,8 +27,8 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
     with open_folder("calibrate", config, robot, out, force, runs) as folder:
         found = run(
             runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
-            model=config.model, starts=config.starts, seed=config.seed, profiles=config.profiles,
-            blocks=config.hold_out, tell=tell,
+            model=config.model, starts=config.starts, population=config.population, seed=config.seed,
+            profiles=config.profiles, blocks=config.hold_out, tell=tell,
         )  # fmt: skip
         found.save(folder.partial, config.robot)
         folder.write_text("config.resolved.toml", configuration.as_toml(config))

@@ -367,6 +367,13 @@ def calibrate(
     starts: Annotated[
         int | None, typer.Option(help="Searches.  \\[default: 64; histories 8; rows with drive or track 1]")
     ] = None,
+    population: Annotated[
+        int | None,
+        typer.Option(
+            help="Draws of which the best is where a search with drive or track begins.  "
+            "\\[default: 256 where the running gear is free, else 0]"
+        ),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the starts.  \\[default: 0]")] = None,
     profiles: Annotated[
         bool | None,
@@ -394,7 +401,8 @@ def calibrate(
 
     options = _options(model=model, robot=robot, set=set_, effects=effects, report=report) | {
         "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
-        "noise": noise, "starts": starts, "seed": seed, "profiles": profiles, "hold_out": hold_out,
+        "noise": noise, "starts": starts, "population": population, "seed": seed, "profiles": profiles,
+        "hold_out": hold_out,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Calibrate, None, options), no_cache)
     from sweeps import calibrate as room

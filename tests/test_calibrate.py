@@ -5,6 +5,7 @@ import dataclasses
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -234,6 +235,12 @@ def test_histories_need_drive(measured):
 def test_unknown_fidelity_lists_the_choices(measured):
     with pytest.raises(BadConfiguration, match=r"--model trak: no such fidelity; .*allowed: steady, drive"):
         quick(measured, model="trak")
+
+
+def test_what_a_fidelity_does_not_read_is_not_freed(measured):
+    says = "--free running_gear.guide_recess: --model drive does not read it; allowed: --model track"
+    with pytest.raises(BadConfiguration, match=re.escape(says)):
+        quick(measured, model="drive", free=["default", "running_gear.guide_recess"])
 
 
 @pytest.mark.slow

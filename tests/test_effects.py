@@ -72,8 +72,8 @@ SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}
 def dimensions(unit: str) -> Counter:
     """Exponents of the base units of a product such as `N·m·s^2` or `V/C^2`."""
     total: Counter = Counter()
-    for sign, symbol, power in re.findall(r"([·/]?)([^·/^]+)(?:\^(\d+))?", unit):
-        exponent = int(power or 1) * (-1 if sign == "/" else 1)
+    for sign, symbol, power in re.findall(r"([·/]?)([^·/^]+)(?:\^(\d+(?:\.\d+)?))?", unit):
+        exponent = float(power or 1) * (-1 if sign == "/" else 1)
         if symbol in BASE:
             total[symbol] += exponent
         elif symbol in DERIVED:

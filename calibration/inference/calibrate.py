@@ -28,6 +28,8 @@ from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 
+#: Draws among which a rollout chooses its start where parameters are free that `steady` does not read.
+POPULATION = 256
 #: Source of the prior of a guide friction whose share is a result of the model.
 _OF_PRODUCT = "its product with the share of the guides, as in the other fidelities"
 
@@ -42,6 +44,7 @@ def calibrate(
     noise: str | None = None,
     model: str = "steady",
     starts: int | None = None,
+    population: int | None = None,
     seed: int = 0,
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
@@ -57,6 +60,8 @@ def calibrate(
         model: name of a fidelity.
         starts: the prior mean and `starts - 1` draws from the prior; for settled rows with a rollout the optimum of
             `steady` and draws from its posterior.
+        population: draws among which a rollout chooses where its searches begin, by its own objective; None takes
+            `POPULATION` where parameters are free that `steady` does not read, else none.
         profiles: whether to profile every parameter.
         blocks: kinds of blocks to hold out; True: all that tell something of such data.
             These three by default as the kind of data and the fidelity say.
@@ -108,7 +113,9 @@ def calibrate(
     posed = observers.pose(runs, base, coordinates, known.sd, model)
     notes += observe.check_start(runs, known)
 
-    found, beside = _searched(runs, base, posed, known, starts, seed, tell)
+    if population is None:
+        population = POPULATION if fidelities.unread("steady", names) else 0
+    found, beside = _searched(runs, base, posed, known, starts, population, seed, tell)
     posed, z = found.problem, np.asarray(found.best.z)
     fitted = posed.robot(jnp.asarray(z))
     after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
@@ -186,7 +193,14 @@ def _of_product(known: Mapping[str, tuple[float, float]]) -> list[str]:
 
 
 def _searched(
-    runs: Runs, base: Robot, posed: Problem, known: Noise, starts: int, seed: int, tell: Callable[[str], None]
+    runs: Runs,
+    base: Robot,
+    posed: Problem,
+    known: Noise,
+    starts: int,
+    population: int,
+    seed: int,
+    tell: Callable[[str], None],
 ) -> tuple[Found, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
@@ -202,6 +216,9 @@ def _searched(
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.nearby(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
+    if population:
+        draws = multistart.nearby(easy.problem, beside, rng, population)
+        points = multistart.best_of(posed, np.concatenate([points, draws]), tell)[:starts]
     return multistart.search_one_by_one(posed, known, points, easy.shares, tell), beside
 
 
