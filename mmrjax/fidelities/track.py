@@ -337,7 +337,7 @@ def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
         return []
     return [
         f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
-        f"{limits.min():.2g} s, so its readings there are not to be trusted; V_s is too small for μ_s"
+        f"{limits.min():.2g} s, so its readings there are not to be trusted; its contacts are too stiff"
     ]
 
 
