@@ -214,7 +214,9 @@ def test_every_fidelity_is_swept_over_parameters(sweep, tmp_path, model, options
 
 
 def test_track_step_that_a_corner_cannot_bear_is_refused_before_the_first_run(sweep, tmp_path):
-    config = 'model = "track"\nduration_s = 0.01\nstep_s = 1e-3\n[axes]\n"running_gear.contact_stiffness" = [3e7, 3e9]\n'
+    config = (
+        'model = "track"\nduration_s = 0.01\nstep_s = 1e-3\n[axes]\n"running_gear.contact_stiffness" = [3e7, 3e9]\n'
+    )
     code, _, err = sweep("s", config=config)
     assert code == 2 and "--model track: at running_gear.contact_stiffness 3e+09: step: got 0.001 s" in err
     assert not list(tmp_path.glob("s*"))
