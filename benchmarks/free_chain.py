@@ -322,7 +322,7 @@ def beside(gears: list[RunningGear]) -> list[dict]:
                 "period_34_s": period,
                 "line_of_34": harmonics(normal[-round(periods * period / 1e-3) :], periods),
                 "speed_wheel": fast,
-                "speed_m_s": float(answer.result.reading.speed[0]),
+                "speed_m_s": float(answer.result.reading["speed"][0]),
             }
         )
     return found

@@ -90,7 +90,7 @@ def derivatives() -> dict:
 
     def current(theta, run):
         changed = params.replace(robot, {n: values[n] * (1 + theta[k]) for k, n in enumerate(DERIVED)})
-        return track(changed, run, duration=0.5, rolling=True).result.reading.total_current
+        return track(changed, run, duration=0.5, rolling=True).result.reading["total_current"]
 
     at, found = jnp.zeros(len(DERIVED)), {"parameters": len(DERIVED)}
     for name, call in (("run", current), ("forward", jax.jacfwd(current)), ("reverse", jax.grad(current))):
@@ -115,7 +115,7 @@ def assumptions() -> dict:
         normal = answer.signals.normal[..., -300:]
         ripple = (normal.max(-1) - normal.min(-1)) / 2 / normal.mean(-1)
         reading = answer.result.reading
-        return answer.steady.guide_share, reading.total_current, reading.speed, ripple, answer.result.status
+        return answer.steady.guide_share, reading["total_current"], reading["speed"], ripple, answer.result.status
 
     cases = [(name, value) for name, values in ASSUMED.items() for value in values]
     gears = [params.replace(robot.running_gear, {name: jnp.asarray(value)}) for name, value in cases]
