@@ -55,8 +55,7 @@ def ahead(space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings:
 
 
 def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
-    """Set aside rows with a reading that stands alone: its own shift is less probable by chance
-    than any effect or curve.
+    """Set aside rows with a reading that stands alone: its own shift is less probable than any effect or curve.
 
     Rows that stand together are none: they stay, and `cluster` says where.
 

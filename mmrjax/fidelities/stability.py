@@ -47,9 +47,8 @@ def _maps(
 
 def _unhurried(robot: Robot) -> Robot:
     """The robot with every V_s at least `LEAST`."""
-    names = [p.name for p in params.walk(robot) if p.name.endswith("ground.friction.speed_static")]
-    values = {p.name: jnp.maximum(p.value, LEAST) for p in params.walk(robot) if p.name in names}
-    return params.replace(robot, values)
+    laws = [p for p in params.walk(robot) if p.name.endswith("ground.friction.speed_static")]
+    return params.replace(robot, {p.name: jnp.maximum(p.value, LEAST) for p in laws})
 
 
 def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " runs"]:
