@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.result import result, slips, withhold
+from mmrjax.fidelities.result import result, unless_slipping, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
@@ -25,7 +25,6 @@ from mmrjax.signals import (
     CONVERGED,
     FAILED,
     NOT_SETTLED,
-    SLIDES,
     STALLED,
     Result,
     Signals,
@@ -181,9 +180,7 @@ def _status(robot: Robot, conditions: Conditions, end: Signals, done: Array) -> 
     stands = jnp.minimum(end.direction, end.direction_travel) < 1.0
     status = jnp.where(stands & (end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
     gain = end.acceleration * jnp.sign(end.speed_sliding)
-    gaining, losing = gain > 1e-3, gain < -1e-3  # 1 mm/s²
-    sliding = jnp.where(gaining, NOT_SETTLED, jnp.where(losing | stands, SLIDES, status))
-    status = jnp.where(slips(robot, end), sliding, status)
+    status = unless_slipping(status, robot, end, gain, 1e-3, stands)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)

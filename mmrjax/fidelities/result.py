@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from mmrjax import balances, ground
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import Result, Signals, quotient
+from mmrjax.signals import NOT_SETTLED, SLIDES, Result, Signals, quotient
 
 
 def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
@@ -55,6 +55,19 @@ def slips(robot: Robot, signals: Signals) -> Array:
     """Whether the movers slide over the ground faster than V_s."""
     friction = robot.chassis(signals.configuration).ground.friction
     return jnp.abs(signals.speed_sliding) > friction.speed_static
+
+
+def unless_slipping(
+    status: Array, robot: Robot, signals: Signals, gain: Scalar, least: float, stands: Array | bool
+) -> Array:
+    """The status of a run, of one that slips by what the robot does: `not_settled` while it gains speed, `slides`
+    where it loses speed or stands, else what it is without.
+
+    Args:
+        gain: how fast it gains speed [m/s²]; least: from which that counts; stands: whether it does not travel.
+    """
+    loose = jnp.where(gain > least, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least) | stands, SLIDES, status))
+    return jnp.where(slips(robot, signals), loose, status)
 
 
 def _efficiency(out: Scalar, into: Scalar) -> Array:

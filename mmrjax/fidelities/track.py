@@ -15,7 +15,7 @@ from mmrjax import contact, fidelities, undercarriage
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
-from mmrjax.fidelities.result import result, slips, withhold
+from mmrjax.fidelities.result import result, unless_slipping, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -24,7 +24,6 @@ from mmrjax.signals import (
     CONVERGED,
     FAILED,
     NOT_SETTLED,
-    SLIDES,
     STALLED,
     TIPS,
     Result,
@@ -122,10 +121,9 @@ def _status(run: System, steady: Steady, end: Motion) -> Array:
     robot, conditions, signals = run.robot, run.conditions, steady.signals
     status = jnp.where(steady.change > SETTLED, NOT_SETTLED, CONVERGED)
     status = jnp.where(signals.direction < 0.999, STALLED, status)
-    gaining, losing = signals.acceleration > 1e-2, signals.acceleration < -1e-2  # m/s², on average over the window
     stands = signals.speed < robot.chassis(conditions.configuration).ground.friction.speed_rest
-    sliding = jnp.where(gaining, NOT_SETTLED, jnp.where(losing | stands, SLIDES, status))
-    status = jnp.where(slips(robot, signals), sliding, status)
+    # On average over the window.
+    status = unless_slipping(status, robot, signals, signals.acceleration, 1e-2, stands)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(margin(run) < 0, TIPS, status)
