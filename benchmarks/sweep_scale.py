@@ -132,8 +132,8 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         "seconds": total,
         "points_per_s": job.plan.design.points / total,
         "first_chunk_with_compiling_s": first,
-        # two threads: one makes points and starts to compute (on processors, that is all of computing), the other
-        # waits for what is computed, fetches and writes
+        # three threads: one makes points; one waits for them and starts to compute (on processors, that is all of
+        # computing); one waits for what is computed, fetches and writes
         "points_s": times.points,
         "compute_s": times.start + times.compute,
         "transfer_s": times.transfer,

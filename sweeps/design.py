@@ -42,7 +42,7 @@ class Joint(Protocol):
 #: may depend on it.
 TOGETHER = 4096
 #: Points that a thread makes at once, a multiple of these.
-PART = 32 * TOGETHER
+PART = 16 * TOGETHER
 
 
 @dataclasses.dataclass(frozen=True)
@@ -248,8 +248,8 @@ def latin_hypercube(seed: int, number: int, dimensions: int, first: int, count: 
 
 #: Rounds of the network that permutes; four are what Luby and Rackoff (1988) need, the rest for weak round functions.
 ROUNDS = 8
-#: Points that are permuted together: what is worked on stays in the processor's cache.
-CACHED = 16_384
+#: Points that are permuted together: what is worked on stays in the processor's cache, and threads seldom meet.
+CACHED = 65_536
 
 
 def permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) -> UInt64[np.ndarray, " points"]:

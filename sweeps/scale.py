@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -52,7 +54,7 @@ class Job:
 
 @dataclasses.dataclass
 class Times:
-    """Seconds spent by what overlaps: making points and starting to compute them (on processors that is computing
+    """Seconds spent by what overlaps: waiting for points and starting to compute them (on processors that is computing
     itself); waiting for what is computed, fetching it from the device, writing it; and the whole."""
 
     points: float = 0.0
@@ -170,15 +172,25 @@ Produced = Iterator[Piece]
 
 
 def produce(compiled: Compiled, chunks: Iterable[int], times: Times) -> Produced:
-    """Compute chunks on the local devices, in order."""
-    for chunk in chunks:
-        start = time.perf_counter()
-        values = compiled.points(chunk)
-        made = time.perf_counter()
-        arrays = compiled(values)
-        times.points += made - start
-        times.start += time.perf_counter() - made
-        yield Piece(chunk, arrays, values)
+    """Compute chunks on the local devices, in order, the points of the next being made meanwhile."""
+    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="points") as maker:
+        ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
+        for chunk in chunks:
+            ahead.append((chunk, maker.submit(compiled.points, chunk)))
+            if len(ahead) > 1:
+                yield _started(compiled, *ahead.popleft(), times)
+        while ahead:
+            yield _started(compiled, *ahead.popleft(), times)
+
+
+def _started(compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], times: Times) -> Piece:
+    start = time.perf_counter()
+    values = points.result()
+    made = time.perf_counter()
+    arrays = compiled(values)
+    times.points += made - start
+    times.start += time.perf_counter() - made
+    return Piece(chunk, arrays, values)
 
 
 def fetched(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
