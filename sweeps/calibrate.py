@@ -16,7 +16,9 @@ from sweeps.inputs import load_robot, read_runs
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
 
 
-def calibrate(config: configuration.Calibrate, source: str, out: Path | None, force: bool) -> int:
+def calibrate(
+    config: configuration.Calibrate, source: str, out: Path | None, force: bool, members: Path | None = None
+) -> int:
     """Calibrate a robot to a table and leave a run folder; returns the exit code.
 
     0 done; 3 done, but the search did not converge, or a row or a fit without a block did not.
@@ -27,7 +29,8 @@ def calibrate(config: configuration.Calibrate, source: str, out: Path | None, fo
     with open_folder("calibrate", config, robot, out, force, runs) as folder:
         found = run(
             runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
-            model=config.model, starts=config.starts, population=config.population, seed=config.seed,
+            model=config.model, starts=config.starts, population=config.population,
+            generations=config.generations, members=members, seed=config.seed,
             profiles=config.profiles, blocks=config.hold_out, tell=tell,
         )  # fmt: skip
         found.save(folder.partial, config.robot)

@@ -370,9 +370,14 @@ def calibrate(
     population: Annotated[
         int | None,
         typer.Option(
-            help="Draws of which the best is where a search with drive or track begins.  "
-            "\\[default: 256 where the running gear is free, else 0]"
+            help="Members of each generation of a search without gradients, with which one with drive or track "
+            "begins.  \\[default: 256 where the running gear is free, else 0]"
         ),
+    ] = None,
+    generations: Annotated[int | None, typer.Option(help="Of the population, at most.  \\[default: 12]")] = None,
+    members: Annotated[
+        Path | None,
+        typer.Option(help="File that keeps the population's runs; the same command with it goes on from there."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the starts.  \\[default: 0]")] = None,
     profiles: Annotated[
@@ -395,19 +400,20 @@ def calibrate(
     """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
 
     Writes robot.toml, which every command takes with --robot, and result.json. With --model drive or track the search
-    begins at the optimum of steady; track takes minutes. Intervals are linear then, unless --profiles.
+    begins at the optimum of steady; track takes minutes. Intervals are linear then, unless --profiles. With the
+    running gear free (--model track --free running_gear.guide_recess,...) a population is searched first.
     """
     from sweeps import config
 
     options = _options(model=model, robot=robot, set=set_, effects=effects, report=report) | {
         "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
-        "noise": noise, "starts": starts, "population": population, "seed": seed, "profiles": profiles,
-        "hold_out": hold_out,
+        "noise": noise, "starts": starts, "population": population, "generations": generations, "seed": seed,
+        "profiles": profiles, "hold_out": hold_out,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Calibrate, None, options), no_cache)
     from sweeps import calibrate as room
 
-    return room.calibrate(resolved, data, out, force)
+    return room.calibrate(resolved, data, out, force, members)
 
 
 @app.command(epilog="Example: mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml")

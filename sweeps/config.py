@@ -221,7 +221,8 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
 
     Attributes:
         free, fix: parameters to free (`default` stands for the default set) and to hold, by dotted name.
-        starts: searches; population: draws among which a rollout chooses where they begin.
+        starts: searches; population: members of each generation of a search without gradients
+            before those of a rollout; generations: at most.
         profiles: whether to profile every parameter.
         hold_out: whether to fit again without each block. None leaves these three to the fidelity.
     """
@@ -230,6 +231,7 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
     fix: tuple[str, ...] = ()
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = None
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    generations: Annotated[int, Field(ge=1, le=10_000)] | None = None
     profiles: bool | None = None
     hold_out: bool | None = None
 

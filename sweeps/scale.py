@@ -54,8 +54,8 @@ class Job:
 
 @dataclasses.dataclass
 class Times:
-    """Seconds spent by what overlaps: waiting for points and starting to compute them (on processors that is computing
-    itself); waiting for what is computed, fetching it from the device, writing it; and the whole."""
+    """Seconds spent by what overlaps: waiting for points and starting to compute them (on processors that is all of
+    computing); waiting for what is computed, fetching it from the device, writing it; and the whole."""
 
     points: float = 0.0
     start: float = 0.0

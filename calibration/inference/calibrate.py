@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +14,23 @@ from calibration.data import own_mass, robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
-from calibration.inference import checks, estimates, identifiability, lack_of_fit, multistart, observers, priors
+from calibration.inference import (
+    checks,
+    estimates,
+    identifiability,
+    lack_of_fit,
+    multistart,
+    observers,
+    population,
+    priors,
+)
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.foreign import foreign_priors
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
+from calibration.inference.population import GENERATIONS
 from calibration.inference.posterior import of_coordinates
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
@@ -28,8 +39,10 @@ from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 
-#: Draws among which a rollout chooses its start where parameters are free that `steady` does not read.
+#: Members of a generation where parameters are free that `steady` does not read.
 POPULATION = 256
+#: Parameters that the resolved running gear gives another meaning: beginnings after their configuration.
+FRICTION = "ground.friction."
 #: Source of the prior of a guide friction whose share is a result of the model.
 _OF_PRODUCT = "its product with the share of the guides, as in the other fidelities"
 
@@ -45,6 +58,8 @@ def calibrate(
     model: str = "steady",
     starts: int | None = None,
     population: int | None = None,
+    generations: int | None = None,
+    members: Path | None = None,
     seed: int = 0,
     profiles: bool | None = None,
     blocks: Sequence[str] | bool | None = None,
@@ -60,8 +75,10 @@ def calibrate(
         model: name of a fidelity.
         starts: the prior mean and `starts - 1` draws from the prior; for settled rows with a rollout the optimum of
             `steady` and draws from its posterior.
-        population: draws among which a rollout chooses where its searches begin, by its own objective; None takes
-            `POPULATION` where parameters are free that `steady` does not read, else none.
+        population: members of each generation of a search without gradients, with which that of a rollout begins;
+            None takes `POPULATION` where parameters are free that `steady` does not read, else none.
+        generations: at most, None `population.GENERATIONS`; members: file in which those that were run are kept, and
+            from which the same calibration goes on.
         profiles: whether to profile every parameter.
         blocks: kinds of blocks to hold out; True: all that tell something of such data.
             These three by default as the kind of data and the fidelity say.
@@ -115,7 +132,10 @@ def calibrate(
 
     if population is None:
         population = POPULATION if fidelities.unread("steady", names) else 0
-    found, beside = _searched(runs, base, posed, known, starts, population, seed, tell)
+    if (members is not None or generations is not None) and not population:
+        raise BadConfiguration("--generations, --members: there is no population; state --population")
+    evolved = _Evolved(population, generations or GENERATIONS, members)
+    found, beside = _searched(runs, base, posed, known, starts, evolved, seed, tell)
     posed, z = found.problem, np.asarray(found.best.z)
     fitted = posed.robot(jnp.asarray(z))
     after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
@@ -128,7 +148,9 @@ def calibrate(
         doing = ["the linear analysis", *["profiles"] * profiles, *["blocks held out"] * bool(kinds)]
         tell(f"optimum found; now {', '.join(doing)}")
     notes += posed.observe.cautions(fitted)
-    about = identifiability.analyse(posed, jnp.asarray(z))
+    searched = found.searched
+    about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
+    notes += searched.statements() if searched is not None else []
     profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about) if profiles else None
     masks = {kind: holdout.blocks(runs, kind) for kind in kinds}
     held = holdout.held_out(posed, np.asarray(z), masks)
@@ -162,6 +184,7 @@ def calibrate(
         objective=float(found.best.cost),
         converged=bool(found.best.converged),
         starts=found.starts,
+        searched=searched,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
         adequacy=lack_of_fit.adequacy(left, known=not known.estimated.any()),
         identifiability=about,
@@ -198,7 +221,7 @@ def _searched(
     posed: Problem,
     known: Noise,
     starts: int,
-    population: int,
+    evolved: _Evolved,
     seed: int,
     tell: Callable[[str], None],
 ) -> tuple[Found, np.ndarray | None]:
@@ -216,10 +239,42 @@ def _searched(
     points[0] = beside = np.asarray(easy.best.z)
     points[1:] = multistart.nearby(easy.problem, beside, rng, len(points) - 1)
     posed = dataclasses.replace(posed, data=easy.problem.data)
-    if population:
-        draws = multistart.nearby(easy.problem, beside, rng, population)
-        points = multistart.best_of(posed, np.concatenate([points, draws]), tell)[:starts]
-    return multistart.search_one_by_one(posed, known, points, easy.shares, tell), beside
+    if not evolved.size:
+        return multistart.search_one_by_one(posed, known, points, easy.shares, tell), beside
+    covariance = _first_generation(easy.problem, beside)
+    members = population.Members(posed, evolved.file)
+    everyone = population.evolve(
+        members, population.objective(posed, known), beside, covariance, size=evolved.size,
+        generations=evolved.generations, seed=seed, beside=points, tell=tell,
+    )  # fmt: skip
+    at = int(everyone.order[0])
+    posed, shares = multistart.noisier_at(posed, known, everyone, at)
+    tell("population done; now derivatives against differences at the best")
+    about = identifiability.analyse(posed, jnp.asarray(everyone.z[at]))
+    off = population.apart(posed, members, everyone.z[at], about.jacobian, about.sd)
+    names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
+    slope, left = population.regression(posed, everyone, at) if names else (None, np.nan)
+    searched = population.Searched(everyone, at, names, slope, left)
+    return multistart.at_best(posed, known, shares, searched, tell), beside
+
+
+@dataclasses.dataclass(frozen=True)
+class _Evolved:
+    """A search by generations: members of each, 0 for none; how many at most; the file in which members are kept."""
+
+    size: int
+    generations: int
+    file: Path | None
+
+
+def _first_generation(easy: Problem, z: np.ndarray) -> np.ndarray:
+    """Covariance of the first generation: what `steady` knows, but the friction of contacts is as the prior says, as
+    it meant another thing to `steady`."""
+    covariance = identifiability.analyse(easy, jnp.asarray(z)).covariance.copy()
+    friction = np.array([FRICTION in name for name in easy.coordinates.names])
+    covariance[friction] = covariance[:, friction] = 0.0
+    covariance[friction, friction] = 1.0
+    return covariance
 
 
 def _reached(posed: Problem, status: np.ndarray, reading: jax.Array) -> np.ndarray:

@@ -87,13 +87,16 @@ def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
     return jacobian[fit.informing(data)], jacobian[: data.measured.size]
 
 
-def analyse(problem: Problem, z: Array, data: Data | None = None) -> Identifiability:
+def analyse(problem: Problem, z: Array, data: Data | None = None, slope: np.ndarray | None = None) -> Identifiability:
     """The linear analysis of `problem` at coordinates z, from readings and priors alone.
 
+    `slope`, where it is given, is taken for the Jacobian of the whitened readings, (rows · channels, parameters).
     Where the adhesion limit holds z the limit is one-sided, which is for the profile to show: no sd does.
     """
     data = problem.data if data is None else data
-    if problem.observe.long:
+    if slope is not None:
+        whole, readings = np.concatenate([slope, np.eye(len(z))]), slope
+    elif problem.observe.long:
         jacobian = np.asarray(fit.linearised(problem, z, data)[1])
         whole, readings = jacobian[fit.informing(data)], jacobian[: data.measured.size]
     else:

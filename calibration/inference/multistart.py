@@ -7,17 +7,16 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from calibration.inference import identifiability
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.noise import Noise
-from calibration.inference.problem import Data, Problem
+from calibration.inference.population import Population, Searched
+from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.robot import Robot
 
 #: Costs closer than this to the best [½σ²] are the same optimum.
@@ -26,8 +25,6 @@ AGREE = 1e-3
 ROUNDS, SETTLED_SHARE = 30, 1e-3
 #: Draws among which the starts of a rollout's searches are chosen.
 DRAWS = 2000
-#: Members of a population that are run together.
-TOGETHER = 16
 #: Tightenings of the penalty on adhesion, tenfold each.
 TIGHTENINGS = 3
 
@@ -80,12 +77,14 @@ class Found:
         problem: with the noise (and stiffness) it ended with; best: its optimum.
         starts: how the searches ended.
         shares: estimated sd of each channel as a share of its size, NaN where the sd was known.
+        searched: the population that it began from, None without.
     """
 
     problem: Problem
     best: fit.Optimum
     starts: Starts
     shares: np.ndarray
+    searched: Searched | None = None
 
 
 def unreachable(posed: Problem, status: np.ndarray) -> np.ndarray:
@@ -182,29 +181,32 @@ def nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -
     return draws[np.argsort(lost, kind="stable")[:count]]
 
 
-@eqx.filter_jit
-def _objectives(posed: Problem, points: Float[Array, "points parameters"]) -> Float[Array, " points"]:
-    def one(z: jax.Array) -> jax.Array:
-        residual = jnp.concatenate([posed.misfit(z, posed.data), z - posed.data.centre])
-        return 0.5 * jnp.sum(residual**2)
+def at_best(
+    posed: Problem, noise: Noise, shares: np.ndarray, searched: Searched, tell: Callable[[str], None]
+) -> Found:
+    """What a population found, its best member searched on by gradients where those are to be trusted."""
+    z = searched.found.z[searched.at]
+    if searched.slope is None:
+        return dataclasses.replace(search_one_by_one(posed, noise, z[None], shares, tell), searched=searched)
+    seen = Observation(*(jnp.asarray(x[searched.at]) for x in (
+        searched.found.reading, searched.found.adhesion_used, searched.found.status,
+    )))  # fmt: skip
+    error = np.concatenate([np.asarray(posed.whitened(seen, posed.data)), z - np.asarray(posed.data.centre)])
+    rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion
+    best = fit.optimum(np.concatenate([searched.slope, rows, np.eye(len(z))]), error, z, posed.data)
+    settled = np.array([searched.found.settled])
+    best = dataclasses.replace(best, converged=jnp.asarray(searched.found.settled))
+    ended = Starts(np.array([float(best.cost)]), settled, sum(g.failed for g in searched.found.generations))
+    return Found(posed, best, ended, shares, searched)
 
-    return jax.vmap(one)(points)
 
-
-def best_of(posed: Problem, points: np.ndarray, tell: Callable[[str], None]) -> np.ndarray:
-    """Points in the order of the problem's own objective, the lowest first.
-
-    What a rollout resolves may have thresholds (contacts that open and close), across which no gradient leads.
-    """
-    begun, cost = time.perf_counter(), np.full(len(points), np.inf)
-    for first in range(0, len(points), TOGETHER):
-        part = points[first : first + TOGETHER]
-        filled = np.concatenate([part, np.repeat(part[-1:], TOGETHER - len(part), 0)])
-        found = np.asarray(_objectives(posed, jnp.asarray(filled)))[: len(part)]
-        cost[first : first + TOGETHER] = np.where(np.isfinite(found), found, np.inf)
-        done, minutes = min(first + TOGETHER, len(points)), (time.perf_counter() - begun) / 60
-        tell(f"population: {done} of {len(points)}, lowest objective {cost.min():.4g}, {minutes:.1f} min")
-    return points[np.argsort(cost, kind="stable")]
+def noisier_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
+    """The problem with the noise that is most probable for a member, and the shares that it is of readings."""
+    weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
+    error = np.where(weight > 0, (searched.reading[at] - np.asarray(posed.data.measured)) / size, 0.0)
+    share = np.sqrt(np.sum(error**2, 0) / np.maximum(weight.sum(0), 1.0))
+    shares = np.where(noise.estimated, np.hypot(share, noise_room.FLOOR), np.nan)
+    return _noisier(posed, noise, shares), shares
 
 
 def first_shares(noise: Noise) -> np.ndarray:

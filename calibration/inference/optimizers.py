@@ -130,6 +130,12 @@ def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: A
     return Optimum(pin.apply(z), sd, cost, decrement, decrement < DECREMENT + DECREMENT_SHARE * cost, steps)
 
 
+def optimum(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
+    """A point as an optimum, from its residuals (misfit, then prior) and their Jacobian, however these were found."""
+    j, r, at = (jnp.asarray(x, float) for x in (jacobian, residual, z))
+    return _optimum(j, r, at, data, no_pin(len(z)), jnp.asarray(0))
+
+
 class Search(optx.LevenbergMarquardt):
     """Levenberg-Marquardt that also ends after `PATIENCE` steps in a row that did not lower the objective.
 

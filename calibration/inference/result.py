@@ -14,6 +14,7 @@ from calibration.data.posterior import Posterior
 from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
+from calibration.inference.population import Searched
 from mmrjax import channels
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
@@ -256,7 +257,7 @@ class CalibrationResult:
         status_before, status: word of each row, shape (rows,).
         adhesion_used: by the calibrated robot [-], shape (rows,).
         objective: at the optimum [½σ²]; converged: whether the search did.
-        starts: how all searches ended.
+        starts: how all searches ended; searched: the population that came before them, None without.
         chi_square: of the readings that are there; adequacy: whether they are what noise leaves.
         identifiability: the linear analysis; posterior: of the free parameters.
         notes: sentences worth reading before it is used.
@@ -282,6 +283,7 @@ class CalibrationResult:
     objective: float
     converged: bool
     starts: Starts
+    searched: Searched | None
     chi_square: ChiSquare
     adequacy: Adequacy
     identifiability: Identifiability
@@ -337,6 +339,7 @@ class CalibrationResult:
                     "starts_at_best": self.starts.agree,
                     "agreement": self.starts.statement(),
                     "seed": self.seed,
+                    "population": None if self.searched is None else self.searched.to_json(),
                 },
                 "chi2": dataclasses.asdict(self.chi_square),
                 "adequate": self.adequacy.to_json(),

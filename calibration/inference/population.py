@@ -1,0 +1,346 @@
+"""Searches that need no gradient: a population of robots run in one batch, in generations.
+
+What a rollout resolves has thresholds (contacts that open and close, regimes of vibration), across which no gradient
+leads. Members are drawn by CMA-ES (Hansen and Ostermeier 2001; the library `cmaes`); everything that a member's run
+gave is kept, so that noise can be estimated anew without running it again, and so that a regression over the members
+says how readings change near the best.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from calibration.data.errors import BadConfiguration
+from calibration.inference import noise as noise_room
+from calibration.inference.noise import Noise
+from calibration.inference.problem import MISSING, Observation, Problem
+
+#: Members that are run together: on processors, and on an accelerator.
+TOGETHER = (16, 512)
+#: Generations after which a search ends, and how many of them may pass without a gain of so much [½σ²].
+GENERATIONS, PATIENCE, GAIN = 12, 4, 0.5
+#: What a row that is not reached costs [½σ²].
+LOST = 1e3
+#: Members of the local regression for each coefficient of it.
+MEMBERS_EACH = 3
+#: Step of the differences by which derivatives are checked [posterior sd], and how far the two may be apart.
+STEP, APART = 0.2, 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class Generation:
+    """What a generation found.
+
+    Attributes:
+        members: that were run; failed: of them, those with a row that could not be run or left the ground.
+        lowest: objective of the best so far; median: of this generation [½σ²].
+    """
+
+    members: int
+    failed: int
+    lowest: float
+    median: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Population:
+    """All members of a search.
+
+    Attributes:
+        z: coordinates, shape (members, parameters).
+        reading: what the model says of every row [SI], shape (members, rows, channels).
+        adhesion_used, status: of every row, shape (members, rows).
+        cost: objective with the noise that the search ended with [½σ²]; inf where it has none.
+        generations: in order.
+    """
+
+    z: Float[np.ndarray, "members parameters"]
+    reading: Float[np.ndarray, "members rows channels"]
+    adhesion_used: Float[np.ndarray, "members rows"]
+    status: Int[np.ndarray, "members rows"]
+    cost: Float[np.ndarray, " members"]
+    generations: tuple[Generation, ...]
+
+    @property
+    def order(self) -> Int[np.ndarray, " members"]:
+        """Members by their cost, the lowest first."""
+        return np.argsort(self.cost, kind="stable")
+
+    @property
+    def settled(self) -> bool:
+        """Whether the last generations gained nothing that counts."""
+        lowest = [g.lowest for g in self.generations]
+        return len(lowest) > PATIENCE and lowest[-PATIENCE - 1] - lowest[-1] < GAIN
+
+
+class Rows(NamedTuple):
+    """What the model says of every row, for members: see `Population`."""
+
+    reading: Float[np.ndarray, "members rows channels"]
+    adhesion_used: Float[np.ndarray, "members rows"]
+    status: Int[np.ndarray, "members rows"]
+
+
+Objective = Callable[[np.ndarray, Rows], Float[np.ndarray, " members"]]
+
+
+def identity(posed: Problem) -> str:
+    """What makes two problems the same: data, base robot, coordinates, model."""
+    arrays, rest = eqx.partition(posed, eqx.is_array_like)
+    digest = hashlib.sha256(str(rest).encode())
+    for leaf in jax.tree.leaves(arrays):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()[:16]
+
+
+class Members:
+    """Runs members, and keeps what they gave, in a file where one is named, from which a search goes on.
+
+    Raises:
+        BadConfiguration: the file is none of members, of another problem's members, or cannot be written.
+    """
+
+    def __init__(self, posed: Problem, file: Path | None = None) -> None:
+        # The noise is none of it: it may be estimated anew on the way.
+        bare = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
+        self._posed, self._file, self._own = posed, file, identity(dataclasses.replace(posed, data=bare))
+        self._kept: dict[bytes, tuple[np.ndarray, ...]] = {}
+        if file is not None and file.exists():
+            self._load(file)
+
+    def _load(self, file: Path) -> None:
+        try:
+            with np.load(file) as there:
+                own, arrays = str(there["identity"]), [there[k] for k in ("z", "reading", "adhesion_used", "status")]
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise BadConfiguration(f"--members {file}: no file of members; {error}") from None
+        if own != self._own:
+            raise BadConfiguration(
+                f"--members {file}: its members are of another calibration (data, robot, parameters or model); "
+                "remove it, or name another file"
+            )
+        self._kept = {row[0].tobytes(): row[1:] for row in zip(*arrays, strict=True)}
+
+    def _save(self) -> None:
+        if self._file is None:
+            return
+        z = np.array([np.frombuffer(key) for key in self._kept])
+        reading, adhesion_used, status = map(np.array, zip(*self._kept.values(), strict=True))
+        aside = self._file.with_name(self._file.name + ".partial")
+        try:
+            with aside.open("wb") as out:
+                own = np.array(self._own)
+                np.savez(out, identity=own, z=z, reading=reading, adhesion_used=adhesion_used, status=status)
+                out.flush()
+                os.fsync(out.fileno())
+            aside.replace(self._file)
+        except OSError as error:
+            aside.unlink(missing_ok=True)
+            raise BadConfiguration(f"--members {self._file}: cannot be written: {error.strerror}") from None
+
+    def lost(self, seen: Rows) -> Bool[np.ndarray, "members rows"]:
+        """Measured rows that the model does not reach."""
+        return self._posed.observe.unreachable(seen.status) & (np.asarray(self._posed.data.weight).max(1) > 0)
+
+    def run(self, points: np.ndarray, advance: Callable[[int], None] = lambda _: None) -> Rows:
+        """What the model says of every row for each point."""
+        keys = [np.ascontiguousarray(z, float).tobytes() for z in points]
+        new = [z for key, z in zip(keys, points, strict=True) if key not in self._kept]
+        together = TOGETHER[jax.default_backend() != "cpu"]
+        for first in range(0, len(new), together):
+            part = np.array(new[first : first + together])
+            filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
+            seen = jax.device_get(_observed(self._posed, jnp.asarray(filled)))
+            for z, *row in zip(part, seen.reading, seen.adhesion_used, seen.status, strict=False):
+                self._kept[z.tobytes()] = tuple(map(np.asarray, row))
+            self._save()
+            advance(len(points) - len(new) + first + len(part))
+        reading, adhesion_used, status = map(np.array, zip(*map(self._kept.__getitem__, keys), strict=True))
+        return Rows(reading, adhesion_used, status)
+
+
+@eqx.filter_jit
+def _observed(posed: Problem, points: Float[Array, "points parameters"]) -> Observation:
+    return jax.vmap(posed.observation)(points)
+
+
+def objective(posed: Problem, noise: Noise) -> Objective:
+    """Half the sum of squares of misfit and prior, of members; where the sd of a channel is not known, with the sd
+    that is most probable for that member: n ln s in place of its squares, s the rms of its errors as shares of the
+    readings.
+
+    A row that was measured and that a member does not reach costs `LOST`; a member of which a reading that counts
+    could not be computed has no cost: inf.
+    """
+    data = posed.data
+    weight, measured, sd = np.asarray(data.weight), np.asarray(data.measured), np.asarray(data.sd)
+    size = noise.sd / noise_room.START
+
+    def of(z: np.ndarray, seen: Rows) -> Float[np.ndarray, " members"]:
+        error = np.where(weight > 0, seen.reading - measured, 0.0)
+        squares = np.sum((z - np.asarray(data.centre)) ** 2, -1)
+        for k, estimated in enumerate(noise.estimated):
+            count = weight[:, k].sum()
+            if estimated and count:
+                share = np.sqrt(np.sum(weight[:, k] * (error[..., k] / size[:, k]) ** 2, -1) / count)
+                squares += 2 * count * np.log(np.hypot(share, noise_room.FLOOR))
+            else:
+                squares += np.sum(weight[:, k] * (error[..., k] / sd[:, k]) ** 2, -1)
+        cost = 0.5 * squares + LOST * (posed.observe.unreachable(seen.status) & (weight.max(1) > 0)).sum(-1)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    return of
+
+
+def evolve(
+    members: Members,
+    objective: Objective,
+    centre: np.ndarray,
+    covariance: np.ndarray,
+    *,
+    size: int,
+    seed: int,
+    generations: int = GENERATIONS,
+    beside: np.ndarray | None = None,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> Population:
+    """Search by generations.
+
+    Args:
+        members: runs them; objective: of members.
+        centre, covariance: of the first generation, in coordinates z.
+        size: members of a generation; seed: of the draws.
+        beside: points that are run with the first generation.
+        tell: is given a sentence after every batch.
+    """
+    from cmaes import CMA
+
+    begun = time.perf_counter()
+    search = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
+    z = np.empty((0, len(centre))) if beside is None else np.asarray(beside, float)
+    seen, told = None, list[Generation]()
+    for number in range(1, generations + 1):
+        drawn = np.array([search.ask() for _ in range(size)])
+        asked = drawn if number > 1 or not len(z) else np.concatenate([z, drawn])
+
+        def advance(done: int) -> None:
+            minutes = (time.perf_counter() - begun) / 60
+            tell(f"generation {number}: {done} of {len(asked)} members, {minutes:.1f} min")  # noqa: B023
+
+        now = members.run(asked, advance)
+        z = asked if seen is None else np.concatenate([z, asked])
+        seen = now if seen is None else Rows(*map(np.concatenate, zip(seen, now, strict=True)))
+        cost = objective(z, seen)
+        own = cost[-size:]
+        search.tell([(d, float(c)) for d, c in zip(drawn, np.where(np.isfinite(own), own, MISSING**2), strict=True)])
+        failed = int(np.sum(members.lost(now).any(-1)))
+        told.append(Generation(len(asked), failed, float(cost.min()), float(np.median(own))))
+        tell(f"generation {number}: lowest objective {cost.min():.4g}, median {np.median(own):.4g}, {failed} failed")
+        found = Population(z, *seen, cost, tuple(told))
+        if found.settled:
+            break
+    return found
+
+
+def regression(posed: Problem, found: Population, at: int) -> tuple[Float[np.ndarray, "readings parameters"], float]:
+    """How whitened readings change with z near a member, by least squares over the members nearest to it.
+
+    Where contacts open and close the derivative of a run says what happens without that; this says what happens
+    with it, over the distance of the members.
+
+    Returns:
+        The slope, shape (rows · channels, parameters), and the rms of what it leaves [σ].
+    """
+    there = np.isfinite(found.cost)
+    z, reading = found.z[there], found.reading[there]
+    number = min(len(z), MEMBERS_EACH * (z.shape[1] + 1))
+    spread = np.linalg.pinv(np.cov(z.T).reshape(z.shape[1], -1))
+    apart = z - found.z[at]
+    near = np.argsort(np.einsum("ij,jk,ik->i", apart, spread, apart), kind="stable")[:number]
+    scale = np.asarray(posed.data.weight / posed.data.sd)
+    moved = ((reading[near] - found.reading[at]) * scale).reshape(number, -1)
+    design = np.column_stack([np.ones(number), apart[near]])
+    # A ridge of one prior sd: what the members do not tell is no slope.
+    ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
+    slope = np.linalg.solve(design.T @ design + ridge, design.T @ moved)
+    left = moved - design @ slope
+    return slope[1:].T, float(np.sqrt(np.mean(left**2)))
+
+
+def apart(
+    posed: Problem, members: Members, z: np.ndarray, jacobian: np.ndarray, sd: np.ndarray
+) -> Bool[np.ndarray, " parameters"]:
+    """Parameters by which the derivatives of a run are not those of its differences, shape (parameters,).
+
+    Differences are central, `STEP` of the posterior sd to either side; a column is apart where it differs by more
+    than `APART` of its size and by more than one data sd per posterior sd.
+    """
+    steps = STEP * np.diag(sd)
+    seen = members.run(np.concatenate([z + steps, z - steps]))
+    scale = np.asarray(posed.data.weight / posed.data.sd)
+    ahead, behind = np.split(np.where(scale > 0, seen.reading * scale, 0.0), 2)
+    differences = ((ahead - behind) / (2 * STEP)).reshape(len(z), -1)  # per posterior sd
+    derivatives = jacobian.T * sd[:, None]
+    off = np.linalg.norm(derivatives - differences, axis=1)
+    size = np.maximum(np.linalg.norm(differences, axis=1), np.linalg.norm(derivatives, axis=1))
+    return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class Searched:
+    """What a search by generations led to.
+
+    Attributes:
+        found: every member; at: the best of them.
+        apart: names of parameters by which the derivatives of a run are not those of its differences.
+        slope: of the whitened readings, from the members, where derivatives are not to be trusted; else None.
+        left: rms of what the slope leaves of the members that it is from [σ], NaN without.
+    """
+
+    found: Population
+    at: int
+    apart: tuple[str, ...]
+    slope: np.ndarray | None
+    left: float
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {
+            "members": len(self.found.z),
+            "settled": self.found.settled,
+            "generations": [dataclasses.asdict(g) for g in self.found.generations],
+            "derivatives_apart": list(self.apart),
+            "regression_rms_sd": self.left if np.isfinite(self.left) else None,
+        }
+
+    def statements(self) -> list[str]:
+        """What to know of it, a sentence each."""
+        said = [
+            f"{len(self.found.z)} members in {len(self.found.generations)} generations; "
+            + ("the last gained nothing that counts" if self.found.settled else "the last still gained: go on with "
+               "more --generations")
+        ]  # fmt: skip
+        failed = sum(g.failed for g in self.found.generations)
+        if failed:
+            said.append(
+                f"{failed} of the members have a row that slides, tips or cannot be run; none of them is best"
+            )
+        if self.apart:
+            said.append(
+                f"derivatives of the run by {', '.join(self.apart)} are not those of its differences (contacts open "
+                "and close): what the rows determine is read from a regression over the members near the best, which "
+                f"leaves {self.left:.2g} sd rms"
+            )
+        return said
