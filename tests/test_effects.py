@@ -620,7 +620,7 @@ mass_error mass_offset rotating_inertia supply_sag battery_sag series_resistance
 thermal_drift armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
 gear_quadratic_loss stribeck_gear churning stribeck_track tension_friction centrifugal_tension bending_loss stick_slip
 speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip
-speed_slip load_slip pulley_eccentricity ammeter_gain ammeter_offset encoder_scale speed_gain
+speed_slip load_slip pulley_eccentricity vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain
 """.split()  # noqa: SIM905
 MODULES = [m.name for m in pkgutil.iter_modules(effects.__path__, "mmrjax.effects.")]
 

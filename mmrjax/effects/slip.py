@@ -6,9 +6,12 @@ import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
 from mmrjax.effects.periodic import Periodic, phase_parameter
-from mmrjax.params import Index, Scalar
+from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
+
+#: Speed [m/s] and distance of the demand from its limit [-] within which the law of shaking contacts is rounded off.
+SLOWEST, ROUNDED = 1e-3, 0.05
 
 
 class SlipEffect(Effect):
@@ -158,3 +161,40 @@ class PulleyEccentricity(Periodic, SlipEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return -self.amplitude * signals.speed_theoretical * self.wave(signals)
+
+
+class VibrationSlip(SlipEffect):
+    """ΔV = a (V_teor / 1 m/s)^p u / (1 - u), u = demand over the adhesion limit of eq. (6); on tracks alone.
+
+    Contacts that shake slide while they bear little; dry friction turns into an apparent viscous one.
+
+    Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 averaged over
+    contacts that swing by s (`mmrjax.vibration`), where V_s is small beside s: slip in proportion to s and, with the
+    load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows (docs/vibration.md). The last is
+    rounded off within 0.05 of the limit, beyond which the robot slides anyway. A loss where demand and traction
+    agree in sign.
+    """
+
+    driver = "demand"
+    movers = "tracks"
+
+    amplitude: Scalar = amplitude(
+        unit="m/s",
+        meaning="speed lost at 1 m/s and half of the adhesion",
+        bounds=(-0.05, 0.5),
+        sd=0.03,
+        source="contacts of the track model swing by 1 to 4 % of the speed: running gears of docs/vibration.md",
+    )
+    exponent: Scalar = parameter(
+        2.0,
+        unit="-",
+        meaning="exponent p of the speed with which the swing grows",
+        bounds=(0.0, 5.0),
+        sd=0.7,
+        source="inertia forces of what shakes grow as the square of its frequency; running gears: 2.1 to 3.4",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        used = signals.demand / signals.adhesion_limit
+        speed = jnp.sqrt(signals.speed_theoretical**2 + SLOWEST**2) ** self.exponent
+        return self.amplitude * speed * used / jnp.hypot(1 - jnp.abs(used), ROUNDED) * signals.direction
