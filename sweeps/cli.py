@@ -374,7 +374,7 @@ def calibrate(
             "begins.  \\[default: 256 where the running gear is free, else 0]"
         ),
     ] = None,
-    generations: Annotated[int | None, typer.Option(help="Of the population, at most.  \\[default: 12]")] = None,
+    generations: Annotated[int | None, typer.Option(help="Of the population, at most.  \\[default: 30]")] = None,
     members: Annotated[
         Path | None,
         typer.Option(help="File that keeps the population's runs; the same command with it goes on from there."),

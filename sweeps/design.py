@@ -266,31 +266,48 @@ def permutation(key: int, number: int, points: UInt64[np.ndarray, " points"]) ->
     answer = np.array(points)
     for first in range(0, len(answer), CACHED):
         block = answer[first : first + CACHED]
-        left = np.arange(len(block))
+        left, scratch = np.arange(len(block)), np.empty((2, len(block)), np.uint64)
         while len(left):
             high, low = np.divmod(block[left], np.uint64(b))
+            x, y = scratch[:, : len(left)]
             for k in range(0, ROUNDS, 2):
-                high = _added(high, _mixed(low, keys[k]), np.uint64(a))
-                low = _added(low, _mixed(high, keys[k + 1]), np.uint64(b))
-            found = high * np.uint64(b) + low
-            block[left] = found
-            left = left[found >= number]
+                _add(high, _mixed(low, keys[k], x, y), np.uint64(a), y)
+                _add(low, _mixed(high, keys[k + 1], x, y), np.uint64(b), y)
+            high *= np.uint64(b)
+            high += low
+            block[left] = high
+            left = left[high >= number]
     return answer
 
 
-def _added(x: UInt64[np.ndarray, " n"], word: UInt64[np.ndarray, " n"], most: np.uint64) -> UInt64[np.ndarray, " n"]:
-    """x + r modulo `most` (below 2^32), r being what the upper half of a word is of 0 .. most - 1."""
-    total = x + ((word >> np.uint64(32)) * most >> np.uint64(32))
-    return np.minimum(total, total - most)  # below 0 it wraps round to what is larger
+Words = UInt64[np.ndarray, " n"]
 
 
-def _mixed(words: UInt64[np.ndarray, " n"], key: np.uint64) -> UInt64[np.ndarray, " n"]:
-    """The finaliser of splitmix64 (Steele et al. 2014) on words and a key."""
+def _add(x: Words, word: Words, most: np.uint64, scratch: Words) -> None:
+    """x = x + r modulo `most` (below 2^32), r being what the upper half of a word is of 0 .. most - 1."""
+    word >>= np.uint64(32)
+    word *= most
+    word >>= np.uint64(32)
+    x += word
+    np.subtract(x, most, out=scratch)
+    np.minimum(x, scratch, out=x)  # below 0 it wraps round to what is larger
+
+
+def _mixed(words: Words, key: np.uint64, x: Words, scratch: Words) -> Words:
+    """The finaliser of splitmix64 (Steele et al. 2014) on words and a key, in x.
+
+    In place throughout: memory that each thread asks for anew keeps the others waiting.
+    """
     with np.errstate(over="ignore"):
-        x = words * np.uint64(0x9E3779B97F4A7C15) + key
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        return x ^ (x >> np.uint64(31))
+        np.multiply(words, np.uint64(0x9E3779B97F4A7C15), out=x)
+        x += key
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+            np.right_shift(x, np.uint64(shift), out=scratch)
+            x ^= scratch
+            x *= np.uint64(factor)
+        np.right_shift(x, np.uint64(31), out=scratch)
+        x ^= scratch
+    return x
 
 
 #: Bits of a Sobol number, which a double holds beside the half that keeps it off 0.

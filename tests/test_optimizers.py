@@ -62,22 +62,6 @@ def starts(size, count, seed=0):
     return jnp.asarray(np.random.default_rng(seed).standard_normal((count, size)))
 
 
-def test_a_population_is_put_in_the_order_of_its_objective(clean, truth):
-    """Across calls of so many members, the last one filled up; the truth is the best."""
-    rng = np.random.default_rng(8)
-    count = multistart.TOGETHER + 3
-    points = np.asarray(truth) + 0.3 * rng.standard_normal((count, len(truth)))
-    points[-1] = truth
-    told: list[str] = []
-    ordered = multistart.best_of(clean, points, told.append)
-    cost = [
-        0.5 * float(jnp.sum(clean.misfit(jnp.asarray(z), clean.data) ** 2) + jnp.sum((z - clean.data.centre) ** 2))
-        for z in ordered
-    ]
-    assert cost == sorted(cost) and cost[0] == pytest.approx(0.0, abs=1e-12)
-    assert f"population: {count} of {count}, lowest objective" in told[-1] and len(told) == 2
-
-
 def test_normal_equations_solve():
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((9, 5)), rng.standard_normal(9)

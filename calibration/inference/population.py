@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import os
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +31,7 @@ from calibration.inference.problem import MISSING, Observation, Problem
 #: Members that are run together: on processors, and on an accelerator.
 TOGETHER = (16, 512)
 #: Generations after which a search ends, and how many of them may pass without a gain of so much [½σ²].
-GENERATIONS, PATIENCE, GAIN = 12, 4, 0.5
+GENERATIONS, PATIENCE, GAIN = 30, 8, 0.5
 #: What a row that is not reached costs [½σ²].
 LOST = 1e3
 #: Members of the local regression for each coefficient of it.
@@ -122,9 +123,9 @@ class Members:
 
     def _load(self, file: Path) -> None:
         try:
-            with np.load(file) as there:
+            with file.open("rb") as bytes_, np.load(bytes_) as there:
                 own, arrays = str(there["identity"]), [there[k] for k in ("z", "reading", "adhesion_used", "status")]
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise BadConfiguration(f"--members {file}: no file of members; {error}") from None
         if own != self._own:
             raise BadConfiguration(

@@ -1,0 +1,249 @@
+"""Searches by generations: what they find, what is kept, what the members say of derivatives, bad files."""
+
+import dataclasses
+import errno
+import os
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from calibration.inference import identifiability, noise, observers, population, priors
+from calibration.inference.calibrate import calibrate
+from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.population import Members, Rows
+from calibration.inference.problem import Observation
+from mmrjax import channels, robots
+
+NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
+SIZE = 48
+
+
+class Stepped(SettledRuns):
+    """Settled rows whose current jumps where the armature's resistance passes its prior mean, as a contact would
+    close."""
+
+    def __call__(self, robot):
+        seen = super().__call__(robot)
+        jump = jnp.where(robot.motor.resistance > robots.nominal().motor.resistance, 0.3, 0.0)
+        return Observation(seen.reading.at[:, 0].add(jump), seen.adhesion_used, seen.status)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    table = records.read("measured")
+    return table.where((table["configuration"] == "6T2A") & (table["slope_deg"] < 10))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return np.array([0.8, -0.6, 0.5, 0.9])
+
+
+@pytest.fixture(scope="module")
+def known(runs):
+    return noise.of(runs, SettledRuns.sizes(runs), "current=1%,motor_speed=0.2%,speed=0.2%")
+
+
+@pytest.fixture(scope="module")
+def posed(runs, truth, known):
+    """Readings of a robot at `truth`, with priors that are right about it."""
+    robot = robots.nominal()
+    problem = observers.pose(runs, robot, priors.coordinates(robot, NAMES), known.sd)
+    reading = problem.observation(jnp.asarray(truth)).reading
+    return dataclasses.replace(
+        problem, data=dataclasses.replace(problem.data, measured=reading, centre=jnp.asarray(truth))
+    )
+
+
+def evolve(posed, known, generations=30, file=None, seed=3):
+    members = Members(posed, file)
+    size = len(NAMES)
+    return population.evolve(
+        members, population.objective(posed, known), np.zeros(size), np.eye(size), size=SIZE, seed=seed,
+        generations=generations,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found(posed, known):
+    return evolve(posed, known)
+
+
+def test_generations_come_down_to_the_truth(found, truth):
+    best = found.z[found.order[0]]
+    assert found.cost.min() < 0.5 and np.abs(best - truth).max() < 0.5
+    lowest = [g.lowest for g in found.generations]
+    assert lowest == sorted(lowest, reverse=True) and lowest[-1] < lowest[0] / 10
+    assert len(found.z) == sum(g.members for g in found.generations)
+
+
+def test_same_seed_same_members_and_another_seed_others(posed, known, found):
+    again = evolve(posed, known)
+    np.testing.assert_array_equal(again.z, found.z)
+    np.testing.assert_array_equal(again.cost, found.cost)
+    assert not np.array_equal(evolve(posed, known, 1, seed=4).z, found.z[:SIZE])
+
+
+def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
+    rows = Rows(found.reading[:3], found.adhesion_used[:3], found.status[:3])
+    for z, cost in zip(found.z[:3], population.objective(posed, known)(found.z[:3], rows), strict=True):
+        readings = np.asarray(posed.misfit(jnp.asarray(z), posed.data))[: posed.data.measured.size]
+        lost = np.isin(np.asarray(posed.observation(jnp.asarray(z)).status), (2, 3, 4))
+        if not lost.any():
+            expected = 0.5 * (np.sum(readings**2) + np.sum((z - np.asarray(posed.data.centre)) ** 2))
+            assert cost == pytest.approx(expected, rel=1e-9)
+
+
+def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, runs, found):
+    """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
+    unknown = noise.of(runs, SettledRuns.sizes(runs))
+    worst = found.order[-2:]  # far above the least share that is taken for noise
+    rows = Rows(found.reading[worst], found.adhesion_used[worst], found.status[worst])
+    costs = population.objective(posed, unknown)(found.z[worst], rows)
+    size, measured = SettledRuns.sizes(runs), np.asarray(posed.data.measured)
+
+    def at(k, shares):
+        error = (found.reading[k] - measured) / size / shares
+        return 0.5 * np.sum(error**2) + len(size) * np.sum(np.log(shares))
+
+    best = [
+        min(at(k, np.array([a, b, c])) for a in GRID for b in GRID for c in GRID)
+        + 0.5 * np.sum((found.z[k] - np.asarray(posed.data.centre)) ** 2)
+        + population.LOST * np.isin(found.status[k], (2, 3, 4)).sum()
+        for k in worst
+    ]
+    assert costs[1] - costs[0] == pytest.approx(best[1] - best[0], abs=0.1)
+
+
+GRID = np.geomspace(1.2e-3, 1.0, 80)
+
+
+def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(posed, known, found):
+    status = found.status[:1].copy()
+    status[0, 0] = 2
+    reached = Rows(found.reading[:1], found.adhesion_used[:1], np.zeros_like(status))
+    lost = reached._replace(status=status)
+    cost = population.objective(posed, known)
+    assert cost(found.z[:1], lost) - cost(found.z[:1], reached) == pytest.approx(population.LOST)
+    broken = reached._replace(reading=np.full_like(reached.reading, np.nan))
+    assert np.isinf(cost(found.z[:1], broken))
+
+
+# --- kept ---------------------------------------------------------------------------------------------------------
+
+
+def test_kept_members_are_not_run_again_and_an_ended_search_goes_on(posed, known, found, tmp_path, monkeypatch):
+    file = tmp_path / "members.npz"
+    evolve(posed, known, 2, file)
+    run = []
+    true = population._observed
+    monkeypatch.setattr(population, "_observed", lambda *a: run.append(1) or true(*a))
+    whole = evolve(posed, known, len(found.generations), file)
+    np.testing.assert_array_equal(whole.z, found.z)
+    np.testing.assert_array_equal(whole.cost, found.cost)
+    together = population.TOGETHER[0]
+    assert len(run) == (len(found.generations) - 2) * -(-SIZE // together)
+    run.clear()
+    evolve(posed, known, len(found.generations), file)
+    assert not run
+    assert [p.name for p in tmp_path.iterdir()] == ["members.npz"]
+
+
+def test_members_of_another_calibration_are_refused(posed, known, tmp_path):
+    file = tmp_path / "members.npz"
+    evolve(posed, known, 1, file)
+    other = dataclasses.replace(posed, data=dataclasses.replace(posed.data, measured=posed.data.measured * 1.01))
+    with pytest.raises(BadConfiguration, match="its members are of another calibration"):
+        Members(other, file)
+    noisier = dataclasses.replace(posed, data=dataclasses.replace(posed.data, sd=2 * posed.data.sd))
+    assert len(Members(noisier, file)._kept) == SIZE  # the noise is none of what was run
+
+
+@pytest.mark.parametrize("content", [b"", b"no file of members", b"PK\x03\x04 cut off"], ids=["empty", "text", "cut"])
+def test_file_that_holds_no_members_is_refused(posed, tmp_path, content):
+    file = tmp_path / "members.npz"
+    file.write_bytes(content)
+    with pytest.raises(BadConfiguration, match="no file of members"):
+        Members(posed, file)
+
+
+def test_full_disk_is_said_and_leaves_what_was_there(posed, known, tmp_path, monkeypatch):
+    file = tmp_path / "members.npz"
+    evolve(posed, known, 1, file)
+    before = file.read_bytes()
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(BadConfiguration, match="cannot be written: No space left"):
+        evolve(posed, known, 2, file)
+    assert file.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["members.npz"]
+
+
+# --- derivatives and differences -----------------------------------------------------------------------------------
+
+
+def test_regression_over_members_is_the_derivative_of_a_smooth_model(posed, found):
+    at = int(found.order[0])
+    about = identifiability.analyse(posed, jnp.asarray(found.z[at]))
+    slope, left = population.regression(posed, found, at)
+    assert np.linalg.norm(slope - about.jacobian) < 0.15 * np.linalg.norm(about.jacobian) and left < 1.0
+    members = Members(posed)
+    assert not population.apart(posed, members, found.z[at], about.jacobian, about.sd).any()
+
+
+def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found):
+    """The derivative by the resistance says nothing of the jump; that by the other parameters is right."""
+    stepped = eqx.tree_at(
+        lambda p: p.observe, posed, Stepped(posed.observe.conditions, "steady"), is_leaf=lambda x: x is posed.observe
+    )
+    about = identifiability.analyse(stepped, jnp.zeros(len(NAMES)))
+    off = population.apart(stepped, Members(stepped), np.zeros(len(NAMES)), about.jacobian, about.sd)
+    assert off.tolist() == [True, False, False, False]
+
+
+def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found):
+    at = int(found.order[0])
+    calm = population.Searched(found, at, (), None, np.nan)
+    assert "the last gained nothing that counts" in calm.statements()[0] or not found.settled
+    torn = population.Searched(dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4)
+    assert "still gained" in torn.statements()[0] and "by a are not those of its differences" in torn.statements()[-1]
+    assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
+
+
+def test_options_of_a_population_that_is_not_there_are_refused():
+    with pytest.raises(BadConfiguration, match="there is no population"):
+        calibrate(records.read("measured"), robots.nominal(), generations=3)
+
+
+@pytest.mark.slow
+def test_running_gear_is_found_through_the_track_model(tmp_path):
+    """Readings of a shaking gear; the population comes near its slip, which the flush gear does not."""
+    table = records.read("measured")
+    table = table.where((table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 15))
+    from mmrjax import params
+    from mmrjax.fidelities.track import track_batch
+
+    changed = {
+        "6T2A.ground.friction.static": 0.59, "6T2A.ground.friction.dynamic": 0.52,
+        "6T2A.ground.friction.speed_static": 0.02, "6T2A.track.guide_friction": 0.06,
+        "running_gear.guide_recess": 3.5e-4, "running_gear.contact_damping": 840.0,
+    }  # fmt: skip
+    robot = params.replace(robots.nominal(), changed)
+    shown = track_batch(robot, table.conditions(robot), duration=0.6, step=5e-5, rolling=True).result.reading
+    columns = dict(table.columns)
+    for channel in channels.CHANNELS:
+        columns[channel.column] = np.asarray(shown[channel.name]) / channel.factor
+    data = dataclasses.replace(table, columns=columns)
+    found = calibrate(
+        data, robots.nominal(), model="track", noise="current=2%,motor_speed=0.5%,speed=0.5%", population=48,
+        free=("default", "running_gear.guide_recess", "running_gear.contact_damping"), generations=8,
+        members=tmp_path / "m.npz",
+    )  # fmt: skip
+    assert found.errors_after["speed"].rms_percent < 0.6 * found.errors_before["speed"].rms_percent
+    assert found.searched is not None and len(found.searched.found.z) > 48
