@@ -22,6 +22,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+import equinox as eqx  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from measure import machine  # noqa: E402
@@ -34,7 +35,8 @@ from calibration.inference.problem import Observation, Problem, data_of  # noqa:
 from mmrjax import channels, params, robots  # noqa: E402
 from mmrjax.conditions import Conditions  # noqa: E402
 from mmrjax.fidelities import steady  # noqa: E402
-from mmrjax.fidelities.track import STEP, track, track_batch  # noqa: E402
+from mmrjax.fidelities.stability import largest_step  # noqa: E402
+from mmrjax.fidelities.track import STEP, Trajectory, track  # noqa: E402
 from mmrjax.robot import Robot  # noqa: E402
 from mmrjax.signals import Result  # noqa: E402
 
@@ -53,6 +55,7 @@ FREE = (
     "running_gear.payload_height",
 )
 SD = 0.4  # of the slip [percentage points]
+NEAR = 0.15  # spread of the first generation about a set that is given [prior sd]
 
 
 class Longer(SettledRuns):
@@ -97,15 +100,21 @@ def search(
         return np.where(np.isfinite(cost), cost, np.inf)
 
     size = len(FREE)
+    centre, spread = np.zeros(size), 1.0
+    if arguments.near is not None:
+        values, coordinates = json.loads(arguments.near.read_text(encoding="utf-8")), problem.coordinates
+        theta = np.array([values[name] for name in FREE])
+        u = np.where(np.array(coordinates.scale), np.log(np.maximum(theta, 1e-12)), theta)
+        centre, spread = (u - np.asarray(coordinates.location)) / np.asarray(coordinates.spread), NEAR
     return population.evolve(
-        members, objective, np.zeros(size), np.eye(size), size=arguments.population,
+        members, objective, centre, spread**2 * np.eye(size), size=arguments.population,
         generations=arguments.generations, seed=arguments.seed, tell=lambda said: print(said, file=sys.stderr),
     )  # fmt: skip
 
 
 def known(problem: Problem, found: Population, at: int) -> dict[str, Any]:
     """What the rows determine, from a regression of the slip over the members near the best."""
-    there = np.isfinite(found.cost)
+    there = np.isfinite(found.cost) & np.isfinite(slip(problem, found.reading)).all(1)
     z = found.z[there]
     near = np.argsort(np.sum((z - found.z[at]) ** 2, 1), kind="stable")[: 5 * (len(FREE) + 1)]
     values = slip(problem, found.reading[there][near])
@@ -115,11 +124,18 @@ def known(problem: Problem, found: Population, at: int) -> dict[str, Any]:
     return {"singular_values": singular.round(3).tolist(), "determined": int(np.sum(singular > 1))}
 
 
+@eqx.filter_jit
+def shaken(robot: Robot, conditions: Conditions, step: float) -> Trajectory:
+    """Runs at a step, whatever the linear limit says of it."""
+    return jax.vmap(lambda one: track(robot, one, duration=DURATION, step=step, rolling=True))(conditions)
+
+
 def again(problem: Problem, z: np.ndarray) -> dict[str, Any]:
     """Slip of 1.5 s at several steps, and how much the best set shakes."""
     robot, conditions, found = problem.robot(z), problem.observe.conditions, {}
+    found["largest stable step"] = float(largest_step(robot, conditions).min())
     for parts in (1, 2, 4):
-        runs = track_batch(robot, conditions, duration=DURATION, step=STEP / parts, rolling=True)
+        runs = shaken(robot, conditions, STEP / parts)
         signals, last = runs.steady.signals, runs.time > 0.75
         found[f"step / {parts}"] = {
             "slip": np.round(100 * (1 - signals.speed / signals.speed_theoretical), 3).tolist(),
@@ -141,6 +157,7 @@ def main() -> None:
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--all-rows", action="store_true", help="also the first measured row, else left out")
     options.add_argument("--without", type=float, help="slope whose rows are held out and predicted [deg]")
+    options.add_argument("--near", type=Path, help="JSON file of constants near which to search")
     options.add_argument("--members", type=Path, help="file that keeps what was run")
     arguments = options.parse_args()
     problem, target = posed(arguments.against)

@@ -10,7 +10,7 @@ import pytest
 
 from calibration.data import runs as records
 from calibration.inference import blocks as holdout
-from calibration.inference import identifiability, multistart, noise, observers, priors, problem
+from calibration.inference import identifiability, noise, observers, priors, problem
 from calibration.inference import optimizers as fit
 from calibration.inference.normal_equations import backward, cholesky, forward
 from mmrjax import robots
