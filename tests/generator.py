@@ -167,7 +167,7 @@ LIBRARY: dict[str, Form] = {
     "nonlinear_slip": Form("nonlinear_slip", "slip", lambda s, q: np.clip(s.D / s.D_max, -2, 2) ** 3 * s.V_teor, 0.05),
     "speed_slip": Form("speed_slip", "slip", lambda s, q: s.V_teor**2, 0.02),
     "load_slip": Form("load_slip", "slip", lambda s, q: s.N * s.V_teor, 1e-4),
-    "vibration_slip": Form("vibration_slip", "slip", lambda s, q: (1 - s.wheeled) * np.hypot(s.V_teor, 1e-3) ** q["exponent"] * s.D / s.D_max / np.hypot(1 - abs(s.D / s.D_max), 0.05), 0.03, {"exponent": (1.3, 2.7)}),
+    "vibration_slip": Form("vibration_slip", "slip", lambda s, q: (1 - s.wheeled) * np.hypot(s.V_teor, 1e-3) ** q["exponent"] * s.D / s.D_max / np.hypot(1 - abs(s.D / s.D_max), 0.05), 0.02, {"exponent": (1.3, 2.7)}),
     "ammeter_gain": Form("ammeter_gain", "total_current", lambda s, q: SIDES * s.I, 0.02, either=True),
     "ammeter_offset": Form("ammeter_offset", "total_current", lambda s, q: np.ones_like(s.I), 0.1, either=True),
     "encoder_scale": Form("encoder_scale", "motor_speed", lambda s, q: s.w, 0.01, either=True),

@@ -837,7 +837,9 @@ def test_library_declares_what_the_loop_asks_for():
     assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {"thermal_drift": "winding_heating"}
     assert [e.name for e in ALL if e.odd_in_travel] == ["slope_bias"]
-    assert {e.name: e.movers for e in ALL if e.movers} == {"mass_offset": "wheels", "grouser_polygon": "tracks"}
+    assert {e.name: e.movers for e in ALL if e.movers} == {
+        "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",
+    }  # fmt: skip
 
 
 def test_effect_that_needs_the_battery_shows_on_it_alone():

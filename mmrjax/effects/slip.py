@@ -10,7 +10,7 @@ from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
-#: Speed [m/s] and distance of the demand from its limit [-] within which the law of shaking contacts is rounded off.
+#: Share of V_1 and distance of the demand from its limit within which shaking contacts are rounded off [-].
 SLOWEST, ROUNDED = 1e-3, 0.05
 
 
@@ -164,15 +164,15 @@ class PulleyEccentricity(Periodic, SlipEffect):
 
 
 class VibrationSlip(SlipEffect):
-    """ΔV = a (V_teor / 1 m/s)^p u / (1 - u), u = demand over the adhesion limit of eq. (6); on tracks alone.
+    """ΔV = a (V_teor / V_1)^p u / (1 - u), u = demand over the adhesion limit of eq. (6); on tracks alone.
 
     Contacts that shake slide while they bear little; dry friction turns into an apparent viscous one.
 
     Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 averaged over
     contacts that swing by s (`mmrjax.vibration`), where V_s is small beside s: slip in proportion to s and, with the
     load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows (docs/vibration.md). The last is
-    rounded off within 0.05 of the limit, beyond which the robot slides anyway. A loss where demand and traction
-    agree in sign.
+    rounded off within 0.05 of the limit, beyond which the robot slides anyway. Under a demand that pulls forward the
+    robot runs ahead of its tracks.
     """
 
     driver = "demand"
@@ -180,9 +180,9 @@ class VibrationSlip(SlipEffect):
 
     amplitude: Scalar = amplitude(
         unit="m/s",
-        meaning="speed lost at 1 m/s and half of the adhesion",
+        meaning="speed lost at V_1 and half of the adhesion",
         bounds=(-0.05, 0.5),
-        sd=0.03,
+        sd=0.02,
         source="contacts of the track model swing by 1 to 4 % of the speed: running gears of docs/vibration.md",
     )
     exponent: Scalar = parameter(
@@ -193,8 +193,16 @@ class VibrationSlip(SlipEffect):
         sd=0.7,
         source="inertia forces of what shakes grow as the square of its frequency; running gears: 2.1 to 3.4",
     )
+    speed_reference: Scalar = parameter(
+        1.0,
+        unit="m/s",
+        meaning="speed V_1 that the amplitude is stated at",
+        bounds=(1e-3, 100.0),
+        relative_sd=0.01,
+        source="a choice: the amplitude is what varies",
+    )
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         used = signals.demand / signals.adhesion_limit
-        speed = jnp.sqrt(signals.speed_theoretical**2 + SLOWEST**2) ** self.exponent
-        return self.amplitude * speed * used / jnp.hypot(1 - jnp.abs(used), ROUNDED) * signals.direction
+        faster = jnp.hypot(signals.speed_theoretical / self.speed_reference, SLOWEST) ** self.exponent
+        return self.amplitude * faster * used / jnp.hypot(1 - jnp.abs(used), ROUNDED)
