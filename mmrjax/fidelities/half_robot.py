@@ -209,20 +209,25 @@ def axle_height(run: System) -> Scalar:
     return jnp.where(run.chassis.on_tracks > 0.5, tracked, run.chassis.radius)
 
 
-def stand(run: System) -> Motion:
+def stand(run: System, turned: Scalar = 0.0) -> Motion:
     """At rest on the ground, the contacts bearing the weight: Newton in height and pitch.
 
-    A robot that tips starts level, its lowest contacts just touching.
+    Newton begins where every contact that could bear touches, for from there it does not overshoot. A robot that
+    tips starts level, its lowest contacts just touching.
+
+    Args:
+        turned: angle of both pulleys [rad], which is where the belt stands.
     """
     forward, up, total = centre(run)
     weight = total * GRAVITY
     cos, sin = jnp.cos(run.conditions.slope), jnp.sin(run.conditions.slope)
     axle = axle_height(run)
-    zeros = jnp.zeros(5, jnp.result_type(axle))
+    rest = jnp.zeros(5, jnp.result_type(axle))
+    zeros = rest.at[3:5].set(turned)
 
     def unbalanced(y: Float[Array, " 2"]) -> Float[Array, " 2"]:
         q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
-        at = undercarriage.touch(run.path, run.chassis, q, zeros)
+        at = undercarriage.touch(run.path, run.chassis, q, rest)
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
         return jnp.stack([(at.normal - weight * cos) / weight, moment / weight])
 
@@ -235,12 +240,13 @@ def stand(run: System) -> Motion:
         limit = jnp.asarray([2e-4, 2e-3])
         return y - jnp.clip(move, -limit, limit), None
 
-    y0 = jnp.asarray([2e-4, 0.0], zeros.dtype)
+    recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
+    y0 = jnp.stack([2e-4 + recess, jnp.zeros_like(recess)])
     y, _ = jax.lax.scan(newton, y0, None, length=30)
     y = jnp.where(margin(run) > 0, y, jnp.zeros_like(y))
     q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
-    return Motion(q, zeros, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
+    return Motion(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
 
 
 def roll(run: System) -> Motion:
