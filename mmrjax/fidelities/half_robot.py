@@ -156,6 +156,23 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     return contacts.at[which, which].add(losses)
 
 
+def _pushed(
+    run: System, motion: Motion, signals: Signals, pulled: Pull
+) -> tuple[Float[Array, " 5"], Float[Array, "5 5"]]:
+    """Velocities one explicit step on, and the mass matrix."""
+    force, armature = generalized(run, signals, pulled)
+    data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
+    model = run.model.replace(dof_armature=armature)
+    data = mjx.step(model, data)
+    return data.qvel, mjx.full_m(model, data)
+
+
+def mass_matrix(run: System, motion: Motion) -> Float[Array, "5 5"]:
+    """Mass matrix M on v, the rotors' armature in it [kg, kg·m, kg·m²]."""
+    signals, _, pulled = instant(run, motion)
+    return _pushed(run, motion, signals, pulled)[1]
+
+
 def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     """One step of MJX (semi-implicit Euler) and of the winding.
 
@@ -166,12 +183,9 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
     """
     signals, at, pulled = instant(run, motion)
-    force, armature = generalized(run, signals, pulled)
-    data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
-    model = run.model.replace(dof_armature=armature)
-    data = mjx.step(model, data)
-    mass, damping = mjx.full_m(model, data), resistance(run, motion, signals, at, pulled)
-    gained = jnp.linalg.solve(mass + run.step * damping, mass @ (data.qvel - motion.v))
+    pushed, mass = _pushed(run, motion, signals, pulled)
+    damping = resistance(run, motion, signals, at, pulled)
+    gained = jnp.linalg.solve(mass + run.step * damping, mass @ (pushed - motion.v))
     v = motion.v + gained
     fallen = damping @ gained
     over_step = {

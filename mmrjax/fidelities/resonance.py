@@ -1,0 +1,237 @@
+"""Where ripple peaks over speed, and whether a harmonic of the running gear meets a natural frequency there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import find_peaks, peak_widths
+
+from mmrjax.belt import Path
+from mmrjax.fidelities.modes import Mode
+from mmrjax.fidelities.ripple import fluctuation
+from mmrjax.fidelities.track import Trajectory
+from mmrjax.robot import Robot
+from mmrjax.running_gear import TEETH_PULLEY
+from mmrjax.signals import CONVERGED, NOT_SETTLED
+
+#: What ripples: name → signal and words.
+SIGNALS = {
+    "reaction": ("normal", "reaction of the ground"),
+    "current": ("total_current", "current"),
+    "speed": ("speed", "speed"),
+    "motor_speed": ("speed_motor", "motor speed"),
+}
+TAIL = 0.5  # share of a run at its end in which ripple is read
+PERIODS = 3  # fewest passings in it from which ripple is read
+#: A peak over speed stands out of its surroundings by this share of itself, and is no smaller than this [-].
+STANDS_OUT, NOTICEABLE = 0.05, 2e-4
+_SAME = 0.2  # of an order: how near to a whole order the strongest line has to be
+
+
+class Passing(NamedTuple):
+    """What passes the chassis at a pitch.
+
+    Attributes:
+        name: grousers or teeth; pitch: of the belt [m]; travel: of the robot from one to the next, without slip [m].
+    """
+
+    name: str
+    pitch: float
+    travel: float
+
+
+def passing(robot: Robot, configuration: int) -> Passing:
+    """What shakes a configuration: the grousers S_g on tracks; on wheels, which have none, the tooth mesh S_t."""
+    chassis, radius = robot.configurations.members[configuration], float(robot.radius_pulley)
+    if float(chassis.on_tracks) > 0.5:
+        pitch = float(Path(robot.radius_pulley, robot.running_gear).pitch)
+        return Passing("grousers", pitch, pitch)
+    pitch = 2 * np.pi * radius / TEETH_PULLEY
+    return Passing("teeth", pitch, pitch * float(chassis.radius) / radius)
+
+
+@dataclasses.dataclass(frozen=True)
+class Vibrations:
+    """What ripples in each run of a batch; NaN where it is not `read`.
+
+    Attributes:
+        status: codes into `STATUSES`.
+        read: whether its ripple is: it travels and at least `PERIODS` pitches passed.
+        speed: mean [m/s]; passing: frequency at which grousers or teeth pass [Hz].
+        mean, deviation, frequency: of each of `SIGNALS`, see `ripple.Fluctuation`.
+    """
+
+    status: np.ndarray
+    read: np.ndarray
+    speed: np.ndarray
+    passing: np.ndarray
+    mean: dict[str, np.ndarray]
+    deviation: dict[str, np.ndarray]
+    frequency: dict[str, np.ndarray]
+
+    @property
+    def settled(self) -> np.ndarray:
+        """Whether a run is read and goes on steadily."""
+        return self.read & (self.status == CONVERGED)
+
+
+def vibrations(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
+    """Ripple at the end of each run of a batch.
+
+    Args:
+        runs: fields have shape (runs, samples, ...).
+        pitch: of what passes [m].
+    """
+    time, status = np.asarray(runs.time[0]), np.asarray(runs.result.status)
+    tail = time > time[-1] - TAIL * (time[-1] - time[0])
+    at = time[tail]
+    found = {
+        name: np.array([fluctuation(at, x) for x in np.asarray(getattr(runs.signals, field))[:, tail]])
+        for name, (field, _) in SIGNALS.items()
+    }
+    rates = np.asarray(runs.signals.speed_wheel)[:, tail].mean(axis=1) * float(robot.radius_pulley) / pitch
+    travels = np.isin(status, (CONVERGED, NOT_SETTLED)) & np.isfinite([x[:, 1] for x in found.values()]).all(axis=0)
+    read = travels & (rates * (at[-1] - at[0]) >= PERIODS)
+    column = {name: np.where(read[:, None], x, np.nan).T for name, x in found.items()}
+    mean, deviation, frequency = ({name: x[k] for name, x in column.items()} for k in range(3))
+    return Vibrations(status, read, mean["speed"], np.where(read, rates, np.nan), mean, deviation, frequency)
+
+
+class Peak(NamedTuple):
+    """A peak of ripple over speed at one payload.
+
+    Attributes:
+        signal: of `SIGNALS`; payload: [kg].
+        speed, low, high: where it is highest, and where it is above 70 % of its rise [m/s].
+        ripple: there, standard deviation over mean [-].
+        rise: over the higher of its two valleys, as a share of itself [-].
+        order: of the passing frequency that is strongest there; 0: it is no whole one.
+        frequency: of the strongest line [Hz].
+        mode: natural vibration at that frequency, which confirms the crossing; empty: none.
+    """
+
+    signal: str
+    payload: float
+    speed: float
+    low: float
+    high: float
+    ripple: float
+    rise: float
+    order: int
+    frequency: float
+    mode: str
+
+
+def peaks(
+    signal: str,
+    payload: float,
+    speed: Float[np.ndarray, " runs"],
+    passing: Float[np.ndarray, " runs"],
+    deviation: Float[np.ndarray, " runs"],
+    frequency: Float[np.ndarray, " runs"],
+    modes: Sequence[Mode],
+) -> list[Peak]:
+    """Peaks of ripple over speed at one payload, with the mode that each is at.
+
+    A crossing of a harmonic and a natural frequency counts where ripple peaks and its strongest line is that harmonic
+    and within the mode's band: neither is assumed from the other.
+
+    Args:
+        speed, passing, deviation, frequency: of the runs that are read, in the order of `speed`.
+        modes: at this payload.
+    """
+    if len(speed) < 3:
+        return []
+    tops, facts = find_peaks(deviation, prominence=1e-12)
+    widths = peak_widths(deviation, tops, rel_height=0.3)
+    index, answer = np.arange(len(speed)), []
+    for k, top in enumerate(tops):
+        height, rise = float(deviation[top]), float(facts["prominences"][k] / deviation[top])
+        if rise < STANDS_OUT or height < NOTICEABLE:
+            continue
+        low, high = (float(np.interp(widths[side][k], index, speed)) for side in (2, 3))
+        ratio = frequency[top] / passing[top]
+        whole = round(float(ratio)) if np.isfinite(ratio) else 0
+        order = whole if whole and abs(ratio - whole) < _SAME else 0
+        near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
+        mode = min(near, key=lambda m: abs(m.frequency - frequency[top])).name if near else ""
+        answer.append(
+            Peak(signal, payload, float(speed[top]), low, high, height, rise, order, float(frequency[top]), mode)
+        )
+    return answer
+
+
+class Crossing(NamedTuple):
+    """Where a harmonic of the passing frequency meets a natural frequency.
+
+    Attributes:
+        mode, order, payload: which [kg]; speed: at the mode's mean frequency [m/s].
+        signals: whose ripple peaks there; empty: the crossing does not show.
+    """
+
+    mode: str
+    order: int
+    payload: float
+    speed: float
+    signals: tuple[str, ...]
+
+
+def crossings(
+    modes: Sequence[Mode], payload: float, travel: float, slowest: float, fastest: float, found: Sequence[Peak]
+) -> list[Crossing]:
+    """Crossings at one payload between two speeds [m/s], and which peaks of ripple confirm them.
+
+    Args:
+        travel: of the robot from one passing to the next [m].
+    """
+    answer = []
+    for mode in modes:
+        if not mode.resonant:
+            continue
+        first = max(int(np.ceil(mode.frequency * travel / fastest)), 1)
+        for order in range(first, int(mode.frequency * travel / slowest) + 1):
+            shows = tuple(p.signal for p in found if (p.payload, p.mode, p.order) == (payload, mode.name, order))
+            answer.append(Crossing(mode.name, order, payload, mode.frequency * travel / order, shows))
+    return answer
+
+
+class Resonance(NamedTuple):
+    """Confirmed peaks of one mode, order and signal over the payloads.
+
+    Attributes:
+        speeds: least and greatest speed of the peaks [m/s]; avoid: of their widths.
+        frequencies: least and greatest of their lines [Hz].
+        payloads: at which it shows [kg]; ripple: the largest [-].
+    """
+
+    mode: str
+    order: int
+    signal: str
+    speeds: tuple[float, float]
+    avoid: tuple[float, float]
+    frequencies: tuple[float, float]
+    payloads: tuple[float, ...]
+    ripple: float
+
+
+def resonances(found: Sequence[Peak]) -> list[Resonance]:
+    """Confirmed peaks by mode, order and signal, the largest ripple first within a signal, in the order of `SIGNALS`."""
+    keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode)
+    answer = []
+    for key in keys:
+        of = [p for p in found if (p.mode, p.order, p.signal) == key]
+        speeds, lines = [p.speed for p in of], [p.frequency for p in of]
+        avoid = min(p.low for p in of), max(p.high for p in of)
+        ends = (min(speeds), max(speeds)), avoid, (min(lines), max(lines))
+        answer.append(Resonance(*key, *ends, tuple(p.payload for p in of), max(p.ripple for p in of)))
+    return sorted(answer, key=lambda r: (list(SIGNALS).index(r.signal), -r.ripple))
+
+
+def strongest(found: Sequence[Resonance]) -> list[Resonance]:
+    """Of each signal the resonances with at least half of its largest ripple."""
+    largest = {s: max((r.ripple for r in found if r.signal == s), default=0.0) for s in SIGNALS}
+    return [r for r in found if r.ripple >= largest[r.signal] / 2]
