@@ -18,17 +18,28 @@ from mmrjax.robot import Robot
 from mmrjax.running_gear import TEETH_PULLEY
 from mmrjax.signals import CONVERGED, NOT_SETTLED
 
-#: What ripples: name → signal and words.
+
+class Signal(NamedTuple):
+    """What ripples: the signal's field, words for it, its unit for people and the SI value of one such unit."""
+
+    field: str
+    label: str
+    unit: str
+    factor: float
+
+
+#: By name.
 SIGNALS = {
-    "reaction": ("normal", "reaction of the ground"),
-    "current": ("total_current", "current"),
-    "speed": ("speed", "speed"),
-    "motor_speed": ("speed_motor", "motor speed"),
+    "reaction": Signal("normal", "reaction of the ground", "N", 1.0),
+    "current": Signal("total_current", "current", "A", 1.0),
+    "speed": Signal("speed", "speed", "mm_s", 1e-3),
+    "motor_speed": Signal("speed_motor", "motor speed", "rpm", 2 * np.pi / 60),
 }
 TAIL = 0.5  # share of a run at its end in which ripple is read
 PERIODS = 3  # fewest passings in it from which ripple is read
 #: A peak over speed stands out of its surroundings by this share of itself, and is no smaller than this [-].
 STANDS_OUT, NOTICEABLE = 0.05, 2e-4
+MATTERS = 0.01  # ripple for which a speed is to be avoided [-]
 _SAME = 0.2  # of an order: how near to a whole order the strongest line has to be
 
 
@@ -90,8 +101,8 @@ def vibrations(robot: Robot, runs: Trajectory, pitch: float) -> Vibrations:
     tail = time > time[-1] - TAIL * (time[-1] - time[0])
     at = time[tail]
     found = {
-        name: np.array([fluctuation(at, x) for x in np.asarray(getattr(runs.signals, field))[:, tail]])
-        for name, (field, _) in SIGNALS.items()
+        name: np.array([fluctuation(at, x) for x in np.asarray(getattr(runs.signals, signal.field))[:, tail]])
+        for name, signal in SIGNALS.items()
     }
     rates = np.asarray(runs.signals.speed_wheel)[:, tail].mean(axis=1) * float(robot.radius_pulley) / pitch
     travels = np.isin(status, (CONVERGED, NOT_SETTLED)) & np.isfinite([x[:, 1] for x in found.values()]).all(axis=0)
@@ -107,8 +118,8 @@ class Peak(NamedTuple):
     Attributes:
         signal: of `SIGNALS`; payload: [kg].
         speed, low, high: where it is highest, and where it is above 70 % of its rise [m/s].
-        ripple: there, standard deviation over mean [-].
-        rise: over the higher of its two valleys, as a share of itself [-].
+        ripple: the highest, standard deviation over mean [-].
+        rise: of the ripple over the higher of its two valleys [-].
         order: of the passing frequency that is strongest there; 0: it is no whole one.
         frequency: of the strongest line [Hz].
         mode: natural vibration at that frequency, which confirms the crossing; empty: none.
@@ -150,18 +161,18 @@ def peaks(
     widths = peak_widths(deviation, tops, rel_height=0.3)
     index, answer = np.arange(len(speed)), []
     for k, top in enumerate(tops):
-        height, rise = float(deviation[top]), float(facts["prominences"][k] / deviation[top])
-        if rise < STANDS_OUT or height < NOTICEABLE:
+        height, rise = float(deviation[top]), float(facts["prominences"][k])
+        if rise < STANDS_OUT * height or height < NOTICEABLE:
             continue
         low, high = (float(np.interp(widths[side][k], index, speed)) for side in (2, 3))
         ratio = frequency[top] / passing[top]
+        bend, slope, _ = np.polyfit(speed[top - 1 : top + 2] - speed[top], deviation[top - 1 : top + 2], 2)
+        at = float(speed[top] + np.clip(-slope / (2 * bend), *(speed[[top - 1, top + 1]] - speed[top]) / 2))
         whole = round(float(ratio)) if np.isfinite(ratio) else 0
         order = whole if whole and abs(ratio - whole) < _SAME else 0
         near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
         mode = min(near, key=lambda m: abs(m.frequency - frequency[top])).name if near else ""
-        answer.append(
-            Peak(signal, payload, float(speed[top]), low, high, height, rise, order, float(frequency[top]), mode)
-        )
+        answer.append(Peak(signal, payload, at, low, high, height, rise, order, float(frequency[top]), mode))
     return answer
 
 
@@ -205,7 +216,7 @@ class Resonance(NamedTuple):
     Attributes:
         speeds: least and greatest speed of the peaks [m/s]; avoid: of their widths.
         frequencies: least and greatest of their lines [Hz].
-        payloads: at which it shows [kg]; ripple: the largest [-].
+        payloads: at which it shows [kg]; ripple: the largest [-]; rise: the largest over its surroundings [-].
     """
 
     mode: str
@@ -216,10 +227,11 @@ class Resonance(NamedTuple):
     frequencies: tuple[float, float]
     payloads: tuple[float, ...]
     ripple: float
+    rise: float
 
 
 def resonances(found: Sequence[Peak]) -> list[Resonance]:
-    """Confirmed peaks by mode, order and signal, the largest ripple first within a signal, in the order of `SIGNALS`."""
+    """Confirmed peaks by mode, order and signal: signals in the order of `SIGNALS`, their largest ripple first."""
     keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode)
     answer = []
     for key in keys:
@@ -227,11 +239,13 @@ def resonances(found: Sequence[Peak]) -> list[Resonance]:
         speeds, lines = [p.speed for p in of], [p.frequency for p in of]
         avoid = min(p.low for p in of), max(p.high for p in of)
         ends = (min(speeds), max(speeds)), avoid, (min(lines), max(lines))
-        answer.append(Resonance(*key, *ends, tuple(p.payload for p in of), max(p.ripple for p in of)))
+        answer.append(
+            Resonance(*key, *ends, tuple(p.payload for p in of), max(p.ripple for p in of), max(p.rise for p in of))
+        )
     return sorted(answer, key=lambda r: (list(SIGNALS).index(r.signal), -r.ripple))
 
 
 def strongest(found: Sequence[Resonance]) -> list[Resonance]:
-    """Of each signal the resonances with at least half of its largest ripple."""
-    largest = {s: max((r.ripple for r in found if r.signal == s), default=0.0) for s in SIGNALS}
-    return [r for r in found if r.ripple >= largest[r.signal] / 2]
+    """What is to be avoided: of each signal the resonances that rise at least half as far as its largest, to 1 %."""
+    largest = {s: max((r.rise for r in found if r.signal == s), default=0.0) for s in SIGNALS}
+    return [r for r in found if r.rise >= largest[r.signal] / 2 and r.ripple >= MATTERS]
