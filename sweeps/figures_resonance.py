@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from mmrjax.channels import MM
-from mmrjax.fidelities.resonance import SIGNALS, strongest
+from mmrjax.fidelities.resonance import MATTERS, SIGNALS, strongest
 from sweeps import words
 from sweeps.figures_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
+from sweeps.resonance import percent
 
 if TYPE_CHECKING:
     from sweeps.resonance import ResonanceResult
@@ -56,13 +57,16 @@ def campbell(axes: Axes, found: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
     table, what, top = found.table, found.passing, _top(found)
     fastest = float(np.nanmax(table["travel_mm_s"]))
+    place = np.inf
     for order in range(1, ORDERS + 1):
         at_end = order * fastest * MM / what.travel
         axes.plot([0, fastest], [0, at_end], color=FAINT, lw=0.8, zorder=1)
-        reaches = min(at_end, 0.985 * top)
-        inside = at_end <= top
+        inside, last = at_end <= top, place
+        place = fastest if inside else fastest * 0.985 * top / at_end
+        if last - place < 0.03 * fastest and not inside:
+            break  # labels and lines would cover one another
         axes.annotate(
-            f"{order}×", (fastest * reaches / at_end, reaches), xytext=(4, 0) if inside else (0, -2),
+            f"{order}×", (place, min(at_end, 0.985 * top)), xytext=(4, 0) if inside else (0, -2),
             textcoords="offset points", color=FAINT, fontsize=8.5, va="center" if inside else "top",
             bbox=None if inside else dict(boxstyle="round,pad=0.1", fc="white", ec="none"),
         )  # fmt: skip
@@ -72,10 +76,10 @@ def campbell(axes: Axes, found: ResonanceResult) -> None:
         axes.scatter(
             table["travel_mm_s"][found.read], table[f"{name}_frequency_Hz"][found.read],
             s=4 + 60 * (ripple / max(float(np.nanmax(ripple)), 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55,
-            lw=0, zorder=3, label=f"{SIGNALS[name].label}, up to {float(np.nanmax(ripple)):.2g} %",
+            lw=0, zorder=3, label=f"{SIGNALS[name].label}, up to {percent(float(np.nanmax(ripple)))}",
         )  # fmt: skip
     strong = _strong(found)
-    hits = [p for p in found.peaks if (p.mode, p.order, p.signal) in strong]
+    hits = [p for p in found.peaks if p.mode and (p.mode, p.order, p.signal) in strong]
     axes.scatter(
         [p.speed / MM for p in hits], [p.frequency for p in hits], s=130, marker="*", color="white",
         edgecolor=INK, lw=0.9, zorder=4, label="ripple peaks at a natural frequency: avoid" if hits else None,
@@ -85,15 +89,16 @@ def campbell(axes: Axes, found: ResonanceResult) -> None:
         speed = float(np.median(table["travel_mm_s"][points & (table["supply_voltage_V"] == voltage)]))
         axes.axvline(speed, color=INK, lw=0.9, ls=":", zorder=2)
         axes.annotate(
-            f"{voltage:g} V", (speed, top), xytext=(3, -2), textcoords="offset points", va="top", fontsize=8.5,
-            color=INK,
+            f"{voltage:g} V", (speed, top), xytext=(0, 2), textcoords="offset points", va="bottom", ha="center",
+            fontsize=8.5, color=INK,
         )  # fmt: skip
     axes.set(ylim=(0, top), ylabel="frequency [Hz]")
-    axes.set_title(
-        f"{found.configuration}: n × speed / {what.travel / MM:.4g} mm ({what.name} passing) against natural frequencies"
-    )
-    axes.legend(loc="lower right", title="strongest line of a run, larger for more ripple (sd / mean)", title_fontsize=8.5,
-                alignment="left", frameon=True, framealpha=0.9, edgecolor="none")  # fmt: skip
+    heading = f"{found.configuration}: {what.name} pass every {what.travel / MM:.4g} mm of travel; dotted: Table 8"
+    axes.set_title(heading, pad=18)
+    axes.legend(
+        loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, handletextpad=0.2, columnspacing=1.2,
+        title="a run's strongest line, larger for more ripple (sd / mean):", title_fontsize=8.5, alignment="center",
+    )  # fmt: skip
 
 
 def _bands(axes: Axes, found: ResonanceResult) -> None:
@@ -112,7 +117,8 @@ def _bands(axes: Axes, found: ResonanceResult) -> None:
         loads = " to ".join(dict.fromkeys(f"{payload:g}" for payload, _ in ends))
         axes.annotate(
             f"{name} {means} Hz\n({loads} kg)", (0, (low + high) / 2), xytext=(4, 0), textcoords="offset points",
-            va="center", color=colour, fontsize=8.5, fontweight="bold",
+            va="center", color=colour, fontsize=8.5, fontweight="bold", zorder=5,
+            bbox=dict(boxstyle="round,pad=0.15", fc="white", ec="none", alpha=0.75),
         )  # fmt: skip
 
 
@@ -122,8 +128,9 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     ripple = table[f"{name}_ripple_percent"]
     settled = found.read & (table["status"] == "converged")
     shown = ripple[settled] if settled.any() else ripple[found.read]
-    norm = colors.Normalize(0, float(np.nanmax(shown)) or 1.0)
-    guess = _speeds(found)
+    most = float(np.nanmax(shown)) or 1.0
+    norm = colors.Normalize(0, most)
+    guess = found.travel
     for row, payload in enumerate(payloads):
         of = np.flatnonzero(table["payload_kg"] == payload)
         of = of[np.argsort(guess[of])]
@@ -144,7 +151,8 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     for p in found.peaks:
         if p.signal == name and (p.mode, p.order, p.signal) in strong:
             place = (p.low / MM, payloads.index(p.payload) - 0.5)
-            axes.add_patch(Rectangle(place, (p.high - p.low) / MM, 1.0, fill=False, ec=INK, lw=1.3, zorder=3))
+            axes.add_patch(Rectangle(place, (p.high - p.low) / MM, 1.0, fill=False, ec=INK, lw=1.3, zorder=3,
+                                     ls="-" if p.mode else ":"))  # fmt: skip
     points = np.flatnonzero(table["table8"] & found.read)
     loads = table["payload_kg"][points]
     inside = (loads >= payloads[0]) & (loads <= payloads[-1])
@@ -158,15 +166,8 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     others = [s for s in dict.fromkeys(map(str, table["status"])) if s != "converged"]
     kinds = "; ".join(f"{_UNREAD.get(s, '·').replace('_', '–')} {words.short(s)}" for s in others)
     label = SIGNALS[name].label
-    axes.set_title(f"Ripple of {label}" + (f"   ({kinds})" if kinds else ""))
+    remarks = [] if most >= 100 * MATTERS else [f"under {100 * MATTERS:g} %: no speed to avoid for it"]
+    remarks += [kinds] if kinds else []
+    axes.set_title(f"Ripple of {label}" + (f"   ({'; '.join(remarks)})" if remarks else ""))
     if len(axes.collections) and "mesh" in locals():
-        axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=8, label="sd / mean [%]")  # type: ignore[union-attr]
-
-
-def _speeds(found: ResonanceResult) -> np.ndarray:
-    """Speed of each run [mm/s]; of those without one as their voltage has it in the others."""
-    speed, voltage = found.table["travel_mm_s"], found.table["supply_voltage_V"]
-    if found.read.sum() < 2:
-        return speed
-    line = np.polyfit(voltage[found.read], speed[found.read], 1)
-    return np.where(found.read, speed, np.polyval(line, voltage))
+        axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=8, label="sd / mean [%]")

@@ -24,6 +24,7 @@ from mmrjax.fidelities.resonance import (
     Passing,
     Peak,
     Resonance,
+    confirmed,
     crossings,
     passing,
     peaks,
@@ -46,6 +47,7 @@ from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder, open_folder
 CHUNK = 96  # runs in one call
 FEWEST = 5  # voltages over which a peak can be told
 SHORTEST = 0.5  # [s], of a run
+SAID = 3  # ranges to avoid in a sentence
 #: Status of a run that is too slow for its ripple to be read.
 SLOW = "too_slow"
 
@@ -73,7 +75,7 @@ class ResonanceResult:
 
     @property
     def resonances(self) -> list[Resonance]:
-        """Confirmed peaks over the payloads."""
+        """Peaks over the payloads; those without a mode are confirmed by none."""
         return resonances(self.peaks)
 
     @property
@@ -102,58 +104,91 @@ class ResonanceResult:
         return sorted(ranges, key=lambda x: x[0])
 
     @property
+    def restless(self) -> list[tuple[float, float]]:
+        """Ranges of speed in which some run did not settle [m/s], each half way to the next run that did."""
+        ranges = []
+        speed = self.travel * MM
+        for payload in self.modes:
+            of = np.flatnonzero((self.table["payload_kg"] == payload) & np.isfinite(speed))
+            of = of[np.argsort(speed[of])]
+            x = speed[of]
+            edges = np.concatenate([x[:1], (x[1:] + x[:-1]) / 2, x[-1:]])
+            bad = self.table["status"][of] != "converged"
+            ranges += [(edges[k], edges[k + 1]) for k in np.flatnonzero(bad)]
+        return _merged(ranges)
+
+    @property
+    def travel(self) -> np.ndarray:
+        """Speed of every run [mm/s]; where it has none, as its voltage has it in the others (NaN: in none)."""
+        speed, voltage = self.table["travel_mm_s"], self.table["supply_voltage_V"]
+        if self.read.sum() < 2:
+            return speed
+        line = np.polyfit(voltage[self.read], speed[self.read], 1)
+        return np.where(self.read, speed, np.polyval(line, voltage))
+
+    @property
     def quiet(self) -> list[tuple[float, float]]:
-        """Ranges of speed between those to avoid [m/s]."""
+        """Ranges of speed without peaks to avoid, at any payload, where every run settles [m/s]."""
         low, high = self.speeds
         gaps = []
-        for begin, end, _ in self.avoid:
+        for begin, end in _merged([*((a, b) for a, b, _ in self.avoid), *self.restless]):
             if begin > low:
-                gaps.append((low, begin))
+                gaps.append((low, min(begin, high)))
             low = max(low, end)
         return [*gaps, (low, high)] if low < high else gaps
 
-    @property
-    def restless(self) -> float:
-        """Speed [m/s] of the slowest run that travels and does not settle; NaN: all do."""
-        rows = self.read & (self.table["status"] == "not_settled")
-        return float(self.table["travel_mm_s"][rows].min() * MM) if rows.any() else float("nan")
-
     def statement(self) -> str:
-        """Which speeds to avoid, in sentences."""
+        """Which speeds to avoid."""
+        return " ".join(self.sentences)
+
+    @property
+    def sentences(self) -> list[str]:
+        """Which speeds to avoid, the most important first."""
         low, high = self.speeds
         if not np.isfinite(low):
-            return f"No run of {self.configuration} travels: there is no ripple to read (status says why)."
+            return [f"No run of {self.configuration} travels: there is no ripple to read (status says why)."]
         parts = []
-        if self.avoid:
-            parts.append("Avoid " + "; ".join(self._range(*of) for of in self.avoid) + ".")
-            if self.quiet:
-                parts.append(f"Free of these: {', '.join(_span(*x) for x in self.quiet)} mm/s.")
-            parts += [self._table8()] if self._table8() else []
-        else:
-            largest = ", ".join(f"{s.label} {self._largest(n):.2g} %" for n, s in SIGNALS.items())
+        named, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
+        if named:
+            parts.append(f"Avoid {_listed(named, self.passing.name)}.")
+        elif not bare:
+            largest = ", ".join(f"{s.label} {percent(self._largest(n))}" for n, s in SIGNALS.items())
             parts.append(
-                f"No speed to avoid between {_span(low, high)} mm/s: no ripple peaks at a natural frequency "
-                f"(largest: {largest})."
+                f"No speed to avoid for its ripple between {_span(low, high)} mm/s: nothing peaks at a natural "
+                f"frequency (largest ripple: {largest})."
             )
-        if np.isfinite(self.restless):
-            parts.append(f"From {self.restless / MM:.0f} mm/s on some runs do not settle (marked on the map).")
+        if bare:
+            also = "Ripple also peaks" if named else "Ripple peaks"
+            parts.append(f"{also}, with no natural frequency to name, at {_listed(bare, self.passing.name)}.")
+        for name, lowest, highest in self._spread():
+            parts.append(
+                f"{name.capitalize()} has no one frequency: {_span(lowest, highest, 1)} Hz over the belt's position."
+            )
+        if self.restless:
+            spans = ", ".join(_span(*x) for x in self.restless)
+            parts.append(f"Not every run settles at {spans} mm/s.")
+        if self.avoid or self.restless:
+            free = ", ".join(_span(*x) for x in self.quiet)
+            parts.append(f"Free of all this: {free} mm/s." if free else "No speed is free of all this.")
+        if self._table8():
+            parts.append(self._table8())
         if self.passing.name == "teeth":
             parts.append(
                 f"This configuration has no grousers on the ground; what passes are the belt's teeth, every "
                 f"{self.passing.travel / MM:.2f} mm of travel."
             )
-        return " ".join(parts)
+        return parts
 
     def _largest(self, signal: str) -> float:
         return float(np.nanmax(self.table[f"{signal}_ripple_percent"]))
 
-    def _range(self, low: float, high: float, of: list[Resonance]) -> str:
-        first, last = min(r.frequencies[0] for r in of), max(r.frequencies[1] for r in of)
-        how = ", ".join(f"{SIGNALS[r.signal].label} ±{100 * r.ripple:.2g} %" for r in of)
-        return (
-            f"{_span(low, high)} mm/s ({of[0].mode} at {_span(first, last, 1)} Hz meets {of[0].order} × "
-            f"{self.passing.name}: {how})"
-        )
+    def _spread(self) -> list[tuple[str, float, float]]:
+        """Modes that amplify but change by an octave with the position of the belt, with their range [Hz]."""
+        every = [m for of in self.modes.values() for m in of if m.amplifies and not m.resonant]
+        names = dict.fromkeys(m.name for m in every)
+        return [
+            (n, min(m.low for m in every if m.name == n), max(m.high for m in every if m.name == n)) for n in names
+        ]
 
     def _table8(self) -> str:
         """Which points of Table 8 are in a range to avoid, by payload."""
@@ -165,7 +200,7 @@ class ResonanceResult:
             if hit:
                 loads = ", ".join(f"{self.table['payload_kg'][k]:g}" for k in hit)
                 inside.append(f"{voltage:g} V with {'every payload' if len(hit) == len(of) else loads + ' kg'}")
-        return f"Of Table 8 at {self.slope_deg:g}°, in a peak: {'; '.join(inside)}." if inside else ""
+        return f"Of Table 8 at {self.slope_deg:g}°, in such a peak: {'; '.join(inside)}." if inside else ""
 
     def shaken(self, row: int | np.integer[Any]) -> bool:
         """Whether a run is within one of the strongest peaks of its own payload."""
@@ -212,6 +247,36 @@ class ResonanceResult:
                 for k in np.flatnonzero(self.table["table8"])
             ],
         }  # fmt: skip
+
+
+def _merged(ranges: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Ranges as few that do not overlap, lowest first."""
+    found: list[tuple[float, float]] = []
+    for low, high in sorted(ranges):
+        if found and low <= found[-1][1]:
+            found[-1] = found[-1][0], max(found[-1][1], high)
+        else:
+            found.append((low, high))
+    return found
+
+
+def percent(value: float) -> str:
+    """A ripple [%] as a sentence has it."""
+    return "under 0.01 %" if value < 0.01 else f"{value:.0f} %" if value >= 10 else f"{value:.2g} %"
+
+
+def _listed(ranges: list[tuple[float, float, list[Resonance]]], what: str) -> str:
+    """Ranges to avoid, the lowest speed first; of many those that rise most."""
+    most = sorted(ranges, key=lambda r: -max(x.rise for x in r[2]))[:SAID]
+    texts = []
+    for low, high, of in sorted(most, key=lambda r: r[0]):
+        first, last = min(r.frequencies[0] for r in of), max(r.frequencies[1] for r in of)
+        meets = f"{of[0].mode} at {_span(first, last, 1)} Hz meets " if of[0].mode else ""
+        order = f"{of[0].order} × {what}" if of[0].order else f"{_span(first, last, 1)} Hz"
+        how = ", ".join(f"{SIGNALS[r.signal].label} {percent(100 * r.ripple)}" for r in of)
+        texts.append(f"{_span(low, high)} mm/s ({meets}{order}; ripple up to: {how})")
+    more = f"; {len(ranges) - len(most)} more on the map" if len(ranges) > len(most) else ""
+    return "; ".join(texts) + more
 
 
 def _span(low: float, high: float, unit: float = MM) -> str:
@@ -343,7 +408,7 @@ def _found(
     linear = modes(robot, run.commanded(robot, grid(at, robot), config))
     by_payload = dict(zip(payloads, linear, strict=True))
     tops: list[Peak] = []
-    meets: list[Crossing] = []
+    ends: dict[float, tuple[float, float]] = {}
     for payload, of in by_payload.items():
         rows = np.flatnonzero((table["payload_kg"] == payload) & (table["status"] == "converged"))
         rows = rows[np.argsort(table["travel_mm_s"][rows])]
@@ -359,7 +424,9 @@ def _found(
             )
         ]  # fmt: skip
         tops += here
-        meets += crossings(of, payload, what.travel, speed[0], speed[-1], here)
+        ends[payload] = float(speed[0]), float(speed[-1])
+    tops = confirmed(tops, by_payload)
+    meets = [c for p, of in ends.items() for c in crossings(by_payload[p], p, what.travel, *of, tops)]
     return ResonanceResult(
         config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
     )

@@ -48,15 +48,23 @@ class Mode(NamedTuple):
     positions: float
 
     @property
-    def resonant(self) -> bool:
-        """Whether it amplifies, and is there at most positions of the belt."""
+    def amplifies(self) -> bool:
+        """Whether it is lightly damped, at most positions of the belt."""
         return self.damping < RESONANT and self.positions > 0.5
 
     @property
+    def resonant(self) -> bool:
+        """Whether it amplifies at a frequency that the belt's position does not change by an octave or more.
+
+        Over an octave some harmonic is always within the range, and a peak there would confirm nothing.
+        """
+        return self.amplifies and self.high < 2 * self.low
+
+    @property
     def band(self) -> tuple[float, float]:
-        """Frequencies at which it resonates [Hz]: its range, widened by the half-power width ζ f."""
+        """Frequencies at which it resonates [Hz]: its range or its half-power width f ± ζ f, whichever is wider."""
         width = abs(self.damping) * self.frequency
-        return self.low - width, self.high + width
+        return min(self.low, self.frequency - width), max(self.high, self.frequency + width)
 
 
 def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> list[list[Mode]]:

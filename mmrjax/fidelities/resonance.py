@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ class Signal(NamedTuple):
 
 #: By name.
 SIGNALS = {
-    "reaction": Signal("normal", "reaction of the ground", "N", 1.0),
+    "reaction": Signal("normal", "ground reaction", "N", 1.0),
     "current": Signal("total_current", "current", "A", 1.0),
     "speed": Signal("speed", "speed", "mm_s", 1e-3),
     "motor_speed": Signal("speed_motor", "motor speed", "rpm", 2 * np.pi / 60),
@@ -40,6 +40,7 @@ PERIODS = 3  # fewest passings in it from which ripple is read
 #: A peak over speed stands out of its surroundings by this share of itself, and is no smaller than this [-].
 STANDS_OUT, NOTICEABLE = 0.05, 2e-4
 MATTERS = 0.01  # ripple for which a speed is to be avoided [-]
+MOVES = 0.03  # share by which a mode moves with payload so that its peaks have to follow
 _SAME = 0.2  # of an order: how near to a whole order the strongest line has to be
 
 
@@ -176,6 +177,27 @@ def peaks(
     return answer
 
 
+def confirmed(found: Sequence[Peak], modes: Mapping[float, Sequence[Mode]]) -> list[Peak]:
+    """The peaks, without their mode where they do not follow it over the payloads.
+
+    Where a mode's frequency changes with payload by more than `MOVES`, the lines of the peaks of one order have to
+    change the same way; a peak that moves against it only crosses its band.
+
+    Args:
+        modes: by payload [kg].
+    """
+    answer = list(found)
+    for key in dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode):
+        of = [k for k, p in enumerate(found) if (p.mode, p.order, p.signal) == key]
+        natural = np.array([next(m.frequency for m in modes[found[k].payload] if m.name == key[0]) for k in of])
+        if np.ptp(natural) < MOVES * natural.mean():
+            continue
+        if np.polyfit(natural, [found[k].frequency for k in of], 1)[0] <= 0:
+            for k in of:
+                answer[k] = found[k]._replace(mode="")
+    return answer
+
+
 class Crossing(NamedTuple):
     """Where a harmonic of the passing frequency meets a natural frequency.
 
@@ -211,9 +233,10 @@ def crossings(
 
 
 class Resonance(NamedTuple):
-    """Confirmed peaks of one mode, order and signal over the payloads.
+    """Peaks of one mode, order and signal over the payloads.
 
     Attributes:
+        mode: natural vibration that confirms them; empty: none does.
         speeds: least and greatest speed of the peaks [m/s]; avoid: of their widths.
         frequencies: least and greatest of their lines [Hz].
         payloads: at which it shows [kg]; ripple: the largest [-]; rise: the largest over its surroundings [-].
@@ -231,8 +254,8 @@ class Resonance(NamedTuple):
 
 
 def resonances(found: Sequence[Peak]) -> list[Resonance]:
-    """Confirmed peaks by mode, order and signal: signals in the order of `SIGNALS`, their largest ripple first."""
-    keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found if p.mode)
+    """Peaks by mode, order and signal: signals in the order of `SIGNALS`, their largest ripple first."""
+    keys = dict.fromkeys((p.mode, p.order, p.signal) for p in found)
     answer = []
     for key in keys:
         of = [p for p in found if (p.mode, p.order, p.signal) == key]
