@@ -238,6 +238,7 @@ class ResonanceResult:
                 for low, high, of in self.avoid
             ],
             "quiet_m_s": self.quiet,
+            "restless_m_s": self.restless,
             "table8": [
                 {
                     **{key: self.table[key][k].item() for key in ("supply_voltage_V", "payload_kg", "travel_mm_s")},
