@@ -1,6 +1,7 @@
 """Natural frequencies of half a robot: against NumPy, against a vibration that rings, and their names."""
 
 import dataclasses
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +88,7 @@ def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
     at = crosses + apart[crosses] / (apart[crosses] - apart[crosses + 1])
     bounce = named(wheeled[0], "bounce")
     assert 1 / (2 * 1e-4 * np.diff(at[:5]).mean()) == pytest.approx(bounce.frequency, rel=0.02)
-    peaks = np.abs([apart[a:b].min() if apart[a + 1] < 0 else apart[a:b].max() for a, b in zip(crosses, crosses[1:])])
+    peaks = np.abs([apart[a:b].min() if apart[a + 1] < 0 else apart[a:b].max() for a, b in pairwise(crosses)])
     decay = np.log(peaks[0] / peaks[2]) / (2 * np.pi)
     assert decay / np.hypot(1, decay) == pytest.approx(bounce.damping, abs=0.02)
 

@@ -12,7 +12,8 @@ import jsonschema
 import numpy as np
 import pytest
 
-from sweeps import cli, config
+from mmrjax.fidelities.track import track_batch
+from sweeps import cli, config, run
 from sweeps import resonance as room
 from sweeps.figures_resonance import resonance_map
 from tests.pages import Tables, drawn, outside
@@ -54,7 +55,7 @@ def test_ripple_peaks_where_harmonics_meet_natural_frequencies(tracked):
                 p for p in found.peaks if (p.payload, p.signal, p.mode, p.order) == (payload, signal, mode, order)
             )
             assert peak.speed == pytest.approx(natural[mode] * found.passing.travel / order, rel=0.04)
-            assert peak.rise > 0.2 * peak.ripple
+            assert peak.rise > 0.1 * peak.ripple
     light, heavy = (next(p for p in found.peaks if p.payload == x and p.mode == "bounce") for x in (0.0, 8.0))
     assert heavy.speed < 0.9 * light.speed
 
@@ -80,18 +81,14 @@ def test_command_leaves_result_tables_and_a_page_of_its_own(tracked):
 
 
 def test_ripple_of_reaction_is_that_of_the_track_model(robot, tracked):
-    """Of one point, from the run itself."""
-    from mmrjax.conditions import Conditions
-    from mmrjax.fidelities.track import track_batch
-
+    """Of every point, from the runs themselves, their drift left in."""
     found = tracked[1]
-    first = {key: found.table[key][0] for key in ("supply_voltage_V", "payload_kg", "reaction_ripple_percent")}
-    runs = track_batch(
-        robot, Conditions(["6T2A"], voltage=[first["supply_voltage_V"]], payload=[first["payload_kg"]]).resolved(robot),
-        duration=1.0, rolling=True,
-    )  # fmt: skip
-    normal = np.asarray(runs.signals.normal[0])[500:]
-    assert 100 * normal.std() / normal.mean() == pytest.approx(first["reaction_ripple_percent"], rel=0.02)
+    again = config.resolve(config.Resonance, tracked[0] / "config.resolved.toml", {})
+    conditions = run.commanded(robot, room._points(again, robot)[0], again)
+    runs = track_batch(robot, conditions, duration=1.0, step=1e-4, rolling=True, progress=lambda share: None)
+    normal = np.asarray(runs.signals.normal)[:, 500:]
+    ripple = 100 * normal.std(axis=1) / normal.mean(axis=1)
+    np.testing.assert_allclose(found.table["reaction_ripple_percent"], ripple, rtol=0.02)
 
 
 def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
@@ -107,7 +104,7 @@ def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
     partly = dataclasses.replace(found, table=table)
     assert "Not every run settles at" in partly.statement()
     assert partly.statuses["failed"] == len(bad) - 1 and partly.statuses["slides"] == 1
-    assert "failed" in resonance_map(partly).axes[1].get_title(loc="left")
+    assert "failed" in resonance_map(partly).axes[1].get_title()
     json.dumps(partly.to_json())
     table["status"][:] = "failed"
     for key in table:
@@ -117,7 +114,6 @@ def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
     assert none.statement() == "No run of 6T2A travels: there is no ripple to read (status says why)."
 
 
-@pytest.mark.slow
 def test_wheels_have_no_grousers_and_nothing_to_avoid(tmp_path):
     out = tmp_path / "wheels"
     assert command([*SMALL, "--configuration", "4W2T", "--out", out]) == 0
@@ -127,7 +123,6 @@ def test_wheels_have_no_grousers_and_nothing_to_avoid(tmp_path):
     assert {m["name"] for m in result["modes"]} == {"bounce", "pitch"}
 
 
-@pytest.mark.slow
 def test_shaking_gear_says_what_does_not_settle(tmp_path):
     settings = {
         "running_gear.guide_recess": 3.5e-4, "running_gear.contact_damping": 840,
