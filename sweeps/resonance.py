@@ -411,7 +411,8 @@ def _found(
     tops: list[Peak] = []
     ends: dict[float, tuple[float, float]] = {}
     for payload, of in by_payload.items():
-        rows = np.flatnonzero((table["payload_kg"] == payload) & (table["status"] == "converged"))
+        gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
+        rows = np.flatnonzero(gridded & (table["status"] == "converged"))
         rows = rows[np.argsort(table["travel_mm_s"][rows])]
         if not len(rows):
             continue

@@ -168,7 +168,7 @@ def peaks(
         low, high = (float(np.interp(widths[side][k], index, speed)) for side in (2, 3))
         ratio = frequency[top] / passing[top]
         bend, slope, _ = np.polyfit(speed[top - 1 : top + 2] - speed[top], deviation[top - 1 : top + 2], 2)
-        at = float(speed[top] + np.clip(-slope / (2 * bend), *(speed[[top - 1, top + 1]] - speed[top]) / 2))
+        at = float(np.clip(speed[top] - slope / (2 * bend), low, high))
         whole = round(float(ratio)) if np.isfinite(ratio) else 0
         order = whole if whole and abs(ratio - whole) < _SAME else 0
         near = [m for m in modes if order and m.resonant and m.band[0] <= frequency[top] <= m.band[1]]
