@@ -600,7 +600,7 @@ def resonance(
 
     A Campbell diagram sets the frequency at which grousers pass, and its harmonics, against bounce and pitch of the
     robot on its contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv,
-    modes.csv and peaks.csv; the points of Table 8 are run too. About a minute and a half on two cores.
+    modes.csv and peaks.csv; the points of Table 8 are run too. About a minute on two cores.
     """
     from sweeps import config
 
