@@ -569,6 +569,59 @@ def sensitivity(
     return room.sensitivity(resolved, out, force)
 
 
+@app.command(
+    epilog="Example: mmrjax resonance --configuration 6T2A --voltages 10:40:0.5 --payloads 0,4,8 "
+    "--set running_gear.guide_recess=1e-4"
+)
+def resonance(
+    configuration: _Configuration = None,
+    voltages: Annotated[
+        str | None,
+        typer.Option(
+            help="Supply voltages (V), by which the speed is set; at least 5.  \\[default: 10:40:1, that is 31]"
+        ),
+    ] = None,
+    payloads: Annotated[
+        str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8, of Table 8]")
+    ] = None,
+    slope: _Slope = 0.0,
+    surface: _Surface = "lacquered_wood",
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            "--duration",
+            help="Length of a run (s), at least 0.5; ripple is read in its second half.  \\[default: 1.5]",
+        ),
+    ] = None,
+    step: _Step = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+    no_cache: _NoCache = False,
+) -> int:
+    """Say which speeds to avoid: ripple of reaction, current and speed over speed and payload, by the track model.
+
+    A Campbell diagram sets the frequency at which grousers pass, and its harmonics, against bounce and pitch of the
+    robot on its contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv,
+    modes.csv and peaks.csv; the points of Table 8 are run too. About a minute on two cores.
+    """
+    from sweeps import config
+
+    options = _options(
+        duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
+    ) | {
+        "configuration": configuration, "voltages_V": config.axis("--voltages", voltages),
+        "payloads_kg": config.axis("--payloads", payloads), "slope_deg": slope, "surface": surface,
+    }  # fmt: skip
+    resolved = _prepared(config.resolve(config.Resonance, None, options), no_cache)
+    from sweeps import resonance as room
+
+    return room.resonance(resolved, out, force)
+
+
 @app.command()
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""

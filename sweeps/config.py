@@ -212,6 +212,22 @@ class Render(RobotPart, FidelityPart, SupplyPart):
     model: Literal["track"] = "track"
 
 
+class Resonance(RobotPart, FidelityPart, OutputPart):
+    """A map of ripple over speed and payload, of the fidelity that resolves the running gear.
+
+    Attributes:
+        configuration: of the robot, by name; None takes its first.
+        voltages_V, payloads_kg: axes of the map; slope_deg, surface: of all of it.
+    """
+
+    model: Literal["track"] = "track"
+    configuration: str | None = None
+    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] = tuple(10.0 + k for k in range(31))
+    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
+    slope_deg: Slope = 0.0
+    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
+
+
 class Reproduce(RobotPart, ModelPart):
     """The paper's figures and tables."""
 
@@ -329,7 +345,8 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         name: first["ctx"][name] for name in ("gt", "ge", "lt", "le", "expected") if name in first.get("ctx", {})
     }
     wanted = first["msg"][0].lower() + first["msg"][1:]
-    allowed = {"slopes_deg": _SLOPE, "payloads_kg": _PAYLOAD, "voltages_V": _VOLTAGE}.get(key)
+    ranges = {"slopes_deg": _SLOPE, "slope_deg": _SLOPE, "payloads_kg": _PAYLOAD, "voltages_V": _VOLTAGE}
+    allowed = ranges.get(key)
     if allowed is not None and limits:
         wanted = f"expected {'more than ' if key == 'voltages_V' else ''}{allowed[0]:g} to {allowed[1]:g}"
     return f"{where}: got {first['input']!r}; {wanted}"
@@ -378,6 +395,10 @@ def axis(option: str, text: str | None) -> tuple[float, ...] | None:
                 values += numbers
                 continue
             first, last, step = numbers
+            if (last - first) * step < 0:
+                raise BadConfiguration(
+                    f"{option}: got {part}, which ends before it begins; expected first:last:step as 0:20:0.5"
+                )
             count = (last - first) / step
             if not 0 <= count < 1e6:
                 raise ValueError

@@ -156,6 +156,23 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     return contacts.at[which, which].add(losses)
 
 
+def _pushed(
+    run: System, motion: Motion, signals: Signals, pulled: Pull
+) -> tuple[Float[Array, " 5"], Float[Array, "5 5"]]:
+    """Velocities one explicit step on, and the mass matrix."""
+    force, armature = generalized(run, signals, pulled)
+    data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
+    model = run.model.replace(dof_armature=armature)
+    data = mjx.step(model, data)
+    return data.qvel, mjx.full_m(model, data)
+
+
+def mass_matrix(run: System, motion: Motion) -> Float[Array, "5 5"]:
+    """Mass matrix M on v, the rotors' armature in it [kg, kg·m, kg·m²]."""
+    signals, _, pulled = instant(run, motion)
+    return _pushed(run, motion, signals, pulled)[1]
+
+
 def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     """One step of MJX (semi-implicit Euler) and of the winding.
 
@@ -166,12 +183,9 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
     """
     signals, at, pulled = instant(run, motion)
-    force, armature = generalized(run, signals, pulled)
-    data = run.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force)
-    model = run.model.replace(dof_armature=armature)
-    data = mjx.step(model, data)
-    mass, damping = mjx.full_m(model, data), resistance(run, motion, signals, at, pulled)
-    gained = jnp.linalg.solve(mass + run.step * damping, mass @ (data.qvel - motion.v))
+    pushed, mass = _pushed(run, motion, signals, pulled)
+    damping = resistance(run, motion, signals, at, pulled)
+    gained = jnp.linalg.solve(mass + run.step * damping, mass @ (pushed - motion.v))
     v = motion.v + gained
     fallen = damping @ gained
     over_step = {
@@ -209,20 +223,25 @@ def axle_height(run: System) -> Scalar:
     return jnp.where(run.chassis.on_tracks > 0.5, tracked, run.chassis.radius)
 
 
-def stand(run: System) -> Motion:
+def stand(run: System, turned: Scalar = 0.0) -> Motion:
     """At rest on the ground, the contacts bearing the weight: Newton in height and pitch.
 
-    A robot that tips starts level, its lowest contacts just touching.
+    Newton begins where every contact that could bear touches, for from there it does not overshoot. A robot that
+    tips starts level, its lowest contacts just touching.
+
+    Args:
+        turned: angle of both pulleys [rad], which is where the belt stands.
     """
     forward, up, total = centre(run)
     weight = total * GRAVITY
     cos, sin = jnp.cos(run.conditions.slope), jnp.sin(run.conditions.slope)
     axle = axle_height(run)
-    zeros = jnp.zeros(5, jnp.result_type(axle))
+    rest = jnp.zeros(5, jnp.result_type(axle))
+    zeros = rest.at[3:5].set(turned)
 
     def unbalanced(y: Float[Array, " 2"]) -> Float[Array, " 2"]:
         q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
-        at = undercarriage.touch(run.path, run.chassis, q, zeros)
+        at = undercarriage.touch(run.path, run.chassis, q, rest)
         moment = weight * (cos * (forward + y[1] * up) - sin * (up + axle)) - jnp.sum(at.force * at.lever_x)
         return jnp.stack([(at.normal - weight * cos) / weight, moment / weight])
 
@@ -235,12 +254,13 @@ def stand(run: System) -> Motion:
         limit = jnp.asarray([2e-4, 2e-3])
         return y - jnp.clip(move, -limit, limit), None
 
-    y0 = jnp.asarray([2e-4, 0.0], zeros.dtype)
+    recess = jnp.maximum(run.path.gear.guide_recess, 0.0) * run.chassis.on_tracks
+    y0 = jnp.stack([2e-4 + recess, jnp.zeros_like(recess)])
     y, _ = jax.lax.scan(newton, y0, None, length=30)
     y = jnp.where(margin(run) > 0, y, jnp.zeros_like(y))
     q = zeros.at[1].set(axle - y[0]).at[2].set(y[1])
     memory = {effect.name: jnp.zeros_like(axle) for effect in run.robot.remembering}
-    return Motion(q, zeros, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
+    return Motion(q, rest, jnp.zeros_like(axle), run.conditions.discharge * jnp.ones_like(axle), memory)
 
 
 def roll(run: System) -> Motion:

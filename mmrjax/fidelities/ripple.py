@@ -53,6 +53,36 @@ def ripple(time: Series, values: Series) -> Ripple:
     return Ripple(float(values.mean()), float(np.ptp(rest) / 2 / abs(values.mean())), period)
 
 
+class Fluctuation(NamedTuple):
+    """How much a signal varies about its mean, and at which frequency most.
+
+    Attributes:
+        mean: [the signal's unit].
+        deviation: standard deviation over the mean [-].
+        frequency: of the strongest line of its spectrum [Hz]; NaN: it does not vary.
+    """
+
+    mean: float
+    deviation: float
+    frequency: float
+
+
+def fluctuation(time: Series, values: Series) -> Fluctuation:
+    """Fluctuation of evenly sampled `values`; a straight drift is taken off, a Hann window is on the spectrum."""
+    time, values = np.asarray(time, float), np.asarray(values, float)
+    mean = float(values.mean())
+    if not np.isfinite(values).all() or mean == 0.0:
+        return Fluctuation(mean, float("nan"), float("nan"))
+    rest = values - np.polyval(np.polyfit(time, values, 1), time)
+    deviation = float(rest.std() / abs(mean))
+    if deviation < 1e-13:  # rounding
+        return Fluctuation(mean, deviation, float("nan"))
+    size = 1 << (8 * len(rest) - 1).bit_length()  # filled up with zeros, for a fine grid of frequencies
+    power = np.abs(np.fft.rfft(rest * np.hanning(len(rest)), size)) ** 2
+    best = int(np.argmax(power[1:-1])) + 1
+    return Fluctuation(mean, deviation, float(_vertex(power, best) / (size * (time[1] - time[0]))))
+
+
 def _vertex(values: Series, k: int) -> float:
     below, here, above = values[k - 1 : k + 2]
     return float(k + (below - above) / (2 * (below - 2 * here + above)))

@@ -12,14 +12,23 @@ from jaxtyping import Array, Float
 
 from mmrjax import params
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.half_robot import Motion, advance, roll, stand, system
-from mmrjax.params import Scalar
+from mmrjax.fidelities.half_robot import Motion, System, advance, roll, stand, system
 from mmrjax.robot import Robot
 from mmrjax.undercarriage import lever_tip
 
 SAFETY = 0.75  # of the linear limit: contacts bear more than when standing, by their ripple
 LEAST = 0.01  # [m/s], V_s that the linear limit is found with at least
-_PROBE = 1e-6  # [s], step from which rates are told
+PROBE = 1e-6  # [s], step from which rates are taken
+
+
+def step_derivative(run: System, at: Motion) -> Float[Array, "11 11"]:
+    """Derivative of (q, v, current) one step on by (q, v, current), of one run."""
+
+    def after(y: Float[Array, " 11"]) -> Float[Array, " 11"]:
+        moved, _, _ = advance(run, Motion(y[:5], y[5:10], y[10], at.discharge, at.memory))
+        return jnp.concatenate([moved.q, moved.v, jnp.asarray(moved.current)[None]])
+
+    return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]))
 
 
 @eqx.filter_jit
@@ -29,18 +38,9 @@ def _maps(
     """Derivatives of (q, v, current) one step on by (q, v, current), standing and rolling."""
 
     def one(conditions: Conditions, steps: Float[Array, " starts"]) -> Float[Array, "starts 11 11"]:
-        run = system(robot, conditions, _PROBE)
-
-        def after(y: Float[Array, " 11"], at: Motion, step: Scalar) -> Float[Array, " 11"]:
-            moved, _, _ = advance(
-                system(robot, conditions, step), Motion(y[:5], y[5:10], y[10], at.discharge, at.memory)
-            )
-            return jnp.concatenate([moved.q, moved.v, jnp.asarray(moved.current)[None]])
-
-        def slope(at: Motion, step: Scalar) -> Float[Array, "11 11"]:
-            return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]), at, step)
-
-        return jax.vmap(slope)(jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run)), steps)
+        run = system(robot, conditions, PROBE)
+        starts = jax.tree.map(lambda *at: jnp.stack(at), stand(run), roll(run))
+        return jax.vmap(lambda at, step: step_derivative(system(robot, conditions, step), at))(starts, steps)
 
     return jax.vmap(one)(conditions, steps)
 
@@ -68,7 +68,7 @@ def largest_step(robot: Robot, conditions: Conditions) -> Float[np.ndarray, " ru
     low, high = np.full((*conditions.shape, 2), -7.0), np.full((*conditions.shape, 2), -2.0)  # powers of ten
     # What grows in continuous time too (a robot about to tip, friction that falls with speed) is no matter of
     # the step; slow drifts neither.
-    rates = (maps(np.full_like(low, _PROBE)) - np.eye(11)) / _PROBE
+    rates = (maps(np.full_like(low, PROBE)) - np.eye(11)) / PROBE
     physical = 20.0 + 2 * np.maximum(np.linalg.eigvals(rates).real.max(axis=-1), 0.0)
     for _ in range(16):
         middle = (low + high) / 2

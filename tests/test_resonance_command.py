@@ -1,0 +1,180 @@
+"""The command `resonance`: what it finds on 6T2A, what it leaves, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from mmrjax.fidelities.track import track_batch
+from sweeps import cli, config, run
+from sweeps import resonance as room
+from sweeps.figures_resonance import resonance_map
+from tests.pages import Tables, drawn, outside
+
+SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "resonance.schema.json").read_text("utf-8"))
+SMALL = ("resonance", "--voltages", "24:40:2", "--payloads", "8,0", "--duration", "1")
+
+
+def command(arguments):
+    """Run a command in this process; returns its exit code."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        cli.main()
+    return end.value.code
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory):
+    """Folder and ResonanceResult of a small map of 6T2A, as the command makes it."""
+    folder, kept = tmp_path_factory.mktemp("runs") / "map", []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(room, "print_resonance", kept.append)
+        assert command([*SMALL, "--out", folder]) == 0
+    return folder, kept[0]
+
+
+def rows(path):
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_ripple_peaks_where_harmonics_meet_natural_frequencies(tracked):
+    """Reaction where the third harmonic of the grousers meets bounce, current where the second meets pitch."""
+    found = tracked[1]
+    for payload, of in found.modes.items():
+        natural = {m.name: m.frequency for m in of}
+        for signal, mode, order in (("reaction", "bounce", 3), ("current", "pitch", 2)):
+            (peak,) = (
+                p for p in found.peaks if (p.payload, p.signal, p.mode, p.order) == (payload, signal, mode, order)
+            )
+            assert peak.speed == pytest.approx(natural[mode] * found.passing.travel / order, rel=0.04)
+            assert peak.rise > 0.1 * peak.ripple
+    light, heavy = (
+        next(p for p in found.peaks if (p.payload, p.mode, p.order) == (x, "bounce", 3)) for x in (0.0, 8.0)
+    )
+    assert heavy.speed < 0.9 * light.speed
+
+
+def test_command_leaves_result_tables_and_a_page_of_its_own(tracked):
+    folder, found = tracked
+    result = json.loads((folder / "result.json").read_text())
+    jsonschema.validate(result, SCHEMA)
+    assert result["schema"] == "mmrjax.resonance/1" and result["statement"] == found.statement()
+    assert result["statement"].startswith("Avoid ")
+    assert {(a["mode"], a["order"]) for a in result["avoid"]} == {("bounce", 3), ("pitch", 2)}
+    points = rows(folder / "points.csv")
+    assert len(points) == result["runs"] == 18 + 16  # 33 V is no voltage of the grid; 24 V is
+    assert sum(p["table8"] == "True" for p in points) == 18 == len(result["table8"])
+    assert {m["name"] for m in rows(folder / "modes.csv")} == {"bounce", "pitch", "drive"}
+    assert len(rows(folder / "peaks.csv")) == len(result["peaks"])
+    page = (folder / "report.html").read_text()
+    assert "map" in drawn(page) and outside(folder) == []
+    tables = Tables(page).tables
+    assert len(tables["points"]) == 1 + 18 and len(tables["frequencies"]) == 1 + 6
+    assert {"config.resolved.toml", "robot.toml", "manifest.json"} <= {p.name for p in folder.iterdir()}
+    assert not folder.with_name("map.partial").exists()
+
+
+def test_ripple_of_reaction_is_that_of_the_track_model(robot, tracked):
+    """Of every point, from the runs themselves, their drift left in."""
+    found = tracked[1]
+    again = config.resolve(config.Resonance, tracked[0] / "config.resolved.toml", {})
+    conditions = run.commanded(robot, room._points(again, robot)[0], again)
+    runs = track_batch(robot, conditions, duration=1.0, step=1e-4, rolling=True, progress=lambda share: None)
+    normal = np.asarray(runs.signals.normal)[:, 500:]
+    ripple = 100 * normal.std(axis=1) / normal.mean(axis=1)
+    np.testing.assert_allclose(found.table["reaction_ripple_percent"], ripple, rtol=0.02)
+
+
+def test_runs_without_ripple_are_shown_as_what_they_are(tracked):
+    """Half the runs of a payload fail, one slides: still a figure, gaps for numbers, and a sentence that says so."""
+    found = tracked[1]
+    table = {key: values.copy() for key, values in found.table.items()}
+    bad = np.flatnonzero((table["payload_kg"] == 8.0) & (table["supply_voltage_V"] > 30))
+    table["status"][bad] = "failed"
+    table["status"][bad[0]] = "slides"
+    for key in table:
+        if key.endswith(("_percent", "_Hz", "mm_s")):
+            table[key][bad] = np.nan
+    partly = dataclasses.replace(found, table=table)
+    assert "Not every run settles at" in partly.statement()
+    assert partly.statuses["failed"] == len(bad) - 1 and partly.statuses["slides"] == 1
+    assert "failed" in resonance_map(partly).axes[1].get_title()
+    json.dumps(partly.to_json())
+    table["status"][:] = "failed"
+    for key in table:
+        if key.endswith(("_percent", "_Hz", "mm_s")):
+            table[key][:] = np.nan
+    none = dataclasses.replace(found, table=table, peaks=[], crossings=[])
+    assert none.statement() == "No run of 6T2A travels: there is no ripple to read (status says why)."
+
+
+def test_wheels_have_no_grousers_and_nothing_to_avoid(tmp_path):
+    out = tmp_path / "wheels"
+    assert command([*SMALL, "--configuration", "4W2T", "--out", out]) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["passing"]["of"] == "teeth" and result["avoid"] == []
+    assert "no grousers" in result["statement"]
+    assert {m["name"] for m in result["modes"]} == {"bounce", "pitch"}
+
+
+def test_shaking_gear_says_what_does_not_settle(tmp_path):
+    settings = {
+        "running_gear.guide_recess": 3.5e-4, "running_gear.contact_damping": 840,
+        "running_gear.contact_stiffness": 4.2e7, "running_gear.guide_gap": 0.012, "6T2A.ground.friction.static": 0.59,
+        "6T2A.ground.friction.dynamic": 0.52, "6T2A.ground.friction.speed_static": 0.021,
+        "6T2A.ground.friction.speed_dynamic": 0.21, "6T2A.track.guide_friction": 0.06,
+    }  # fmt: skip
+    changes = [part for name, value in settings.items() for part in ("--set", f"{name}={value:g}")]
+    out = tmp_path / "shaking"
+    assert command([*SMALL, *changes, "--out", out]) == 3
+    result = json.loads((out / "result.json").read_text())
+    assert result["statuses"]["converged"] < result["runs"] and result["restless_m_s"]
+    assert "Pitch has no one frequency" in result["statement"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--set", "running_gear.guide_reces=1e-4"), "guide_recess"),
+        (("--voltages", ""), "--voltages: got nothing; expected numbers as 0,5,10"),
+        (("--voltages", "36:10:1"), "--voltages: got 36:10:1, which ends before it begins; expected first:last:step"),
+        (("--voltages", "24,24,33"), "--voltages: got 2 of them; expected at least 5"),
+        (("--voltages", "0:30:5"), "option voltages_V.0: got 0.0; expected more than 0 to 100"),
+        (("--payloads", "0,-1"), "option payloads_kg.1: got -1.0; expected 0 to 300"),
+        (("--slope", "60"), "option slope_deg: got 60.0; expected -45 to 45"),
+        (("--surface", "ice"), "surface"),
+        (("--duration", "0.2"), "--duration: got 0.2 s; expected at least 0.5 s"),
+        (("--configuration", "8W"), "--configuration: got 8W; the robot has no such configuration"),
+        (("--robot", "no.toml"), "no.toml"),
+        (("--set", "running_gear.lever_front=-1.5"), "lever_front"),
+        ((*SMALL[1:], "--step", "0.001", "--set", "running_gear.contact_stiffness=3e9"),
+         "the largest stable step is"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_in_a_sentence_and_leaves_nothing(arguments, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert command(["resonance", *arguments, "--out", "map"]) == 2
+    said = capsys.readouterr().err
+    assert words in said and "Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_has_units_and_an_example(capsys):
+    assert command(["resonance", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert "(V)" in said and "(kg)" in said and "Example: mmrjax resonance" in said
+
+
+def test_resolved_configuration_is_read_again(tracked):
+    text = (tracked[0] / "config.resolved.toml").read_text()
+    assert 'model = "track"' in text and "voltages_V = [24.0, 26.0" in text
+    again = config.resolve(config.Resonance, tracked[0] / "config.resolved.toml", {})
+    assert again.payloads_kg == (0.0, 8.0) and again.options["duration"] == 1.0
