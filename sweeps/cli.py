@@ -448,6 +448,21 @@ def loop(
             help="An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration."
         ),
     ] = None,
+    resolve: Annotated[
+        bool,
+        typer.Option(
+            "--resolve",
+            help="Ask the track model whether a running gear within its priors leaves what remains in slip, track or "
+            "ground; tens of minutes on two cores.",
+        ),
+    ] = False,
+    population: Annotated[
+        int | None, typer.Option(help="Members of a generation of --resolve.  \\[default: 128]")
+    ] = None,
+    generations: Annotated[int | None, typer.Option(help="Of --resolve, at most.  \\[default: 20]")] = None,
+    members: Annotated[
+        Path | None, typer.Option(help="File that keeps the runs of --resolve; the same command goes on from there.")
+    ] = None,
     robot: _Robot = None,
     set_: _Set = None,
     effects: _Effects = None,
@@ -465,13 +480,13 @@ def loop(
 
     options = _options(robot=robot, set=set_, effects=effects, report=report) | {
         "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
-        "prefer": prefer,
-        "forbid": config.words(forbid),
+        "prefer": prefer, "forbid": config.words(forbid), "resolve": resolve or None, "population": population,
+        "generations": generations,
     }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Loop, None, options), no_cache)
+    settled = _prepared(config.resolve(config.Loop, None, options), no_cache)
     from sweeps import loop as room
 
-    return room.loop(resolved, data, out, force)
+    return room.loop(settled, data, out, force, members)
 
 
 @app.command(epilog="Example: mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000")

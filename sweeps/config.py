@@ -259,11 +259,15 @@ class Loop(RobotPart, InferencePart, OutputPart):
         replicates: of the bootstrap.
         prefer: whether the fit to all rows or errors held out choose the leader of a class.
         forbid: kinds of experiments, and configurations, that are not to be proposed.
+        resolve: whether the track model is asked about what remains; population, generations: of its search.
     """
 
     replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
     prefer: Literal["fit", "held-out"] = "fit"
     forbid: tuple[str, ...] = ()
+    resolve: bool = False
+    population: Annotated[int, Field(ge=4, le=1_000_000)] | None = None
+    generations: Annotated[int, Field(ge=1, le=10_000)] | None = None
 
 
 class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from pathlib import Path
 
@@ -10,7 +11,8 @@ from rich.table import Table
 from calibration.data import effect_file, posterior, robot_file
 from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
-from calibration.discovery.result import DiscoveryResult
+from calibration.discovery.resolve import resolve
+from calibration.discovery.result import TRACK_FILE, DiscoveryResult
 from calibration.inference import priors
 from mmrjax import channels
 from sweeps import config as configuration
@@ -19,7 +21,7 @@ from sweeps.inputs import load_robot, read_runs
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
 
 
-def loop(config: configuration.Loop, source: str, out: Path | None, force: bool) -> int:
+def loop(config: configuration.Loop, source: str, out: Path | None, force: bool, members: Path | None = None) -> int:
     """Run the closed loop on a table and leave a run folder; returns the exit code.
 
     0 done; 3 done, but rows could not be simulated, or the fit that is proposed did not converge.
@@ -38,13 +40,22 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool)
             replicates=config.replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
             progress=progress,
         )  # fmt: skip
+        if config.resolve:
+            found = dataclasses.replace(found, resolved=resolve(
+                found, noise=config.noise or None, population=config.population, generations=config.generations,
+                members=members, seed=config.seed, tell=progress,
+            ))  # fmt: skip
         folder.write_json("result.json", found.to_json())
         folder.write_table("rows.csv", found.rows_table())
         folder.write_text("config.resolved.toml", configuration.as_toml(config))
         note = f"found by the loop from {config.robot} with {runs.source}: {found.statement}"
         robot_file.write(found.robot, folder.partial / "robot.toml", note=note)
         posterior.write(found.posterior, folder.partial / posterior.FILE)
+        if found.resolved is not None:
+            robot_file.write(found.resolved.robot, folder.partial / TRACK_FILE, note=found.resolved.statement)
         print_discovery(found)
+        if config.resolve and found.resolved is None:
+            say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
         if config.report:
             from sweeps import report_loop
 
@@ -81,6 +92,10 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(findings.said_hidden(found))
     if found.unnamed is not None:
         say(f"{found.unnamed.proposal.formula} ({found.unnamed.proposal.mark})")
+    if found.resolved is not None:
+        say(found.resolved.statement)
+        for note in found.resolved.notes:
+            say(f"- track model: {note}")
     after = found.next_experiment
     if after is not None:
         sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""

@@ -19,6 +19,10 @@ from mmrjax import channels
 from mmrjax.robot import Robot
 
 SCHEMA = "mmrjax.loop/1"
+#: The robot whose running gear the track model found.
+TRACK_FILE = "robot_track.toml"
+#: Error at which a running gear is said to leave what remains.
+RESOLVED_ERROR = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -304,6 +308,82 @@ class HeldOutAlternative:
 
 
 @dataclasses.dataclass(frozen=True)
+class Resolved:
+    """What the track model says.
+
+    Attributes:
+        asked: why it was asked: where something remains, or what was found there.
+        rows: on tracks that were fitted.
+        robot: for `--model track`, with the running gear that fits best.
+        constants: of the running gear and the friction, by name.
+        known_from_rows: constants of which the rows say more than their priors.
+        alike: pairs of constants that trade against one another, with their correlation.
+        fall: of twice the objective by the running gear, priors counted [σ²]; p: of as large a fall by chance.
+        chi2: of the readings with the gear as stated and with the best one [σ²]; readings: that count.
+        rms_percent: by channel, with the gear as stated and with the best one [%].
+        slip_rms: the same of the slip [percentage points].
+        notes: of the search.
+    """
+
+    asked: str
+    rows: int
+    robot: Robot
+    constants: dict[str, Estimate]
+    known_from_rows: tuple[str, ...]
+    alike: tuple[tuple[str, str, float], ...]
+    fall: float
+    p: float
+    chi2: tuple[float, float]
+    readings: int
+    rms_percent: dict[str, tuple[float, float]]
+    slip_rms: tuple[float, float]
+    notes: tuple[str, ...]
+
+    @property
+    def explains(self) -> bool:
+        """Whether a running gear within its priors leaves what remains, more than chance would."""
+        return self.p < RESOLVED_ERROR
+
+    @property
+    def statement(self) -> str:
+        """In a sentence or two."""
+        before, after = self.slip_rms
+        gear = ", ".join(
+            f"{name.removeprefix('running_gear.')} {e.value:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
+            for name, e in self.constants.items() if name.startswith("running_gear.")
+        )  # fmt: skip
+        slip = f"slip of the {self.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
+        if not self.explains:
+            return (
+                f"The track model was asked about {self.asked}: no running gear within its priors leaves it "
+                f"({slip}, χ² falls by {self.fall:.0f}, p = {self.p:.2g})"
+            )
+        known = f"the rows determine {len(self.known_from_rows)} of {len(self.constants)} constants"
+        return (
+            f"The track model was asked about {self.asked}: a running gear within its priors leaves it ({slip}, χ² "
+            f"falls by {self.fall:.0f}, p = {self.p:.2g}): {gear}; {known}"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {
+            "asked": self.asked,
+            "statement": self.statement,
+            "explains": self.explains,
+            "rows": self.rows,
+            "constants": {name: dataclasses.asdict(e) for name, e in self.constants.items()},
+            "known_from_rows": list(self.known_from_rows),
+            "alike": [{"a": a, "b": b, "correlation": r} for a, b, r in self.alike],
+            "fall_chi2": self.fall,
+            "p": self.p,
+            "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
+            "rms_percent": {n: {"before": b, "after": a} for n, (b, a) in self.rms_percent.items()},
+            "slip_rms_points": {"before": self.slip_rms[0], "after": self.slip_rms[1]},
+            "notes": list(self.notes),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
 class DiscoveryResult:
     """All that the loop found.
 
@@ -335,6 +415,7 @@ class DiscoveryResult:
         settings: the statistical constants; replicates: of the bootstrap, that settled.
         notes: sentences worth saying.
         sensitivity: what is said with other assumed noise.
+        resolved: what the track model says of what remains; None where it was not asked, or has no say.
     """
 
     verdict: str
@@ -378,6 +459,7 @@ class DiscoveryResult:
     replicates: int
     notes: tuple[str, ...] = ()
     sensitivity: tuple[Sensitivity, ...] = ()
+    resolved: Resolved | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
@@ -433,6 +515,7 @@ class DiscoveryResult:
             "noise": self.noise,
             "noise_sensitivity": [dataclasses.asdict(s) for s in self.sensitivity],
             "notes": list(self.notes),
+            "resolved": None if self.resolved is None else self.resolved.to_json(),
         }
 
     def rows_table(self) -> dict[str, np.ndarray]:
@@ -462,7 +545,8 @@ class DiscoveryResult:
         return table
 
     def save(self, folder: Path | str) -> None:
-        """Write `result.json`, `rows.csv`, `posterior.nc` and `robot.toml` into a folder."""
+        """Write `result.json`, `rows.csv`, `posterior.nc` and `robot.toml` into a folder; `robot_track.toml` where the
+        track model was asked."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
@@ -470,6 +554,8 @@ class DiscoveryResult:
         note = f"found by the loop with {self.runs.source}: {self.statement}"
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         posterior.write(self.posterior, folder / posterior.FILE)
+        if self.resolved is not None:
+            robot_file.write(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
 
 
 @dataclasses.dataclass(frozen=True)

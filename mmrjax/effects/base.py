@@ -60,6 +60,7 @@ class Effect(eqx.Module):
             shows it.
         odd_in_travel: whether it keeps its sign in space and not in the frame of travel, as a wrong slope does:
             a robot that is turned about, so that its travel is forward again, meets minus its amplitude.
+        resolved: whether the track model has by itself what it stands for.
         movers: `tracks` or `wheels` where it acts on configurations of that kind alone.
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
             temperature, a phase); None has none. A run starts with memory 0.
@@ -80,6 +81,7 @@ class Effect(eqx.Module):
     settles_to: ClassVar[str] = ""
     needs_battery: ClassVar[bool] = False
     odd_in_travel: ClassVar[bool] = False
+    resolved: ClassVar[bool] = False
     movers: ClassVar[str] = ""
     memory_size: ClassVar[float | None] = None
     memory_unit: ClassVar[str] = "-"

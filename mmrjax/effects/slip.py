@@ -177,6 +177,7 @@ class VibrationSlip(SlipEffect):
 
     driver = "demand"
     movers = "tracks"
+    resolved = True
 
     amplitude: Scalar = amplitude(
         unit="m/s",

@@ -1,0 +1,139 @@
+"""What remains in slip, track or ground, asked of the resolved running gear: would one within its priors leave it?
+
+The lumped laws are fed by smooth contacts; the track model has grousers and guides, and shakes. Friction is fitted
+through it twice to the rows on tracks, once with the running gear as stated and once with its constants free.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from calibration.data.errors import BadConfiguration
+from calibration.discovery.result import DiscoveryResult, Estimate, Resolved
+from calibration.inference import observers
+from calibration.inference.calibrate import calibrate
+from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.result import CalibrationResult
+from mmrjax import channels
+from mmrjax.effects import UNNAMED
+from mmrjax.robot import Robot
+
+#: Balances that the resolved running gear has a say in.
+BALANCES = ("slip", "track", "ground")
+#: Constants of the running gear that are freed, and friction of each configuration on tracks that is freed beside.
+GEAR = ("guide_recess", "guide_gap", "contact_stiffness", "contact_damping", "centre_offset", "payload_height")
+FRICTION = ("ground.friction.static", "ground.friction.dynamic", "ground.friction.speed_static")
+#: Members of a generation, and generations at most.
+POPULATION, GENERATIONS = 128, 20
+
+
+def asked(found: DiscoveryResult) -> str:
+    """What of a verdict the running gear could leave, in words; "" for nothing."""
+    places = [w for w in (found.unnamed, found.remains) if w is not None]
+    for place in places:
+        for balance in (place.balance, *place.balances_alike):
+            if balance in BALANCES:
+                return f"what is missing in the balance {balance} over {place.variable.replace('_', ' ')}"
+    named = [e.name for e in found.effects if e.balance in BALANCES]
+    if named:
+        return f"{', '.join(named)}, found by the lumped model"
+    weighed = [a for a in found.alternatives if any(found_in(name, found) for name in a.effects)]
+    if weighed:
+        names = [n for n in weighed[0].effects if found_in(n, found)]
+        return f"{', '.join(names)}, which explains the readings nearly as well"
+    return ""
+
+
+def found_in(name: str, found: DiscoveryResult) -> bool:
+    """Whether an effect of the library enters one of `BALANCES`."""
+    return any(s.name == name and s.balance in BALANCES for s in found.scores)
+
+
+def resolve(
+    found: DiscoveryResult,
+    *,
+    noise: str | None = None,
+    population: int | None = None,
+    generations: int | None = None,
+    members: Path | None = None,
+    seed: int = 0,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> Resolved | None:
+    """Ask the track model about a verdict.
+
+    Args:
+        found: by the loop, from settled rows; noise: as the loop was given it.
+        population, generations, members, seed: of the search, see `calibrate`.
+
+    Returns:
+        None where nothing is to be asked: nothing remains in slip, track or ground, or no row is on tracks.
+
+    Raises:
+        BadConfiguration: the data are histories.
+    """
+    if observers.kind(found.runs) is not SettledRuns:
+        raise BadConfiguration("--resolve: the track model is asked about settled rows; these are histories")
+    reason, robot = asked(found), found.robot
+    tracked = [name for name, chassis in robot.configurations.items() if float(chassis.on_tracks) > 0.5]
+    rows = found.runs.where(found.included & np.isin(found.runs["configuration"], tracked))
+    if not reason or not len(rows):
+        return None
+    present = {str(c) for c in rows["configuration"]}
+    lumped = {f.name for f in found.effects if f.balance in BALANCES} | set(UNNAMED)
+    kept = tuple(e for e in robot.effects if not (e.resolved or (e.name in lumped and e.balance in BALANCES)))
+    robot = dataclasses.replace(robot, effects=kept)
+    friction = tuple(f"{name}.{part}" for name in tracked if name in present for part in FRICTION)
+    gear = tuple(f"running_gear.{name}" for name in GEAR)
+    sds = _noise(found, noise)
+
+    def fit(free: tuple[str, ...], size: int, most: int | None = None, file: Path | None = None) -> CalibrationResult:
+        return calibrate(
+            rows, robot, free=free, noise=sds, model="track", population=size, generations=most, members=file,
+            seed=seed, profiles=False, blocks=False, tell=tell,
+        )  # fmt: skip
+
+    tell("resolved: friction through the track model, its running gear as stated")
+    stated = fit(friction, 0)
+    tell("resolved: the running gear free")
+    size = POPULATION if population is None else population
+    free = fit((*friction, *gear), size, GENERATIONS if generations is None else generations, members)
+    fall = 2 * (stated.objective - free.objective)
+    return Resolved(
+        asked=reason,
+        rows=len(rows),
+        robot=free.robot,
+        constants={n: Estimate(p.value, p.sd, p.unit) for n, p in free.parameters.items()},
+        known_from_rows=tuple(n for n, p in free.parameters.items() if p.held_by == "data"),
+        alike=tuple(free.identifiability.correlated()),
+        fall=float(fall),
+        p=float(chi2.sf(max(fall, 0.0), len(gear))),
+        chi2=(stated.chi_square.value, free.chi_square.value),
+        readings=int(np.isfinite(rows.measured()).sum()),
+        rms_percent={
+            c.name: (stated.errors_after[c.name].rms_percent, free.errors_after[c.name].rms_percent)
+            for c in channels.CHANNELS
+        },
+        slip_rms=(_slip_rms(stated, robot), _slip_rms(free, robot)),
+        notes=tuple(free.notes),
+    )
+
+
+def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
+    """What the loop took sds to be, in words for `calibrate`."""
+    assumed = [c for c in channels.CHANNELS if found.noise.get(c.name, {}).get("source") == "assumed"]
+    parts = [*([stated] if stated else []), *(f"{c.word}={100 * c.sd_share:g}%" for c in assumed)]
+    return ",".join(parts) or None
+
+
+def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:
+    """Rms difference of the slip 1 - V / (r_k ω_k) [percentage points], of rows that read both speeds."""
+    motor, speed = (fitted.readings[name] for name in ("motor_speed", "speed"))
+    ratio = float(robot.gearbox.ratio) / float(robot.radius_pulley)
+    with np.errstate(all="ignore"):
+        slips = [100 * (1 - getattr(speed, which) * ratio / getattr(motor, which)) for which in ("after", "measured")]
+    return float(np.sqrt(np.nanmean((slips[0] - slips[1]) ** 2)))
