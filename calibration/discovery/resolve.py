@@ -91,17 +91,19 @@ def resolve(
     gear = tuple(f"running_gear.{name}" for name in GEAR)
     sds = _noise(found, noise)
 
-    def fit(free: tuple[str, ...], size: int, most: int | None = None, file: Path | None = None) -> CalibrationResult:
+    size = POPULATION if population is None else population
+    most = GENERATIONS if generations is None else generations
+
+    def fit(free: tuple[str, ...], file: Path | None = None) -> CalibrationResult:
         return calibrate(
             rows, robot, free=free, noise=sds, model="track", population=size, generations=most, members=file,
             seed=seed, profiles=False, blocks=False, tell=tell,
         )  # fmt: skip
 
     tell("resolved: friction through the track model, its running gear as stated")
-    stated = fit(friction, 0)
+    stated = fit(friction)
     tell("resolved: the running gear free")
-    size = POPULATION if population is None else population
-    free = fit((*friction, *gear), size, GENERATIONS if generations is None else generations, members)
+    free = fit((*friction, *gear), members)
     fall = 2 * (stated.objective - free.objective)
     return Resolved(
         asked=reason,

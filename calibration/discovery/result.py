@@ -545,8 +545,8 @@ class DiscoveryResult:
         return table
 
     def save(self, folder: Path | str) -> None:
-        """Write `result.json`, `rows.csv`, `posterior.nc` and `robot.toml` into a folder; `robot_track.toml` where the
-        track model was asked."""
+        """Write `result.json`, `rows.csv`, `posterior.nc` and `robot.toml` into a folder, and `robot_track.toml` too
+        where the track model was asked."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
