@@ -17,7 +17,7 @@ from test_stated_values import made as leads
 from calibration.data.writing import finite
 from calibration.discovery import findings
 from calibration.discovery.clusters import Cluster
-from calibration.discovery.result import HiddenEffect
+from calibration.discovery.result import Estimate, HiddenEffect, Resolved
 from sweeps import loop as room
 from sweeps import report_loop
 
@@ -61,7 +61,7 @@ def shown(tmp_path_factory):
 def test_result_has_its_schema(shown, capsys, name):
     got = shown(name, capsys)
     jsonschema.validate(got.document, SCHEMA)
-    for field in ("standing", "cluster", "hidden"):
+    for field in ("standing", "cluster", "hidden", "resolved"):
         less = {k: v for k, v in got.document.items() if k != field}
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(less, SCHEMA)
@@ -185,3 +185,29 @@ def test_names_say_what_would_explain_more_than_they():
     assert findings.said_ruled_out(of("unnamed", better, near)).startswith(
         "a would explain as much as the curve, but is"
     )
+
+
+@pytest.mark.parametrize(
+    ("p", "says"), [(1e-6, "a running gear within its priors leaves it"), (0.4, "no running gear")]
+)
+def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, says):
+    found = shown("leads", capsys).found
+    resolved = Resolved(
+        asked="what is missing in the balance slip over slope", rows=10, robot=found.robot,
+        constants={"running_gear.guide_recess": Estimate(3.1e-4, 4e-5, "m"), "x.static": Estimate(0.58, 0.02, "-")},
+        known_from_rows=("running_gear.guide_recess",), alike=(("a", "b", -0.95),), fall=61.0, p=p,
+        chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)}, slip_rms=(3.3, 0.6), notes=("said too",),
+    )  # fmt: skip
+    found = dataclasses.replace(found, resolved=resolved)
+    document = finite(found.to_json())
+    jsonschema.validate(document, SCHEMA)
+    assert document["resolved"]["explains"] == (p < 0.01) and document["resolved"]["slip_rms_points"]["after"] == 0.6
+    page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
+    assert says in page.text and "slip of the 10 rows on tracks 3.3 → 0.6 points rms" in page.text
+    assert page.tables["resolved_constants"][1][0] == "running_gear.guide_recess"
+    assert [row[-1] for row in page.tables["resolved_constants"][1:]] == ["the rows", "its prior"]
+    capsys.readouterr()
+    room.print_discovery(found)
+    assert says in " ".join(capsys.readouterr().out.split())
+    found.save(tmp_path / "saved")
+    assert (tmp_path / "saved" / "robot_track.toml").exists()

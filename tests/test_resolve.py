@@ -1,0 +1,82 @@
+"""The track model asked about what remains: when it is asked, of what robot, and what it finds (slow)."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from calibration.discovery import resolve as room
+from calibration.discovery.result import Whereabouts
+from mmrjax import robots
+from mmrjax.effects import ALL, BY_NAME
+
+
+def found(unnamed=None, remains=None, effects=(), alternatives=(), scores=("vibration_slip", "series_resistance")):
+    table = records.read("measured")
+    return SimpleNamespace(
+        unnamed=unnamed, remains=remains, alternatives=alternatives, robot=robots.nominal(), runs=table,
+        effects=tuple(SimpleNamespace(name=n, balance=BY_NAME[n].balance) for n in effects),
+        scores=tuple(SimpleNamespace(name=n, balance=BY_NAME[n].balance) for n in scores),
+        included=np.ones(len(table), bool), noise={},
+    )  # fmt: skip
+
+
+def where(balance, alike=()):
+    return Whereabouts(balance, "", alike, "slope", ())
+
+
+@pytest.mark.parametrize(
+    ("case", "says"),
+    [
+        (dict(unnamed=where("slip")), "what is missing in the balance slip over slope"),
+        (dict(unnamed=where("motor", ("gearbox", "track"))), "in the balance track over slope"),
+        (dict(remains=where("ground")), "in the balance ground over slope"),
+        (dict(effects=("nonlinear_slip",)), "nonlinear_slip, found by the lumped model"),
+        (dict(alternatives=(SimpleNamespace(effects={"vibration_slip": 1.0}),)), "vibration_slip, which explains"),
+        (dict(unnamed=where("electrical"), effects=("series_resistance",)), ""),
+        (dict(), ""),
+    ],
+)  # fmt: skip
+def test_it_is_asked_about_slip_track_and_ground_alone(case, says):
+    asked = room.asked(found(**case))
+    assert says in asked if says else asked == ""
+
+
+def test_nothing_is_run_where_it_has_no_say(monkeypatch):
+    monkeypatch.setattr(room, "calibrate", lambda *a, **k: pytest.fail("it was asked"))
+    assert room.resolve(found()) is None
+    wheels = found(unnamed=where("slip"))
+    wheels.included = np.asarray(wheels.runs["configuration"] == "4W2T")
+    assert room.resolve(wheels) is None
+
+
+def test_histories_are_refused():
+    series = found(unnamed=where("slip"))
+    series.runs = dataclasses.replace(
+        series.runs, columns=series.runs.columns | {"time_s": np.zeros(len(series.runs))}
+    )
+    with pytest.raises(BadConfiguration, match="histories"):
+        room.resolve(series)
+
+
+def test_what_the_track_model_has_by_itself_is_left_out_of_the_robot(monkeypatch):
+    """Both fits are of the rows on tracks, with the same noise; what was found in slip, and what it resolves, is gone."""
+    asked = found(effects=("nonlinear_slip",))
+    held = ("vibration_slip", "nonlinear_slip", "series_resistance")
+    asked.robot = dataclasses.replace(asked.robot, effects=tuple(BY_NAME[n]() for n in held))
+    seen = []
+
+    def fit(rows, robot, **options):
+        seen.append((rows, robot, options))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(room, "calibrate", fit)
+    with pytest.raises(KeyboardInterrupt):
+        room.resolve(asked, noise="speed=1%")
+    rows, robot, options = seen[0]
+    assert [e.name for e in robot.effects] == ["series_resistance"] and set(rows["configuration"]) == {"6T2A"}
+    assert options["model"] == "track" and options["noise"] == "speed=1%"
+    assert [e.name for e in ALL if e.resolved] == ["vibration_slip"]
