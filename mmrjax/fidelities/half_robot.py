@@ -19,6 +19,7 @@ from mmrjax import balances, mjcf, undercarriage
 from mmrjax.belt import Path
 from mmrjax.chassis import Chassis, inertia_reduced
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.linear import factorise, substitute
 from mmrjax.fidelities.steady import steady
 from mmrjax.mjcf import Masses, mjx
 from mmrjax.params import Scalar
@@ -171,7 +172,7 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
     model = run.model.replace(dof_armature=armature)
     data = mjx.step(model, data)
     mass, damping = mjx.full_m(model, data), resistance(run, motion, signals, at, pulled)
-    gained = jnp.linalg.solve(mass + run.step * damping, mass @ (data.qvel - motion.v))
+    gained = substitute(factorise(mass + run.step * damping), mass @ (data.qvel - motion.v))
     v = motion.v + gained
     fallen = damping @ gained
     over_step = {
