@@ -10,6 +10,8 @@ Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -83,7 +85,7 @@ def _geometry(
     )
 
 
-def touch(path: Path, chassis: Chassis, q: Float[Array, " 5"], v: Float[Array, " 5"]) -> Touch:
+def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
     """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
 
     Where the belt hangs free between pulley and guide it yields under the grouser as a string of tension
