@@ -28,8 +28,8 @@ from mmrjax.trigonometry import cosine, sine
 CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration bear nothing
 TEETH_GROUSER = TEETH_BELT // GROUSERS  # teeth under one grouser's pitch
 
-_WHEEL = np.arange(CONTACTS) >= GROUSERS
-_END = np.where(_WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0)  # of the wheelbase: front, rear
+WHEEL = np.arange(CONTACTS) >= GROUSERS
+_END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0)  # of the wheelbase: front, rear
 
 
 class Touch(eqx.Module):
@@ -40,6 +40,8 @@ class Touch(eqx.Module):
         rate_x, rate_z: its velocity per belt speed [-].
         weight: share of the driven pulley in that belt speed [-].
         speed_x: its velocity over the ground, uphill [m/s].
+        gap, gap_rate: height over the ground [m] and its rate [m/s].
+        compliance: of the belt under it at its tension [m/N].
         force: normal force R_z [N]; damped: how fast it falls with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
         belt: tensions of the runs.
@@ -51,6 +53,9 @@ class Touch(eqx.Module):
     rate_z: Float[Array, " contacts"]
     weight: Float[Array, " contacts"]
     speed_x: Float[Array, " contacts"]
+    gap: Float[Array, " contacts"]
+    gap_rate: Float[Array, " contacts"]
+    compliance: Float[Array, " contacts"]
     force: Float[Array, " contacts"]
     damped: Float[Array, " contacts"]
     guided: Float[Array, " contacts"]
@@ -63,26 +68,36 @@ class Touch(eqx.Module):
         return jnp.sum(self.force)
 
 
-def _contacts(grousers: Float[Array, " 24"], wheels: Array | float = 0.0) -> Float[Array, " contacts"]:
+def of_contacts(grousers: Float[Array, " 24"], wheels: Array | float = 0.0) -> Float[Array, " contacts"]:
     """One array of grousers and wheels, padded and masked: XLA vectorises that and not a concatenation."""
-    return jnp.where(_WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
+    return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 
 
 def _geometry(
     path: Path, where: Tips, weight: Array, pitch: Scalar, radius_wheel: Scalar
 ) -> tuple[Array, Array, Array, Array, Array]:
     cos, sin = cosine(pitch), sine(pitch)
-    forward, up = _contacts(where.forward, path.gear.wheelbase / 2 * _END), _contacts(where.up)
-    ahead, rise = _contacts(where.rate_forward), _contacts(where.rate_up)
+    forward, up = of_contacts(where.forward, path.gear.wheelbase / 2 * _END), of_contacts(where.up)
+    ahead, rise = of_contacts(where.rate_forward), of_contacts(where.rate_up)
     # The lowest point of a wheel is below its axle, however the robot is pitched.
-    below = jnp.where(_WHEEL, radius_wheel, 0.0)
+    below = jnp.where(WHEEL, radius_wheel, 0.0)
     return (
         forward * cos + up * sin,
         up * cos - forward * sin - below,
         ahead * cos + rise * sin - below / path.radius,
         rise * cos - ahead * sin,
-        _contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
+        of_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
     )
+
+
+def bearing(chassis: Chassis) -> Float[Array, " contacts"]:
+    """1 for contacts that bear in this configuration, else 0 [-]."""
+    return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
+
+
+def tension_free(path: Path, belt: Runs) -> Scalar:
+    """Tension under which the lower run yields where it hangs free, P - P_ct [N], kept from slack."""
+    return jnp.maximum(belt.lower - belt.centrifugal, 0.01 * path.gear.pretension)
 
 
 def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
@@ -104,11 +119,10 @@ def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed
-    taut = jnp.maximum(belt.lower - belt.centrifugal, 0.01 * gear.pretension)
-    compliance = _contacts(where.compliance / taut)
+    compliance = of_contacts(where.compliance / tension_free(path, belt))
     depth = jnp.maximum(-gap, 1e-9)
     yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
-    bears = jnp.where(_WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
+    bears = bearing(chassis)
     stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
     force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
     return Touch(
@@ -118,9 +132,12 @@ def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence
         rate_z=rate_z,
         weight=weight,
         speed_x=v[0] + v[2] * z + rate_x * speed,
+        gap=gap,
+        gap_rate=gap_rate,
+        compliance=compliance,
         force=jnp.asarray(force * bears),
         damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * bears,
-        guided=_contacts(where.guided),
+        guided=of_contacts(where.guided),
         place=place,
         belt=belt,
     )

@@ -283,10 +283,8 @@ def _linearized(run: System, motion: Motion, step: _Step, changed: System) -> Li
     """The contacts' sums with derivatives by the motion, and by whatever else changes."""
     given = _inputs(run, motion) | {"slip": step.slip}
     constants = contact_sums.inputs(changed.path, changed.chassis, changed.conditions.adhesion)
-    names = (*contact_sums.MOTION, *(name for name, change in constants.items() if change is not None))
-    if any(effect.balance == "slip" for effect in run.robot.effects):
-        names = (*names, "slip")
-    return contact_sums.linearize(run.path, run.chassis, given, step.gained, names)
+    differentiated = tuple(name for name, change in constants.items() if change is not None)
+    return contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
 
 
 def _held(
