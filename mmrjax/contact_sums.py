@@ -20,7 +20,6 @@ from mmrjax.belt import Path, runs, tips
 from mmrjax.chassis import Chassis
 from mmrjax.params import Scalar
 from mmrjax.signals import Signals
-from mmrjax.running_gear import GROUSERS
 from mmrjax.trigonometry import cosine, sine
 from mmrjax.undercarriage import WHEEL, Touch, bearing, of_contacts, tension_free, touch
 
@@ -44,6 +43,8 @@ FRICTION = ("static", "dynamic", "speed_static", "speed_dynamic")
 CHASSIS = ("radius", "on_tracks")
 #: Coordinates and velocities (see `undercarriage`) but for the travel, on which nothing depends.
 MOTION = ("z", "pitch", "front", "rear", "v_x", "v_z", "v_pitch", "v_front", "v_rear")
+#: Of each contact: F, R, F~ and R~ [N] (see `Sums`) and how fast F rises with sliding [N·s/m].
+Forces = tuple[Array, ...]
 
 
 class Sums(eqx.Module):
@@ -216,34 +217,38 @@ class _Law(eqx.Module):
     along: Array  # what the step changes the contact's velocity by [m/s]
     off: Array
 
-    def forces(self) -> tuple[Array, ...]:
+    def forces(self) -> Forces:
         """F, R, F~, R~ [N] and the rise of F [N·s/m]."""
         force, down = self.at.force, self.at.damped * self.off
         fallen = jnp.maximum(self.rise, 0.0) * force * self.along + self.coefficient * down
         return self.coefficient * force, force, fallen, down, self.rise * force
 
     def moved(
-        self, gap: Any = None, gap_rate: Any = None, slide: Any = None, along: Any = None, off: Any = None,
+        self,
+        gap: Any = None,
+        gap_rate: Any = None,
+        slide: Any = None,
+        along: Any = None,
+        off: Any = None,
         compliance: Any = None,
-    ) -> tuple[Array, ...]:  # fmt: skip
+    ) -> Forces:
         """How `forces` change with the gap, its rate, the sliding speed, what a step changes velocities by and the
-        compliance of the belt."""
+        compliance of the belt; None: not at all."""
         at, sinks = self.at, None if gap is None else -gap
         yields = None if compliance is None else -self.share * compliance
         force = _total((self.by_depth, sinks), (-at.damped, gap_rate), (at.force, yields))
         damped = _total((self.damped_by_depth, sinks), (at.damped, yields))
         turned = _total((self.bend * at.force, slide), (self.rise, force))
         down = _total((damped, self.off), (at.damped, off))
-        implicit = jnp.maximum(self.rise, 0.0) * at.force
         fallen = _total(
             (jnp.where(self.rise > 0, self.along, 0.0), turned),
-            (implicit, along),
+            (jnp.maximum(self.rise, 0.0) * at.force, along),
             (self.rise * at.damped * self.off, slide),
             (self.coefficient, down),
         )
         pulled = _total((self.rise * at.force, slide), (self.coefficient, force))
-        return tuple(jnp.zeros_like(at.force) if a is None else a * jnp.ones_like(at.force) for a in
-                     (pulled, force, fallen, down, turned))  # fmt: skip
+        found = (pulled, force, fallen, down, turned)
+        return tuple(jnp.zeros_like(at.force) if a is None else a for a in found)
 
 
 def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gained: Array) -> _Law:
@@ -271,146 +276,129 @@ def _law(path: Path, chassis: Chassis, at: Touch, given: Mapping[str, Any], gain
     )
 
 
+class _Levers(eqx.Module):
+    """Levers with which forces along the ground and off it enter the sums, each of shape (levers, contacts)."""
+
+    level: Array
+    steep: Array
+
+    @classmethod
+    def of(cls, unit: Any, x: Array, z: Array, front: tuple[Array, Array, Array], rear: tuple[Array, ...]) -> _Levers:
+        """From levers of the pitch [m], and on each pulley those of F, R [m] and of friction on the guide [m]."""
+        return cls(jnp.stack([unit, z, front[0], rear[0]]), jnp.stack([unit, x, *front[1:], *rear[1:]]))
+
+
+def _weighed(forces: Sequence[Forces], levers: Sequence[_Levers]) -> Float[Array, "forces levers sums"]:
+    """The sums over all contacts of forces with levers, each with each."""
+    level, steep = jnp.stack([a.level for a in levers]), jnp.stack([a.steep for a in levers])
+    pulls = jnp.stack([jnp.stack([row[0], row[2], row[4]]) for row in forces])
+    bears = jnp.stack([jnp.stack([row[1], row[3]]) for row in forces])
+    # (forces, kind, levers, lever)
+    pulls, bears = jnp.tensordot(pulls, level, ((2,), (2,))), jnp.tensordot(bears, steep, ((2,), (2,)))
+    pull, fallen, rise = (pulls[:, k] for k in range(3))
+    force, down = (bears[:, k] for k in range(2))
+    left, held = pull - fallen, force - down
+    sums = Sums(
+        traction=pull[..., 0],
+        normal=force[..., 0],
+        moment=left[..., 1] - held[..., 1],
+        rear=left[..., 3] + held[..., 4],
+        front=pull[..., 2] + force[..., 2],
+        guide_front=force[..., 3],
+        guide_rear=force[..., 5],
+        fallen_x=fallen[..., 0],
+        fallen_z=down[..., 0],
+        fallen_front=fallen[..., 2] + down[..., 2],
+        rise=rise[..., 0],
+        rise_front=rise[..., 2],
+    )
+    return jnp.stack([getattr(sums, name) for name in ROWS], axis=-1)
+
+
 def _by_motion(
     path: Path, chassis: Chassis, given: Mapping[str, Any], gained: Array
 ) -> tuple[Float[Array, " sums"], Float[Array, "motion sums"]]:
     """The sums, and their derivatives by `MOTION`.
 
     Each contact is moved along ten directions: its height, the pitch, the place of the belt as each pulley turns, five
-    velocities and the yielding of the belt. What its forces change by is weighed with the levers of the sums; what
-    the levers change by is weighed with its forces.
+    velocities and the yielding of the belt. What its forces change by is weighed with the levers of the sums, and what
+    the levers change by with its forces.
     """
     height, pitch, front, rear, *v = (given[name] for name in MOTION)
     at = touch(path, chassis, (0.0, height, pitch, front, rear), v)
     law = _law(path, chassis, at, given, gained)
-    radius, x, z, rate_x, rate_z = path.radius, at.lever_x, at.lever_z, at.rate_x, at.rate_z
-    on_front, on_rear = radius * (1 - at.weight), radius * at.weight
+    x, z, rate_x, rate_z, guided, one = at.lever_x, at.lever_z, at.rate_x, at.rate_z, at.guided, jnp.ones_like(at.gap)
+    on_front, on_rear = path.radius * (1 - at.weight), path.radius * at.weight
+    speed, drawn = (on_front * a[3] + on_rear * a[4] for a in (v, gained))
 
-    def turned(x: Array, z: Array, rate_x: Array, rate_z: Array, compliance: Any = None) -> tuple[Array, ...]:
+    def turned(dx: Array, dz: Array, ahead: Array, rise: Array, compliance: Array | None = None) -> Forces:
         """Change of the forces as contact points and their rates change."""
-        speed, drawn = (on_front * a[3] + on_rear * a[4] for a in (v, gained))
         return law.moved(
-            gap=z,
-            gap_rate=rate_z * speed - v[2] * x,
-            slide=-v[2] * z - rate_x * speed,
-            along=gained[2] * z + rate_x * drawn,
-            off=rate_z * drawn - gained[2] * x,
+            gap=dz,
+            gap_rate=rise * speed - v[2] * dx,
+            slide=-v[2] * dz - ahead * speed,
+            along=gained[2] * dz + ahead * drawn,
+            off=rise * drawn - gained[2] * dx,
             compliance=compliance,
         )
 
-    def levers(x: Any, z: Any, rate_x: Any, rate_z: Any, guided: Any, weight: Any) -> tuple[Array, ...]:
-        """What the sums change by as the levers of the forces do."""
-        pulls, bears, fallen, down, rises = forces
-        left, held, along = pulls - fallen, bears - down, _total((pulls, rate_x), (bears, rate_z))
-        shift = None if weight is None else radius * weight
-        none = jnp.zeros_like(bears)
-        back = None if weight is None else -shift
+    def levers(dx: Array, dz: Array, ahead: Array, rise: Array, share: Array) -> _Levers:
+        """Change of the levers as they do."""
+        rates = (ahead, rise, share)
+        front, rear = (tuple(a * on for a in rates) for on in (on_front, on_rear))
+        return _Levers.of(jnp.zeros_like(x), dx, dz, front, rear)
 
-        def both(a: Any, b: Any, at_a: Array, at_b: Array, share: Array, shift: Any) -> Any:
-            return _total((a, rate_x, share), (b, rate_z, share), (a, at_a, shift), (b, at_b, shift))
-
-        del along
-        rows = (
-            None,
-            None,
-            _total((left, z), (-held, x)),
-            both(left, held, at.rate_x, at.rate_z, on_rear, shift),
-            both(pulls, bears, at.rate_x, at.rate_z, on_front, back),
-            _total((guided, bears, on_front), (at.guided, bears, back)),
-            _total((guided, bears, on_rear), (at.guided, bears, shift)),
-            None,
-            None,
-            both(fallen, down, at.rate_x, at.rate_z, on_front, back),
-            None,
-            _total((rises, rate_x, on_front), (rises, at.rate_x, back)),
-        )
-        return tuple(none if row is None else row for row in rows)
-
-    forces = law.forces()
-    one = jnp.ones_like(x)
-    # Along the belt the tips move in the frame of the chassis, which is pitched.
-    (place, _), (by_front, weight) = jax.jvp(lambda a: path.place(a, rear), (front,), (jnp.ones_like(front),))
-    tip = jax.jvp(lambda p: tips(path, p), (place,), (jnp.ones_like(place),))[1]
+    # Along the belt the tips move in the frame of the chassis, which is pitched; their share of the pulleys changes.
+    unit = jnp.ones_like(front)
+    (place, _), (by_front, shared) = jax.jvp(lambda a: path.place(a, rear), (front,), (unit,))
+    by_front, shared, by_rear = of_contacts(by_front), of_contacts(shared), at.weight * path.radius
+    tip = jax.tree.map(of_contacts, jax.jvp(lambda p: tips(path, p), (place,), (jnp.ones_like(place),))[1])
     cos, sin = cosine(pitch), sine(pitch)
-    tip = jax.tree.map(of_contacts, tip)
-    shift = (
+    belt = (
         tip.forward * cos + tip.up * sin,
         tip.up * cos - tip.forward * sin,
         tip.rate_forward * cos + tip.rate_up * sin,
         tip.rate_up * cos - tip.rate_forward * sin,
     )
     below = jnp.where(WHEEL, chassis.radius, 0.0)
-    tilt = (z + below, -x, rate_z, -rate_x - below / radius)
-    by_front, by_rear, weight = of_contacts(by_front), of_contacts(radius * at.weight[:GROUSERS]), of_contacts(weight)
+    pitched = (z + below, -x, rate_z, -rate_x - below / path.radius)
 
     def free(motion: Sequence[Scalar]) -> Scalar:
         return tension_free(path, runs(path, motion[:2], motion[2:]))
 
     pulleys = (front, rear, v[3], v[4])
-    taut, taut_by = free(pulleys), []
-    for k, name in enumerate(("front", "rear", "v_front", "v_rear")):
-        slope = jax.jvp(lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (jnp.ones_like(taut),))
-        taut_by.append((MOTION.index(name), slope[1]))
-    along_belt = turned(*shift, tip.compliance / taut)
-    over, gains = radius * (v[4] - v[3]), radius * (gained[4] - gained[3])
-    across = law.moved(
-        gap_rate=rate_z * over, slide=-rate_x * over, along=rate_x * gains, off=rate_z * gains
-    )
-    directions = [
+    taut = free(pulleys)
+    drawn_belt = turned(*belt, tip.compliance / taut)
+    over, gains = (path.radius * (a[4] - a[3]) for a in (v, gained))
+    handed = law.moved(gap_rate=rate_z * over, slide=-rate_x * over, along=rate_x * gains, off=rate_z * gains)
+    changes = [
         law.moved(gap=one),
-        turned(*tilt),
-        tuple(a * by_front + b * weight for a, b in zip(along_belt, across, strict=True)),
-        tuple(a * by_rear for a in along_belt),
+        turned(*pitched),
+        tuple(a * by_front + b * shared for a, b in zip(drawn_belt, handed, strict=True)),
+        tuple(a * by_rear for a in drawn_belt),
         law.moved(slide=-one),
         law.moved(gap_rate=one),
         law.moved(gap_rate=-x, slide=-z),
         law.moved(gap_rate=rate_z * on_front, slide=-rate_x * on_front),
         law.moved(gap_rate=rate_z * on_rear, slide=-rate_x * on_rear),
         law.moved(compliance=-at.compliance / taut),
-        forces,
     ]
-    slopes = _weighed(directions, at, on_front, on_rear)
-    belt = levers(*shift, tip.guided, None)
-    weights = levers(None, None, None, None, None, one)
-    geometry = jnp.stack(
-        [
-            jnp.stack(levers(*tilt, None, None)),
-            jnp.stack([a * by_front + b * weight for a, b in zip(belt, weights, strict=True)]),
-            jnp.stack([a * by_rear for a in belt]),
-        ]
-    )
-    moved = slopes[: len(MOTION)].at[1:4].add(geometry @ one)
-    for k, slope in taut_by:
-        moved = moved.at[k].add(slope * slopes[-2])
-    return slopes[-1], moved
-
-
-def _weighed(
-    forces: Sequence[tuple[Array, ...]], at: Touch, on_front: Array, on_rear: Array
-) -> Float[Array, "rows sums"]:
-    """The sums over the contacts for rows of (F, R, F~, R~, rise of F)."""
-    one = jnp.ones_like(at.force)
-    level = jnp.stack([one, at.lever_z, at.rate_x * on_rear, at.rate_x * on_front])
-    steep = jnp.stack([one, at.lever_x, at.rate_z * on_rear, at.rate_z * on_front, at.guided * on_front, at.guided * on_rear])
-    pulls = jnp.stack([jnp.stack([row[0], row[2], row[4]]) for row in forces]) @ level.T
-    bears = jnp.stack([jnp.stack([row[1], row[3]]) for row in forces]) @ steep.T
-    (pull, fallen, rise), (force, down) = (jnp.moveaxis(a, 1, 0) for a in (pulls, bears))
-    left, held = pull - fallen, force - down
-    rows = [
-        pull[:, 0],
-        force[:, 0],
-        left[:, 1] - held[:, 1],
-        left[:, 2] + held[:, 2],
-        pull[:, 3] + force[:, 3],
-        force[:, 4],
-        force[:, 5],
-        fallen[:, 0],
-        down[:, 0],
-        fallen[:, 3] + down[:, 3],
-        rise[:, 0],
-        rise[:, 3],
+    forces, rates = law.forces(), (rate_x, rate_z, guided)
+    here = _Levers.of(one, x, z, *(tuple(a * on for a in rates) for on in (on_front, on_rear)))
+    rows = _weighed([*changes, forces], [here])[:, 0]
+    over_belt = levers(*belt, tip.guided)
+    shift = tuple(path.radius * a * shared for a in rates)
+    by_share = _Levers.of(jnp.zeros_like(x), 0 * x, 0 * x, tuple(-a for a in shift), shift)
+    moved = [
+        levers(*pitched, jnp.zeros_like(x)),
+        jax.tree.map(lambda a, b: a * by_front + b, over_belt, by_share),
+        jax.tree.map(lambda a: a * by_rear, over_belt),
     ]
-    return jnp.stack(rows, axis=-1)
+    slopes = rows[: len(MOTION)].at[1:4].add(_weighed([forces], moved)[0])
+    for k, name in enumerate(("front", "rear", "v_front", "v_rear")):
+        by = jax.jvp(lambda a, k=k: free((*pulleys[:k], a, *pulleys[k + 1 :])), (pulleys[k],), (unit,))[1]
+        slopes = slopes.at[MOTION.index(name)].add(by * rows[-2])
+    return rows[-1], slopes
 
 
 class Drawn(eqx.Module):
