@@ -59,7 +59,7 @@ class Sums(eqx.Module):
         front: of F and R on the driving pulley [N·m].
         guide_front, guide_rear: of R's share on the guide, on both pulleys, at a coefficient of friction of 1 [N·m].
         fallen_x, fallen_z, fallen_front: F~ and R~ along the ground and off it [N] and on the driving pulley [N·m].
-        rise, rise_front: how fast F rises with all sliding speeds [N·s/m], and its moment on the driving pulley [N·s].
+        rise, rise_front: how fast F rises with all sliding speeds [N·s/m], and so does its part of `front` [N·s].
     """
 
     traction: Scalar
@@ -283,7 +283,7 @@ class _Levers(eqx.Module):
     steep: Array
 
     @classmethod
-    def of(cls, unit: Any, x: Array, z: Array, front: tuple[Array, Array, Array], rear: tuple[Array, ...]) -> _Levers:
+    def of(cls, unit: Any, x: Array, z: Array, front: tuple[Array, ...], rear: tuple[Array, ...]) -> _Levers:
         """From levers of the pitch [m], and on each pulley those of F, R [m] and of friction on the guide [m]."""
         return cls(jnp.stack([unit, z, front[0], rear[0]]), jnp.stack([unit, x, *front[1:], *rear[1:]]))
 
@@ -320,9 +320,9 @@ def _by_motion(
 ) -> tuple[Float[Array, " sums"], Float[Array, "motion sums"]]:
     """The sums, and their derivatives by `MOTION`.
 
-    Each contact is moved along ten directions: its height, the pitch, the place of the belt as each pulley turns, five
-    velocities and the yielding of the belt. What its forces change by is weighed with the levers of the sums, and what
-    the levers change by with its forces.
+    Each contact is moved along ten directions: its height, the pitch, the place of the belt as each pulley turns,
+    five velocities and the yielding of the belt. What its forces change by is weighed with the levers of the sums,
+    and what the levers change by with its forces.
     """
     height, pitch, front, rear, *v = (given[name] for name in MOTION)
     at = touch(path, chassis, (0.0, height, pitch, front, rear), v)
@@ -345,8 +345,9 @@ def _by_motion(
     def levers(dx: Array, dz: Array, ahead: Array, rise: Array, share: Array) -> _Levers:
         """Change of the levers as they do."""
         rates = (ahead, rise, share)
-        front, rear = (tuple(a * on for a in rates) for on in (on_front, on_rear))
-        return _Levers.of(jnp.zeros_like(x), dx, dz, front, rear)
+        return _Levers.of(
+            jnp.zeros_like(x), dx, dz, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates)
+        )
 
     # Along the belt the tips move in the frame of the chassis, which is pitched; their share of the pulleys changes.
     unit = jnp.ones_like(front)
@@ -384,7 +385,7 @@ def _by_motion(
         law.moved(compliance=-at.compliance / taut),
     ]
     forces, rates = law.forces(), (rate_x, rate_z, guided)
-    here = _Levers.of(one, x, z, *(tuple(a * on for a in rates) for on in (on_front, on_rear)))
+    here = _Levers.of(one, x, z, tuple(a * on_front for a in rates), tuple(a * on_rear for a in rates))
     rows = _weighed([*changes, forces], [here])[:, 0]
     over_belt = levers(*belt, tip.guided)
     shift = tuple(path.radius * a * shared for a in rates)
@@ -447,4 +448,6 @@ class Mover(eqx.Module):
         friction = chassis.track.guide_friction * signals.direction
         guided = (sums.guide_front + sums.guide_rear) / self.radius
         load = -(sums.front - friction * sums.guide_front + self.torque_front)
-        return Drawn(sums.traction, sums.moment, sums.rear - friction * sums.guide_rear, friction * guided, guided, load)
+        return Drawn(
+            sums.traction, sums.moment, sums.rear - friction * sums.guide_rear, friction * guided, guided, load
+        )

@@ -68,7 +68,7 @@ class Touch(eqx.Module):
         return jnp.sum(self.force)
 
 
-def of_contacts(grousers: Float[Array, " 24"], wheels: Array | float = 0.0) -> Float[Array, " contacts"]:
+def of_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0) -> Float[Array, " contacts"]:
     """One array of grousers and wheels, padded and masked: XLA vectorises that and not a concatenation."""
     return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
 

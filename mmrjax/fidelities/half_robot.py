@@ -167,7 +167,8 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     share = pulled.force / jnp.maximum(at.force, 1e-9)
     pushes = share[:, None] * along + off
     contacts = (along.T * rises) @ along + (pushes.T * at.damped) @ off
-    return contacts + jnp.diag(jnp.stack([losses[0], *[jnp.zeros_like(losses[0])] * 2, losses[1], jnp.zeros_like(losses[0])]))
+    none = jnp.zeros_like(losses[0])
+    return contacts + jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
 
 
 class _Step(eqx.Module):
@@ -216,13 +217,9 @@ def _moved(
     motion: Motion, step: Scalar, later: _Later, fallen: Array, gained: Array, signals: Signals
 ) -> tuple[Motion, Signals]:
     v = motion.v + gained
-    over_step = {
-        "traction": signals.traction - fallen[0],
-        "normal": signals.normal - fallen[1],
-        "acceleration": gained[0] / step,
-    }
     after = Motion(motion.q + step * v, v, later.current, later.discharge, later.memory)
-    return after, dataclasses.replace(signals, **over_step)
+    traction, normal = signals.traction - fallen[0], signals.normal - fallen[1]
+    return after, dataclasses.replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
 
 
 @eqx.filter_custom_jvp
@@ -246,51 +243,51 @@ def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Scalar]:
 
 
 @advance.def_jvp
-def _(
+def _differentiated(
     primals: tuple[System, Motion], tangents: tuple[Any, Any]
 ) -> tuple[tuple[Motion, Signals, Scalar], tuple[Motion, Signals, Scalar]]:
     run, motion = primals
     step = _step(run, motion)
-    run, changed = (dataclasses.replace(x, model=None, data=None) for x in (run, tangents[0]))
-    linearized = _linearized(run, motion, step, changed)
+    # The model's constants follow from the rest of the run.
+    run, d_run = (dataclasses.replace(x, model=None, data=None) for x in (run, tangents[0]))
+    d_motion = tangents[1]
+    linearized = _linearized(run, motion, step, d_run)
 
     def held(run: System, motion: Motion) -> tuple[Array, Array, _Later, Signals, Scalar]:
         return _held(run, motion, step.gained, linearized)
 
-    was, moved = eqx.filter_jvp(held, primals_out := (run, motion), (changed, tangents[1]))
-    left, fallen, later, signals, guided = was
-    d_left, d_fallen, *d_others, d_guided = moved
-    d_gained = substitute(step.factors, d_left)
-    d_fallen = d_fallen + step.damping[:2] @ d_gained
-    given = (primals_out[1], run.step, later, fallen, step.gained, signals)
-    (_, _), (after, over) = eqx.filter_jvp(
-        _moved, given, (tangents[1], changed.step, d_others[0], d_fallen, d_gained, d_others[1])
+    (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
+    d_left, d_fallen, d_later, d_signals, d_guided = d_held
+    # None: what is differentiated does not enter.
+    d_gained = jnp.zeros_like(left) if d_left is None else substitute(step.factors, d_left)
+    through = step.damping[:2] @ d_gained
+    d_fallen = through if d_fallen is None else d_fallen + through
+    _, (d_after, d_over) = eqx.filter_jvp(
+        _moved,
+        (motion, run.step, later, fallen, step.gained, signals),
+        (d_motion, d_run.step, d_later, d_fallen, d_gained, d_signals),
     )
-    return (step.after, step.signals, step.guided), (after, over, d_guided)
+    return (step.after, step.signals, step.guided), (d_after, d_over, d_guided)
 
 
-def _inputs(run: System, motion: Motion) -> dict[str, Any]:
-    """What the contacts depend on, by name; of tangents alike."""
-    q, v = motion.q, motion.v
-    moving = [None] * 9 if q is None else [q[k] for k in range(1, 5)]
-    moving = [*moving[:4], *([None] * 5 if v is None else [v[k] for k in range(5)])]
-    return dict(zip(contact_sums.MOTION, moving, strict=True)) | contact_sums.inputs(
-        run.path, run.chassis, run.conditions.adhesion
-    )
+def _inputs(run: System, motion: Motion) -> dict[str, Scalar]:
+    """What the contacts depend on, by name."""
+    moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
+    return moving | contact_sums.inputs(run.path, run.chassis, run.conditions.adhesion)
 
 
 def _linearized(run: System, motion: Motion, step: _Step, changed: System) -> Linearized:
-    """The contacts' sums with derivatives by the motion, and by whatever else changes."""
-    given = _inputs(run, motion) | {"slip": step.slip}
+    """The contacts' sums with derivatives by the motion, and by what else is `changed`."""
     constants = contact_sums.inputs(changed.path, changed.chassis, changed.conditions.adhesion)
     differentiated = tuple(name for name, change in constants.items() if change is not None)
+    given = _inputs(run, motion) | {"slip": step.slip}
     return contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
 
 
 def _held(
     run: System, motion: Motion, gained: Float[Array, " 5"], linearized: Linearized
 ) -> tuple[Array, Array, _Later, Signals, Scalar]:
-    """What a step with Δv held leaves of Δt τ - Δt c - (M + Δt K) Δv, the first two of K Δv, and the rest of a step."""
+    """What a step with Δv held leaves of Δt τ - Δt c - (M + Δt K) Δv, K Δv of x and z, and the rest of a step."""
     q, v = motion.q, motion.v
     belt = runs(run.path, (q[3], q[4]), (v[3], v[4]))
     sums = linearized.near(_inputs(run, motion))
