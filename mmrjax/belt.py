@@ -8,6 +8,7 @@ forward running: lower run (backwards), rear pulley (up), upper run (forwards), 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float
 from mmrjax.contact import step
 from mmrjax.params import Scalar
 from mmrjax.running_gear import GROUSERS, TEETH_PULLEY, RunningGear
+from mmrjax.trigonometry import cosine, sine
 
 #: Relative swing of the pulley's radius: links of a chain lie on a polygon of as many sides as teeth.
 POLYGON = (1 - math.cos(math.pi / TEETH_PULLEY)) / 2
@@ -101,10 +103,10 @@ def tips(path: Path, place: Float[Array, " n"]) -> Tips:
     straight = jnp.where(x > 0, -x, jnp.where(turned < jnp.pi, 0.0, x + arc))
     height = gear.grouser_height
     return Tips(
-        forward=side * (run / 2 + straight + radius * jnp.sin(turned) + height * jnp.sin(tilt)),
-        up=-radius * jnp.cos(turned) - height * jnp.cos(tilt) + rise,
-        rate_forward=-jnp.cos(turned) + height * jnp.cos(tilt) * tilt_rate,
-        rate_up=side * (-jnp.sin(turned) + height * jnp.sin(tilt) * tilt_rate + rise_rate),
+        forward=side * (run / 2 + straight + radius * sine(turned) + height * sine(tilt)),
+        up=-radius * cosine(turned) - height * cosine(tilt) + rise,
+        rate_forward=-cosine(turned) + height * cosine(tilt) * tilt_rate,
+        rate_up=side * (-sine(turned) + height * sine(tilt) * tilt_rate + rise_rate),
         guided=jnp.where(x > 0, step(x, 0.0, 0.0, gear.guide_gap, 1.0), 0.0),
         compliance=u * (1 - u) * gear.guide_gap,
     )
@@ -133,10 +135,10 @@ def travel(radius: Scalar, angle: Scalar) -> tuple[Scalar, Scalar]:
     ε from the geometry): the tooth mesh, whose period is S_t.
     """
     phase = TEETH_PULLEY * angle
-    return radius * (angle + POLYGON * jnp.sin(phase) / TEETH_PULLEY), radius * (1 + POLYGON * jnp.cos(phase))
+    return radius * (angle + POLYGON * sine(phase) / TEETH_PULLEY), radius * (1 + POLYGON * cosine(phase))
 
 
-def runs(path: Path, angles: Float[Array, " 2"], rates: Float[Array, " 2"]) -> Runs:
+def runs(path: Path, angles: Sequence[Scalar], rates: Sequence[Scalar]) -> Runs:
     """Tensions from the angles [rad] and rates [rad/s] of front and rear pulley, relative to the chassis.
 
     P = max(0, P_0 ± k Δs ± b Δṡ), Δs the belt drawn by the front pulley less that of the rear one: the

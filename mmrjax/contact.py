@@ -80,6 +80,14 @@ class Friction(eqx.Module):
         rising = self.static * direction(speed, self.speed_static)
         return jnp.where(size < self.speed_static, rising, jnp.sign(speed) * falling)
 
+    def rise(self, speed: Scalar) -> Scalar:
+        """How fast the coefficient rises with sliding `speed` [s/m]; negative between V_s and V_d."""
+        size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static
+        u = jnp.clip((size - self.speed_static) / width, 0.0, 1.0)
+        x = jnp.clip(speed / self.speed_static, -1.0, 1.0)
+        rising = self.static * 1.5 * (1 - x**2) / self.speed_static
+        return jnp.where(size < self.speed_static, rising, (self.dynamic - self.static) * 6 * u * (1 - u) / width)
+
     def speed_creep(self, coefficient: Scalar) -> Scalar:
         """Sliding speed [m/s] at which static friction gives `coefficient`: the inverse below V_s.
 
@@ -113,3 +121,8 @@ def force_contact(
     deep = jnp.where(touching, h, depth)  # a value with a finite derivative where there is no contact
     force = stiffness * deep**exponent - damping * gap_rate * step(deep, 0.0, 0.0, depth, 1.0)
     return jnp.where(touching, jnp.maximum(force, 0.0), 0.0)
+
+
+def damping_contact(force: Scalar, gap: Scalar, gap_free: Scalar, damping: Scalar, depth: Scalar) -> Scalar:
+    """How fast a `force` given by `force_contact` falls with the gap's rate [N·s/m]; its arguments."""
+    return jnp.where(force > 0, damping * step(gap_free - gap, 0.0, 0.0, depth, 1.0), 0.0)

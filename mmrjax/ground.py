@@ -34,6 +34,10 @@ class Ground(eqx.Module):
         """Traction [N] of a contact that slides at `speed_sliding` [m/s], eq. (25) with Fig. 7."""
         return self.friction.coefficient(speed_sliding) * adhesion * normal
 
+    def traction_rise(self, speed_sliding: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
+        """How fast that traction rises with `speed_sliding` [N·s/m]."""
+        return self.friction.rise(speed_sliding) * adhesion * normal
+
     def speed_creep(self, demand: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
         """Sliding speed [m/s] at which the contact carries `demand` [N]."""
         return self.friction.speed_creep(demand / (adhesion * normal))

@@ -10,20 +10,26 @@ Contact pairs of one side: 24 grousers with the ground, 168 teeth with each of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax.belt import Path, Runs, Tips, runs, tension_along, tips
 from mmrjax.chassis import Chassis
-from mmrjax.contact import force_contact
+from mmrjax.contact import damping_contact, force_contact
 from mmrjax.params import Scalar
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 from mmrjax.signals import GRAVITY, Signals
+from mmrjax.trigonometry import cosine, sine
 
 CONTACTS = GROUSERS + WHEELS  # with the ground, of one side; those of the other configuration bear nothing
 TEETH_GROUSER = TEETH_BELT // GROUSERS  # teeth under one grouser's pitch
+
+WHEEL = np.arange(CONTACTS) >= GROUSERS
+_END = np.where(WHEEL, np.where(np.arange(CONTACTS) == GROUSERS, 1.0, -1.0), 0.0)  # of the wheelbase: front, rear
 
 
 class Touch(eqx.Module):
@@ -34,6 +40,8 @@ class Touch(eqx.Module):
         rate_x, rate_z: its velocity per belt speed [-].
         weight: share of the driven pulley in that belt speed [-].
         speed_x: its velocity over the ground, uphill [m/s].
+        gap, gap_rate: height over the ground [m] and its rate [m/s].
+        compliance: of the belt under it at its tension [m/N].
         force: normal force R_z [N]; damped: how fast it falls with the gap's rate [N·s/m].
         guided: share of the force that passes to the lower guide [-].
         belt: tensions of the runs.
@@ -45,6 +53,9 @@ class Touch(eqx.Module):
     rate_z: Float[Array, " contacts"]
     weight: Float[Array, " contacts"]
     speed_x: Float[Array, " contacts"]
+    gap: Float[Array, " contacts"]
+    gap_rate: Float[Array, " contacts"]
+    compliance: Float[Array, " contacts"]
     force: Float[Array, " contacts"]
     damped: Float[Array, " contacts"]
     guided: Float[Array, " contacts"]
@@ -57,22 +68,39 @@ class Touch(eqx.Module):
         return jnp.sum(self.force)
 
 
+def of_contacts(grousers: Float[Array, " 24"], wheels: Array | np.ndarray | float = 0.0) -> Float[Array, " contacts"]:
+    """One array of grousers and wheels, padded and masked: XLA vectorises that and not a concatenation."""
+    return jnp.where(WHEEL, wheels, jnp.pad(grousers, (0, WHEELS)))
+
+
 def _geometry(
     path: Path, where: Tips, weight: Array, pitch: Scalar, radius_wheel: Scalar
 ) -> tuple[Array, Array, Array, Array, Array]:
-    cos, sin = jnp.cos(pitch), jnp.sin(pitch)
-    half = path.gear.wheelbase / 2 * jnp.asarray([1.0, -1.0])
-    none = jnp.zeros(WHEELS)
+    cos, sin = cosine(pitch), sine(pitch)
+    forward, up = of_contacts(where.forward, path.gear.wheelbase / 2 * _END), of_contacts(where.up)
+    ahead, rise = of_contacts(where.rate_forward), of_contacts(where.rate_up)
+    # The lowest point of a wheel is below its axle, however the robot is pitched.
+    below = jnp.where(WHEEL, radius_wheel, 0.0)
     return (
-        jnp.concatenate([where.forward * cos + where.up * sin, half * cos]),
-        jnp.concatenate([where.up * cos - where.forward * sin, -half * sin - radius_wheel]),
-        jnp.concatenate([where.rate_forward * cos + where.rate_up * sin, none - radius_wheel / path.radius]),
-        jnp.concatenate([where.rate_up * cos - where.rate_forward * sin, none]),
-        jnp.concatenate([weight, jnp.asarray([0.0, 1.0])]),
+        forward * cos + up * sin,
+        up * cos - forward * sin - below,
+        ahead * cos + rise * sin - below / path.radius,
+        rise * cos - ahead * sin,
+        of_contacts(weight, jnp.where(_END < 0, 1.0, 0.0)),
     )
 
 
-def touch(path: Path, chassis: Chassis, q: Float[Array, " 5"], v: Float[Array, " 5"]) -> Touch:
+def bearing(chassis: Chassis) -> Float[Array, " contacts"]:
+    """1 for contacts that bear in this configuration, else 0 [-]."""
+    return jnp.where(WHEEL, 1 - chassis.on_tracks, chassis.on_tracks)
+
+
+def tension_free(path: Path, belt: Runs) -> Scalar:
+    """Tension under which the lower run yields where it hangs free, P - P_ct [N], kept from slack."""
+    return jnp.maximum(belt.lower - belt.centrifugal, 0.01 * path.gear.pretension)
+
+
+def touch(path: Path, chassis: Chassis, q: Sequence[Scalar] | Array, v: Sequence[Scalar] | Array) -> Touch:
     """Contact points and normal forces (27)-(29) at coordinates `q`, velocities `v`.
 
     Where the belt hangs free between pulley and guide it yields under the grouser as a string of tension
@@ -84,27 +112,19 @@ def touch(path: Path, chassis: Chassis, q: Float[Array, " 5"], v: Float[Array, "
         q, v: coordinates and velocities, see the module.
     """
     gear = path.gear
-    belt = runs(path, q[3:5], v[3:5])
+    belt = runs(path, (q[3], q[4]), (v[3], v[4]))
     place, weight = path.place(q[3], q[4])
     where = tips(path, place)
     x, z, rate_x, rate_z, weight = _geometry(path, where, weight, q[2], chassis.radius)
     speed = path.radius * ((1 - weight) * v[3] + weight * v[4])
     gap = q[1] + z
     gap_rate = v[1] - v[2] * x + rate_z * speed
-    taut = jnp.maximum(belt.lower - belt.centrifugal, 0.01 * gear.pretension)
-    compliance = jnp.concatenate([where.compliance / taut, jnp.zeros(WHEELS)])
+    compliance = of_contacts(where.compliance / tension_free(path, belt))
     depth = jnp.maximum(-gap, 1e-9)
     yields = 1 / (1 + compliance * gear.contact_stiffness * depth ** (gear.contact_exponent - 1))
-    bears = jnp.concatenate(
-        [jnp.full(GROUSERS, 1.0) * chassis.on_tracks, jnp.full(WHEELS, 1.0) * (1 - chassis.on_tracks)]
-    )
-
-    def normal(gap_rate: Array) -> Array:
-        stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
-        force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
-        return jnp.asarray(force * bears)
-
-    force, rises = jax.jvp(normal, (gap_rate,), (jnp.ones_like(gap_rate),))
+    bears = bearing(chassis)
+    stiffness, damping = gear.contact_stiffness * yields, gear.contact_damping * yields
+    force = force_contact(gap, gap_rate, 0.0, stiffness, gear.contact_exponent, damping, gear.contact_depth)
     return Touch(
         lever_x=x,
         lever_z=z,
@@ -112,9 +132,12 @@ def touch(path: Path, chassis: Chassis, q: Float[Array, " 5"], v: Float[Array, "
         rate_z=rate_z,
         weight=weight,
         speed_x=v[0] + v[2] * z + rate_x * speed,
-        force=force,
-        damped=-rises,
-        guided=jnp.concatenate([where.guided, jnp.zeros(WHEELS)]),
+        gap=gap,
+        gap_rate=gap_rate,
+        compliance=compliance,
+        force=jnp.asarray(force * bears),
+        damped=damping_contact(force, gap, 0.0, damping, gear.contact_depth) * bears,
+        guided=of_contacts(where.guided),
         place=place,
         belt=belt,
     )
@@ -150,12 +173,7 @@ def _sliding(signals: Signals, at: Touch) -> Float[Array, " contacts"]:
 
 def friction_rise(chassis: Chassis, signals: Signals, at: Touch) -> Float[Array, " contacts"]:
     """How fast the traction of each contact rises with its sliding [N·s/m]."""
-
-    def force(sliding: Array) -> Array:
-        return jnp.asarray(chassis.ground.traction(sliding, at.force, signals.adhesion))
-
-    sliding = _sliding(signals, at)
-    return jax.jvp(force, (sliding,), (jnp.ones_like(sliding),))[1]
+    return jnp.asarray(chassis.ground.traction_rise(_sliding(signals, at), at.force, signals.adhesion))
 
 
 def pull(path: Path, chassis: Chassis, signals: Signals, at: Touch, height: Scalar) -> Pull:

@@ -15,10 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, mjcf, undercarriage
-from mmrjax.belt import Path
+from mmrjax import balances, contact_sums, mjcf, undercarriage
+from mmrjax.belt import Path, runs
 from mmrjax.chassis import Chassis, inertia_reduced
 from mmrjax.conditions import Conditions
+from mmrjax.contact_sums import Linearized
+from mmrjax.fidelities.linear import Factors, factorise, substitute
 from mmrjax.fidelities.steady import steady
 from mmrjax.mjcf import Masses, mjx
 from mmrjax.params import Scalar
@@ -48,6 +50,7 @@ class System(eqx.Module):
     """One run's constants: what `rate` and `advance` need beside the motion.
 
     Attributes:
+        chassis: of the run's configuration.
         model, data: MJX model with this member's constants, and the data whose structure it needs.
         step: interval of integration [s].
     """
@@ -56,14 +59,10 @@ class System(eqx.Module):
     conditions: Conditions
     path: Path
     half: Masses
+    chassis: Chassis
     model: Any
     data: Any
     step: Scalar
-
-    @property
-    def chassis(self) -> Chassis:
-        """The chassis of the run's configuration."""
-        return self.robot.chassis(self.conditions.configuration)
 
 
 def system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
@@ -74,7 +73,8 @@ def system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
     model, data = mjcf.template()
     gear = robot.running_gear
     model = mjcf.member(model, half, conditions.slope, gear.wheelbase, step)
-    return System(robot, conditions, Path(robot.radius_pulley, gear), half, model, data, jnp.asarray(step))
+    path, chassis = Path(robot.radius_pulley, gear), robot.chassis(conditions.configuration)
+    return System(robot, conditions, path, half, chassis, model, data, jnp.asarray(step, float))
 
 
 class _Mover(eqx.Module):
@@ -93,24 +93,44 @@ class _Mover(eqx.Module):
 def instant(run: System, motion: Motion) -> tuple[Signals, Touch, Pull]:
     """All signals, contacts and forces of an instant."""
     at = undercarriage.touch(run.path, run.chassis, motion.q, motion.v)
-    signals, pulled = _balanced(run, motion, at, motion.v[0], motion.v[3])
+    signals, pulled = _resolved(run, motion, _Mover(run.path, at, motion.q[1]), motion.v[0], motion.v[3])
     return signals, at, pulled
 
 
-def _balanced(run: System, motion: Motion, at: Touch, speed: Scalar, speed_shaft: Scalar) -> tuple[Signals, Pull]:
+def _resolved(
+    run: System, motion: Motion, mover: balances.Mover, speed: Scalar, speed_shaft: Scalar
+) -> tuple[Signals, Any]:
     """Signals and forces with the contacts as they are, the robot [m/s] and the driving shaft [rad/s] at a speed."""
     ratio = run.robot.gearbox.ratio
     state = State(motion.current, ratio * speed_shaft, speed, motion.discharge, motion.memory)
-    mover = _Mover(run.path, at, motion.q[1])
     return balances.resolved(run.robot, run.conditions, state, mover, run.half.inertia_pulley)
+
+
+def _losses(run: System, motion: Motion, mover: balances.Mover) -> tuple[Scalar, Scalar]:
+    """How the resistance of the ground rises with the robot's speed [N·s/m], and the drive's losses with that of the
+    driving shaft [N·m·s]: none where they fall."""
+
+    def forward(speed: Scalar) -> Scalar:
+        signals, pulled = _resolved(run, motion, mover, speed, motion.v[3])
+        return pulled.traction - signals.resistance
+
+    def shaft(speed: Scalar) -> Scalar:
+        return jnp.asarray(_resolved(run, motion, mover, motion.v[0], speed)[0].torque_net)
+
+    one = jnp.ones_like(motion.v[0])
+    fall_x, fall_shaft = (jax.jvp(f, (motion.v[k],), (one,))[1] for f, k in ((forward, 0), (shaft, 3)))
+    return jnp.maximum(-fall_x, 0.0), jnp.maximum(-fall_shaft, 0.0)
 
 
 def generalized(run: System, signals: Signals, pulled: Pull) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
     """Generalized forces on q [N, N·m], and the armature's inertia seen at each joint [kg·m²], eq. (31)."""
     force = jnp.insert(pulled.generalized, 3, signals.torque_net)
+    return force, jnp.zeros_like(force).at[3].set(_rotating(run, signals))
+
+
+def _rotating(run: System, signals: Signals) -> Scalar:
     motor, ratio = run.robot.motor.inertia, run.robot.gearbox.ratio
-    rotating = inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
-    return force, jnp.zeros_like(force).at[3].set(rotating)
+    return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
 
 
 def current_after(run: System, signals: Signals) -> Scalar:
@@ -138,13 +158,7 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     Friction that falls with sliding, beyond V_s, is an instability of the robot and not of the step: it is left out.
     The drive's losses and the resistance of the ground rise steeply from rest: those are on K's diagonal.
     """
-
-    def driven(speeds: Float[Array, " 2"]) -> Float[Array, " 2"]:
-        signals, pulled = _balanced(run, motion, at, *speeds)
-        return jnp.stack([pulled.generalized[0], jnp.asarray(signals.torque_net)])
-
-    which = jnp.asarray([0, 3])
-    losses = jnp.maximum(-jnp.diagonal(jax.jacfwd(driven)(motion.v[which])), 0.0)
+    losses = _losses(run, motion, _Mover(run.path, at, motion.q[1]))
     rises = jnp.maximum(undercarriage.friction_rise(run.chassis, signals, at), 0.0)
     front, rear = run.path.radius * (1 - at.weight), run.path.radius * at.weight
     one, none = jnp.ones_like(rises), jnp.zeros_like(rises)
@@ -153,7 +167,8 @@ def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled:
     share = pulled.force / jnp.maximum(at.force, 1e-9)
     pushes = share[:, None] * along + off
     contacts = (along.T * rises) @ along + (pushes.T * at.damped) @ off
-    return contacts.at[which, which].add(losses)
+    none = jnp.zeros_like(losses[0])
+    return contacts + jnp.diag(jnp.stack([losses[0], none, none, losses[1], none]))
 
 
 def _pushed(
@@ -173,34 +188,140 @@ def mass_matrix(run: System, motion: Motion) -> Float[Array, "5 5"]:
     return _pushed(run, motion, signals, pulled)[1]
 
 
-def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Pull]:
-    """One step of MJX (semi-implicit Euler) and of the winding.
+class _Step(eqx.Module):
+    """A step as it was computed, and what its derivatives need: K, factors of M + Δt K, and Δv."""
 
-    Signals are those before it; traction, normal load and acceleration those of the step.
+    after: Motion
+    signals: Signals
+    guided: Scalar
+    damping: Float[Array, "5 5"]
+    factors: Factors
+    gained: Float[Array, " 5"]
+    slip: Scalar
 
-    Forces of the contacts are taken at the step's end as far as they depend on v, to first order: (M + Δt K) Δv =
-    Δt M a with MJX's mass matrix M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7). Within
-    V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
-    """
+
+def _step(run: System, motion: Motion) -> _Step:
     signals, at, pulled = instant(run, motion)
     pushed, mass = _pushed(run, motion, signals, pulled)
     damping = resistance(run, motion, signals, at, pulled)
-    gained = jnp.linalg.solve(mass + run.step * damping, mass @ (pushed - motion.v))
-    v = motion.v + gained
-    fallen = damping @ gained
-    over_step = {
-        "traction": signals.traction - fallen[0],
-        "normal": signals.normal - fallen[1],
-        "acceleration": gained[0] / run.step,
-    }
+    factors = factorise(mass + run.step * damping)
+    gained = substitute(factors, mass @ (pushed - motion.v))
+    after, over = _moved(motion, run.step, _later(run, motion, signals), damping @ gained, gained, signals)
+    return _Step(after, over, pulled.guided, damping, factors, gained, jnp.asarray(signals.speed_slip_terms))
+
+
+class _Later(eqx.Module):
+    """What a step does to the state beside coordinates and velocities."""
+
+    current: Scalar
+    discharge: Scalar
+    memory: Mapping[str, Scalar]
+
+
+def _later(run: System, motion: Motion, signals: Signals) -> _Later:
     charge = run.robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
     memory = {
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
     }
-    discharge = motion.discharge + run.step * charge
-    after = Motion(motion.q + run.step * v, v, current_after(run, signals), discharge, memory)
-    return after, dataclasses.replace(signals, **over_step), pulled
+    return _Later(current_after(run, signals), motion.discharge + run.step * charge, memory)
+
+
+def _moved(
+    motion: Motion, step: Scalar, later: _Later, fallen: Array, gained: Array, signals: Signals
+) -> tuple[Motion, Signals]:
+    v = motion.v + gained
+    after = Motion(motion.q + step * v, v, later.current, later.discharge, later.memory)
+    traction, normal = signals.traction - fallen[0], signals.normal - fallen[1]
+    return after, dataclasses.replace(signals, traction=traction, normal=normal, acceleration=gained[0] / step)
+
+
+@eqx.filter_custom_jvp
+def advance(run: System, motion: Motion) -> tuple[Motion, Signals, Scalar]:
+    """One step of MJX (semi-implicit Euler) and of the winding.
+
+    Forces of the contacts are taken at the step's end as far as they depend on v, to first order: (M + Δt K) Δv =
+    Δt M a with MJX's mass matrix M and acceleration a (linearly implicit Euler; Hairer and Wanner 1996, IV.7). Within
+    V_s the time constant of a contact is m V_s / (μ_s R_z), microseconds for a small V_s.
+
+    Derivatives are those of the step as computed, written once: with Δv held, what the step leaves of Δt τ - Δt c -
+    (M + Δt K) Δv = 0 is differentiated (τ the forces of `generalized`, c MJX's bias), and the same factors solve for
+    the change of Δv.
+
+    Returns:
+        The motion after it; the signals before it, but traction, normal load and acceleration those of the step; the
+        load on the lower guide before it [N].
+    """
+    step = _step(run, motion)
+    return step.after, step.signals, step.guided
+
+
+@advance.def_jvp
+def _differentiated(
+    primals: tuple[System, Motion], tangents: tuple[Any, Any]
+) -> tuple[tuple[Motion, Signals, Scalar], tuple[Motion, Signals, Scalar]]:
+    run, motion = primals
+    step = _step(run, motion)
+    # The model's constants follow from the rest of the run.
+    run, d_run = (dataclasses.replace(x, model=None, data=None) for x in (run, tangents[0]))
+    d_motion = tangents[1]
+    linearized = _linearized(run, motion, step, d_run)
+
+    def held(run: System, motion: Motion) -> tuple[Array, Array, _Later, Signals, Scalar]:
+        return _held(run, motion, step.gained, linearized)
+
+    (left, fallen, later, signals, _), d_held = eqx.filter_jvp(held, (run, motion), (d_run, d_motion))
+    d_left, d_fallen, d_later, d_signals, d_guided = d_held
+    # None: what is differentiated does not enter.
+    d_gained = jnp.zeros_like(left) if d_left is None else substitute(step.factors, d_left)
+    through = step.damping[:2] @ d_gained
+    d_fallen = through if d_fallen is None else d_fallen + through
+    _, (d_after, d_over) = eqx.filter_jvp(
+        _moved,
+        (motion, run.step, later, fallen, step.gained, signals),
+        (d_motion, d_run.step, d_later, d_fallen, d_gained, d_signals),
+    )
+    return (step.after, step.signals, step.guided), (d_after, d_over, d_guided)
+
+
+def _inputs(run: System, motion: Motion) -> dict[str, Scalar]:
+    """What the contacts depend on, by name."""
+    moving = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True))
+    return moving | contact_sums.inputs(run.path, run.chassis, run.conditions.adhesion)
+
+
+def _linearized(run: System, motion: Motion, step: _Step, changed: System) -> Linearized:
+    """The contacts' sums with derivatives by the motion, and by what else is `changed`."""
+    constants = contact_sums.inputs(changed.path, changed.chassis, changed.conditions.adhesion)
+    differentiated = tuple(name for name, change in constants.items() if change is not None)
+    given = _inputs(run, motion) | {"slip": step.slip}
+    return contact_sums.linearize(run.path, run.chassis, given, step.gained, differentiated)
+
+
+def _held(
+    run: System, motion: Motion, gained: Float[Array, " 5"], linearized: Linearized
+) -> tuple[Array, Array, _Later, Signals, Scalar]:
+    """What a step with Δv held leaves of Δt τ - Δt c - (M + Δt K) Δv, K Δv of x and z, and the rest of a step."""
+    q, v = motion.q, motion.v
+    belt = runs(run.path, (q[3], q[4]), (v[3], v[4]))
+    sums = linearized.near(_inputs(run, motion))
+    mover = contact_sums.Mover(linearized, sums, run.path.radius, belt.torque_front)
+    signals, drawn = _resolved(run, motion, mover, v[0], v[3])
+    sums = mover.shifted(signals.speed_slip_terms)
+    losses = [loss * gained[k] for k, loss in zip((0, 3), _losses(run, motion, mover), strict=True)]
+    force = jnp.stack(
+        [
+            drawn.traction - signals.resistance - sums.fallen_x - losses[0],
+            sums.normal - sums.fallen_z,
+            drawn.moment + signals.resistance * q[1],
+            signals.torque_net - sums.fallen_front - losses[1],
+            drawn.rear + belt.torque_rear,
+        ]
+    )
+    gear, rotating = run.path.gear, _rotating(run, signals)
+    spent = mjcf.impulse(run.half, gear.wheelbase, run.conditions, q[2], v[2], rotating, gained, run.step)
+    fallen = jnp.stack([sums.fallen_x + losses[0], sums.fallen_z])
+    return run.step * force - spent, fallen, _later(run, motion, signals), signals, drawn.guided
 
 
 def margin(run: System) -> Scalar:

@@ -170,8 +170,8 @@ def track(
 
 def _record(run: System, start: Motion, steps: int, samples: int) -> tuple[Motion, Record]:
     def small(motion: Motion, _: None) -> tuple[Motion, tuple[Signals, Array]]:
-        after, signals, pulled = advance(run, motion)
-        return after, (signals, pulled.guided)
+        after, signals, guided = advance(run, motion)
+        return after, (signals, guided)
 
     @jax.checkpoint  # reverse mode keeps one motion a sample and recomputes the steps between
     def interval(motion: Motion, _: None) -> tuple[Motion, Record]:

@@ -1,0 +1,216 @@
+"""Derivatives of a step of the track model, written by hand, against those of what is computed."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax import contact_sums, mjcf, params, undercarriage
+from mmrjax.belt import Path
+from mmrjax.conditions import Conditions
+from mmrjax.effects import BY_NAME
+from mmrjax.fidelities import half_robot
+from mmrjax.fidelities.half_robot import Motion, advance, generalized, instant, system
+from mmrjax.mjcf import mjx
+
+RUNS = {
+    "tracked": dict(voltage=24.0, slope_deg=5.0, payload=3.0, battery=1.0),
+    "wheeled": dict(voltage=33.0, slope_deg=3.0, payload=8.0, configuration=1),
+}
+#: Slip that follows speed and load, loads and losses, two memories, mass and inertia.
+EFFECTS = ("rolling_radius", "belt_creep", "nonlinear_slip", "voltage_sag", "mass_error", "speed_slip")
+STEP = 1e-4
+
+
+@pytest.fixture(scope="module")
+def recessed(robot):
+    """A robot in which nothing that contacts depend on is zero."""
+    return params.replace(robot, {"running_gear.guide_recess": jnp.asarray(1e-4)})
+
+
+@pytest.fixture(scope="module")
+def eventful(recessed):
+    """The same with effects that enter a step in every way: slip, memories, losses, mass, inertia."""
+    remembering = [e for e in BY_NAME.values() if e.memory_size is not None][:2]
+    chosen = [BY_NAME[n] for n in EFFECTS if n in BY_NAME] + [
+        next(e for e in BY_NAME.values() if e.balance == balance) for balance in ("inertia", "ground", "gearbox")
+    ]
+    effects = {e.name: e for e in [*chosen, *remembering]}
+    robot = dataclasses.replace(recessed, effects=tuple(e() for e in effects.values()))
+    sizes = {p.name: 0.3 * p.spec.prior_sd(0.0) for p in params.walk(robot) if p.spec.amplitude}
+    return params.replace(robot, {name: jnp.asarray(size) for name, size in sizes.items()})
+
+
+def motion_of(robot, run, k):
+    """In mid-run, no two parts alike; which of the contacts slip beyond V_s differs with `k`."""
+    draw = np.random.default_rng(k)
+    setup = system(robot, run, STEP)
+    low = float(half_robot.axle_height(setup))
+    q = jnp.asarray([0.1, low - 2e-4, 1e-3 * draw.normal(), 0.3 + draw.random(), 0.0])
+    q = q.at[4].set(q[3] - 1e-4)
+    turning = [0.7, 25.0, 30.0][k % 3]
+    speed = turning * float(setup.chassis.radius) * [0.9, 0.99, 0.7][k % 3]
+    v = jnp.asarray([speed, 2e-3 * draw.normal(), 0.02 * draw.normal(), turning, turning * 1.002])
+    memory = {e.name: jnp.asarray(0.3 + 0.1 * draw.random()) for e in robot.remembering}
+    return Motion(q, v, jnp.asarray(1.5 + draw.random()), jnp.asarray(20.0), memory)
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+@pytest.mark.parametrize("k", range(3))
+def test_slopes_of_the_sums_are_their_derivatives(recessed, name, k):
+    """By the motion, the slip and every constant of the contacts, to 1e-9 of the largest of each sum's slopes."""
+    run = Conditions(**RUNS[name])
+    setup, motion = system(recessed, run, STEP), motion_of(recessed, run, k)
+    gained = 1e-3 * jnp.asarray([0.3, -1.0, 0.5, 20.0, 30.0])
+    constants = contact_sums.inputs(setup.path, setup.chassis, run.adhesion)
+    given = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True)) | constants
+    given = {name: jnp.asarray(value, float) for name, value in given.items()} | {"slip": jnp.asarray(1e-3)}
+
+    @jax.jit
+    def found(given):
+        return contact_sums.linearize(setup.path, setup.chassis, given, gained, tuple(constants))
+
+    @jax.jit
+    @jax.jacfwd
+    def slopes(given):
+        gear = dataclasses.replace(setup.path.gear, **{n: given[n] for n in contact_sums.GEAR})
+        path, chassis = Path(given["pulley"], gear), setup.chassis
+        laws = {n: given[f"friction_{n}"] for n in contact_sums.FRICTION}
+        ground = dataclasses.replace(chassis.ground, friction=dataclasses.replace(chassis.ground.friction, **laws))
+        own = {n: given[f"chassis_{n}"] for n in contact_sums.CHASSIS}
+        chassis = dataclasses.replace(chassis, ground=ground, **own)
+        q = jnp.stack([jnp.zeros(()), *(given[n] for n in contact_sums.MOTION[:4])])
+        v = jnp.stack([given[n] for n in contact_sums.MOTION[4:]])
+        at = undercarriage.touch(path, chassis, q, v)
+        return contact_sums.shares(path, chassis, at, given["slip"], given["adhesion"], gained).sum(axis=-1)
+
+    ours, theirs = found(given), slopes(given)
+    expected = np.stack([np.asarray(theirs[name]) for name in ours.names])
+    assert set(ours.names) == set(given)
+    assert (np.abs(expected).max(axis=1) > 0).sum() >= {"tracked": 19, "wheeled": 12}[name]
+    for row, want in zip(np.asarray(ours.slopes), expected, strict=True):
+        np.testing.assert_allclose(row, want, rtol=1e-9, atol=1e-9 * np.abs(want).max() + 1e-10)
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_impulse_is_that_of_mjx(recessed, name):
+    run = Conditions(**RUNS[name])
+    setup, motion = system(recessed, run, STEP), motion_of(recessed, run, 1)
+    motion = dataclasses.replace(motion, q=motion.q.at[2].set(0.3), v=motion.v.at[2].set(2.0))
+    signals, _, pulled = instant(setup, motion)
+    force, armature = generalized(setup, signals, pulled)
+    model = setup.model.replace(dof_armature=armature)
+    data = mjx.step(model, setup.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force))
+    spent = mjcf.impulse(
+        setup.half, setup.path.gear.wheelbase, run, motion.q[2], motion.v[2], armature[3], data.qvel - motion.v, STEP
+    )
+    np.testing.assert_allclose(spent / STEP, force, rtol=1e-9, atol=1e-9 * float(jnp.abs(force).max()))
+
+
+def _stepped(robot, run, motion, step, forward):
+    return forward(system(robot, run, step), motion)
+
+
+def _as_computed(run, motion):
+    step = half_robot._step(run, motion)
+    return step.after, step.signals, step.guided
+
+
+def _changes(tree, seed):
+    """A random change of every number, relative to its size."""
+    draw = np.random.default_rng(seed)
+    leaves, structure = jax.tree.flatten(eqx.filter(tree, eqx.is_inexact_array))
+    changes = [jnp.asarray((np.abs(np.asarray(x)) + 1e-3) * draw.normal(size=x.shape)) for x in leaves]
+    return jax.tree.unflatten(structure, changes)
+
+
+def _equal(ours, theirs):
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        if jnp.issubdtype(jnp.asarray(b).dtype, jnp.inexact):
+            np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-7 * max(float(jnp.abs(b).max()), 1e-12))
+
+
+@pytest.fixture(scope="module")
+def forward():
+    """Derivatives of a step along a direction: as differentiated, and of what it computes."""
+
+    @eqx.filter_jit
+    def both(at, moved):
+        return tuple(eqx.filter_jvp(lambda *a, s=s: _stepped(*a, s), at, moved)[1] for s in (advance, _as_computed))
+
+    return both
+
+
+def _some(after, signals, guided):
+    return jnp.sum(after.q) + jnp.sum(after.v) + after.current + signals.traction + 1e-2 * guided
+
+
+@pytest.fixture(scope="module")
+def backward():
+    return eqx.filter_jit(eqx.filter_grad(lambda at: _some(*_stepped(*at, advance))))
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+@pytest.mark.parametrize("k", range(3))
+def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, backward, name, k):
+    """Every parameter, condition, coordinate, rate and memory and the step at once, forward and backward."""
+    run = jax.tree.map(lambda x: jnp.asarray(x, float), Conditions(**RUNS[name]).resolved(eventful))
+    at = (eventful, run, motion_of(eventful, run, k), jnp.asarray(STEP))
+    moved = _changes(at, k)
+    ours, theirs = forward(at, moved)
+    _equal(ours, theirs)
+    pairs = zip(jax.tree.leaves(backward(at)), jax.tree.leaves(moved), strict=True)
+    assert sum(float(jnp.sum(a * b)) for a, b in pairs) == pytest.approx(float(_some(*ours)), rel=1e-8)
+
+
+@pytest.mark.parametrize("name", ["running_gear.contact_stiffness", "6T2A.track.guide_friction"])
+def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name):
+    """What else is constant has no derivative to begin with."""
+    run = Conditions(**RUNS["tracked"])
+    motion = motion_of(recessed, run, 1)
+    value = next(p.value for p in params.walk(recessed) if p.name == name)
+
+    @jax.jit
+    def both(x):
+        def after(x, step):
+            return _stepped(params.replace(recessed, {name: x}), run, motion, STEP, step)
+
+        return [jax.jvp(lambda x, s=s: after(x, s), (x,), (x,))[1] for s in (advance, _as_computed)]
+
+    ours, theirs = both(value)
+    _equal(ours, theirs)
+    assert max(float(jnp.abs(x).max()) for x in jax.tree.leaves(theirs[0])) > 0
+
+
+def test_second_derivatives_are_those_of_what_is_computed(recessed):
+    run = Conditions(**RUNS["tracked"])
+    motion = motion_of(recessed, run, 1)
+
+    def slope(v, step):
+        def after(v):
+            return step(system(recessed, run, STEP), dataclasses.replace(motion, v=v))[0].v
+
+        return jax.jacfwd(jax.jacfwd(after))(v)
+
+    ours, theirs = (jax.jit(lambda v, s=s: slope(v, s))(motion.v) for s in (advance, _as_computed))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7 * float(jnp.abs(theirs).max()))
+
+
+@pytest.mark.slow
+def test_a_wrong_slope_is_seen(eventful, forward, monkeypatch):
+    """The comparison can fail: a thousandth more of what turns with the driving pulley."""
+    run = jax.tree.map(lambda x: jnp.asarray(x, float), Conditions(**RUNS["tracked"]).resolved(eventful))
+    at = (eventful, run, motion_of(eventful, run, 1), jnp.asarray(STEP))
+    moved, right = _changes(at, 1), contact_sums.linearize
+
+    def wrong(*arguments):
+        found = right(*arguments)
+        return dataclasses.replace(found, slopes=found.slopes.at[contact_sums.MOTION.index("front")].multiply(1.001))
+
+    monkeypatch.setattr(contact_sums, "linearize", wrong)
+    ours = eqx.filter_jit(lambda at: eqx.filter_jvp(lambda *a: _stepped(*a, advance), at, moved)[1])(at)
+    with pytest.raises(AssertionError):
+        _equal(ours, forward(at, moved)[1])
