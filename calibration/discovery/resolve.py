@@ -17,7 +17,6 @@ from calibration.data.errors import BadConfiguration
 from calibration.discovery.result import DiscoveryResult, Estimate, Resolved
 from calibration.inference import observers
 from calibration.inference.calibrate import calibrate
-from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
 from mmrjax.effects import UNNAMED
@@ -76,7 +75,7 @@ def resolve(
     Raises:
         BadConfiguration: the data are histories.
     """
-    if observers.kind(found.runs) is not SettledRuns:
+    if not observers.kind(found.runs).rows_tell:
         raise BadConfiguration("--resolve: the track model is asked about settled rows; these are histories")
     reason, robot = asked(found), found.robot
     tracked = [name for name, chassis in robot.configurations.items() if float(chassis.on_tracks) > 0.5]
@@ -134,8 +133,9 @@ def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
 
 def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:
     """Rms difference of the slip 1 - V / (r_k ω_k) [percentage points], of rows that read both speeds."""
-    motor, speed = (fitted.readings[name] for name in ("motor_speed", "speed"))
+    motor = fitted.readings["motor_speed"]
+    speed = fitted.readings["speed"]
     ratio = float(robot.gearbox.ratio) / float(robot.radius_pulley)
     with np.errstate(all="ignore"):
-        slips = [100 * (1 - getattr(speed, which) * ratio / getattr(motor, which)) for which in ("after", "measured")]
-    return float(np.sqrt(np.nanmean((slips[0] - slips[1]) ** 2)))
+        simulated, measured = 1 - speed.after * ratio / motor.after, 1 - speed.measured * ratio / motor.measured
+    return float(100 * np.sqrt(np.nanmean((simulated - measured) ** 2)))
