@@ -117,10 +117,12 @@ def test_the_robot_says_the_same_in_the_other_fidelities(found, made):
 
 
 @pytest.mark.slow
-def test_a_friction_law_too_stiff_for_the_step_is_said(base, made):
-    stiff = params.replace(base, {CREEP: jnp.asarray(0.02)})
+def test_a_belt_too_stiff_for_the_step_is_said(base, made):
+    """Friction and contacts are implicit in a step, the springs of the belt are not."""
+    stiff = params.replace(base, {"running_gear.span_stiffness": jnp.asarray(1e8)})
     (said,) = fidelities.get("track").cautions(stiff, made.conditions(stiff))
-    assert said.startswith("rows 1, 2: the track model's step of 0.0001 s is above the largest stable one")
+    assert said.startswith("rows 1, 2")
+    assert "the track model's step of 0.0001 s is above the largest stable one" in said
 
 
 @pytest.mark.slow

@@ -89,7 +89,8 @@ def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> 
         ValueError: a lever reaches below the ground, or the step is too large for the stiffness; the message
             then names a step that is neither too large nor at odds with `sample`.
     """
-    tracked = np.asarray(jax.vmap(robot.chassis)(conditions.configuration).on_tracks) > 0.5
+    on_tracks = np.array([float(chassis.on_tracks) for chassis in robot.configurations.members])
+    tracked = on_tracks[np.asarray(conditions.configuration, int)] > 0.5
     gear = robot.running_gear
     height = float(robot.radius_pulley + gear.grouser_height)  # levers are on tracks alone
     for name, angle, side in (("lever_front", gear.lever_front, 1.0), ("lever_rear", gear.lever_rear, -1.0)):
@@ -103,7 +104,7 @@ def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> 
     worst = int(np.argmin(limits))
     if step > limits[worst]:
         raise ValueError(
-            f"step: got {step:g} s; contacts and friction are too stiff for it, the largest stable step is "
+            f"step: got {step:g} s; contacts, belt or friction are too stiff for it, the largest stable step is "
             f"{limits[worst]:.2g} s (run {worst + 1} of {len(limits)}); take {_whole(sample, limits[worst]):g} s, a "
             "softer contact or a larger V_s"
         )

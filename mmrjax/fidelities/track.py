@@ -335,7 +335,7 @@ def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
         return []
     return [
         f"rows {rows}: the track model's step of {STEP:g} s is above the largest stable one of the calibrated robot, "
-        f"{limits.min():.2g} s, so its readings there are not to be trusted; its contacts are too stiff"
+        f"{limits.min():.2g} s, so its readings there are not to be trusted; its contacts or its belt are too stiff"
     ]
 
 
