@@ -216,9 +216,18 @@ def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found)
     assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
 
 
-def test_options_of_a_population_that_is_not_there_are_refused():
-    with pytest.raises(BadConfiguration, match="there is no population"):
-        calibrate(records.read("measured"), robots.nominal(), generations=3)
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (dict(generations=3), "there is no population"),
+        (dict(population=50), "settled rows with --model drive or track alone"),
+        (dict(population=2, model="drive"), "at least 4 members"),
+        (dict(generations=3, population=0, model="track"), "there is no population"),
+    ],
+)
+def test_options_of_a_population_that_cannot_be_are_refused(options, says):
+    with pytest.raises(BadConfiguration, match=says):
+        calibrate(records.read("measured"), robots.nominal(), **options)
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ from calibration.inference.foreign import foreign_priors
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
-from calibration.inference.population import GENERATIONS
+from calibration.inference.population import GENERATIONS, LEAST
 from calibration.inference.posterior import of_coordinates
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
@@ -134,6 +134,12 @@ def calibrate(
         population = POPULATION if fidelities.unread("steady", names) else 0
     if (members is not None or generations is not None) and not population:
         raise BadConfiguration("--generations, --members: there is no population; state --population")
+    if population and not posed.observe.eased:
+        raise BadConfiguration(
+            f"--population: got {population}; settled rows with --model drive or track alone are searched so"
+        )
+    if 0 < population < LEAST:
+        raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
     evolved = _Evolved(population, generations or GENERATIONS, members)
     found, beside = _searched(runs, base, posed, known, starts, evolved, seed, tell)
     posed, z = found.problem, np.asarray(found.best.z)

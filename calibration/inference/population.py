@@ -32,6 +32,8 @@ from calibration.inference.problem import MISSING, Observation, Problem
 TOGETHER = (16, 512)
 #: Generations after which a search ends, and how many of them may pass without a gain of so much [½σ²].
 GENERATIONS, PATIENCE, GAIN = 30, 8, 0.5
+#: Fewest members of a generation.
+LEAST = 4
 #: What a row that is not reached costs [½σ²].
 LOST = 1e3
 #: Members of the local regression for each coefficient of it.
