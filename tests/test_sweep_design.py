@@ -218,7 +218,7 @@ BAD = {
     "range without number": ({"axes": {"slope_deg": {"start": 0, "stop": 3}}}, r"axes\.slope_deg: number is missing; expected start, stop, number"),
     "range on no scale": ({"axes": {"slope_deg": RANGE | {"scale": "sqrt"}}}, r"scale: got 'sqrt'; allowed: linear, log"),
     "logarithm of zero": ({"axes": {"slope_deg": RANGE | {"scale": "log"}}}, r"start: got 0; expected more than 0 with scale log"),
-    "steps upside down": ({"axes": {"slope_deg": "20:0:5"}}, r"axes\.slope_deg: got 20:0:5; expected numbers as 0,5,10 or first:last:step"),
+    "steps upside down": ({"axes": {"slope_deg": "20:0:5"}}, r"axes\.slope_deg: got 20:0:5, which ends before it begins; expected first:last:step"),
     "a word": ({"axes": {"voltage": [15, "high"]}}, r"axes\.voltage: got 'high'; expected a number"),
     "twice the same": ({"axes": {"voltage": [15, 15]}}, r"axes\.voltage: got a value twice"),
     "out of bounds": ({"axes": {"slope_deg": [0, 95]}}, r"axes\.slope_deg: got 95; expected -45 to 45 deg \(slope"),
