@@ -5,10 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import params, robots, vibration
+from calibration.data.runs import Runs
+from calibration.discovery.discover import discover
+from mmrjax import channels, params, robots, vibration
 from mmrjax.conditions import Conditions
 from mmrjax.contact import Friction
-from mmrjax.fidelities.track import track
+from mmrjax.fidelities.track import track, track_batch
+from mmrjax.signals import CONVERGED, NOT_SETTLED
 
 LAW = Friction(static=0.6, dynamic=0.5, speed_static=0.01, speed_dynamic=0.1)
 
@@ -116,3 +119,34 @@ def test_slip_of_track_model_runs_follows_from_their_ripple(shaken, gear):
 def test_fig_7_alone_misses_the_slip_of_the_gear_that_shakes(shaken):
     slip, law, alone, _ = shaken["recess 0.35 mm, soft"]
     assert np.sqrt(np.mean((law - slip) ** 2)) < 0.5 * np.sqrt(np.mean((alone - slip) ** 2))
+
+
+@pytest.mark.slow
+def test_loop_finds_the_effect_in_what_the_track_model_made():
+    """Seventy rows of a gear that shakes (set S of docs/vibration.md), with noise; nobody tells the loop of it."""
+    gear = {
+        "guide_recess": 3.327e-4, "guide_gap": 10.29e-3, "contact_stiffness": 4.261e7, "contact_damping": 806.9,
+        "centre_offset": -1.54e-3, "payload_height": 67.5e-3,
+    }  # fmt: skip
+    ground = {"static": 0.5735, "dynamic": 0.5524, "speed_static": 0.01777, "speed_dynamic": 0.1777}
+    values = {f"running_gear.{k}": v for k, v in gear.items()} | {"6T2A.track.guide_friction": 0.06}
+    values |= {f"6T2A.ground.friction.{k}": v for k, v in ground.items()}
+    values |= {"4W2T.ground.friction.static": 0.57, "4W2T.ground.friction.dynamic": 0.5}
+    robot = params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in values.items()})
+    axes = np.meshgrid((0, 1), (15.0, 24.0, 33.0), (0.0, 5.0, 10.0, 15.0), (0.0, 4.0, 8.0), indexing="ij")
+    kind, voltage, slope, payload = (x.ravel() for x in axes)
+    conditions = Conditions(kind, voltage=voltage, slope_deg=slope, payload=payload)
+    shown = track_batch(robot, conditions, duration=1.5, rolling=True).result
+    rng, goes_on = np.random.default_rng(4), np.isin(np.asarray(shown.status), (CONVERGED, NOT_SETTLED))
+    columns = {
+        "configuration": np.where(kind == 0, "6T2A", "4W2T"), "supply_voltage_V": voltage, "payload_kg": payload,
+        "slope_deg": slope, "total_mass_kg": np.where(kind == 0, 13.1, 11.5) + payload,
+    }  # fmt: skip
+    for channel, sd in zip(channels.CHANNELS, (0.01, 0.003, 0.003), strict=True):
+        noise = 1 + sd * rng.standard_normal(len(kind))
+        columns[channel.column] = np.asarray(shown.reading[channel.name]) / channel.factor * noise
+    table = Runs("made by the track model", columns).where(goes_on)
+    found = discover(table, robots.nominal(), noise="current=1%,motor_speed=0.3%,speed=0.3%")
+    assert found.verdict in ("named", "class") and [e.name for e in found.effects] == ["vibration_slip"]
+    before, after = found.errors_held_out["voltage"]
+    assert after["speed"]["rms_percent"] < 0.5 * before["speed"]["rms_percent"]
