@@ -188,20 +188,30 @@ def test_names_say_what_would_explain_more_than_they():
 
 
 @pytest.mark.parametrize(
-    ("p", "says"), [(1e-6, "a running gear within its priors leaves it"), (0.4, "no running gear")]
+    ("p", "outside", "settled", "says"),
+    [
+        (1e-6, (), True, "a running gear within its priors leaves it"),
+        (0.4, (), True, "no running gear within its priors was found to leave it"),
+        (1e-6, ("running_gear.guide_gap",), True, "; running_gear.guide_gap outside)"),
+        (1e-6, (), False, "1 of 2 constants; the search had not settled, go on with --members"),
+    ],
 )
-def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, says):
+def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside, settled, says):
     found = shown("leads", capsys).found
     resolved = Resolved(
         asked="what is missing in the balance slip over slope", rows=10, robot=found.robot,
         constants={"running_gear.guide_recess": Estimate(3.1e-4, 4e-5, "m"), "x.static": Estimate(0.58, 0.02, "-")},
-        known_from_rows=("running_gear.guide_recess",), alike=(("a", "b", -0.95),), fall=61.0, p=p,
+        known_from_rows=("running_gear.guide_recess",), alike=(("a", "b", -0.95),),
+        outside=outside, settled=settled, fall=61.0, p=p,
         chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)}, slip_rms=(3.3, 0.6), notes=("said too",),
     )  # fmt: skip
     found = dataclasses.replace(found, resolved=resolved)
     document = finite(found.to_json())
     jsonschema.validate(document, SCHEMA)
-    assert document["resolved"]["explains"] == (p < 0.01) and document["resolved"]["slip_rms_points"]["after"] == 0.6
+    assert (
+        document["resolved"]["explains"] == (p < 0.01 and not outside)
+        and document["resolved"]["slip_rms_points"]["after"] == 0.6
+    )
     page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
     assert says in page.text and "slip of the 10 rows on tracks 3.3 → 0.6 points rms" in page.text
     assert page.tables["resolved_constants"][1][0] == "running_gear.guide_recess"

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from calibration.data.errors import BadConfiguration
-from calibration.discovery.result import DiscoveryResult, Estimate, Resolved
+from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, Resolved
 from calibration.inference import observers
 from calibration.inference.calibrate import calibrate
 from calibration.inference.result import CalibrationResult
@@ -111,6 +111,8 @@ def resolve(
         constants={n: Estimate(p.value, p.sd, p.unit) for n, p in free.parameters.items()},
         known_from_rows=tuple(n for n, p in free.parameters.items() if p.held_by == "data"),
         alike=tuple(free.identifiability.correlated()),
+        outside=tuple(n for n, p in free.parameters.items() if n in gear and abs(p.shift) > PLAUSIBLE),
+        settled=stated.converged and free.converged,
         fall=float(fall),
         p=float(chi2.sf(max(fall, 0.0), len(gear))),
         chi2=(stated.chi_square.value, free.chi_square.value),

@@ -23,6 +23,8 @@ SCHEMA = "mmrjax.loop/1"
 TRACK_FILE = "robot_track.toml"
 #: Error at which a running gear is said to leave what remains.
 RESOLVED_ERROR = 0.01
+#: Prior sds beyond which a constant of the running gear is not plausible.
+PLAUSIBLE = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,6 +320,7 @@ class Resolved:
         constants: of the running gear and the friction, by name.
         known_from_rows: constants of which the rows say more than their priors.
         alike: pairs of constants that trade against one another, with their correlation.
+        outside: constants further than `PLAUSIBLE` prior sds from their priors; settled: whether both searches ended.
         fall: of twice the objective by the running gear, priors counted [σ²]; p: of as large a fall by chance.
         chi2: of the readings with the gear as stated and with the best one [σ²]; readings: that count.
         rms_percent: by channel, with the gear as stated and with the best one [%].
@@ -331,6 +334,8 @@ class Resolved:
     constants: dict[str, Estimate]
     known_from_rows: tuple[str, ...]
     alike: tuple[tuple[str, str, float], ...]
+    outside: tuple[str, ...]
+    settled: bool
     fall: float
     p: float
     chi2: tuple[float, float]
@@ -342,7 +347,7 @@ class Resolved:
     @property
     def explains(self) -> bool:
         """Whether a running gear within its priors leaves what remains, more than chance would."""
-        return self.p < RESOLVED_ERROR
+        return self.p < RESOLVED_ERROR and not self.outside
 
     @property
     def statement(self) -> str:
@@ -352,16 +357,18 @@ class Resolved:
             f"{name.removeprefix('running_gear.')} {e.value:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
             for name, e in self.constants.items() if name.startswith("running_gear.")
         )  # fmt: skip
+        on = "" if self.settled else "; the search had not settled, go on with --members and more --generations"
         slip = f"slip of the {self.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
         if not self.explains:
+            why = f"; {', '.join(self.outside)} outside" if self.outside else ""
             return (
-                f"The track model was asked about {self.asked}: no running gear within its priors leaves it "
-                f"({slip}, χ² falls by {self.fall:.0f}, p = {self.p:.2g})"
+                f"The track model was asked about {self.asked}: no running gear within its priors was found to leave "
+                f"it ({slip}, χ² falls by {self.fall:.0f}, p = {self.p:.2g}{why}){on}"
             )
         known = f"the rows determine {len(self.known_from_rows)} of {len(self.constants)} constants"
         return (
             f"The track model was asked about {self.asked}: a running gear within its priors leaves it ({slip}, χ² "
-            f"falls by {self.fall:.0f}, p = {self.p:.2g}): {gear}; {known}"
+            f"falls by {self.fall:.0f}, p = {self.p:.2g}): {gear}; {known}{on}"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -374,6 +381,8 @@ class Resolved:
             "constants": {name: dataclasses.asdict(e) for name, e in self.constants.items()},
             "known_from_rows": list(self.known_from_rows),
             "alike": [{"a": a, "b": b, "correlation": r} for a, b, r in self.alike],
+            "outside": list(self.outside),
+            "settled": self.settled,
             "fall_chi2": self.fall,
             "p": self.p,
             "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
