@@ -8,11 +8,11 @@ from pathlib import Path
 
 from rich.table import Table
 
-from calibration.data import effect_file, posterior, robot_file
+from calibration.data import effect_file
 from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
-from calibration.discovery.result import TRACK_FILE, DiscoveryResult
+from calibration.discovery.result import DiscoveryResult
 from calibration.inference import priors
 from mmrjax import channels
 from sweeps import config as configuration
@@ -45,14 +45,8 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
                 found, noise=config.noise or None, population=config.population, generations=config.generations,
                 members=members, seed=config.seed, tell=progress,
             ))  # fmt: skip
-        folder.write_json("result.json", found.to_json())
-        folder.write_table("rows.csv", found.rows_table())
+        found.save(folder.partial, config.robot)
         folder.write_text("config.resolved.toml", configuration.as_toml(config))
-        note = f"found by the loop from {config.robot} with {runs.source}: {found.statement}"
-        robot_file.write(found.robot, folder.partial / "robot.toml", note=note)
-        posterior.write(found.posterior, folder.partial / posterior.FILE)
-        if found.resolved is not None:
-            robot_file.write(found.resolved.robot, folder.partial / TRACK_FILE, note=found.resolved.statement)
         print_discovery(found)
         if config.resolve and found.resolved is None:
             say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")

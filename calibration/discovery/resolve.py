@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from calibration.data.errors import BadConfiguration
 from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, Resolved
+from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibrate import calibrate
 from calibration.inference.result import CalibrationResult
@@ -128,9 +129,8 @@ def resolve(
 
 def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
     """What the loop took sds to be, in words for `calibrate`."""
-    assumed = [c for c in channels.CHANNELS if found.noise.get(c.name, {}).get("source") == "assumed"]
-    parts = [*([stated] if stated else []), *(f"{c.word}={100 * c.sd_share:g}%" for c in assumed)]
-    return ",".join(parts) or None
+    assumed = [name for name, about in found.noise.items() if about["source"] == "assumed"]
+    return ",".join(part for part in (stated, noise_room.default(assumed)) if part) or None
 
 
 def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:

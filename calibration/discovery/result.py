@@ -553,14 +553,15 @@ class DiscoveryResult:
         table["use"] = words
         return table
 
-    def save(self, folder: Path | str) -> None:
+    def save(self, folder: Path | str, robot_name: str = "") -> None:
         """Write `result.json`, `rows.csv`, `posterior.nc` and `robot.toml` into a folder, and `robot_track.toml` too
-        where the track model was asked."""
+        where the track model was asked; `robot_name` is that of the robot that the loop began with."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table())
-        note = f"found by the loop with {self.runs.source}: {self.statement}"
+        start = f" from {robot_name}" if robot_name else ""
+        note = f"found by the loop{start} with {self.runs.source}: {self.statement}"
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         posterior.write(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:

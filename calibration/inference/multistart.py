@@ -15,7 +15,7 @@ from calibration.inference import identifiability
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.noise import Noise
-from calibration.inference.population import Population, Searched
+from calibration.inference.population import Population, Searched, most_probable
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.robot import Robot
 
@@ -202,10 +202,7 @@ def at_best(
 
 def noisier_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
     """The problem with the noise that is most probable for a member, and the shares that it is of readings."""
-    weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
-    error = np.where(weight > 0, (searched.reading[at] - np.asarray(posed.data.measured)) / size, 0.0)
-    share = np.sqrt(np.sum(error**2, 0) / np.maximum(weight.sum(0), 1.0))
-    shares = np.where(noise.estimated, np.hypot(share, noise_room.FLOOR), np.nan)
+    shares = most_probable(posed, noise, searched.reading[at])
     return _noisier(posed, noise, shares), shares
 
 

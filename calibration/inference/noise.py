@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -106,10 +106,10 @@ def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
     return Noise(sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 
-def default() -> str:
+def default(names: Collection[str] | None = None) -> str:
     """What the loop takes sds to be where neither the file nor the user says: averages of at least three repeats,
-    printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2."""
-    return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in channels.CHANNELS)
+    printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2. Of some channels by name, or of all."""
+    return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in channels.CHANNELS if names is None or c.name in names)
 
 
 def assumed(runs: Runs, sizes: np.ndarray, stated: str | None = None, factor: float = 1.0) -> Noise:

@@ -179,6 +179,16 @@ def _observed(posed: Problem, points: Float[Array, "points parameters"]) -> Obse
     return jax.vmap(posed.observation)(points)
 
 
+def most_probable(
+    posed: Problem, noise: Noise, reading: Float[np.ndarray, "... rows channels"]
+) -> Float[np.ndarray, "... channels"]:
+    """Sd of each channel that is most probable for readings, as a share of its size; NaN where it is known."""
+    weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
+    error = np.where(weight > 0, (reading - np.asarray(posed.data.measured)) / size, 0.0)
+    share = np.sqrt(np.sum(weight * error**2, -2) / np.maximum(weight.sum(0), 1.0))
+    return np.where(noise.estimated, np.hypot(share, noise_room.FLOOR), np.nan)
+
+
 def objective(posed: Problem, noise: Noise) -> Objective:
     """Half the sum of squares of misfit and prior, of members; where the sd of a channel is not known, with the sd
     that is most probable for that member: n ln s in place of its squares, s the rms of its errors as shares of the
@@ -189,16 +199,15 @@ def objective(posed: Problem, noise: Noise) -> Objective:
     """
     data = posed.data
     weight, measured, sd = np.asarray(data.weight), np.asarray(data.measured), np.asarray(data.sd)
-    size = noise.sd / noise_room.START
 
     def of(z: np.ndarray, seen: Rows) -> Float[np.ndarray, " members"]:
         error = np.where(weight > 0, seen.reading - measured, 0.0)
         squares = np.sum((z - np.asarray(data.centre)) ** 2, -1)
+        shares = most_probable(posed, noise, seen.reading)
         for k, estimated in enumerate(noise.estimated):
             count = weight[:, k].sum()
             if estimated and count:
-                share = np.sqrt(np.sum(weight[:, k] * (error[..., k] / size[:, k]) ** 2, -1) / count)
-                squares += 2 * count * np.log(np.hypot(share, noise_room.FLOOR))
+                squares += 2 * count * np.log(shares[..., k])
             else:
                 squares += np.sum(weight[:, k] * (error[..., k] / sd[:, k]) ** 2, -1)
         cost = 0.5 * squares + LOST * (posed.observe.unreachable(seen.status) & (weight.max(1) > 0)).sum(-1)
@@ -233,7 +242,7 @@ def evolve(
     begun = time.perf_counter()
     search = CMA(np.asarray(centre, float), 1.0, population_size=size, seed=seed, cov=np.array(covariance, float))
     z = np.empty((0, len(centre))) if beside is None else np.asarray(beside, float)
-    seen, told = None, list[Generation]()
+    seen, cost, told = None, np.empty(0), list[Generation]()
     for number in range(1, generations + 1):
         drawn = np.array([search.ask() for _ in range(size)])
         asked = drawn if number > 1 or not len(z) else np.concatenate([z, drawn])
@@ -245,7 +254,7 @@ def evolve(
         now = members.run(asked, advance)
         z = asked if seen is None else np.concatenate([z, asked])
         seen = now if seen is None else Rows(*map(np.concatenate, zip(seen, now, strict=True)))
-        cost = objective(z, seen)
+        cost = np.concatenate([cost, objective(asked, now)])
         own = cost[-size:]
         search.tell([(d, float(c)) for d, c in zip(drawn, np.where(np.isfinite(own), own, MISSING**2), strict=True)])
         failed = int(np.sum(members.lost(now).any(-1)))
