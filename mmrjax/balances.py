@@ -56,6 +56,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.ground.friction.speed_rest
+    duty = robot.driver.duty_limited(conditions.duty, state.current)
     signals = Signals(
         configuration=conditions.configuration,
         on_tracks=chassis.on_tracks,
@@ -73,7 +74,9 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
         direction_travel=contact.direction(state.speed, rest) if direction is None else direction,
         speed_wheel=speed_wheel,
         speed_theoretical=speed_theoretical,
-        total_current=robot.sides * state.current,
+        temperature=state.temperature,
+        duty=duty,
+        total_current=robot.sides * state.current * duty,
     )
     stated = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     mass = stated + added(robot, _fill(signals, mass=stated), "mass")
@@ -82,17 +85,19 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
 
 
 def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
-    """Voltage at the motors [V]."""
+    """Voltage at the motors [V]: the driver's share of what the supply gives, less the drops on the way to it."""
     source = power.voltage_source(
         robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
     )
-    return _fill(signals, voltage=source - added(robot, signals, "supply"))
+    blocked = robot.driver.voltage_blocked(signals.duty, signals.current, robot.motor.resistance, conditions.open)
+    arriving = source - added(robot, signals, "supply")
+    return _fill(signals, voltage_source=source, voltage=signals.duty * arriving - blocked)
 
 
 def electrical(robot: Robot, signals: Signals) -> Signals:
     """What of the supply voltage is left to change the current [V]."""
     back = robot.motor.voltage_back(signals.speed_motor)
-    drop = robot.motor.voltage_winding(signals.current) + added(robot, signals, "electrical")
+    drop = robot.motor.voltage_winding(signals.current, signals.temperature) + added(robot, signals, "electrical")
     return _fill(
         signals,
         voltage_back=back,
@@ -236,15 +241,18 @@ def resolved(
     return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
 
 
-def settled(robot: Robot, conditions: Conditions, state: State) -> tuple[Signals, Scalar]:
-    """All signals of steady forward travel: traction is the demand.
+def settled(robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0) -> tuple[Signals, Scalar]:
+    """All signals of steady travel: traction is the demand.
+
+    Args:
+        direction: of travel, 1 forward or -1 backward; friction acts against it also at rest.
 
     Returns:
         The signals, and the sliding speed at which the friction law carries that demand [m/s], which
         `signals.speed_sliding` has to meet.
     """
     chassis = robot.chassis(conditions.configuration)
-    signals = begin(robot, conditions, state, direction=jnp.ones_like(state.speed_motor))
+    signals = begin(robot, conditions, state, direction=direction * jnp.ones_like(state.speed_motor))
     signals = _to_slip(robot, conditions, chassis, signals)
     # Nothing changes in steady travel: the rates that other fidelities compute are zero.
     still = jnp.zeros_like(signals.demand)

@@ -32,6 +32,8 @@ class Conditions(eqx.Module):
         adhesion: adhesion of this surface as a ratio to the one that the robot's friction is stated for [-].
         total_mass: mass of robot and payload as weighed [kg]; None takes the robot's own mass and the payload.
         order: place in the sequence of runs; what drifts from run to run depends on it [-].
+        duty: share of the supply's voltage that the driver gives the motors, negative backward [-].
+        open: 1 where the motors' circuit is open, so that they coast.
     """
 
     configuration: Int[Array, "..."] | np.ndarray
@@ -43,6 +45,8 @@ class Conditions(eqx.Module):
     adhesion: Float[Array, "..."]
     total_mass: Float[Array, "..."] | None
     order: Float[Array, "..."]
+    duty: Float[Array, "..."]
+    open: Float[Array, "..."]
 
     def __init__(
         self,
@@ -55,25 +59,27 @@ class Conditions(eqx.Module):
         adhesion: Number = 1.0,
         total_mass: Number | None = None,
         order: Number = 0.0,
+        duty: Number = 1.0,
+        open: Number | bool = 0.0,
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
             which = jnp.asarray(which).astype(int)
-        given = (voltage, slope_deg, payload, battery, discharge, adhesion, order)
+        given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
         numbers = [jnp.asarray(v, float) for v in given]
         mass = None if total_mass is None else jnp.asarray(total_mass, float)
         shapes = [x.shape for x in (which, *numbers, *([] if mass is None else [mass]))]
         try:
             shape = jnp.broadcast_shapes(*shapes)
         except ValueError:
-            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in ("total_mass", "order")]
-            of = dict(zip([*names, "order", "total_mass"], shapes, strict=False))
+            names = [f.name for f in dataclasses.fields(type(self)) if f.name != "total_mass"]
+            of = dict(zip([*names, "total_mass"], shapes, strict=False))
             said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
         self.configuration = (np if which.dtype.kind == "U" else jnp).broadcast_to(which, shape)
-        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion, self.order = (
-            jnp.broadcast_to(x, shape) for x in numbers
-        )
+        numbers = [jnp.broadcast_to(x, shape) for x in numbers]
+        self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
+        self.order, self.duty, self.open = numbers[6:]
         self.total_mass = None if mass is None else jnp.broadcast_to(mass, shape)
 
     @property

@@ -12,8 +12,14 @@ from mmrjax.signals import quotient
 class Gearbox(eqx.Module):
     """M_r = i η_rm (M_d - M_rf_idle) with M_rf_idle = M_rf0 sign ω + K_fr ω.
 
-    Driven from the output (overhauling) the load loss turns round: M_r = (i / η_rm) (M_d - M_rf_idle),
-    which the paper leaves out because it never coasts; without it a descent would gain energy.
+    Driven from the output (overhauling) the load loss turns round: M_r = (i / η_b) (M_d - M_rf_idle) with the
+    efficiency η_b of `efficiency_backward`, which the paper leaves out because it never coasts; without it a descent
+    would gain energy.
+
+    Attributes:
+        mesh_theory: η_b by the theory of the mesh, 2 - 1/η_rm; else equal to η_rm.
+        speed_limit: at the input [rad/s]; torque_limit: continuous, at the output of the gearbox [N·m], None where
+            not stated.
     """
 
     ratio: Scalar = parameter(
@@ -49,17 +55,31 @@ class Gearbox(eqx.Module):
         source="Table 2: 1.4e-3 mN·m·s",
     )
     speed_limit: float = eqx.field(default=8_000 * 0.10471975511965977, static=True)  # 8000 rpm input, catalogue
+    torque_limit: float | None = eqx.field(default=None, static=True)
+    mesh_theory: bool = eqx.field(default=False, static=True)
+
+    @property
+    def efficiency_backward(self) -> Scalar:
+        """η_b, load driving the motor [-]: η_rm, or by the theory of the mesh 2 - 1/η_rm, at least 0.02.
+
+        A loss in proportion to the force in the mesh is (1/η - 1) of the power that leaves it, whichever way that
+        flows; from η = 1/2 down such a gear locks itself.
+        """
+        if not self.mesh_theory:
+            return self.efficiency_load
+        return jnp.maximum(2 - 1 / self.efficiency_load, 0.02)
 
     def torque_idle(self, speed: Scalar, direction: Scalar) -> Scalar:
         """Idle loss torque at the input M_rf_idle [N·m], eq. (20), at input `speed` [rad/s]."""
         return self.friction_coulomb * direction + self.friction_viscous * speed
 
     def efficiency_flow(self, transmitted: Scalar, direction: Scalar) -> Scalar:
-        """η_rm where power flows to the wheels, 1/η_rm where it flows back [-].
+        """η_rm where power flows to the wheels, 1/η_b where it flows back, fading to 1 at rest with `direction` [-].
 
         `transmitted` is the input torque less the idle torque [N·m].
         """
-        return jnp.where(transmitted * direction >= 0, self.efficiency_load, 1 / self.efficiency_load)
+        flow = jnp.sign(transmitted) * direction
+        return 1 + flow * jnp.where(flow >= 0, self.efficiency_load - 1, 1 - 1 / self.efficiency_backward)
 
     def torque_output(self, transmitted: Scalar, direction: Scalar) -> Scalar:
         """Output torque M_r [N·m], eqs. (22), (23)."""

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from mmrjax.params import Scalar, parameter
 
 _SHEET = "maker's sheet of RE30 310007 (24 V, 60 W)"
+
+ALPHA = 0.00393  # temperature coefficient of copper's resistance at 20 °C [1/K], IEC 60028 (1925)
+#: Temperature for which makers state the resistance of a winding [°C].
+TEMPERATURE_REFERENCE = 25.0
 
 
 class Motor(eqx.Module):
@@ -60,13 +65,37 @@ class Motor(eqx.Module):
         relative_sd=0.05,
         source=f"{_SHEET}: 33.5 g·cm^2",
     )
-    resistance_thermal: Scalar = parameter(
-        6.0 + 1.7,
+    resistance_thermal_winding: Scalar = parameter(
+        1.7,
         unit="K/W",
-        meaning="thermal resistance winding to ambient",
+        meaning="thermal resistance winding to housing",
         bounds=(0.0, 100.0),
         relative_sd=0.2,
-        source=f"{_SHEET}: 1.7 to the housing, 6.0 to ambient",
+        source=_SHEET,
+    )
+    resistance_thermal_housing: Scalar = parameter(
+        6.0,
+        unit="K/W",
+        meaning="thermal resistance housing to ambient",
+        bounds=(0.0, 100.0),
+        relative_sd=0.2,
+        source=_SHEET,
+    )
+    time_constant_winding: Scalar = parameter(
+        16.3,
+        unit="s",
+        meaning="thermal time constant of the winding at a constant housing temperature",
+        bounds=(0.1, 1e4),
+        relative_sd=0.2,
+        source=_SHEET,
+    )
+    time_constant_housing: Scalar = parameter(
+        593.0,
+        unit="s",
+        meaning="thermal time constant of the motor: its housing's capacity times the resistance to ambient",
+        bounds=(1.0, 1e5),
+        relative_sd=0.2,
+        source=_SHEET,
     )
     temperature_ambient: Scalar = parameter(
         25.0,
@@ -84,9 +113,11 @@ class Motor(eqx.Module):
         """Back-EMF E = C_E ω [V], eq. (16)."""
         return self.torque_constant * speed
 
-    def voltage_winding(self, current: Scalar) -> Scalar:
-        """Voltage across the winding's resistance I R [V], eq. (15)."""
-        return current * self.resistance
+    def voltage_winding(self, current: Scalar, temperature: Scalar | None = None) -> Scalar:
+        """Voltage across the winding's resistance I R [V], eq. (15); R follows the copper where its `temperature`
+        [°C] is given: R (1 + α (T - 25 °C))."""
+        drop = current * self.resistance
+        return drop if temperature is None else drop * (1 + ALPHA * (temperature - TEMPERATURE_REFERENCE))
 
     def torque_electromagnetic(self, current: Scalar) -> Scalar:
         """M_de = C_m I [N·m], eq. (17)."""
@@ -96,6 +127,47 @@ class Motor(eqx.Module):
         """Friction torque M_df [N·m], eq. (14), at shaft `speed` [rad/s] and its `direction` (-1..1)."""
         return self.friction_coulomb * direction + self.friction_viscous * speed
 
-    def temperature_winding(self, current: Scalar) -> Scalar:
-        """Winding temperature after long running at `current` [°C], resistance taken cold."""
+    @property
+    def resistance_thermal(self) -> Scalar:
+        """Thermal resistance winding to ambient [K/W]."""
+        return self.resistance_thermal_winding + self.resistance_thermal_housing
+
+    def temperature_cold(self, current: Scalar) -> Scalar:
+        """Winding temperature after long running at `current` if its resistance did not rise [°C]."""
         return self.temperature_ambient + self.resistance_thermal * self.resistance * current**2
+
+    def temperature_settled(self, current: Scalar) -> Scalar:
+        """Winding temperature after long running at `current` [°C], its resistance risen with it; inf: there is none.
+
+        T = T_a + R_th R I² (1 + α (T - 25 °C)). From R_th R I² α = 1 on every kelvin more brings more than a kelvin.
+        """
+        rise = self.resistance_thermal * self.resistance * current**2
+        left = 1 - ALPHA * rise
+        finite = left > 0
+        settled = self.temperature_ambient + rise * (
+            1 + ALPHA * (self.temperature_ambient - TEMPERATURE_REFERENCE)
+        ) / jnp.where(finite, left, 1.0)
+        return jnp.where(finite, settled, jnp.inf)
+
+    @property
+    def current_continuous(self) -> Scalar:
+        """Current at which the winding settles at its permissible temperature [A], its resistance risen with it."""
+        allowed = jnp.maximum(self.temperature_limit - self.temperature_ambient, 1.0)
+        hot = self.resistance * (1 + ALPHA * (self.temperature_limit - TEMPERATURE_REFERENCE))
+        return jnp.sqrt(allowed / jnp.maximum(self.resistance_thermal * hot, 1e-9))
+
+    def heating(self, power: Scalar, winding: Scalar, housing: Scalar) -> tuple[Scalar, Scalar]:
+        """Rates of the temperatures of winding and housing [K/s], two bodies in a row.
+
+        C_w T_w' = P - (T_w - T_h) / R_wh, C_h T_h' = (T_w - T_h) / R_wh - (T_h - T_a) / R_ha, with C_w = τ_w / R_wh
+        and C_h = τ_h / R_ha as makers state the time constants (maxon, Key information on motor data).
+
+        Args:
+            power: lost in the winding [W]; winding, housing: temperatures [°C].
+        """
+        flow = (winding - housing) / self.resistance_thermal_winding
+        out = (housing - self.temperature_ambient) / self.resistance_thermal_housing
+        return (
+            (power - flow) * self.resistance_thermal_winding / self.time_constant_winding,
+            (flow - out) * self.resistance_thermal_housing / self.time_constant_housing,
+        )

@@ -67,6 +67,13 @@ class Battery(eqx.Module):
         source="type designation XP2200SL: 2200 mAh",
     )
     cells: int = eqx.field(default=8, static=True)
+    voltage_charge: float = eqx.field(default=4.2, static=True)  # highest of a cell [V], Section 3.3: fully charged
+    voltage_cutoff: float = eqx.field(
+        default=3.0, static=True
+    )  # lowest of a cell [V], usual for Li-Po; not in the paper
+    delay_cutoff: float = eqx.field(default=1.0, static=True)  # how long it may be below [s]; a start draws more
+    current_limit: float | None = eqx.field(default=None, static=True)  # of a cell, discharging [A]
+    current_charge: float | None = eqx.field(default=None, static=True)  # of a cell, charging [A]
 
     def voltage_no_load(self, discharge: Scalar) -> Scalar:
         """No-load voltage of one cell [V] after `discharge` [C], eq. (13)."""
@@ -76,10 +83,13 @@ class Battery(eqx.Module):
         """Load current of the battery I_b = I_s + I_p [A], eq. (10); also dC_b/dt, eq. (11)."""
         return total_current + self.current_other
 
+    def voltage_cell(self, total_current: Scalar, discharge: Scalar) -> Scalar:
+        """Voltage of one cell under load [V], eq. (12), for the motors' `total_current` [A]."""
+        return self.voltage_no_load(discharge) - self.current(total_current) * self.resistance
+
     def voltage(self, total_current: Scalar, discharge: Scalar) -> Scalar:
         """Voltage of the whole battery U_b [V], eqs. (9), (12), for the motors' `total_current` [A]."""
-        cell = self.voltage_no_load(discharge) - self.current(total_current) * self.resistance
-        return self.cells * cell
+        return self.cells * self.voltage_cell(total_current, discharge)
 
     def empty(self, discharge: Scalar) -> Bool[Array, "..."]:
         """Whether the charge taken [C] has reached the capacity; the parabola (13) turns up past it."""

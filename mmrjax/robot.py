@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from mmrjax.chassis import Chassis
+from mmrjax.driver import Driver
 from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
 from mmrjax.params import Index, Scalar, as_float
@@ -73,6 +74,7 @@ class Robot(eqx.Module):
         effects: terms beyond the paper's model; the empty tuple is the paper's model.
         sides: how many motors are driven alike; all per-side quantities are of one of them (assumption 3).
         running_gear: of one side, what the track model needs beside the rest.
+        driver: of the motors.
     """
 
     battery: Battery
@@ -82,6 +84,7 @@ class Robot(eqx.Module):
     effects: tuple[Effect, ...] = ()
     sides: Scalar = eqx.field(default=2.0, converter=as_float)
     running_gear: RunningGear = eqx.field(default_factory=RunningGear)
+    driver: Driver = eqx.field(default_factory=Driver)
 
     def chassis(self, configuration: Index) -> Chassis:
         """The chassis of the configuration with this index; traceable and batchable."""

@@ -15,12 +15,20 @@ from mmrjax.params import Index, Scalar
 GRAVITY = 9.80665  # [m/s²], standard gravity
 
 #: Outcomes of one member of a batch, in the order of their codes.
-STATUSES = ("converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips")
-CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS = range(len(STATUSES))
+STATUSES = (
+    "converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips", "reverses", "rolls_back",
+)  # fmt: skip
+CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, ROLLS_BACK = range(len(STATUSES))
+
+#: Statuses of a run that ended as its conditions ask: `reverses` travels backward since its voltage is negative.
+DONE = (CONVERGED, REVERSES)
 
 #: Limits that a run may exceed, and that it slides on average though it goes on steadily; bit k of `Result.flags` is
-#: the k-th name.
-FLAGS = ("motor_overspeed", "gearbox_overspeed", "winding_hot", "slips")
+#: the k-th name. `winding_hot` is after long running at this current, `too_hot` what a mission really reaches.
+FLAGS = (
+    "motor_overspeed", "gearbox_overspeed", "winding_hot", "slips", "overvoltage", "cut_off", "battery_overcurrent",
+    "current_limited", "gearbox_overload", "too_hot", "demand_missed",
+)  # fmt: skip
 
 
 #: A quantity that the balances have not computed yet.
@@ -36,6 +44,7 @@ class State(eqx.Module):
         speed: speed of the robot along the slope V [m/s].
         discharge: charge taken from the battery C_b [C].
         memory: of each effect that has one, by the effect's name, in its own unit; empty where none is kept.
+        temperature: of the winding [°C], whose resistance follows it; None: not followed, resistance as stated.
     """
 
     current: Scalar
@@ -43,6 +52,7 @@ class State(eqx.Module):
     speed: Scalar
     discharge: Scalar
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
+    temperature: Scalar | None = None
 
 
 class Signals(eqx.Module):
@@ -64,6 +74,7 @@ class Signals(eqx.Module):
     current: Scalar = UNSET  # I_d of one motor [A]
     speed_motor: Scalar = UNSET  # [rad/s]
     speed: Scalar = UNSET  # V of the robot [m/s]
+    temperature: Scalar | None = None  # of the winding, where it is followed [°C]
     # kinematics
     direction: Scalar = UNSET  # of the shafts, -1..1, 0 at rest [-]
     direction_travel: Scalar = UNSET  # of the robot, -1..1 [-]
@@ -73,7 +84,9 @@ class Signals(eqx.Module):
     mass: Scalar = UNSET  # total M [kg]; to effects of balance `mass`, the stated one
     normal: Scalar = UNSET  # normal load of one side [N]
     # supply and electrical
-    total_current: Scalar = UNSET  # of all motors I_s, eq. (10) [A]
+    duty: Scalar = UNSET  # D of the driver, its limit seen to [-]
+    total_current: Scalar = UNSET  # D I of all motors, from the supply I_s, eq. (10) [A]
+    voltage_source: Scalar = UNSET  # of battery or external supply, eq. (8) [V]
     voltage: Scalar = UNSET  # U_e at the motors [V]
     voltage_back: Scalar = UNSET  # E, eq. (16) [V]
     voltage_drop: Scalar = UNSET  # I R and every further drop [V]

@@ -23,13 +23,15 @@ VOLTAGES_V = (15.0, 24.0, 33.0)
 
 #: Least and greatest value of every condition of a run that is a number, and its unit.
 CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
-    "voltage": (0.0, 100.0, "V"),
+    "voltage": (-100.0, 100.0, "V"),
     "slope_deg": (-45.0, 45.0, "deg"),
     "payload": (0.0, 300.0, "kg"),
     "battery": (0.0, 1.0, ""),
     "discharge": (0.0, 360_000.0, "C"),
     "adhesion": (1e-3, 100.0, ""),
     "order": (0.0, 1e9, ""),
+    "duty": (-1.0, 1.0, ""),
+    "open": (0.0, 1.0, ""),
     "total_mass": (0.1, 500.0, "kg"),
 }
 

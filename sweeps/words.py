@@ -38,6 +38,12 @@ STATUSES: dict[str, Status] = {
         "the line of gravity passes outside the contacts: the robot turns over",
         "the line of gravity passes outside the contacts: the robot turns over",
     ),
+    "reverses": Status("reverses", "steady travel backward", "found a steady operating point, travelling backward"),
+    "rolls_back": Status(
+        "rolls back",
+        "gravity drives the robot against its motors",
+        "gravity drives the robot against its motors: it travels downhill steadily",
+    ),
 }
 
 FLAGS = {
@@ -45,6 +51,13 @@ FLAGS = {
     "gearbox_overspeed": "gearbox input faster than its catalogue permits",
     "winding_hot": "winding hotter than permitted after long running at this current",
     "slips": "slides faster than V_s on average, though it goes on steadily",
+    "overvoltage": "more current flows back than the battery may take (charge voltage or charging current)",
+    "cut_off": "a cell below its cut-off voltage",
+    "battery_overcurrent": "more current than a cell may give",
+    "current_limited": "the motor driver's current limit acts",
+    "gearbox_overload": "more torque than the gearbox may carry for long",
+    "too_hot": "winding hotter than permitted",
+    "demand_missed": "a demanded speed was not reached",
 }
 
 

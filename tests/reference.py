@@ -35,7 +35,8 @@ NOMINAL: dict[str, float] = {
     "motor.friction_coulomb": 0.0027,
     "motor.friction_viscous": 5.5e-7,
     "motor.inertia": 3.35e-6,
-    "motor.resistance_thermal": 7.7,
+    "motor.resistance_thermal_winding": 1.7,
+    "motor.resistance_thermal_housing": 6.0,
     "motor.temperature_ambient": 25.0,
     # Table 2; ratio 576/25 x 25/12
     "gearbox.ratio": 576 / 25 * 25 / 12,
@@ -266,10 +267,12 @@ class Side:
         return CELLS * (self.A * C_b * C_b + self.B * C_b + self.U0 - (SIDES * I + self.I_p) * self.R_b)
 
     def efficiency(self, A, B, sign):
-        """η_rm driving, 1/η_rm driven, from motor torque less idle loss A and load B."""
+        """η_rm driving, 1/η_rm driven, 1 at rest and in between, from motor torque less idle loss A and load B."""
         wheel = (self.i * self.eta * A - B) / (self.J_w + self.J_d * self.i**2 * self.eta)
         through = A - self.J_d * self.i * wheel  # torque that reaches the teeth
-        return self.eta if through * sign >= 0 else 1 / self.eta
+        if through * sign >= 0:
+            return 1 - abs(sign) * (1 - self.eta)
+        return 1 + abs(sign) * (1 / self.eta - 1)
 
     def steady_residual(self, x):
         """Volts and newton-metres left over, and speed, at [I, ω / 1000, V]."""

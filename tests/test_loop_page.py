@@ -111,7 +111,8 @@ def test_what_is_too_large_is_said_beside_the_verdict(shown, capsys):
     assert got.document["verdict"] == "unnamed" and 2.7 < float(times) < 3.3
     said = (
         "winding_heating would explain as much as the curve, but is ruled out by size or sign alone: "
-        f"winding_heating at {times} times its largest plausible size; check motor.resistance_thermal."
+        f"winding_heating at {times} times its largest plausible size; "
+        "check motor.resistance_thermal_housing and motor.resistance_thermal_winding."
     )
     assert said in got.printed and said in got.page.text
     assert got.text.index('id="ruled_out"') < got.text.index('id="effects"')

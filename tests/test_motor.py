@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import reference
 
-from mmrjax.motor import Motor
+from mmrjax.motor import ALPHA, Motor
 
 RNG = np.random.default_rng(14)
 
@@ -42,5 +42,21 @@ def test_motor_friction_at_no_load_is_near_the_sheet_current():
 
 
 def test_motor_temperature_settles_at_ambient_plus_heat():
-    motor = Motor(resistance=2.0, resistance_thermal=5.0, temperature_ambient=20.0)
-    assert float(motor.temperature_winding(3.0)) == 20.0 + 5.0 * 2.0 * 9.0
+    motor = Motor(
+        resistance=2.0, resistance_thermal_winding=1.0, resistance_thermal_housing=4.0, temperature_ambient=20.0
+    )
+    assert float(motor.temperature_cold(3.0)) == 20.0 + 5.0 * 2.0 * 9.0
+    settled = float(motor.temperature_settled(3.0))
+    power = 3.0 * float(motor.voltage_winding(3.0, settled))  # copper at that temperature
+    assert settled == pytest.approx(20.0 + 5.0 * power, rel=1e-12) and settled > 110.0
+    assert [float(rate) for rate in motor.heating(power, settled, 20.0 + 4.0 * power)] == pytest.approx(
+        [0, 0], abs=1e-9
+    )
+
+
+def test_no_temperature_settles_where_every_kelvin_brings_more_than_a_kelvin():
+    """α R_th R I² = 1 at 8.1 A for the packaged motor: its stall has no settled temperature."""
+    motor = Motor()
+    edge = float((ALPHA * motor.resistance_thermal * motor.resistance) ** -0.5)
+    assert np.isfinite(motor.temperature_settled(0.99 * edge)) and np.isinf(motor.temperature_settled(1.01 * edge))
+    assert float(motor.temperature_settled(3.91)) == pytest.approx(motor.temperature_limit, rel=5e-3)

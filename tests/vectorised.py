@@ -87,8 +87,21 @@ def closed_form_all(wheeled, voltage, slope_deg, payload, p=NOMINAL):
         **dict(zip(("power_supply", "power_motor", "power_gear", "power_ground"), powers, strict=True)),
         "power_lift": SIDES * load.gravity * V,
         **dict(zip(("efficiency_motor", "efficiency_gear", "efficiency_chassis"), efficiencies, strict=True)),
-        "temperature_winding": p["motor.temperature_ambient"] + p["motor.resistance_thermal"] * R * I * I,
+        "temperature_winding": _settled(p, R * I * I),
     }
+
+
+def _thermal(p):
+    return p["motor.resistance_thermal_winding"] + p["motor.resistance_thermal_housing"]
+
+
+def _settled(p, cold):
+    """Winding temperature after long running with `cold` watts at 25 °C, by turns of T -> T_a + R_th P (1 + α (T - 25))."""
+    ambient = p["motor.temperature_ambient"]
+    temperature = np.full_like(cold, ambient)
+    for _ in range(4000):
+        temperature = np.minimum(ambient + _thermal(p) * cold * (1 + ALPHA * (temperature - 25)), 1e9)
+    return np.where(temperature < 1e6, temperature, np.inf)
 
 
 def newton(
@@ -105,7 +118,7 @@ def newton(
     c0 = (M_f + load.M_0 / (i * eta)) / C
     c1 = (K_f + load.K / (i * i * eta)) / C
     c2 = churning / (i**3 * eta * C)
-    warm, most_warm = p["motor.resistance_thermal"] * R, LIMIT - p["motor.temperature_ambient"]
+    warm, most_warm = _thermal(p) * R, LIMIT - p["motor.temperature_ambient"]
     w = 0.9 * voltage / C
     for _ in range(most):
         I = c0 + (c1 + c2 * w) * w

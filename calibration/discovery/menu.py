@@ -375,7 +375,8 @@ def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.n
     )
     warnings = []
     hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
-    heats = f"a winding left on would reach {hottest:.0f} °C ({reach.hot:.0f} °C is allowed)"
+    would = f"would reach {hottest:.0f} °C" if np.isfinite(hottest) else "would burn: no temperature settles"
+    heats = f"a winding left on {would} ({reach.hot:.0f} °C is allowed)"
     if run.setup is setups.blocked:
         current = highest / reach.resistance
         warnings.append(

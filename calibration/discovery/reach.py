@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 
@@ -116,10 +115,7 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     motors = int(robot.sides)
     travel = operating_readings(robot, conditions)
     largest = {c: float(np.nanmax(travel[:, k], initial=0.0)) for k, c in enumerate(channels.names())}
-    bears = math.sqrt(
-        max(motor.temperature_limit - float(motor.temperature_ambient), 1.0)
-        / max(float(motor.resistance_thermal) * resistance, 1e-9)
-    )
+    bears = float(motor.current_continuous)
     current = min(largest["total_current"] / motors or LOADED * highest / resistance, bears)
     motor_speed = largest["motor_speed"] or RUNNING * highest / constant
     radius = max(float(c.radius) for c in robot.configurations.members)

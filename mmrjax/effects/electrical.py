@@ -5,11 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
+from mmrjax.motor import ALPHA
 from mmrjax.params import Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
-
-ALPHA = 0.00393  # temperature coefficient of copper's resistance at 20 °C [1/K], IEC 60028 (1925)
 
 
 class ElectricalEffect(Effect):
@@ -82,11 +81,12 @@ class WindingHeating(ElectricalEffect):
     Source: IEC 60028 for α; the maker's sheet for R_th = 7.7 K/W. A run shorter than the thermal time
     constants (16 s winding, 593 s housing) reaches only a share of the settled rise: 1 is settled, 0 cold.
     The rise is taken at the cold resistance (first order in α) and held at the winding's limit of 125 °C, so
-    that the inrush of a start, which lasts milliseconds, is not taken for a settled current of 50 A.
+    that the inrush of a start, which lasts milliseconds, is not taken for a settled current of 50 A. Where the
+    winding's temperature is followed (missions), its resistance follows that, and the effect adds nothing.
     """
 
     driver = "current"
-    rests_on = ("motor.resistance_thermal",)
+    rests_on = ("motor.resistance_thermal_housing", "motor.resistance_thermal_winding")
     dissipative = True
 
     amplitude: Scalar = amplitude(
@@ -99,7 +99,9 @@ class WindingHeating(ElectricalEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         motor = robot.motor
-        rise = jnp.minimum(motor.temperature_winding(signals.current), motor.temperature_limit)
+        if signals.temperature is not None:
+            return jnp.zeros_like(signals.current)
+        rise = jnp.minimum(motor.temperature_cold(signals.current), motor.temperature_limit)
         rise = rise - motor.temperature_ambient
         return self.amplitude * ALPHA * rise * motor.voltage_winding(signals.current)
 
@@ -111,7 +113,8 @@ class ThermalDrift(ElectricalEffect):
 
     Source: IEC 60028 for α; the maker's sheet of RE30 310007 for τ and R_wh. The housing, with 593 s, stays
     where it was during a run: its share is `winding_heating`, which settled travel cannot tell from this.
-    The memory is T [K]; where none is kept it is settled.
+    The memory is T [K]; where none is kept it is settled. Where the winding's temperature is followed (missions), its
+    resistance follows that, and the effect adds nothing.
     """
 
     driver = "current"
@@ -151,5 +154,7 @@ class ThermalDrift(ElectricalEffect):
         return (self.settled(robot, signals) - signals.memory[self.name]) / self.time_constant
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
+        if signals.temperature is not None:
+            return jnp.zeros_like(signals.current)
         drop = robot.motor.voltage_winding(signals.current)
         return self.amplitude * ALPHA * self.recall(robot, signals) * drop

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.result import result, unless_slipping, withhold
+from mmrjax.fidelities.result import result, travels, unless_slipping, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
@@ -176,8 +176,9 @@ def drive(
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, done: Array) -> Array:
     settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
-    status = jnp.where(settling, NOT_SETTLED, CONVERGED)
-    stands = jnp.minimum(end.direction, end.direction_travel) < 1.0
+    status = jnp.where(settling, NOT_SETTLED, travels(end.speed, end.voltage))
+    backward = (end.direction <= -1.0) & (end.direction_travel <= -1.0)
+    stands = (jnp.minimum(end.direction, end.direction_travel) < 1.0) & ~backward
     status = jnp.where(stands & (end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
     gain = end.acceleration * jnp.sign(end.speed_sliding)
     status = unless_slipping(status, robot, end, gain, 1e-3, stands)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -11,24 +12,19 @@ from jaxtyping import Array, Int
 from mmrjax import balances, ground
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import NOT_SETTLED, SLIDES, Result, Signals, quotient
+from mmrjax.signals import CONVERGED, FLAGS, NOT_SETTLED, REVERSES, ROLLS_BACK, SLIDES, Result, Signals, quotient
 
 
 def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     """Readings, power chain of Fig. 4 and exceeded limits of one instant."""
     sides = robot.sides
-    power_supply = signals.voltage * signals.total_current
+    power_supply = sides * signals.voltage * signals.current
     power_motor = sides * signals.torque_motor * signals.speed_motor
     power_gear = sides * signals.torque_gear * signals.speed_wheel
     power_ground = sides * signals.traction * signals.speed
-    temperature = robot.motor.temperature_winding(signals.current)
-    over = (
-        jnp.abs(signals.speed_motor) > robot.motor.speed_limit,
-        jnp.abs(signals.speed_motor) > robot.gearbox.speed_limit,
-        temperature > robot.motor.temperature_limit,
-        slips(robot, signals),
-    )
-    flags = sum(jnp.where(o, 1 << k, 0) for k, o in enumerate(over))
+    temperature = robot.motor.temperature_settled(signals.current)
+    over = {**exceeded(robot, signals), "winding_hot": temperature > robot.motor.temperature_limit}
+    flags = mask(over)
     return Result(
         reading=balances.sensor(robot, signals),
         theoretical_speed=signals.speed_theoretical,
@@ -47,8 +43,45 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         efficiency_chassis=_efficiency(power_ground, power_gear),
         temperature_winding=temperature,
         status=status,
-        flags=jnp.asarray(flags),
+        flags=flags,
     )
+
+
+def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
+    """What an instant exceeds, by the flag's name."""
+    battery, on_battery = robot.battery, signals.battery > 0.5
+    cell, current = signals.voltage_source / battery.cells, battery.current(signals.total_current)
+    most, back = battery.current_limit or jnp.inf, battery.current_charge or jnp.inf
+    # A full cell at rest may read its charge voltage: only current that flows into it can exceed it.
+    overcharged = (cell > battery.voltage_charge) & (current < 0)
+    torque = jnp.abs(signals.torque_gear)
+    return {
+        "motor_overspeed": jnp.abs(signals.speed_motor) > robot.motor.speed_limit,
+        "gearbox_overspeed": jnp.abs(signals.speed_motor) > robot.gearbox.speed_limit,
+        "slips": slips(robot, signals),
+        "overvoltage": on_battery & (overcharged | (current < -back)),
+        "cut_off": on_battery & (cell < battery.voltage_cutoff),
+        "battery_overcurrent": on_battery & (current > most),
+        "current_limited": robot.driver.limits(signals.current),
+        "gearbox_overload": torque > (robot.gearbox.torque_limit or jnp.inf),
+    }
+
+
+def mask(over: Mapping[str, Scalar]) -> Array:
+    """Bit mask over `FLAGS`."""
+    return jnp.asarray(sum(jnp.where(o, 1 << FLAGS.index(name), 0) for name, o in over.items()))
+
+
+def travels(speed: Scalar, voltage: Scalar) -> Array:
+    """Status of steady travel at `speed` under a `voltage` at the motors: which of the two drives it."""
+    backward = jnp.asarray(speed) < 0
+    asked = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
+    return jnp.where(asked, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
+
+
+def turned(status: Array) -> Array:
+    """Whether a run travels steadily though not forward under its motors' power."""
+    return (status == REVERSES) | (status == ROLLS_BACK)
 
 
 def slips(robot: Robot, signals: Signals) -> Array:

@@ -75,23 +75,46 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
-        h = t1 - t0
+        def rate(y: Any) -> tuple[Any, Any]:
+            return terms.vf(t0, y, args), y[:0]
 
-        def rate(y: Any) -> Any:
-            return terms.vf(t0, y, args)
-
-        f0 = rate(y0)
-        matrix = jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jax.jacfwd(rate)(y0)
-        solve = _solver(matrix)
-        u = [solve(f0)]
-        y = y0
-        for stage in range(1, 6):
-            y = y + u[-1] if stage == 5 else y0 + sum(a * v for a, v in zip(_A[stage - 1], u, strict=True))
-            u.append(solve(rate(y) + sum(c * v for c, v in zip(_C[stage - 1], u, strict=True)) / h))
-        y1 = y + u[-1]
+        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0)
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
         return y1, u[-1], dense, None, RESULTS.successful
+
+
+def stages(
+    rates: Callable[[Array], tuple[Array, Array]], y0: Float[Array, " n"], q0: Float[Array, " m"], h: Array
+) -> tuple[Array, Array, list[Array], list[Array]]:
+    """One step over `h`, with integrals that do not act back on what they are integrals of.
+
+    The equations of the integrals q' = g(y) need no system to be solved: their part of the matrix is triangular.
+
+    Args:
+        rates: f(y) and g(y).
+
+    Returns:
+        y and q at the end of the step, and the stages of both; the last stage estimates the error.
+    """
+
+    def both(y: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        found = rates(y)
+        return found, found
+
+    (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
+    solve = _solver(jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian)
+    u, v, y, q = [solve(f)], [], y0, q0
+    v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
+    for stage in range(1, 6):
+        y = y + u[-1] if stage == 5 else y0 + sum(a * x for a, x in zip(_A[stage - 1], u, strict=True))
+        q = q + v[-1] if stage == 5 else q0 + sum(a * x for a, x in zip(_A[stage - 1], v, strict=True))
+        f, g = rates(y)
+        u.append(solve(f + sum(c * x for c, x in zip(_C[stage - 1], u, strict=True)) / h))
+        v.append(
+            h * _GAMMA * (g + sum(c * x for c, x in zip(_C[stage - 1], v, strict=True)) / h + jacobian_q @ u[-1])
+        )
+    return y + u[-1], q + v[-1], u, v
 
 
 def _solver(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:

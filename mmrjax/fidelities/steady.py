@@ -13,14 +13,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, outputs, params
+from mmrjax import balances, ground, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
-from mmrjax.fidelities.result import result, withhold
+from mmrjax.fidelities.result import result, travels, turned, withhold
 from mmrjax.robot import Robot
-from mmrjax.signals import BATTERY_EMPTY, CODES, CONVERGED, FAILED, SLIDES, STALLED, Result, Signals, State
+from mmrjax.signals import (
+    BATTERY_EMPTY,
+    CODES,
+    CONVERGED,
+    FAILED,
+    GRAVITY,
+    SLIDES,
+    STALLED,
+    Result,
+    Signals,
+    State,
+)
 
 # Units of the unknowns and of the torque residual, so that all are of the order of one.
 _SPEED, _CURRENT, _SPEED_MOTOR, _VOLTAGE, _TORQUE = 1.0, 10.0, 1000.0, 10.0, 100.0
@@ -39,10 +50,12 @@ _balanced = eqx.filter_jit(balances.settled)
 @eqx.filter_jit
 def _residual(unknowns: Vector, robot: Robot, conditions: Conditions) -> Vector:
     _, conditions = _sound(robot, conditions)
-    signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge))
-    # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0, one of them 0.
-    lacking = -signals.torque_net / _TORQUE
-    torque = jnp.where(unknowns[2] < lacking, unknowns[2], lacking)
+    sense = direction(robot, conditions)
+    signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge), sense)
+    # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0 in the direction of
+    # travel, one of them 0.
+    lacking, moving = -sense * signals.torque_net / _TORQUE, sense * unknowns[2]
+    torque = sense * jnp.where(moving < lacking, moving, lacking)
     slip, voltage = signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE
     return jnp.asarray(slip), jnp.asarray(voltage), torque
 
@@ -62,9 +75,27 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
 
 
-def _start(robot: Robot, conditions: Conditions) -> Vector:
+def direction(robot: Robot, conditions: Conditions) -> Array:
+    """Direction in which a robot can travel, 1 forward or -1 backward: of the torque on its shafts at rest.
+
+    That of the motors at their stall current less gravity's; friction can hold the robot, not turn it round.
+    """
+    chassis = robot.chassis(conditions.configuration)
+    mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
+    stall = robot.motor.torque_electromagnetic(_voltage(robot, conditions) / robot.motor.resistance)
+    weight = ground.force_gravity(mass * (1 / robot.sides), conditions.slope, GRAVITY) * chassis.radius
+    return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
+
+
+def _voltage(robot: Robot, conditions: Conditions) -> Array:
+    """Voltage that the driver gives motors at rest [V], no current flowing."""
     battery = robot.battery.voltage(0.0, conditions.discharge)
-    nominal = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
+    source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
+    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, source)
+
+
+def _start(robot: Robot, conditions: Conditions) -> Vector:
+    nominal = _voltage(robot, conditions)
     speed = nominal * (0.9 / robot.motor.torque_constant)
     return (
         robot.chassis(conditions.configuration).radius * speed * (1 / robot.gearbox.ratio / _SPEED),
@@ -85,11 +116,12 @@ def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
     """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
     state, _ = _root(robot, conditions)
-    return _balanced(robot, _sound(robot, conditions)[1], state)[0]
+    _, sound = _sound(robot, conditions)
+    return _balanced(robot, sound, state, direction(robot, sound))[0]
 
 
 def steady(robot: Robot, conditions: Conditions) -> Result:
-    """Steady forward travel of one run: a root in motor current, motor speed and robot speed.
+    """Steady travel of one run, forward or backward: a root in motor current, motor speed and robot speed.
 
     Derivatives are implicit (forward and reverse). Vmapped by `steady_batch`.
 
@@ -98,17 +130,28 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         conditions: one run, scalar fields.
 
     Returns:
-        Scalars. `status` is `converged`; `stalled` (shafts or robot slower than a tenth of V_s, where
-        friction at rest is not resolved: too little torque; where it cannot turn the shafts, stall current,
-        shaft speed 0, and the robot creeps back at the sliding speed of the static friction law; what
-        gravity would drive back is held); `slides`
+        Scalars. `status` is `converged`; `reverses` (steady travel backward, as a negative voltage asks);
+        `rolls_back` (gravity drives the robot against its motors, or backward without voltage); `stalled` (shafts or
+        robot slower than a tenth of V_s, where friction at rest is not resolved: neither the motors nor gravity can
+        turn the shafts: stall current, shaft speed 0, and the robot creeps at the sliding speed of the static
+        friction law); `slides`
         (the demand is above the adhesion limit), `battery_empty` or `failed`, all three with NaN in
         every number but `mass` and `adhesion_used` (NaN too where the conditions are no numbers, or
         the mass not positive). A member that has no numbers has zero derivatives and harms no
         other.
     """
     point, sound = operating_point(robot, conditions)
-    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED), sound)
+    # What the contact's law gives a robot that stands as creep, friction at rest holds.
+    parked = (point.status == STALLED) & (jnp.abs(point.theoretical_speed) < 1e-9)
+    held = {"speed": jnp.where(parked, 0.0, point.speed)}
+    reading = {**point.reading, **held}
+    point = dataclasses.replace(
+        point,
+        reading=reading,
+        power_ground=jnp.where(parked, 0.0, point.power_ground),
+        power_lift=jnp.where(parked, 0.0, point.power_lift),
+    )
+    return withhold(point, (point.status == CONVERGED) | (point.status == STALLED) | turned(point.status), sound)
 
 
 @eqx.filter_jit
@@ -123,11 +166,15 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     """
     state, solved = _root(robot, conditions)
     sound, conditions = _sound(robot, conditions)
-    signals, _ = _balanced(robot, conditions, state)
+    sense = direction(robot, conditions)
+    signals, _ = _balanced(robot, conditions, state, sense)
     rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
-    stands = jnp.minimum(signals.speed_theoretical, signals.speed) < rest
+    shafts, travel = sense * signals.speed_theoretical, sense * signals.speed
+    # Forward both have to move; what gravity drives back moves if only it slides, shafts turning slowly.
+    stands = jnp.where(sense > 0, jnp.minimum(shafts, travel), jnp.maximum(shafts, travel)) < rest
+    stands |= shafts <= 1e-9
     # Ordered by what a person would say first.
-    status = jnp.where(stands, STALLED, CONVERGED)
+    status = jnp.where(stands, STALLED, travels(signals.speed, _voltage(robot, conditions)))
     status = jnp.where(jnp.abs(signals.demand) > signals.adhesion_limit, SLIDES, status)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)

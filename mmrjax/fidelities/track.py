@@ -15,13 +15,12 @@ from mmrjax import contact, fidelities, undercarriage
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
-from mmrjax.fidelities.result import result, unless_slipping, withhold
+from mmrjax.fidelities.result import result, travels, unless_slipping, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
-    CONVERGED,
     FAILED,
     NOT_SETTLED,
     STALLED,
@@ -119,11 +118,13 @@ def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Ar
 
 def _status(run: System, steady: Steady, end: Motion) -> Array:
     robot, conditions, signals = run.robot, run.conditions, steady.signals
-    status = jnp.where(steady.change > SETTLED, NOT_SETTLED, CONVERGED)
-    status = jnp.where(signals.direction < 0.999, STALLED, status)
-    stands = signals.speed < robot.chassis(conditions.configuration).ground.friction.speed_rest
+    status = jnp.where(steady.change > SETTLED, NOT_SETTLED, travels(signals.speed, signals.voltage))
+    status = jnp.where(jnp.abs(signals.direction) < 0.999, STALLED, status)
+    stands = jnp.sign(signals.direction) * signals.speed < (
+        robot.chassis(conditions.configuration).ground.friction.speed_rest
+    )
     # On average over the window.
-    status = unless_slipping(status, robot, signals, signals.acceleration, 1e-2, stands)
+    status = unless_slipping(status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(margin(run) < 0, TIPS, status)

@@ -1,0 +1,77 @@
+"""Motor driver: the bridge between supply and motors, its current limit, and the controller of a demanded speed."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.params import Scalar, parameter
+
+#: How fast the duty falls beyond the current limit, per limit exceeded by its own size [-]: 0.1 % over takes 0.5.
+STEEPNESS = 500.0
+#: Resistance of an open circuit, as a multiple of the winding's [-].
+OPEN = 1e6
+
+
+class Driver(eqx.Module):
+    """A bridge that gives the motors a share of the supply's voltage, U = D U_s, and takes I_s = D I from the supply.
+
+    It is lossless and its ripple is not resolved: D is the mean over a period of pulse-width modulation.
+
+    Attributes:
+        returns_current: whether supply and bridge take current back from motors that are driven; where not, a diode
+            keeps it from flowing, and motors that turn faster than the supply would turn them coast.
+    """
+
+    current_limit: Scalar = parameter(
+        1000.0,
+        unit="A",
+        meaning="largest current of one motor that the driver lets flow",
+        bounds=(0.01, 1e4),
+        relative_sd=0.1,
+        source="none on the bench: above any current",
+    )
+    gain: Scalar = parameter(
+        2.0,
+        unit="-",
+        meaning="proportional gain of the speed controller, in multiples of the speed constant C_E",
+        bounds=(0.0, 1e3),
+        relative_sd=0.1,
+        source="assumed; the paper has no controller",
+    )
+    time_reset: Scalar = parameter(
+        0.1,
+        unit="s",
+        meaning="reset time of the speed controller: how long its integral takes to repeat the proportional answer",
+        bounds=(1e-3, 1e3),
+        relative_sd=0.1,
+        source="assumed; the paper has no controller",
+    )
+    returns_current: bool = eqx.field(default=True, static=True)
+
+    def duty_limited(self, duty: Scalar, current: Scalar) -> Scalar:
+        """Duty D [-] that holds the motor's `current` [A] at the limit, between -1 and 1."""
+        over = jnp.maximum(jnp.abs(current) / self.current_limit - 1, 0.0)
+        return jnp.clip(duty - jnp.sign(current) * STEEPNESS * over, -1.0, 1.0)
+
+    def limits(self, current: Scalar) -> Scalar:
+        """Whether the limit acts at a motor's `current` [A]."""
+        return jnp.abs(current) > self.current_limit
+
+    def voltage_blocked(self, duty: Scalar, current: Scalar, resistance: Scalar, open_circuit: Scalar) -> Scalar:
+        """Voltage that an open bridge, or the diode of a supply that takes nothing back, holds off the motors [V]."""
+        blocks = open_circuit > 0.5
+        if not self.returns_current:
+            blocks |= duty * current < 0
+        return jnp.where(blocks, OPEN * resistance * current, 0.0)
+
+    def demand(self, error: Scalar, integral: Scalar, speed: Scalar, constant: Scalar) -> Scalar:
+        """Voltage [V] by which a demanded motor speed is followed: PI with the back-EMF fed forward.
+
+        U = C_E (ω* + K (e + 1/T ∫ e dt)).
+
+        Args:
+            error: e, demanded less actual motor speed [rad/s]; integral: ∫ e dt [rad]; speed: ω*, demanded [rad/s];
+            constant: C_E [V·s/rad].
+        """
+        return constant * (speed + self.gain * (error + integral / self.time_reset))

@@ -1,0 +1,64 @@
+"""Energy: where the power of an instant comes from and goes, and what is stored."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from mmrjax.conditions import Conditions
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals
+
+#: Where energy goes, in the order of the chain: name, and what it is.
+SINKS: dict[str, str] = {
+    "battery": "heat in the battery's cells",
+    "other": "the other consumers on the battery",
+    "driver": "driver and wiring: open bridge, diode, and drops on the way to the motors",
+    "winding": "heat in windings, leads and brushes",
+    "motor": "friction of the motors",
+    "gearbox": "losses of the gearboxes",
+    "track": "losses of tracks and guides",
+    "sliding": "sliding over the ground",
+    "rolling": "rolling resistance",
+    "lift": "lifting robot and payload (comes back downhill)",
+}
+
+
+def source(robot: Robot, conditions: Conditions, signals: Signals) -> Scalar:
+    """Power that the source gives [W], negative where it takes some back: the battery's charge at no-load voltage, or
+    what the external supply delivers."""
+    battery = robot.battery
+    chemical = battery.cells * battery.voltage_no_load(signals.discharge) * battery.current(signals.total_current)
+    return jnp.where(conditions.battery > 0.5, chemical, signals.voltage_source * signals.total_current)
+
+
+def sinks(robot: Robot, conditions: Conditions, signals: Signals) -> dict[str, Scalar]:
+    """Power that goes each way of `SINKS` [W], of all motors and sides.
+
+    With what drives inductances and masses (`stored`) they add up to `source`, at every instant.
+    """
+    sides, battery, on_battery = robot.sides, robot.battery, conditions.battery > 0.5
+    load = battery.current(signals.total_current)
+    own = signals.torque_load - signals.torque_track_loss  # at the wheel, of the ground and of effects of the gearbox
+    ground = signals.traction * signals.speed_theoretical
+    into = signals.torque_input * signals.speed_motor - signals.torque_gear * signals.speed_wheel
+    return {
+        "battery": jnp.where(on_battery, battery.cells * battery.resistance * load**2, 0.0),
+        "other": jnp.where(on_battery, battery.current_other * signals.voltage_source, 0.0),
+        "driver": signals.voltage_source * signals.total_current - sides * signals.voltage * signals.current,
+        "winding": sides * signals.voltage_drop * signals.current,
+        "motor": sides * signals.torque_motor_loss * signals.speed_motor,
+        "gearbox": sides * (into + own * signals.speed_wheel - ground),
+        "track": sides * signals.torque_track_loss * signals.speed_wheel,
+        "sliding": sides * signals.traction * (signals.speed_theoretical - signals.speed),
+        "rolling": sides * signals.resistance * signals.speed,
+        "lift": sides * signals.gravity * signals.speed,
+    }
+
+
+def stored(robot: Robot, signals: Signals) -> Scalar:
+    """Energy in the motion of robot, wheels and rotors, and in the motors' inductance [J]."""
+    inertia = robot.chassis(signals.configuration).inertia + signals.inertia_added
+    rotating = robot.motor.inertia * signals.speed_motor**2 + inertia * signals.speed_wheel**2
+    magnetic = signals.inductance * signals.current**2
+    return 0.5 * (signals.mass * signals.speed**2 + robot.sides * (rotating + magnetic))

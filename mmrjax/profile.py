@@ -1,0 +1,162 @@
+"""Profiles: what is asked of a robot, and what it meets, over the time of a mission."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mmrjax.conditions import Conditions, Number
+from mmrjax.errors import UsageError
+from mmrjax.params import Scalar
+
+#: How the motors are driven in a segment: by a share of the supply's voltage; at a demanded motor speed or ground
+#: speed, by the driver's controller; or not: with their terminals shorted (brake) or their circuit open (coast).
+MODES = ("voltage", "motor_speed", "speed", "brake", "coast")
+VOLTAGE, MOTOR_SPEED, SPEED, BRAKE, COAST = range(len(MODES))
+
+#: What a profile may state for each row besides the mode, and of which a row keeps what the conditions say if not.
+CONDITIONS = ("voltage", "duty", "slope_deg", "payload", "adhesion")
+
+
+class Instant(eqx.Module):
+    """What a profile asks at one instant; fields as in `Profile`, None where it states nothing."""
+
+    mode: Int[Array, ""]
+    demand: Scalar
+    voltage: Scalar | None
+    duty: Scalar | None
+    slope_deg: Scalar | None
+    payload: Scalar | None
+    adhesion: Scalar | None
+    current_other: Scalar | None
+
+    def conditions(self, otherwise: Conditions) -> Conditions:
+        """The conditions of this instant; `otherwise` where the profile states nothing."""
+        stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
+        if "payload" in stated and otherwise.total_mass is not None:
+            stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
+        duty = jnp.where(self.mode == BRAKE, 0.0, stated.pop("duty", otherwise.duty))
+        coasts = jnp.where(self.mode == COAST, 1.0, otherwise.open)
+        return dataclasses.replace(otherwise, **stated, duty=duty, open=coasts)
+
+
+class Profile(eqx.Module):
+    """A mission as rows in time; between two rows lies a segment. All numbers differentiable and batchable.
+
+    Attributes:
+        time: of the rows, increasing [s], shape (rows,); the last row ends the mission.
+        mode: index into `MODES` of the segment that a row begins, shape (rows,).
+        demand: motor speed [rad/s] or ground speed [m/s] where the mode asks for one, else not used, shape (rows,).
+        voltage: of the external supply [V]; duty: share of the supply's voltage [-]; slope_deg: [deg]; payload: [kg];
+            adhesion: as a ratio to the robot's surface [-]; current_other: of other consumers on the battery [A].
+            Shape (rows,), or None: as the conditions (the robot, for current_other) say.
+        linear: whether values change linearly from a row to the next; else they hold until it.
+        cycles: how often the rows are run through.
+    """
+
+    time: Float[Array, " rows"]
+    mode: Int[Array, " rows"]
+    demand: Float[Array, " rows"]
+    voltage: Float[Array, " rows"] | None = None
+    duty: Float[Array, " rows"] | None = None
+    slope_deg: Float[Array, " rows"] | None = None
+    payload: Float[Array, " rows"] | None = None
+    adhesion: Float[Array, " rows"] | None = None
+    current_other: Float[Array, " rows"] | None = None
+    linear: bool = eqx.field(default=False, static=True)
+    cycles: int = eqx.field(default=1, static=True)
+
+    @property
+    def segments(self) -> int:
+        """Segments of one cycle."""
+        return self.time.shape[-1] - 1
+
+    @property
+    def duration(self) -> Scalar:
+        """Of the whole mission [s]."""
+        return self.cycles * (self.time[-1] - self.time[0])
+
+    def row(self, k: Index) -> Profile:
+        """The rows `k` and `k + 1`: one segment as a profile of its own."""
+        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 2), self)
+
+    def at(self, elapsed: Scalar) -> Instant:
+        """What is asked `elapsed` seconds after the first of two rows."""
+        share = elapsed / (self.time[1] - self.time[0]) if self.linear else 0.0
+
+        def value(x: Array) -> Scalar:
+            return x[0] + (x[1] - x[0]) * share if self.linear else x[0]
+
+        given = {name: getattr(self, name) for name in (*CONDITIONS, "current_other")}
+        stated = {name: None if x is None else value(x) for name, x in given.items()}
+        return Instant(mode=self.mode[0], demand=value(self.demand), **stated)
+
+
+Index = Int[Array, ""] | int
+
+
+def profile(
+    time: Sequence[float] | np.ndarray,
+    mode: str | Sequence[str] = "voltage",
+    *,
+    demand: Number = 0.0,
+    linear: bool = False,
+    cycles: int = 1,
+    **values: Number | None,
+) -> Profile:
+    """A profile from plain numbers, each one for all rows or one a row.
+
+    Args:
+        time: of the rows [s]; mode: of `MODES`, one or one a row.
+        demand, linear, cycles: see `Profile`; values: the rest of its fields, by name.
+
+    Raises:
+        UsageError: fewer than two rows, a time that does not increase, an unknown mode or field, a length that is not
+            that of `time`, a value that is not finite, a duty beyond -1..1, cycles below 1.
+    """
+    rows = np.asarray(time, float)
+    if rows.ndim != 1 or len(rows) < 2:
+        raise UsageError(f"profile, time: got {rows.size} rows; expected two or more")
+    if not np.isfinite(rows).all():
+        raise UsageError(f"profile, time: row {int(np.argmax(~np.isfinite(rows))) + 1} is not a finite number")
+    back = np.flatnonzero(np.diff(rows) <= 0)
+    if back.size:
+        k = int(back[0]) + 1
+        raise UsageError(
+            f"profile, time: row {k + 1} has {rows[k]:g} s after {rows[k - 1]:g} s; expected a later time"
+        )
+    if cycles < 1 or cycles != int(cycles):
+        raise UsageError(f"profile, cycles: got {cycles}; expected a whole number from 1")
+    modes = [mode] * len(rows) if isinstance(mode, str) else list(mode)
+    for k, name in enumerate(modes):
+        if name not in MODES:
+            raise UsageError(f"profile, mode, row {k + 1}: got {name}; expected {', '.join(MODES)}")
+    known = (*CONDITIONS, "current_other")
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise UsageError(f"profile: no field {unknown[0]}; there are {', '.join(known)}")
+    given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
+    arrays = {}
+    for name, value in given.items():
+        x = np.asarray(value, float)
+        if x.ndim > 1 or (x.ndim == 1 and len(x) != len(rows)):
+            raise UsageError(f"profile, {name}: got {x.shape[0] if x.ndim else 1} values; expected {len(rows)}")
+        if not np.isfinite(x).all():
+            raise UsageError(
+                f"profile, {name}: row {int(np.argmax(~np.isfinite(np.atleast_1d(x)))) + 1} is not finite"
+            )
+        arrays[name] = jnp.asarray(np.broadcast_to(x, rows.shape))
+    duty = np.asarray(arrays.get("duty", 0.0))
+    if (np.abs(duty) > 1).any():
+        raise UsageError(f"profile, duty: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
+    if len(modes) != len(rows):
+        raise UsageError(f"profile, mode: got {len(modes)} values; expected {len(rows)}")
+    index = jnp.asarray([MODES.index(name) for name in modes])
+    return Profile(time=jnp.asarray(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
