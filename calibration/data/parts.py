@@ -1,0 +1,213 @@
+"""Packaged sheets of parts for sizing: motors, gearboxes and cells, each value from a sheet that its row names.
+
+The tables are in `parts/*.csv` in the units of the sheets; the reader gives SI. What a sheet does not state is NaN.
+`docs/parts.md` says where the sheets come from and how consistent they are.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import functools
+import io
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+from importlib import resources
+from typing import Any, TypeVar
+
+from calibration.data.errors import BadData
+from mmrjax.channels import RPM
+
+MILLI = 1e-3
+GRAM_CM2 = 1e-7  # kg·m²
+COULOMB_PER_MAH = 3.6
+
+
+def _column(name: str, factor: float = 1.0) -> Any:
+    """A number of the table; its unit in the column's name, times `factor` gives SI; NaN where the cell is empty."""
+    return dataclasses.field(metadata={"column": name, "factor": factor})
+
+
+def _text(name: str) -> Any:
+    return dataclasses.field(metadata={"column": name, "text": True})
+
+
+def _texts(name: str) -> Any:
+    """Several names in one cell, apart by semicolons."""
+    return dataclasses.field(metadata={"column": name, "list": True})
+
+
+@dataclasses.dataclass(frozen=True)
+class MotorSheet:
+    """A brushed DC motor as its maker's sheet states it, at 25 °C; NaN where the sheet is silent.
+
+    Attributes:
+        name, maker, order_number: of the winding.
+        voltage_nominal: voltage of the no-load and stall values [V].
+        resistance, inductance: terminal resistance [ohm] and inductance [H].
+        torque_constant: C_m [N·m/A].
+        speed_constant: [rad/(s·V)], the inverse of C_m but for rounding.
+        speed_no_load, current_no_load: at the nominal voltage [rad/s], [A].
+        speed_nominal, torque_nominal, current_nominal: at the largest continuous torque [rad/s], [N·m], [A].
+        torque_stall, current_stall: at the nominal voltage [N·m], [A].
+        inertia: of the rotor [kg·m²].
+        speed_max: largest permissible speed [rad/s].
+        resistance_thermal_housing, resistance_thermal_winding: housing to ambient, winding to housing [K/W].
+        time_constant_winding, time_constant_motor: time constants [s].
+        temperature_winding_max: largest permissible winding temperature [°C].
+        mass: [kg].
+        price: of one piece without tax [EUR of 2020].
+        gearboxes: families of `gearboxes()` that the source combines it with, among those packaged.
+        source: sheet and where it was read.
+        note: what else to know.
+    """
+
+    name: str = _text("name")
+    maker: str = _text("maker")
+    order_number: str = _text("order_number")
+    voltage_nominal: float = _column("nominal_voltage_V")
+    resistance: float = _column("terminal_resistance_ohm")
+    inductance: float = _column("terminal_inductance_mH", MILLI)
+    torque_constant: float = _column("torque_constant_mNm_per_A", MILLI)
+    speed_constant: float = _column("speed_constant_rpm_per_V", RPM)
+    speed_no_load: float = _column("no_load_speed_rpm", RPM)
+    current_no_load: float = _column("no_load_current_mA", MILLI)
+    speed_nominal: float = _column("nominal_speed_rpm", RPM)
+    torque_nominal: float = _column("nominal_torque_mNm", MILLI)
+    current_nominal: float = _column("nominal_current_A")
+    torque_stall: float = _column("stall_torque_mNm", MILLI)
+    current_stall: float = _column("stall_current_A")
+    inertia: float = _column("rotor_inertia_gcm2", GRAM_CM2)
+    speed_max: float = _column("max_speed_rpm", RPM)
+    resistance_thermal_housing: float = _column("thermal_resistance_housing_ambient_K_per_W")
+    resistance_thermal_winding: float = _column("thermal_resistance_winding_housing_K_per_W")
+    time_constant_winding: float = _column("thermal_time_constant_winding_s")
+    time_constant_motor: float = _column("thermal_time_constant_motor_s")
+    temperature_winding_max: float = _column("max_winding_temperature_C")
+    mass: float = _column("weight_g", MILLI)
+    price: float = _column("price_EUR")
+    gearboxes: tuple[str, ...] = _texts("gearboxes")
+    source: str = _text("source")
+    note: str = _text("note")
+
+
+@dataclasses.dataclass(frozen=True)
+class GearboxSheet:
+    """A planetary gearbox as its maker's sheet states it; NaN where the sheet is silent.
+
+    Attributes:
+        name, maker, order_number, family: one row a ratio of a family.
+        stages: number of stages.
+        ratio: exact where the sheet gives a fraction.
+        torque_max, torque_intermittent_max: largest continuous and intermittent output torque [N·m].
+        efficiency: largest efficiency, as the sheets give it.
+        inertia: at the input shaft [kg·m²].
+        speed_input_max: largest continuous input speed [rad/s].
+        power_max: largest continuous power [W].
+        mass: [kg].
+        price: of one piece without tax [EUR of 2020].
+        source, note: as of `MotorSheet`.
+    """
+
+    name: str = _text("name")
+    maker: str = _text("maker")
+    order_number: str = _text("order_number")
+    family: str = _text("family")
+    stages: float = _column("stages")
+    ratio: float = _column("ratio")
+    torque_max: float = _column("max_continuous_torque_Nm")
+    torque_intermittent_max: float = _column("max_intermittent_torque_Nm")
+    efficiency: float = _column("max_efficiency_percent", 1e-2)
+    inertia: float = _column("inertia_gcm2", GRAM_CM2)
+    speed_input_max: float = _column("max_continuous_input_speed_rpm", RPM)
+    power_max: float = _column("max_continuous_power_W")
+    mass: float = _column("weight_g", MILLI)
+    price: float = _column("price_EUR")
+    source: str = _text("source")
+    note: str = _text("note")
+
+
+@dataclasses.dataclass(frozen=True)
+class CellSheet:
+    """A battery cell, or a pack of `cells` in series, as its sheet states it; NaN where the sheet is silent.
+
+    Attributes:
+        name, maker, chemistry: of the cell.
+        cells: in series.
+        capacity: [C].
+        voltage_full, voltage_cut_off: of one cell [V].
+        current_max, current_charge_max: largest continuous currents [A].
+        resistance: of one cell to direct current [ohm].
+        impedance: of one cell at 1 kHz [ohm]; smaller than the resistance.
+        mass: of all cells [kg].
+        source, note: as of `MotorSheet`.
+    """
+
+    name: str = _text("name")
+    maker: str = _text("maker")
+    chemistry: str = _text("chemistry")
+    cells: float = _column("cells")
+    capacity: float = _column("capacity_mAh", COULOMB_PER_MAH)
+    voltage_full: float = _column("full_voltage_V")
+    voltage_cut_off: float = _column("cut_off_voltage_V")
+    current_max: float = _column("max_continuous_current_A")
+    current_charge_max: float = _column("max_charge_current_A")
+    resistance: float = _column("resistance_mohm", MILLI)
+    impedance: float = _column("impedance_1kHz_mohm", MILLI)
+    mass: float = _column("weight_g", MILLI)
+    source: str = _text("source")
+    note: str = _text("note")
+
+
+Sheet = TypeVar("Sheet", MotorSheet, GearboxSheet, CellSheet)
+
+
+def _value(text: str, where: str, field: dataclasses.Field[Any]) -> Any:
+    """A cell of the table as the field holds it."""
+    if field.metadata.get("text"):
+        return text
+    if field.metadata.get("list"):
+        return tuple(part.strip() for part in text.split(";") if part.strip())
+    if not text:
+        return math.nan
+    try:
+        return float(Fraction(text)) * field.metadata["factor"]
+    except (ValueError, ZeroDivisionError) as error:
+        raise BadData(f"{where}, {field.metadata['column']}: got {text!r}; expected a number or nothing") from error
+
+
+def _rows(kind: type[Sheet], file: str) -> Iterator[Sheet]:
+    """The sheets of a table.
+
+    Raises:
+        BadData: other columns than the sheet's fields, or a cell that is not a number.
+    """
+    fields = dataclasses.fields(kind)
+    wanted = [f.metadata["column"] for f in fields]
+    table = resources.files("calibration") / "data" / "parts" / file
+    reader = csv.DictReader(io.StringIO(table.read_text("utf-8")), strict=True)
+    if list(reader.fieldnames or ()) != wanted:
+        raise BadData(f"{file}: got the columns {reader.fieldnames}; expected {wanted}")
+    for row in reader:
+        if None in row or None in row.values():
+            raise BadData(f"{file} row {reader.line_num}: got another number of cells than columns, {len(wanted)}")
+        yield kind(**{f.name: _value(row[f.metadata["column"]], f"{file} row {reader.line_num}", f) for f in fields})
+
+
+@functools.cache
+def motors() -> tuple[MotorSheet, ...]:
+    """The packaged motors, in the order of `parts/motors.csv`."""
+    return tuple(_rows(MotorSheet, "motors.csv"))
+
+
+@functools.cache
+def gearboxes() -> tuple[GearboxSheet, ...]:
+    """The packaged gearboxes of up to three stages, by family and ratio."""
+    return tuple(_rows(GearboxSheet, "gearboxes.csv"))
+
+
+@functools.cache
+def cells() -> tuple[CellSheet, ...]:
+    """The packaged cells; the first is the paper's, whose mass no sheet that was found states."""
+    return tuple(_rows(CellSheet, "cells.csv"))
