@@ -89,9 +89,10 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     source = power.voltage_source(
         robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
     )
-    blocked = robot.driver.voltage_blocked(signals.duty, signals.current, robot.motor.resistance, conditions.open)
-    arriving = source - added(robot, signals, "supply")
-    return _fill(signals, voltage_source=source, voltage=signals.duty * arriving - blocked)
+    voltage = signals.duty * (source - added(robot, signals, "supply"))
+    blocked = robot.driver.blocks(signals.duty, signals.current, conditions.open)
+    back = robot.motor.voltage_back(signals.speed_motor)
+    return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
 
 
 def electrical(robot: Robot, signals: Signals) -> Signals:

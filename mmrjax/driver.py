@@ -9,8 +9,6 @@ from mmrjax.params import Scalar, parameter
 
 #: How fast the duty falls beyond the current limit, per limit exceeded by its own size [-]: 0.1 % over takes 0.5.
 STEEPNESS = 500.0
-#: Resistance of an open circuit, as a multiple of the winding's [-].
-OPEN = 1e6
 
 
 class Driver(eqx.Module):
@@ -58,12 +56,11 @@ class Driver(eqx.Module):
         """Whether the limit acts at a motor's `current` [A]."""
         return jnp.abs(current) > self.current_limit
 
-    def voltage_blocked(self, duty: Scalar, current: Scalar, resistance: Scalar, open_circuit: Scalar) -> Scalar:
-        """Voltage that an open bridge, or the diode of a supply that takes nothing back, holds off the motors [V]."""
-        blocks = open_circuit > 0.5
-        if not self.returns_current:
-            blocks |= duty * current < 0
-        return jnp.where(blocks, OPEN * resistance * current, 0.0)
+    def blocks(self, duty: Scalar, current: Scalar, open_circuit: Scalar) -> Scalar:
+        """Whether nothing holds the motors' terminals, which are then at the back-EMF: the circuit is open, or the diode
+        of a supply that takes nothing back keeps a current from flowing there."""
+        blocked = jnp.asarray(open_circuit) > 0.5
+        return blocked if self.returns_current else blocked | (duty * current < 0)
 
     def demand(self, error: Scalar, integral: Scalar, speed: Scalar, constant: Scalar) -> Scalar:
         """Voltage [V] by which a demanded motor speed is followed: PI with the back-EMF fed forward.

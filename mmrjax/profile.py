@@ -42,7 +42,8 @@ class Instant(eqx.Module):
         stated = {name: getattr(self, name) for name in CONDITIONS if getattr(self, name) is not None}
         if "payload" in stated and otherwise.total_mass is not None:
             stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
-        duty = jnp.where(self.mode == BRAKE, 0.0, stated.pop("duty", otherwise.duty))
+        held = (self.mode == BRAKE) | (self.mode == COAST)
+        duty = jnp.where(held, 0.0, stated.pop("duty", otherwise.duty))
         coasts = jnp.where(self.mode == COAST, 1.0, otherwise.open)
         return dataclasses.replace(otherwise, **stated, duty=duty, open=coasts)
 

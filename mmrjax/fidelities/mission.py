@@ -54,7 +54,7 @@ PEAKS: dict[str, str] = {
 }  # fmt: skip
 
 #: Relative tolerance of a step, and in the units of the unknowns.
-TOLERANCE = 1e-5
+TOLERANCE = 2e-5
 #: Most steps of one segment.
 MOST_STEPS = 4096
 #: The first step of a segment [s], and the shortest.
@@ -289,6 +289,7 @@ class _Carry(NamedTuple):
     accepted: Array
     rejected: Array
     failed: Array
+    slope: Array  # of the current, in its unit [1/s]
     kept: Array
     buffer: tuple[Array, ...] | None
 
@@ -300,6 +301,21 @@ def _peaks_of(robot: Robot, signals: Signals) -> Array:
         jnp.abs(signals.speed_motor), jnp.abs(signals.speed), -cell,
     ]  # fmt: skip
     return jnp.stack([jnp.asarray(x, jnp.result_type(signals.current)) for x in of])
+
+
+def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
+    """Largest size of a curve between two values, on the cubic with the slopes `rise` and `fall` at its ends."""
+    sign = jnp.sign(after)
+    x0, x1, d0, d1 = sign * before, sign * after, sign * rise, sign * fall
+    bends = (d0 > 0) & (d1 < 0)
+    a, b = 3 * (d0 + d1 - 2 * (x1 - x0)), 2 * (3 * (x1 - x0) - 2 * d0 - d1)
+    root = b * b - 4 * a * d0
+    bends &= root > 0
+    # The root in 0..1, in the form that stays finite where the cubic is a parabola.
+    low = b - jnp.sqrt(jnp.where(bends, root, 1.0))
+    t = jnp.clip(-2 * d0 / jnp.where(jnp.abs(low) > 1e-12, low, -1e-12), 0.0, 1.0)
+    top = x0 + t * (d0 + t * (b / 2 + t * a / 3))
+    return jnp.where(bends, jnp.maximum(top, jnp.maximum(x0, x1)), jnp.maximum(x0, x1))
 
 
 def _events(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Array:
@@ -370,7 +386,7 @@ def _segment(
         left = length - c.y[_CLOCK]
         last = c.step >= left * (1 - 1e-9)
         h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
-        y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h)
+        y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, inverted=True)
         y = y.at[_CLOCK].set(jnp.where(last, length, y[_CLOCK]))
         scale = tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
         size = optx.rms_norm(u[-1] / scale) * (y.shape[0] / len(UNITS)) ** 0.5
@@ -393,8 +409,11 @@ def _segment(
         step = jnp.where(good & far, h * jnp.clip(jnp.min(share) * 1.001, 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, longest)
-        signals = _instant(robot, otherwise, segment, y, stands)[0]
+        signals, dy, _, _ = _instant(robot, otherwise, segment, y, stands)
+        between_ends = _top(c.y[_CURRENT], y[_CURRENT], h * c.slope, h * dy[_CURRENT])
         peaks = jnp.maximum(c.peaks, _peaks_of(robot, signals))
+        within = jnp.where(taken, robot.sides * UNITS[_CURRENT] * between_ends, -jnp.inf)
+        peaks = peaks.at[list(PEAKS).index("current")].max(within)
         flags, low = _flags(robot, signals, c.low, jnp.where(taken, h, 0.0))
         tripped = low > robot.battery.delay_cutoff
         failed = c.failed | (~good & (h <= SHORTEST))
@@ -407,7 +426,7 @@ def _segment(
         return _Carry(
             y=y, q=q, step=step, stands=stands, ended=ended, low=low, peaks=peaks, flags=c.flags | flags,
             events=events_now, accepted=c.accepted + taken, rejected=c.rejected + ~taken, failed=failed,
-            kept=kept + taken, buffer=buffer,
+            kept=kept + taken, buffer=buffer, slope=dy[_CURRENT],
         )  # fmt: skip
 
     # The segment's beginning may have taken away what held the robot.
@@ -416,6 +435,7 @@ def _segment(
     stands = carry.stands & (firmness(asked.robot, asked.conditions, _state(robot, y, carry.stands)) >= 0)
     step = jnp.minimum(jnp.asarray(FIRST, y.dtype), longest)
     begin = carry._replace(y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, events=events(y, stands))
+    begin = begin._replace(slope=_instant(robot, otherwise, segment, y, stands)[1][_CURRENT])
     c = jax.lax.while_loop(going, turn, begin)
     failed = c.failed | ((c.y[_CLOCK] < nearly) & ~c.ended)
     return c._replace(failed=failed, ended=c.ended | failed)
@@ -504,7 +524,7 @@ def mission(
     carry = _Carry(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(begin.speed == 0.0), ended=false,
         low=jnp.zeros((), dtype), peaks=jnp.full(len(PEAKS), -jnp.inf, dtype), flags=whole,
-        events=jnp.full(3, -1.0, dtype), accepted=whole, rejected=whole, failed=false, kept=whole, buffer=buffer,
+        events=jnp.full(3, -1.0, dtype), accepted=whole, rejected=whole, failed=false, kept=whole, buffer=buffer, slope=jnp.zeros((), dtype),
     )  # fmt: skip
 
     def one(carry: _Carry, k: Array) -> tuple[_Carry, tuple]:

@@ -1,0 +1,366 @@
+"""Missions: against SciPy, closed forms, and themselves; energy, derivatives, standing still, limits."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from scipy.integrate import solve_ivp
+
+from mmrjax import energy, params, robots
+from mmrjax.conditions import Conditions
+from mmrjax.errors import UsageError
+from mmrjax.fidelities import mission as missions
+from mmrjax.fidelities.mission import Start, mission
+from mmrjax.motor import ALPHA
+from mmrjax.profile import MODES, Profile, profile
+from mmrjax.signals import FLAGS, STATUSES
+
+RPM = np.pi / 30
+ROWS = 8
+run = eqx.filter_jit(mission)
+
+
+def rows(time, mode="voltage", **values):
+    """A profile of ROWS rows whatever is asked, every field stated, so that few programs are compiled."""
+    time = np.asarray(time, float)
+    lacking = ROWS - len(time)
+    padded = np.concatenate([time, time[-1] + 1e-3 * np.arange(1, lacking + 1)])
+    modes = [mode] * len(time) if isinstance(mode, str) else list(mode)
+    given = {"demand": 0.0, "voltage": 24.0, "duty": 1.0, "slope_deg": 0.0, "payload": 0.0, "current_other": 1.5}
+    filled = {}
+    for name, value in {**given, **values}.items():
+        x = np.broadcast_to(np.asarray(value, float), time.shape)
+        filled[name] = np.concatenate([x, np.repeat(x[-1], lacking)])
+    return profile(padded, modes + [modes[-1]] * lacking, **filled)
+
+
+def asked(configuration=0, **changes):
+    return Conditions(configuration=configuration, **changes)
+
+
+def flagged(flags):
+    return {name for k, name in enumerate(FLAGS) if int(flags) >> k & 1}
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return params.strong(robots.nominal())
+
+
+MANY = (
+    [0, 3, 4, 5, 8, 9, 11, 12],
+    ["voltage", "coast", "brake", "voltage", "brake", "speed", "speed", "brake"],
+    dict(
+        demand=[0, 0, 0, 0, 0, 0.3, 0, 0],
+        voltage=[24, 24, 24, -20, 24, 24, 24, 24],
+        slope_deg=[0, 0, 0, 5, 0, 5, 5, 0],
+    ),
+)
+
+
+# --- against an independent implementation ----------------------------------------------------------
+
+
+def expected(voltages, times, slope, tolerance=1e-10):
+    """SciPy's Radau on the plain rates of `reference`, with heat and energy, a voltage for each stretch of time."""
+    side = reference.Side(voltages[0], np.radians(slope))
+    p = reference.NOMINAL
+    R_wh, R_ha = p["motor.resistance_thermal_winding"], p["motor.resistance_thermal_housing"]
+    C_w, C_h, cold = 16.3 / R_wh, 593.0 / R_ha, side.R
+
+    def rates(t, y):
+        state, (T_w, T_h) = y[:5], y[5:7]
+        side.R = cold * (1 + 0.00393 * (T_w - 25))
+        own = side.rates(t, state)
+        flow = (T_w - T_h) / R_wh
+        heat = [(side.R * y[0] ** 2 - flow) / C_w, (flow - (T_h - 25) / R_ha) / C_h]
+        return [*own, *heat, 2 * side.U * y[0]]
+
+    y = np.array([0, 0, 0, 0, 0, 25.0, 25.0, 0])
+    ends = []
+    for k, voltage in enumerate(voltages):
+        side.U = voltage
+        scale = np.array([10.0, 1000.0, 1.0, 1.0, 10.0, 10.0, 10.0, 100.0])
+        found = solve_ivp(rates, times[k : k + 2], y, method="Radau", rtol=tolerance, atol=1e-11 * scale)
+        assert found.success
+        y = found.y[:, -1]
+        ends.append(y)
+    return np.array(ends)
+
+
+def test_mission_matches_scipy_through_a_reversal(robot):
+    """No stop on the way: the voltage is turned round while the robot travels."""
+    found = expected([24.0, -15.0, 20.0], [0.0, 1.0, 2.5, 4.0], 3.0)
+    p = rows([0, 1, 2.5, 4], voltage=[24, -15, 20, 20], slope_deg=3.0)
+    p = dataclasses.replace(p, voltage=p.voltage.at[3:].set(20.0))
+    got = run(robot, asked(), p, tolerance=1e-8)
+    distance = np.cumsum(np.asarray(got.segments.of["distance"][0, :3]))
+    np.testing.assert_allclose(
+        distance, found[:, 3], rtol=2e-4, atol=2e-5
+    )  # it begins by standing, SciPy's by creeping
+    taken = np.cumsum(np.asarray(got.segments.energy[0, :3]))
+    np.testing.assert_allclose(taken, found[:, 7], rtol=1e-4)
+
+
+# --- energy -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("configuration", [0, 1])
+@pytest.mark.parametrize("battery", [0.0, 1.0])
+def test_energy_in_is_where_it_went_and_what_is_stored(robot, configuration, battery):
+    """Through starts, stops, reversals and a descent; stored energy from the states, not from the integrals."""
+    time, mode, values = MANY
+    p = rows(time, mode, **{**values, "slope_deg": [0, 0, 0, 5, 0, -20, -20, 0]})
+    found = run(robot, asked(configuration, battery=battery, adhesion=2.0), p, tolerance=2e-6)
+    assert STATUSES[int(found.result.status)] == "converged"
+    through = float(found.total.of["drawn"] + found.total.of["returned"])
+    assert abs(float(found.total.unaccounted)) < 1e-6 * through
+    assert abs(np.asarray(found.segments.unaccounted)).max() < 1e-6 * through
+    assert float(found.total.of["drawn"]) > 100.0
+    losses = [float(found.total.of[name]) for name in energy.SINKS if name not in ("lift", "driver")]
+    assert min(losses) >= 0.0
+
+
+def test_regeneration_charges_the_battery_and_is_flagged_above_its_charge_voltage(robot):
+    idle = params.replace(robot, {"battery.current_other": 0.0})
+    p = rows([0, 60], slope_deg=-20.0, payload=8.0, current_other=0.0)
+    found = run(idle, asked(1, battery=1.0, adhesion=2.3), p)
+    assert float(found.discharge) < -10.0 and float(found.total.energy) < -1000.0
+    assert "overvoltage" in flagged(found.result.flags)
+    drained = run(idle, asked(1, battery=1.0, adhesion=2.3, discharge=3600.0), p)
+    assert float(drained.discharge) < 3600.0 and "overvoltage" not in flagged(drained.result.flags)
+
+
+def test_a_supply_that_takes_nothing_back_lets_the_motors_coast(robot):
+    one_way = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=False))
+    p = rows([0, 5], voltage=10.0, slope_deg=-20.0, payload=8.0)
+    found, both = run(one_way, asked(1, adhesion=2.3), p), run(robot, asked(1, adhesion=2.3), p)
+    assert float(found.total.of["returned"]) < 1e-3 * float(both.total.of["returned"])
+    assert float(found.peaks["speed"]) > 1.5 * float(both.peaks["speed"])
+    assert abs(float(found.total.unaccounted)) < 1e-4 * float(found.total.of["drawn"] + abs(found.total.of["lift"]))
+
+
+def test_theory_of_the_mesh_gives_less_back(robot):
+    mesh = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, mesh_theory=True))
+    assert float(mesh.gearbox.efficiency_backward) == pytest.approx(2 - 1 / 0.74)
+    p = rows([0, 5], slope_deg=-20.0, payload=8.0)
+    equal, less = (run(r, asked(1, adhesion=2.3), p).total.of["returned"] for r in (robot, mesh))
+    assert 0 < float(less) < 0.95 * float(equal)
+
+
+# --- standing ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["brake", "speed"])
+def test_a_robot_held_on_20_degrees_for_an_hour_stays(robot, mode):
+    """By friction at rest where that suffices (tracks), by the motors where it does not (wheels)."""
+    for configuration in (0, 1):
+        if mode == "brake" and configuration == 1:
+            continue  # shorted motors alone let wheels creep down
+        found = run(robot, asked(configuration, adhesion=2.0), rows([0, 3600], mode, slope_deg=20.0, duty=0.0))
+        moved = abs(float(found.total.of["distance"]))
+        assert STATUSES[int(found.result.status)] == "converged"
+        assert moved < (1e-3 if configuration == 0 else 5e-3)
+        assert int(found.steps) < 600
+
+
+def test_what_friction_cannot_hold_rolls_back(robot):
+    found = run(robot, asked(1, adhesion=2.0), rows([0, 20], "coast", slope_deg=20.0))
+    assert float(found.total.of["distance"]) < -20.0
+    assert STATUSES[int(found.status[0, 0])] == "rolls_back"
+
+
+def test_standing_and_breaking_away_agree_with_steady(robot):
+    """A robot at rest starts where steady finds travel, and stays where steady finds none."""
+    from mmrjax.fidelities.steady import steady_batch
+
+    volts, slopes = np.meshgrid([-6.0, -1.0, 0.0, 1.0, 6.0], [-15.0, -4.0, 0.0, 4.0, 15.0])
+    conditions = asked(np.ones(volts.size, int), voltage=volts.ravel(), slope_deg=slopes.ravel(), adhesion=2.0)
+    steady = steady_batch(robot, conditions)
+    p = rows([0, 6])
+    p = dataclasses.replace(p, voltage=None, slope_deg=None, duty=None, payload=None, current_other=None)
+    found = jax.vmap(lambda c: mission(robot, c, p))(conditions)
+    speed = np.asarray(found.result.reading["speed"])
+    settled = np.asarray(steady.reading["speed"])
+    stalled = np.asarray(steady.status) == STATUSES.index("stalled")
+    assert stalled.any() and (~stalled).any()
+    np.testing.assert_allclose(speed[stalled], 0.0, atol=1e-12)
+    np.testing.assert_allclose(speed[~stalled], settled[~stalled], rtol=2e-3)
+
+
+# --- heat -------------------------------------------------------------------------------------------
+
+
+def test_temperature_follows_the_two_bodies_in_closed_form(robot):
+    """A robot held fast, whose winding is of a metal that keeps its resistance: two exponentials."""
+    held = params.replace(robot, {"6T2A.track.loss_coulomb": 20.0})
+    p = rows([0, 100], voltage=2.0)
+    cool = Start(temperature_winding=25.0, temperature_housing=25.0)
+    found = run(held, asked(), p, cool, tolerance=1e-9)
+    assert float(found.total.of["path"]) == 0.0
+    motor = robot.motor
+    C_w, C_h = 16.3 / 1.7, 593.0 / 6.0
+
+    # With copper: C_w T_w' = U² / (R (1 + α (T_w - 25))) - (T_w - T_h) / R_wh at a constant voltage.
+    def rates(t, y):
+        power = 4.0 / (0.611 * (1 + ALPHA * (y[0] - 25)))
+        flow = (y[0] - y[1]) / 1.7
+        return [(power - flow) / C_w, (flow - (y[1] - 25) / 6.0) / C_h]
+
+    end = solve_ivp(rates, [0, float(p.time[-1])], [25.0, 25.0], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    assert float(found.temperature_winding) == pytest.approx(end[0], rel=1e-6)
+    assert float(found.temperature_housing) == pytest.approx(end[1], rel=1e-6)
+    assert float(found.peaks["temperature"]) == pytest.approx(end[0], rel=1e-6)
+    del motor
+
+
+def test_a_motor_held_at_24_volts_is_too_hot(robot):
+    held = params.replace(robot, {"6T2A.track.loss_coulomb": 20.0})
+    found = run(held, asked(), rows([0, 60]))
+    assert "too_hot" in flagged(found.result.flags) and float(found.peaks["temperature"]) > 125.0
+    assert STATUSES[int(found.status[0, 0])] == "stalled"
+
+
+# --- limits -----------------------------------------------------------------------------------------
+
+
+def test_the_current_limit_holds_and_is_flagged(robot):
+    limited = params.replace(robot, {"driver.current_limit": 5.0})
+    found = run(limited, asked(), rows([0, 3]))
+    assert float(found.peaks["current"]) < 2 * 5.0 * 1.003
+    assert "current_limited" in flagged(found.result.flags)
+    free = run(robot, asked(), rows([0, 3]))
+    assert float(free.peaks["current"]) > 60.0 and "current_limited" not in flagged(free.result.flags)
+    assert float(limited.driver.current_limit) == 5.0
+
+
+def test_battery_standing_still_lasts_its_capacity_over_the_other_consumers_current(robot):
+    found = run(robot, asked(battery=1.0), rows([0, 4 * 3600], "brake"))
+    assert STATUSES[int(found.result.status)] == "battery_empty"
+    assert float(found.total.time) == pytest.approx(7920.0 / 1.5, rel=1e-9)
+
+
+def test_cells_that_stay_below_their_cut_off_end_the_mission(robot):
+    weak = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=3.9))
+    found = run(weak, asked(battery=1.0, discharge=2500.0), rows([0, 3600]))
+    assert "cut_off" in flagged(found.result.flags) and STATUSES[int(found.result.status)] == "battery_empty"
+    assert float(found.total.time) < 1000.0
+    started = run(robot, asked(battery=1.0), rows([0, 5]))  # the inrush alone does not count
+    assert float(started.peaks["cell_low"]) < 3.0 and "cut_off" not in flagged(started.result.flags)
+
+
+def test_a_demand_that_cannot_be_met_is_followed_as_far_as_possible_and_flagged(robot):
+    found = run(robot, asked(), rows([0, 5], "speed", demand=2.0))
+    assert "demand_missed" in flagged(found.flags[0, 0])
+    most = run(robot, asked(), rows([0, 5]))
+    assert float(found.result.reading["speed"]) == pytest.approx(float(most.result.reading["speed"]), rel=1e-3)
+    met = run(robot, asked(), rows([0, 5], "speed", demand=0.4))
+    assert "demand_missed" not in flagged(met.flags[0, 0])
+    assert float(met.result.reading["speed"]) == pytest.approx(0.4, rel=1e-3)
+
+
+# --- derivatives ------------------------------------------------------------------------------------
+
+BY = ("motor.resistance", "gearbox.efficiency_load", "6T2A.track.loss_coulomb", "6T2A.mass", "motor.torque_constant")
+
+
+def test_derivatives_through_stops_and_reversals_match_differences(robot):
+    """Of energy, path, Wh/m and temperature, by parameters and by times and values of rows, to 1e-4."""
+    time, mode, values = MANY
+    start = rows(time, mode, **values)
+    base = {p.name: float(p.value) for p in params.walk(robot)}
+
+    def outputs(x):
+        changed = params.replace(robot, {name: base[name] * x[k] for k, name in enumerate(BY)})
+        p = dataclasses.replace(
+            start,
+            time=start.time.at[3].add(x[5] - 1).at[5].add(x[6] - 1),
+            voltage=start.voltage.at[0].multiply(x[7]).at[3].multiply(x[8]),
+            demand=start.demand.at[5].multiply(x[9]),
+        )
+        found = mission(changed, asked(), p, tolerance=1e-7)
+        total = found.total
+        per_metre = total.energy / total.of["path"]
+        return jnp.stack([total.energy, total.of["path"], per_metre, found.peaks["temperature"]])
+
+    x = jnp.ones(len(BY) + 5)
+    value, exact = eqx.filter_jit(lambda x: (outputs(x), jax.jacfwd(outputs)(x)))(x)
+    step, compiled = 1e-3, jax.jit(outputs)
+    for k in range(len(x)):
+        apart = np.asarray(compiled(x.at[k].add(step))) - np.asarray(compiled(x.at[k].add(-step)))
+        # Two parts in 10^4 of a derivative, or of the output where that hardly changes.
+        allowed = 1e-4 * np.abs(apart / (2 * step)) + 1e-5 * np.abs(np.asarray(value))
+        assert (np.abs(np.asarray(exact[:, k]) - apart / (2 * step)) < allowed).all(), k
+
+
+def test_endurance_has_the_derivative_of_its_closed_form(robot):
+    def endurance(capacity):
+        changed = params.replace(robot, {"battery.capacity": capacity})
+        return mission(changed, asked(battery=1.0), rows([0, 4 * 3600], "brake")).total.time
+
+    assert float(jax.jacfwd(endurance)(jnp.asarray(7920.0))) == pytest.approx(1 / 1.5, rel=1e-9)
+
+
+def test_vmap_is_a_loop(robot):
+    time, mode, values = MANY
+    p = rows(time, mode, **values)
+    payload = np.array([0.0, 4.0, 8.0])
+    p = dataclasses.replace(p, payload=None)
+    batch = jax.jit(jax.vmap(lambda m: mission(robot, asked(payload=m), p)))(payload)
+    alone = jax.jit(lambda m: mission(robot, asked(payload=m), p))
+    for k, m in enumerate(payload):
+        one = alone(m)
+        assert float(batch.total.energy[k]) == pytest.approx(float(one.total.energy), rel=1e-9)
+        assert int(batch.steps[k]) == int(one.steps)
+
+
+def test_course_is_the_mission_over_time(robot):
+    time, mode, values = MANY
+    found = run(robot, asked(), rows(time, mode, **values), keep=2000)
+    kept = int(np.isfinite(found.course.time).sum())
+    assert kept == int(found.steps - found.rejected)
+    assert (np.diff(np.asarray(found.course.time)[:kept]) > 0).all()
+    assert float(found.course.energy[kept - 1]) == pytest.approx(float(found.total.energy), rel=1e-12)
+    assert float(found.course.time[kept - 1]) == pytest.approx(float(found.total.time), rel=1e-12)
+    current = 2 * np.abs(np.asarray(found.course.signals.current)[:kept]).max()
+    assert current <= float(found.peaks["current"]) * (1 + 1e-12) and current > 0.99 * float(found.peaks["current"])
+
+
+def test_linear_rows_ramp(robot):
+    ramp = profile([0, 2, 4], "voltage", voltage=[0.0, 24.0, 24.0], linear=True)
+    found = run(robot, asked(), ramp, tolerance=1e-6, keep=2000)
+    t, source = np.asarray(found.course.time), np.asarray(found.course.signals.voltage_source)
+    there = np.isfinite(t) & (t < 2)
+    np.testing.assert_allclose(source[there], 12 * t[there], rtol=1e-9, atol=1e-9)
+    assert float(found.peaks["current"]) < 10.0  # no inrush
+
+
+# --- what is wrong ----------------------------------------------------------------------------------
+
+WRONG = {
+    "got 1 rows; expected two or more": dict(time=[0]),
+    "row 3 has 1 s after 2 s; expected a later time": dict(time=[0, 2, 1]),
+    "time: row 2 is not a finite number": dict(time=[0, np.nan]),
+    "cycles: got 0; expected a whole number from 1": dict(time=[0, 1], cycles=0),
+    f"mode, row 1: got fly; expected {', '.join(MODES)}": dict(time=[0, 1], mode="fly"),
+    "no field slope; there are": dict(time=[0, 1], slope=3.0),
+    "voltage: got 3 values; expected 2": dict(time=[0, 1], voltage=[1, 2, 3]),
+    "voltage: row 2 is not finite": dict(time=[0, 1], voltage=[1, np.nan]),
+    "duty: got 1.5; expected -1 to 1": dict(time=[0, 1], duty=1.5),
+    "mode: got 1 values; expected 2": dict(time=[0, 1], mode=["brake"]),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_wrong_profiles_are_said(message):
+    with pytest.raises(UsageError) as said:
+        profile(**WRONG[message])
+    assert message in str(said.value)
+
+
+def test_every_unit_and_name_of_totals_is_integrated():
+    assert set(energy.SINKS) < set(missions.TOTALS) and isinstance(rows([0, 1]), Profile)
