@@ -114,8 +114,12 @@ class Problem(eqx.Module):
         """Residuals of what any robot shows: readings, then adhesion; shape (rows (channels + 1),)."""
         error = (seen.reading - data.measured) / data.sd
         error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
-        over = jax.nn.relu(seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
-        return jnp.concatenate([error.ravel(), jnp.where(jnp.isfinite(over), over, 0.0)])
+        return jnp.concatenate([error.ravel(), jax.nn.relu(self.excess(seen, data))])
+
+    def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
+        """Demand on adhesion over its margin, as the penalty counts it; negative where a row leaves some."""
+        over = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
+        return jnp.where(jnp.isfinite(over), over, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:
         """The robot at z."""
