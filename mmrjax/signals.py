@@ -18,9 +18,9 @@ GRAVITY = 9.80665  # [m/s²], standard gravity
 STATUSES = ("converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips")
 CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS = range(len(STATUSES))
 
-#: Limits that a run may exceed, and that it slides on average though it goes on steadily; bit k of `Result.flags` is
-#: the k-th name.
-FLAGS = ("motor_overspeed", "gearbox_overspeed", "winding_hot", "slips")
+#: Limits that a run may exceed; that it slides on average though it goes on steadily; that it leaves the ground at
+#: times. Bit k of `Result.flags` is the k-th name.
+FLAGS = ("motor_overspeed", "gearbox_overspeed", "winding_hot", "slips", "jumps")
 
 
 #: A quantity that the balances have not computed yet.

@@ -35,8 +35,8 @@ STATUSES: dict[str, Status] = {
     "failed": Status("failed", "the solver gave up", "the solver found no answer; please report the conditions"),
     "tips": Status(
         "tips over",
-        "the line of gravity passes outside the contacts: the robot turns over",
-        "the line of gravity passes outside the contacts: the robot turns over",
+        "the robot turns over: its line of gravity passes outside the contacts, or its own motion throws it over",
+        "the robot turns over: its line of gravity passes outside the contacts, or its own motion throws it over",
     ),
 }
 
@@ -45,6 +45,7 @@ FLAGS = {
     "gearbox_overspeed": "gearbox input faster than its catalogue permits",
     "winding_hot": "winding hotter than permitted after long running at this current",
     "slips": "slides faster than V_s on average, though it goes on steadily",
+    "jumps": "its running gear drops between guides and pulleys and throws it off the ground at times",
 }
 
 

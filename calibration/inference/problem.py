@@ -29,12 +29,13 @@ class Observation(eqx.Module):
     Attributes:
         reading: of every channel [SI], shape (rows, channels).
         adhesion_used: demand on adhesion over its limit [-], 0 where that is no matter; shape (rows,).
-        status: of the row's run, shape (rows,).
+        status, flags: of the row's run, shape (rows,).
     """
 
     reading: Float[Array, "rows channels"]
     adhesion_used: Float[Array, " rows"]
     status: Int[Array, " rows"]
+    flags: Int[Array, " rows"]
 
 
 class Data(eqx.Module):
