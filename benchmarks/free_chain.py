@@ -43,8 +43,8 @@ from mmrjax.robots import nominal
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 from mmrjax.signals import GRAVITY, State
 
-# [s]; half of it changes the share by less than the scatter of two windows. Explicit: a grouser's damping on the mass of
-# its link allows 2 m / b_max = 1.6e-6 s at 300 N·s/m and 0.6e-6 s at 800; main() takes a third of it where that is less.
+# [s]; half of it changes the share by less than the scatter of two windows. Explicit: the damping of a grouser on the
+# mass of its link allows 2 m / b_max = 1.6e-6 s at 300 N·s/m, 0.6e-6 s at 800; main() takes a third of it if less.
 STEP = 1e-6
 SAMPLE = 500  # steps
 SPEED = 25.66  # [rad/s], of the driving pulley; 6T2A at 33 V on the flat
