@@ -3,6 +3,7 @@
 
 python benchmarks/free_chain.py            the chain alone
 python benchmarks/free_chain.py --track    beside the track model, over the guide's recess
+python benchmarks/free_chain.py --shaking --track    at the running gear that shakes (set S of docs/vibration.md)
 
 One side of 6T2A on the flat without payload. The masses of the belt are free in the plane; stiff springs
 join them; two 48-tooth pulleys hold them from inside by one-sided springs and carry them along by tooth
@@ -30,17 +31,21 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
+from shaking import shaking
 
 from mmrjax import balances, mjcf, params
 from mmrjax.conditions import Conditions
 from mmrjax.contact import force_contact, step
 from mmrjax.fidelities.ripple import period_pitch, ripple
 from mmrjax.fidelities.track import _batch
+from mmrjax.robot import Robot
 from mmrjax.robots import nominal
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, TEETH_PULLEY, RunningGear
 from mmrjax.signals import GRAVITY, State
 
-STEP = 1e-6  # [s]; half of it changes the share by less than the scatter of two windows
+# [s]; half of it changes the share by less than the scatter of two windows. Explicit: the damping of a grouser on the
+# mass of its link allows 2 m / b_max = 1.6e-6 s at 300 N·s/m, 0.6e-6 s at 800; main() takes a third of it if less.
+STEP = 1e-6
 SAMPLE = 500  # steps
 SPEED = 25.66  # [rad/s], of the driving pulley; 6T2A at 33 V on the flat
 
@@ -85,9 +90,10 @@ class Chain(NamedTuple):
     link: float  # pitch of the belt [m]
 
 
-def chain(gear: RunningGear) -> Chain:
-    """The nominal robot's 6T2A on the flat, with `gear`."""
-    robot, run = dataclasses.replace(nominal(), running_gear=gear), Conditions(voltage=33.0)
+def chain(gear: RunningGear, robot: Robot | None = None) -> Chain:
+    """A robot's 6T2A on the flat (None: the nominal one's), with `gear`."""
+    robot = dataclasses.replace(nominal() if robot is None else robot, running_gear=gear)
+    run = Conditions(voltage=33.0)
     rest = State(*(jnp.zeros(()) for _ in range(4)))
     half = mjcf.masses(robot, run, balances.begin(robot, run, rest).mass)
     link = (2 * gear.wheelbase + 2 * jnp.pi * robot.configurations["6T2A"].radius) / TEETH_BELT
@@ -259,9 +265,15 @@ def run(c: Chain, speed, step_s, samples: int):
     return jax.lax.scan(interval, (start(c, speed), jnp.zeros(())), None, length=samples)
 
 
-def measure(gear: RunningGear, speed: float = SPEED, duration: float = 0.5, step_s: float = STEP) -> dict:
+def measure(
+    gear: RunningGear,
+    speed: float = SPEED,
+    duration: float = 0.5,
+    step_s: float = STEP,
+    robot: Robot | None = None,
+) -> dict:
     """Averages and ripple over the whole grouser periods in the last 60 % of `duration` [s]."""
-    c = chain(gear)
+    c = chain(gear, robot)
     sample = SAMPLE * step_s
     samples = round(duration / sample)
     radius = float(c.link) * TEETH_PULLEY / (2 * np.pi)
@@ -275,7 +287,8 @@ def measure(gear: RunningGear, speed: float = SPEED, duration: float = 0.5, step
     tail = slice(samples - round(periods * period / sample), None)
     mean = {name: float(np.mean(np.asarray(getattr(sums, name))[tail])) for name in Sums._fields}
     normal = np.asarray(sums.normal)[tail]
-    clock = sample * np.arange(len(normal))
+    clock, whole = sample * np.arange(len(normal)), max(round(1e-3 / sample), 1)
+    coarse = normal[len(normal) % whole :].reshape(-1, whole).mean(1)
     found = ripple(clock, normal)
     weight = float(c.half.chassis + 2 * c.half.pulley + gear.belt_mass) * GRAVITY
     return {
@@ -283,6 +296,7 @@ def measure(gear: RunningGear, speed: float = SPEED, duration: float = 0.5, step
         "pulley_share": mean["pulleys"] / mean["normal"],
         "carried_over_weight": mean["normal"] / weight,
         "normal_std_over_mean": float(normal.std() / normal.mean()),
+        "normal_std_over_mean_1_ms": float(coarse.std() / coarse.mean()),  # as the track model is read
         "ripple_amplitude": found.amplitude,
         "ripple_period_s": found.period,
         "period_34_s": period,
@@ -304,12 +318,13 @@ def harmonics(values: np.ndarray, periods: int, count: int = 4) -> dict:
     return {"share_of_variance": np.round(lines, 3).tolist(), "strongest": float(np.argmax(power) / periods)}
 
 
-def beside(gears: list[RunningGear]) -> list[dict]:
+def beside(gears: list[RunningGear], robot: Robot | None = None) -> list[dict]:
     """The track model at the same recesses, 33 V on the flat: what the chain is compared with."""
     runs = Conditions(voltage=np.full(1, 33.0))
     found = []
     for gear in gears:
-        answer = _batch(dataclasses.replace(nominal(), running_gear=gear), runs, 0.8, 1e-4, 1e-3, True)
+        one = dataclasses.replace(nominal() if robot is None else robot, running_gear=gear)
+        answer = _batch(one, runs, 0.8, 1e-4, 1e-3, True)
         normal, fast = np.asarray(answer.signals.normal[0, -300:]), float(answer.v[0, -300:, 3].mean())
         period = period_pitch(35e-3, fast, float(nominal().radius_pulley))
         periods = int(0.3 / period)
@@ -330,26 +345,31 @@ def beside(gears: list[RunningGear]) -> list[dict]:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("--recess", default="0", help="of the lower guide [mm], comma-separated")
+    options.add_argument("--recess", help="of the lower guide [mm], comma-separated; default the gear's own")
     options.add_argument("--duration", type=float, default=0.5)
-    options.add_argument("--step", type=float, default=STEP)
+    options.add_argument("--step", type=float, help="[s]; default 1e-6, or what a stiff damper asks for")
     options.add_argument("--speed", type=float, default=SPEED)
     options.add_argument("--track", action="store_true", help="run the track model beside it")
+    options.add_argument("--shaking", action="store_true", help="friction and running gear of set S (shaking.py)")
     options.add_argument("--json", type=Path)
     chosen = options.parse_args()
-    recesses = [float(r) * 1e-3 for r in chosen.recess.split(",")]
+    robot = shaking() if chosen.shaking else nominal()
+    own = 1e3 * float(robot.running_gear.guide_recess)
+    recesses = [float(r) * 1e-3 for r in (chosen.recess or f"{own:g}").split(",")]
     gears = [
-        params.replace(RunningGear(), {"guide_recess": jnp.asarray(r), "grouser_length": jnp.asarray(5e-3)})
+        params.replace(robot.running_gear, {"guide_recess": jnp.asarray(r), "grouser_length": jnp.asarray(5e-3)})
         for r in recesses
     ]
+    largest = 2 * float(robot.running_gear.belt_mass) / TEETH_BELT / float(robot.running_gear.contact_damping)
+    step_s = chosen.step or min(STEP, float(f"{largest / 3:.1g}"))
     found = {f"recess {1e3 * r:g} mm": {} for r in recesses}
     for name, gear in zip(found, gears, strict=True):
-        found[name]["chain"] = measure(gear, chosen.speed, chosen.duration, chosen.step)
+        found[name]["chain"] = measure(gear, chosen.speed, chosen.duration, step_s, robot)
         print(name, json.dumps(found[name]), flush=True)
     if chosen.track:
         wide = [params.replace(g, {"grouser_length": jnp.asarray(10e-3)}) for g in gears]  # the chain's base
         for label, given in (("track", gears), ("track, grousers' base as the chain's", wide)):
-            for name, one in zip(found, beside(given), strict=True):
+            for name, one in zip(found, beside(given, robot), strict=True):
                 found[name][label] = one
                 print(name, label, json.dumps(one), flush=True)
     if chosen.json:

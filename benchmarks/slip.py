@@ -67,7 +67,7 @@ class Longer(SettledRuns):
 
         found = jax.vmap(one)(self.conditions)
         reading = jnp.stack([found.reading[name] for name in channels.names()], -1)
-        return Observation(reading, jnp.asarray(found.adhesion_used), found.status)
+        return Observation(reading, jnp.asarray(found.adhesion_used), found.status, found.flags)
 
 
 def posed(against: str) -> tuple[Problem, np.ndarray]:

@@ -57,8 +57,10 @@ class Driver(eqx.Module):
         return jnp.abs(current) > self.current_limit
 
     def blocks(self, duty: Scalar, current: Scalar, open_circuit: Scalar) -> Scalar:
-        """Whether nothing holds the motors' terminals, which are then at the back-EMF: the circuit is open, or the diode
-        of a supply that takes nothing back keeps a current from flowing there."""
+        """Whether nothing holds the motors' terminals, which are then at the back-EMF.
+
+        The circuit is open, or the diode of a supply that takes nothing back keeps a current from flowing there.
+        """
         blocked = jnp.asarray(open_circuit) > 0.5
         return blocked if self.returns_current else blocked | (duty * current < 0)
 

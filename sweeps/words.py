@@ -35,8 +35,8 @@ STATUSES: dict[str, Status] = {
     "failed": Status("failed", "the solver gave up", "the solver found no answer; please report the conditions"),
     "tips": Status(
         "tips over",
-        "the line of gravity passes outside the contacts: the robot turns over",
-        "the line of gravity passes outside the contacts: the robot turns over",
+        "the robot turns over: its line of gravity passes outside the contacts, or its own motion throws it over",
+        "the robot turns over: its line of gravity passes outside the contacts, or its own motion throws it over",
     ),
     "reverses": Status("reverses", "steady travel backward", "found a steady operating point, travelling backward"),
     "rolls_back": Status(
@@ -58,6 +58,7 @@ FLAGS = {
     "gearbox_overload": "more torque than the gearbox may carry for long",
     "too_hot": "winding hotter than permitted",
     "demand_missed": "a demanded speed was not reached",
+    "jumps": "its running gear drops between guides and pulleys and throws it off the ground at times",
 }
 
 

@@ -106,6 +106,46 @@ def test_a_penalty_that_holds_nothing_moves_nothing(clean, truth):
 
 
 @pytest.mark.slow
+def test_step_ahead_is_the_optimum_beyond_and_along_the_edges_of_penalties():
+    """Against SciPy's general minimiser, with penalties that begin on either side of their edge."""
+    from scipy.optimize import minimize
+
+    rng, crossed = np.random.default_rng(5), 0
+    for _ in range(20):
+        jacobian, residual = rng.standard_normal((16, 4)), rng.standard_normal(16)
+        penalty = np.arange(16) >= 10
+        jacobian[penalty] *= 30.0
+
+        def objective(d, jacobian=jacobian, residual=residual, penalty=penalty):
+            ahead = residual + jacobian @ d
+            return 0.5 * np.sum(np.where(penalty, np.maximum(ahead, 0.0), ahead) ** 2)
+
+        step, gain = fit.step_ahead(residual, jacobian, penalty)
+        best = minimize(objective, step, method="BFGS", options={"gtol": 1e-9})
+        assert objective(step) == pytest.approx(best.fun, rel=1e-6)
+        assert gain == pytest.approx(objective(np.zeros(4)) - best.fun, rel=1e-6)
+        held = ~penalty | (residual > 0)
+        plain = -np.linalg.lstsq(jacobian[held], residual[held])[0]
+        crossed += objective(plain) > objective(np.zeros(4))
+    assert crossed > 5  # where the Gauss-Newton step leads to a higher place
+
+
+def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
+    """With the noise that is estimated of them the rows pull static friction down to the margin; from just inside of
+    it nothing shows the penalty."""
+    posed = pose(measured, robots.nominal(), stated="current=10%,motor_speed=6%,speed=4%")
+    limit = fit.searches(posed, jnp.zeros((1, len(posed.coordinates))), posed.data)[0]
+    assert np.any(np.asarray(posed.observation(limit.z[0]).adhesion_used) > 1 - problem.MARGIN)
+    inside = limit.z[0].at[posed.coordinates.names.index("6T2A.ground.friction.static")].add(3e-4)
+    r, jacobian, seen = fit.linearised(posed, inside, posed.data)
+    assert (np.asarray(seen.adhesion_used) < 1 - problem.MARGIN)[:10].all()
+    plain = np.linalg.lstsq(np.asarray(jacobian), np.asarray(r))[0]
+    assert 0.5 * np.sum((jacobian @ plain) ** 2) > 3 * fit.DECREMENT  # a gain that is not there
+    found, _, _ = fit.search_long(posed, inside, posed.data)
+    assert found.converged and float(found.decrement) < fit.DECREMENT + fit.DECREMENT_SHARE * float(found.cost)
+    assert float(found.cost) == pytest.approx(float(limit.cost[0]), abs=2 * fit.DECREMENT)
+
+
 def test_truth_is_recovered_from_clean_readings(clean, truth):
     found, _, _ = fit.searches(clean, starts(len(truth), 16), clean.data)
     assert np.all(found.converged)

@@ -17,6 +17,7 @@ from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.population import Members, Rows
 from calibration.inference.problem import Observation
 from mmrjax import channels, robots
+from mmrjax.signals import FAILED, FLAGS, SLIDES, TIPS
 
 NAMES = ("motor.resistance", "6T2A.track.loss_coulomb", "6T2A.track.loss_viscous", "6T2A.ground.rolling_resistance")
 SIZE = 48
@@ -29,7 +30,7 @@ class Stepped(SettledRuns):
     def __call__(self, robot):
         seen = super().__call__(robot)
         jump = jnp.where(robot.motor.resistance > robots.nominal().motor.resistance, 0.3, 0.0)
-        return Observation(seen.reading.at[:, 0].add(jump), seen.adhesion_used, seen.status)
+        return Observation(seen.reading.at[:, 0].add(jump), seen.adhesion_used, seen.status, seen.flags)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,7 @@ def test_same_seed_same_members_and_another_seed_others(posed, known, found):
 
 
 def test_objective_is_the_misfit_where_the_noise_is_known(posed, known, found):
-    rows = Rows(found.reading[:3], found.adhesion_used[:3], found.status[:3])
+    rows = Rows(found.reading[:3], found.adhesion_used[:3], found.status[:3], found.flags[:3])
     for z, cost in zip(found.z[:3], population.objective(posed, known)(found.z[:3], rows), strict=True):
         readings = np.asarray(posed.misfit(jnp.asarray(z), posed.data))[: posed.data.measured.size]
         lost = np.isin(np.asarray(posed.observation(jnp.asarray(z)).status), (2, 3, 4))
@@ -102,7 +103,7 @@ def test_objective_with_noise_to_be_estimated_takes_the_most_probable(posed, run
     """n ln s is, but for a constant, ½ Σ (e/σ)² + n ln σ at the σ that makes it smallest."""
     unknown = noise.of(runs, SettledRuns.sizes(runs))
     worst = found.order[-2:]  # far above the least share that is taken for noise
-    rows = Rows(found.reading[worst], found.adhesion_used[worst], found.status[worst])
+    rows = Rows(found.reading[worst], found.adhesion_used[worst], found.status[worst], found.flags[worst])
     costs = population.objective(posed, unknown)(found.z[worst], rows)
     size, measured = SettledRuns.sizes(runs), np.asarray(posed.data.measured)
 
@@ -125,7 +126,7 @@ GRID = np.geomspace(1.2e-3, 1.0, 80)
 def test_row_that_is_not_reached_costs_and_a_reading_that_is_missing_ends_it(posed, known, found):
     status = found.status[:1].copy()
     status[0, 0] = 2
-    reached = Rows(found.reading[:1], found.adhesion_used[:1], np.zeros_like(status))
+    reached = Rows(found.reading[:1], found.adhesion_used[:1], np.zeros_like(status), found.flags[:1])
     lost = reached._replace(status=status)
     cost = population.objective(posed, known)
     assert cost(found.z[:1], lost) - cost(found.z[:1], reached) == pytest.approx(population.LOST)
@@ -214,6 +215,66 @@ def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found)
     torn = population.Searched(dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4)
     assert "still gained" in torn.statements()[0] and "by a are not those of its differences" in torn.statements()[-1]
     assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
+
+
+def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
+    coordinates = dataclasses.replace(
+        posed.coordinates, high=np.where(np.arange(4) == 3, np.log(0.07), posed.coordinates.high)
+    )
+    assert population.edges(coordinates, np.array([2.4, -2.4, 0.0, 0.0])) == {}
+    said = population.edges(coordinates, np.array([2.6, -3.0, 0.0, 9.0]))
+    assert list(said) == [NAMES[0], NAMES[1], NAMES[3]]
+    assert said[NAMES[0]] == "2.6 prior sd above the middle of its prior"
+    assert said[NAMES[1]] == "3.0 prior sd below the middle of its prior"
+    assert said[NAMES[3]] == "at its upper bound"
+
+
+def test_what_members_did_is_counted_and_said(found):
+    at = int(found.order[0])
+    status, flags = np.zeros_like(found.status), np.zeros_like(found.flags)
+    status[:3, 0], status[3, 1], status[4:6, 0] = TIPS, FAILED, SLIDES
+    flags[[at, 7], 1] = 1 << FLAGS.index("jumps")
+    told = population.Searched(
+        dataclasses.replace(found, status=status, flags=flags), at, (), None, np.nan, {"a": "at its upper bound"}
+    )
+    assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
+    assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
+    said = " ".join(told.statements())
+    assert "2 slide, 3 turn over, 1 leave the ground for good or cannot be computed" in said
+    assert "2 of the members jump in some row" in said and "the best in rows 2" in said
+    assert "the search ended at the edge of what was allowed: its best member has a at its upper bound" in said
+
+
+def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
+    """A prior far from what the rows say, and narrow."""
+    name = "6T2A.ground.rolling_resistance"
+    found = calibrate(
+        runs, robots.nominal(), model="drive", free=(name,), stated={name: (0.02, 0.004)}, population=6, generations=3,
+        noise="current=0.5%,motor_speed=2%,speed=2%", profiles=False, blocks=(),
+    )  # fmt: skip
+    best = found.searched.found.z[found.searched.at]
+    assert abs(best[0]) > population.EDGE and abs(found.parameters[name].shift) > population.EDGE
+    assert list(found.searched.edge) == [name]
+    assert found.to_json()["optimizer"]["population"]["at_edge"] == found.searched.edge
+    said = [n for n in found.notes if name in n]
+    assert any("its best member has" in n and "prior sd above" in n for n in said)
+    assert any("its prior" in n and "prior sds from" in n for n in said)
+    assert np.isfinite(found.posterior.covariance).all()
+
+
+def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
+    true = population._observed
+
+    def broken(posed, points):
+        seen = true(posed, points)
+        return Observation(
+            jnp.full_like(seen.reading, jnp.nan), seen.adhesion_used, jnp.full_like(seen.status, TIPS), seen.flags
+        )
+
+    monkeypatch.setattr(population, "_observed", broken)
+    name = "6T2A.ground.rolling_resistance"
+    with pytest.raises(BadConfiguration, match=r"none of \d+ members can be run in every row .*: \d+ tips"):
+        calibrate(runs, robots.nominal(), model="drive", free=(name,), population=4, generations=1)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import margin, stand, system
 from mmrjax.fidelities.stability import _whole, largest_step
 from mmrjax.fidelities.track import _batch, track_batch
-from mmrjax.signals import FAILED
+from mmrjax.signals import CONVERGED, FAILED, FLAGS, TIPS
 from sweeps import config as configuration
 from sweeps import run
 from sweeps.grid import grid
@@ -153,3 +153,47 @@ def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
     with pytest.raises(BadConfiguration, match=rf"run {worst + 1} of {len(runs)}"):
         run.evaluate(robot, runs, config, None, told.append)
     assert told == []
+
+
+#: Set S of docs/vibration.md.
+SHAKING = {
+    "6T2A.ground.friction.static": 0.5735, "6T2A.ground.friction.dynamic": 0.5524,
+    "6T2A.ground.friction.speed_static": 0.01777, "6T2A.ground.friction.speed_dynamic": 0.1777,
+    "6T2A.track.guide_friction": 0.06, "running_gear.guide_recess": 3.327e-4, "running_gear.guide_gap": 0.01029,
+    "running_gear.contact_stiffness": 4.261e7, "running_gear.contact_damping": 806.9,
+    "running_gear.centre_offset": -0.00154, "running_gear.payload_height": 0.0675,
+}  # fmt: skip
+
+
+def changed(robot, values):
+    return params.replace(robot, {name: jnp.asarray(value) for name, value in values.items()})
+
+
+def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
+    """Set S at 33 V on 15 deg leaves the ground for a twentieth of the time; at 15 V it shakes and stays on it."""
+    runs = Conditions(
+        voltage=jnp.asarray([15.0, 33.0]), slope_deg=jnp.asarray([10.0, 15.0]), payload=jnp.asarray([0.0, 8.0])
+    )
+    answer = _batch(changed(robot, SHAKING), runs, 0.6, 1e-4, 1e-3, True)
+    jumps = np.asarray(answer.result.flags) >> FLAGS.index("jumps") & 1
+    assert jumps.tolist() == [0, 1]
+    window = np.asarray(answer.signals.normal)[:, -240:]
+    assert (window[0] > 0.01 * window[0].mean()).all()
+    assert np.mean(window[1] < 0.01 * window[1].mean()) > 0.01
+
+
+def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
+    """A payload 0.6 m up: gravity alone would not turn it over on 20 deg, its start does; at 15 V it climbs."""
+    high = {
+        "running_gear.payload_height": 0.6,
+        "6T2A.ground.friction.static": 1.2,
+        "6T2A.ground.friction.dynamic": 1.1,
+    }
+    tall = changed(robot, high)
+    runs = Conditions(
+        voltage=jnp.asarray([33.0, 15.0]), slope_deg=jnp.asarray([20.0, 0.0]), payload=jnp.asarray([8.0, 0.0])
+    )
+    assert float(margin(system(tall, Conditions(voltage=33.0, slope_deg=20.0, payload=8.0), 1e-4))) > 0
+    answer = _batch(tall, runs, 1.0, 1e-4, 1e-3, False).result
+    assert answer.status.tolist() == [TIPS, CONVERGED]
+    assert np.isnan(float(answer.reading["speed"][0])) and np.isfinite(float(answer.reading["speed"][1]))

@@ -37,7 +37,7 @@ from calibration.inference.remarks import remarks
 from calibration.inference.result import CalibrationResult
 from mmrjax import fidelities
 from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
+from mmrjax.signals import FLAGS, STATUSES
 
 #: Members of a generation where parameters are free that `steady` does not read.
 POPULATION = 256
@@ -157,6 +157,12 @@ def calibrate(
     searched = found.searched
     about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
     notes += searched.statements() if searched is not None else []
+    if not np.isfinite(about.covariance).all():
+        notes.append("the posterior has no finite covariance: values stand, intervals do not")
+    jumps = np.flatnonzero(np.asarray(after.flags) >> FLAGS.index("jumps") & 1)
+    if len(jumps):
+        rows = ", ".join(str(k + 1) for k in jumps)
+        notes.append(f"rows {rows}: the calibrated robot's running gear jumps; it leaves the ground at times")
     profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about) if profiles else None
     masks = {kind: holdout.blocks(runs, kind) for kind in kinds}
     held = holdout.held_out(posed, np.asarray(z), masks)
@@ -254,13 +260,21 @@ def _searched(
         generations=evolved.generations, seed=seed, beside=points, tell=tell,
     )  # fmt: skip
     at = int(everyone.order[0])
+    if not np.isfinite(everyone.cost[at]):
+        ended = population.Searched(everyone, at, (), None, np.nan).outcomes()
+        said = ", ".join(f"{count} {word.replace('_', ' ')}" for word, count in ended.items())
+        raise BadConfiguration(
+            f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ends "
+            f"so: {said or 'none'}); begin from another robot, or free less"
+        )
     posed, shares = multistart.noisier_at(posed, known, everyone, at)
     tell("population done; now derivatives against differences at the best")
     about = identifiability.analyse(posed, jnp.asarray(everyone.z[at]))
     off = population.apart(posed, members, everyone.z[at], about.jacobian, about.sd)
     names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)
     slope, left = population.regression(posed, everyone, at) if names else (None, np.nan)
-    searched = population.Searched(everyone, at, names, slope, left)
+    edge = population.edges(posed.coordinates, everyone.z[at])
+    searched = population.Searched(everyone, at, names, slope, left, edge)
     return multistart.at_best(posed, known, shares, searched, tell), beside
 
 

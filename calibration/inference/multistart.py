@@ -189,7 +189,7 @@ def at_best(
     if searched.slope is None:
         return dataclasses.replace(search_one_by_one(posed, noise, z[None], shares, tell), searched=searched)
     seen = Observation(*(jnp.asarray(x[searched.at]) for x in (
-        searched.found.reading, searched.found.adhesion_used, searched.found.status,
+        searched.found.reading, searched.found.adhesion_used, searched.found.status, searched.found.flags,
     )))  # fmt: skip
     error = np.concatenate([np.asarray(posed.whitened(seen, posed.data)), z - np.asarray(posed.data.centre)])
     rows = np.zeros((posed.data.measured.shape[0], len(z)))  # of the penalty on adhesion

@@ -127,7 +127,11 @@ def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: A
     decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))
-    return Optimum(pin.apply(z), sd, cost, decrement, decrement < DECREMENT + DECREMENT_SHARE * cost, steps)
+    return Optimum(pin.apply(z), sd, cost, decrement, _small(decrement, cost), steps)
+
+
+def _small(decrement: Any, cost: Array) -> Array:
+    return jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
 
 
 def optimum(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Data) -> Optimum:
@@ -171,23 +175,67 @@ def levenberg_marquardt(
     return _finish(problem, solution.value, data, pin, solution.stats["num_steps"])
 
 
-@eqx.filter_jit
 def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     """All that is asked of a rollout at z, in one program: residuals (misfit, then prior), Jacobian, observation.
 
     Where a rollout's step is too long for its friction law (V_s small beside μ_s) the run shakes and its
     derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
     """
+    r, jacobian, seen = _linearised(problem, z, data)
+    return *_counted(r, jacobian, data), seen
+
+
+@eqx.filter_jit
+def _linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    # Of a row that leaves some of its adhesion's margin the penalty is negative here, and has its slope.
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + z.size, bool)])
 
     def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
         seen = problem.observation(z)
-        r = jnp.concatenate([problem.whitened(seen, data), z - data.centre])
+        readings = problem.whitened(seen, data)[: data.measured.size]
+        r = jnp.concatenate([readings, problem.excess(seen, data), z - data.centre])
         return r, (r, seen)
 
     jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
     known = jnp.all(jnp.isfinite(jacobian), axis=1)
     return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0), seen
+
+
+def _penalties(data: Data) -> Bool[Array, " residuals"]:
+    readings, rows = data.measured.size, data.measured.shape[0]
+    return jnp.zeros(readings + rows + data.centre.size, bool).at[readings : readings + rows].set(True)
+
+
+def _counted(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+    counted = ~_penalties(data) | (r > 0)
+    return jnp.where(counted, r, 0.0), jnp.where(counted[:, None], jacobian, 0.0)
+
+
+def step_ahead(
+    residual: Float[np.ndarray, " residuals"],
+    jacobian: Float[np.ndarray, "residuals parameters"],
+    penalty: Bool[np.ndarray, " residuals"],
+) -> tuple[Float[np.ndarray, " parameters"], float]:
+    """Step to the optimum of a linearisation whose penalties count where they are positive, and its gain.
+
+    min_d ½ Σ (r + J d)² over readings and priors + ½ Σ max(0, r + J d)² over penalties, by their active set. The
+    Gauss-Newton step knows those penalties alone that are positive where it begins: from just inside the limit of
+    adhesion it leads across it, and predicts a gain that is not there.
+    """
+
+    def objective(d: np.ndarray) -> float:
+        ahead = residual + jacobian @ d
+        return 0.5 * float(np.sum(np.where(penalty, np.maximum(ahead, 0.0), ahead) ** 2))
+
+    best, active = np.zeros(jacobian.shape[1]), ~penalty | (residual > 0)
+    for _ in range(2 * int(penalty.sum()) + 2):
+        j, r = jacobian[active], residual[active]
+        d = -np.linalg.solve(j.T @ j, j.T @ r)
+        best = min(best, d, key=objective)
+        before, active = active, ~penalty | (residual + jacobian @ d > 0)
+        if (active == before).all():
+            break
+    return best, objective(np.zeros_like(best)) - objective(best)
 
 
 def evaluated(problem: Problem, z: Z, data: Data) -> Array:
@@ -219,12 +267,19 @@ def search_long(
     y, state, accepted = start, None, True
     first: Observation | None = None
     best: tuple[Optimum, Observation] | None = None
+
+    def judged(z: Z, steps: int, r: Array, jacobian: Array) -> tuple[Optimum, np.ndarray]:
+        ahead, gain = step_ahead(np.asarray(r), np.asarray(jacobian), np.asarray(_penalties(data)))
+        found = _optimum(*_counted(r, jacobian, data)[::-1], z, data, pin, jnp.asarray(steps))
+        return dataclasses.replace(found, decrement=jnp.asarray(gain), converged=_small(gain, found.cost)), ahead
+
     for steps in range(1, max_steps + 1):
         at = start if state is None else state.y_eval
         # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
         r = None if accepted else evaluated(problem, at, data)
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best[0].cost:
-            r, jacobian, seen = linearised(problem, at, data)
+            signed, slope, seen = _linearised(problem, at, data)
+            r, jacobian = _counted(signed, slope, data)
         if state is None:
             shape = jax.eval_shape(lambda: r)  # noqa: B023
             tangent = lambda z, _: (r + jacobian @ (z - start), None)  # noqa: B023, E731
@@ -232,13 +287,23 @@ def search_long(
         y, state, done = _step(solver, y, state, r, jacobian)
         accepted = np.array_equal(y, at)
         if accepted:
-            best = _optimum(jacobian, r, y, data, pin, jnp.asarray(steps)), seen
-            done |= best[0].decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best[0].cost)
+            found, ahead = judged(y, steps, signed, slope)
+            best = found, seen
+            done |= found.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost)
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(f"step {steps}: objective {float(best[0].cost):.4f}")
         if done:
             break
     assert best is not None and first is not None
+    # The steps above see the limit of adhesion only once they have crossed it; these go along it.
+    while not best[0].converged and (steps := steps + 1) <= max_steps:
+        at = best[0].z + ahead
+        if not 0.5 * jnp.sum(evaluated(problem, at, data) ** 2) < best[0].cost:
+            break
+        signed, slope, seen = _linearised(problem, at, data)
+        found, ahead = judged(at, steps, signed, slope)
+        best = found, seen
+        tell(f"step {steps}: objective {float(found.cost):.4f}")
     return best[0], first, best[1]
 
 

@@ -26,7 +26,9 @@ from jaxtyping import Array, Bool, Float, Int
 from calibration.data.errors import BadConfiguration
 from calibration.inference import noise as noise_room
 from calibration.inference.noise import Noise
+from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
+from mmrjax.signals import FLAGS, STATUSES
 
 #: Members that are run together: on processors, and on an accelerator.
 TOGETHER = (16, 512)
@@ -38,6 +40,13 @@ LEAST = 4
 LOST = 1e3
 #: Members of the local regression for each coefficient of it.
 MEMBERS_EACH = 3
+#: Distance from the middle of a prior beyond which a search is at its edge [prior sd].
+EDGE = 2.5
+#: How a member loses a row, in words.
+LOST_AS = {
+    "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
+    "stalled": "stall",
+}  # fmt: skip
 #: Step of the differences by which derivatives are checked [posterior sd], and how far the two may be apart.
 STEP, APART = 0.2, 0.25
 
@@ -64,7 +73,7 @@ class Population:
     Attributes:
         z: coordinates, shape (members, parameters).
         reading: what the model says of every row [SI], shape (members, rows, channels).
-        adhesion_used, status: of every row, shape (members, rows).
+        adhesion_used, status, flags: of every row, shape (members, rows).
         cost: objective with the noise that the search ended with [½σ²]; inf where it has none.
         generations: in order.
     """
@@ -73,6 +82,7 @@ class Population:
     reading: Float[np.ndarray, "members rows channels"]
     adhesion_used: Float[np.ndarray, "members rows"]
     status: Int[np.ndarray, "members rows"]
+    flags: Int[np.ndarray, "members rows"]
     cost: Float[np.ndarray, " members"]
     generations: tuple[Generation, ...]
 
@@ -94,8 +104,11 @@ class Rows(NamedTuple):
     reading: Float[np.ndarray, "members rows channels"]
     adhesion_used: Float[np.ndarray, "members rows"]
     status: Int[np.ndarray, "members rows"]
+    flags: Int[np.ndarray, "members rows"]
 
 
+#: What a file of members holds of them.
+KEPT = ("z", *Rows._fields)
 Objective = Callable[[np.ndarray, Rows], Float[np.ndarray, " members"]]
 
 
@@ -126,7 +139,7 @@ class Members:
     def _load(self, file: Path) -> None:
         try:
             with file.open("rb") as bytes_, np.load(bytes_) as there:
-                own, arrays = str(there["identity"]), [there[k] for k in ("z", "reading", "adhesion_used", "status")]
+                own, arrays = str(there["identity"]), [there[k] for k in KEPT]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise BadConfiguration(f"--members {file}: no file of members; {error}") from None
         if own != self._own:
@@ -140,12 +153,13 @@ class Members:
         if self._file is None:
             return
         z = np.array([np.frombuffer(key) for key in self._kept])
-        reading, adhesion_used, status = map(np.array, zip(*self._kept.values(), strict=True))
+        kept: dict[str, Any] = dict(
+            zip(KEPT, (z, *map(np.array, zip(*self._kept.values(), strict=True))), strict=True)
+        )
         aside = self._file.with_name(self._file.name + ".partial")
         try:
             with aside.open("wb") as out:
-                own = np.array(self._own)
-                np.savez(out, identity=own, z=z, reading=reading, adhesion_used=adhesion_used, status=status)
+                np.savez(out, **kept, identity=np.array(self._own))
                 out.flush()
                 os.fsync(out.fileno())
             aside.replace(self._file)
@@ -166,12 +180,11 @@ class Members:
             part = np.array(new[first : first + together])
             filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
             seen = jax.device_get(_observed(self._posed, jnp.asarray(filled)))
-            for z, *row in zip(part, seen.reading, seen.adhesion_used, seen.status, strict=False):
+            for z, *row in zip(part, *(getattr(seen, name) for name in Rows._fields), strict=False):
                 self._kept[z.tobytes()] = tuple(map(np.asarray, row))
             self._save()
             advance(len(points) - len(new) + first + len(part))
-        reading, adhesion_used, status = map(np.array, zip(*map(self._kept.__getitem__, keys), strict=True))
-        return Rows(reading, adhesion_used, status)
+        return Rows(*map(np.array, zip(*map(self._kept.__getitem__, keys), strict=True)))
 
 
 @eqx.filter_jit
@@ -282,7 +295,7 @@ def regression(posed: Problem, found: Population, at: int) -> tuple[Float[np.nda
     apart = z - found.z[at]
     near = np.argsort(np.einsum("ij,jk,ik->i", apart, spread, apart), kind="stable")[:number]
     scale = np.asarray(posed.data.weight / posed.data.sd)
-    moved = ((reading[near] - found.reading[at]) * scale).reshape(number, -1)
+    moved = np.where(scale > 0, (reading[near] - found.reading[at]) * scale, 0.0).reshape(number, -1)
     design = np.column_stack([np.ones(number), apart[near]])
     # A ridge of one prior sd: what the members do not tell is no slope.
     ridge = np.diag([0.0, *np.full(z.shape[1], 1e-3 * number * np.var(apart[near]) + 1e-12)])
@@ -310,6 +323,19 @@ def apart(
     return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
 
 
+def edges(coordinates: Coordinates, z: np.ndarray) -> dict[str, str]:
+    """Parameters at the edge of what is allowed or was expected of them, with where: at a bound, or further than
+    `EDGE` from the middle of the prior, by name."""
+    bound = coordinates.beyond(z)
+    found = {}
+    for name, shift, side in zip(coordinates.names, z, bound, strict=True):
+        if side:
+            found[name] = f"at its {'lower' if side < 0 else 'upper'} bound"
+        elif abs(shift) > EDGE:
+            found[name] = f"{abs(shift):.1f} prior sd {'below' if shift < 0 else 'above'} the middle of its prior"
+    return found
+
+
 @dataclasses.dataclass(frozen=True)
 class Searched:
     """What a search by generations led to.
@@ -319,6 +345,7 @@ class Searched:
         apart: names of parameters by which the derivatives of a run are not those of its differences.
         slope: of the whitened readings, from the members, where derivatives are not to be trusted; else None.
         left: rms of what the slope leaves of the members that it is from [σ], NaN without.
+        edge: of the best member, see `edges`.
     """
 
     found: Population
@@ -326,6 +353,18 @@ class Searched:
     apart: tuple[str, ...]
     slope: np.ndarray | None
     left: float
+    edge: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    def outcomes(self) -> dict[str, int]:
+        """Members with a row that ended so, by the word of the status or flag; none that no member has."""
+        status, flags = self.found.status, self.found.flags
+        ended = {word: int((status == k).any(1).sum()) for k, word in enumerate(STATUSES) if k}
+        ended["jumps"] = int(self._jumps(flags).any(1).sum())
+        return {word: count for word, count in ended.items() if count}
+
+    @staticmethod
+    def _jumps(flags: np.ndarray) -> np.ndarray:
+        return (flags >> FLAGS.index("jumps") & 1).astype(bool)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
@@ -333,6 +372,8 @@ class Searched:
             "members": len(self.found.z),
             "settled": self.found.settled,
             "generations": [dataclasses.asdict(g) for g in self.found.generations],
+            "outcomes": self.outcomes(),
+            "at_edge": self.edge,
             "derivatives_apart": list(self.apart),
             "regression_rms_sd": self.left if np.isfinite(self.left) else None,
         }
@@ -344,11 +385,22 @@ class Searched:
             + ("the last gained nothing that counts" if self.found.settled else "the last still gained: go on with "
                "more --generations")
         ]  # fmt: skip
-        failed = sum(g.failed for g in self.found.generations)
+        ended = self.outcomes()
+        failed = [f"{ended[word]} {words}" for word, words in LOST_AS.items() if word in ended]
         if failed:
             said.append(
-                f"{failed} of the members have a row that slides, tips or cannot be run; none of them is best"
+                f"of the members, in some row: {', '.join(failed)}; a row that is lost costs a member its rank"
             )
+        if "jumps" in ended:
+            rows = np.flatnonzero(self._jumps(self.found.flags[self.at]))
+            best = f"the best in rows {', '.join(str(k + 1) for k in rows)}" if len(rows) else "the best in none"
+            said.append(
+                f"{ended['jumps']} of the members jump in some row: their running gear drops between guides and "
+                f"pulleys and throws them off the ground at times; {best}"
+            )
+        if self.edge:
+            named = ", ".join(f"{name} {where}" for name, where in self.edge.items())
+            said.append(f"the search ended at the edge of what was allowed: its best member has {named}")
         if self.apart:
             said.append(
                 f"derivatives of the run by {', '.join(self.apart)} are not those of its differences (contacts open "

@@ -29,12 +29,13 @@ class Observation(eqx.Module):
     Attributes:
         reading: of every channel [SI], shape (rows, channels).
         adhesion_used: demand on adhesion over its limit [-], 0 where that is no matter; shape (rows,).
-        status: of the row's run, shape (rows,).
+        status, flags: of the row's run, shape (rows,).
     """
 
     reading: Float[Array, "rows channels"]
     adhesion_used: Float[Array, " rows"]
     status: Int[Array, " rows"]
+    flags: Int[Array, " rows"]
 
 
 class Data(eqx.Module):
@@ -114,8 +115,12 @@ class Problem(eqx.Module):
         """Residuals of what any robot shows: readings, then adhesion; shape (rows (channels + 1),)."""
         error = (seen.reading - data.measured) / data.sd
         error = data.weight * jnp.where(jnp.isfinite(error), error, MISSING)
-        over = jax.nn.relu(seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
-        return jnp.concatenate([error.ravel(), jnp.where(jnp.isfinite(over), over, 0.0)])
+        return jnp.concatenate([error.ravel(), jax.nn.relu(self.excess(seen, data))])
+
+    def excess(self, seen: Observation, data: Data) -> Float[Array, " rows"]:
+        """Demand on adhesion over its margin, as the penalty counts it; negative where a row leaves some."""
+        over = (seen.adhesion_used - (1 - MARGIN)) * jnp.max(data.weight, 1) / data.stiffness
+        return jnp.where(jnp.isfinite(over), over, 0.0)
 
     def robot(self, z: Float[Array, " parameters"]) -> Robot:
         """The robot at z."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from calibration.inference import priors
 from calibration.inference.identifiability import Z95
+from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
@@ -79,6 +80,13 @@ def _parameters(found: CalibrationResult) -> list[str]:
         if abs(p.shift) > FAR
     ]
     said += [f"{name} is at its {p.at_bound} bound" for name, p in found.parameters.items() if p.at_bound]
+    if found.searched is not None:
+        said += [
+            f"{name}: its posterior mean lies {abs(p.shift):.1f} prior sds from its prior, at the edge of where the "
+            "search looked: widen the prior and search again, or doubt the model"
+            for name, p in found.parameters.items()
+            if EDGE < abs(p.shift) <= FAR and not p.at_bound
+        ]
     return said
 
 

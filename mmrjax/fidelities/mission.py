@@ -524,7 +524,8 @@ def mission(
     carry = _Carry(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(begin.speed == 0.0), ended=false,
         low=jnp.zeros((), dtype), peaks=jnp.full(len(PEAKS), -jnp.inf, dtype), flags=whole,
-        events=jnp.full(3, -1.0, dtype), accepted=whole, rejected=whole, failed=false, kept=whole, buffer=buffer, slope=jnp.zeros((), dtype),
+        events=jnp.full(3, -1.0, dtype), accepted=whole, rejected=whole, failed=false, kept=whole, buffer=buffer,
+        slope=jnp.zeros((), dtype),
     )  # fmt: skip
 
     def one(carry: _Carry, k: Array) -> tuple[_Carry, tuple]:

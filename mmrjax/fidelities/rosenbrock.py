@@ -98,7 +98,7 @@ def stages(
     Args:
         rates: f(y) and g(y).
         inverted: invert the matrix without exchanging rows: half the time for one run alone. A pivot that vanishes
-            spoils the step, which the control of the error then rejects: the shorter, the more the diagonal dominates.
+            spoils the step, which the control of the error then rejects: a shorter one makes the diagonal dominate.
 
     Returns:
         y and q at the end of the step, and the stages of both; the last stage estimates the error.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 
@@ -22,6 +23,7 @@ from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
     FAILED,
+    FLAGS,
     NOT_SETTLED,
     STALLED,
     TIPS,
@@ -37,6 +39,10 @@ PARTS = 20  # of a run between which progress is told
 #: Length of a run from a rolling start after which it is read as settled [s]. Its last 40 % hold two grouser periods
 #: (34) or more down to 0.29 m/s, and averages over them are within 1e-4 of those of a run of 1.5 s.
 TIME_ROLLED = 0.6
+#: A robot jumps where for this share of the window its reaction is less than this share of its mean [-].
+JUMPS, ALOFT = 0.01, 0.01
+#: Pitch beyond which it has turned over [rad], and height within which that is no number gone wrong [axle heights].
+OVER, HIGH = 0.5, 20.0
 SETTLED = 1e-3  # largest relative change of the speeds from one half of the window to the other
 
 
@@ -130,7 +136,9 @@ def _status(run: System, steady: Steady, end: Motion) -> Array:
     status = jnp.where(margin(run) < 0, TIPS, status)
     finite = jnp.all(jnp.isfinite(end.q)) & jnp.all(jnp.isfinite(end.v)) & jnp.isfinite(signals.total_current)
     # A run that has left the ground, sunk through it or turned over has numbers that mean nothing.
-    grounded = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) & (jnp.abs(end.q[2]) < 0.5)
+    turned = (jnp.abs(end.q[2]) > OVER) & (jnp.abs(end.q[2]) < 2 * jnp.pi)
+    status = jnp.where(turned & (jnp.abs(end.q[1]) < HIGH * axle_height(run)), TIPS, status)
+    grounded = (jnp.abs(end.q[1] - axle_height(run)) < 0.5 * axle_height(run)) & (jnp.abs(end.q[2]) < OVER)
     sane = grounded | (status == TIPS)
     return jnp.where(finite & sane, status, FAILED)
 
@@ -159,9 +167,10 @@ def track(
         of the averaging window to the other, else `not_settled`; `stalled` the shafts do not turn forward;
         `slides` the movers slide beyond V_s and the robot loses speed or stands (one that goes on steadily
         has `converged`, flagged `slips`); `tips` the line of gravity passes
-        outside the contacts; `battery_empty`; `failed` the numbers are no longer finite, or the robot has
-        left the ground or turned over though gravity alone would not turn it. `failed` and `tips` withhold
-        the result's numbers.
+        outside the contacts, or the robot has turned over though gravity alone would not turn it (a
+        resonance, a wild start); `battery_empty`; `failed` the numbers are no longer finite, or the robot has
+        left the ground. `failed` and `tips` withhold the result's numbers. Flagged `jumps`: nothing bears it
+        for more than a hundredth of the averaging window.
     """
     run = system(robot, conditions, step)
     start = roll(run) if rolling else stand(run)
@@ -191,7 +200,12 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
     averages = _average(run, time, travelled, (record.signals, record.guided))
     status = _status(run, averages, end)
     there = (status != FAILED) & (status != TIPS)
-    answer = withhold(result(run.robot, averages.signals, status), there, status != FAILED)
+    answer = result(run.robot, averages.signals, status)
+    window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
+    aloft = window & (record.signals.normal < ALOFT * averages.signals.normal)
+    jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
+    flags = answer.flags | jnp.where(jumps, 1 << FLAGS.index("jumps"), 0)
+    answer = withhold(dataclasses.replace(answer, flags=flags), there, status != FAILED)
     return Trajectory(time[1:], motions.q, motions.v, record.signals, record.reactions, averages, answer)
 
 

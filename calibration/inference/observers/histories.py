@@ -302,7 +302,8 @@ class Histories(Observer):
     def __call__(self, robot: Robot) -> Observation:
         reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(self.whole(robot)))
         followed = jnp.all(jnp.isfinite(reading), 1)
-        return Observation(reading, jnp.zeros(self.run.shape), jnp.where(followed, CONVERGED, FAILED))
+        status = jnp.where(followed, CONVERGED, FAILED)
+        return Observation(reading, jnp.zeros(self.run.shape), status, jnp.zeros_like(status))
 
     @property
     def long(self) -> bool:

@@ -140,7 +140,7 @@ class SettledRuns(Observer):
     def __call__(self, robot: Robot) -> Observation:
         result = fidelities.get(self.fidelity).settled(robot, self.conditions)
         reading = jnp.stack([result.reading[name] for name in channels.names()], -1)
-        return Observation(reading, jnp.asarray(result.adhesion_used), result.status)
+        return Observation(reading, jnp.asarray(result.adhesion_used), result.status, jnp.asarray(result.flags))
 
     @property
     def long(self) -> bool:
