@@ -30,7 +30,7 @@ class Driver(eqx.Module):
         source="none on the bench: above any current",
     )
     gain: Scalar = parameter(
-        2.0,
+        4.0,
         unit="-",
         meaning="proportional gain of the speed controller, in multiples of the speed constant C_E",
         bounds=(0.0, 1e3),
@@ -38,7 +38,7 @@ class Driver(eqx.Module):
         source="assumed; the paper has no controller",
     )
     time_reset: Scalar = parameter(
-        0.1,
+        0.05,
         unit="s",
         meaning="reset time of the speed controller: how long its integral takes to repeat the proportional answer",
         bounds=(1e-3, 1e3),

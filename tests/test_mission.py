@@ -155,17 +155,17 @@ def test_theory_of_the_mesh_gives_less_back(robot):
 # --- standing ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", ["brake", "speed"])
-def test_a_robot_held_on_20_degrees_for_an_hour_stays(robot, mode):
-    """By friction at rest where that suffices (tracks), by the motors where it does not (wheels)."""
-    for configuration in (0, 1):
-        if mode == "brake" and configuration == 1:
-            continue  # shorted motors alone let wheels creep down
-        found = run(robot, asked(configuration, adhesion=2.0), rows([0, 3600], mode, slope_deg=20.0, duty=0.0))
-        moved = abs(float(found.total.of["distance"]))
-        assert STATUSES[int(found.result.status)] == "converged"
-        assert moved < (1e-3 if configuration == 0 else 5e-3)
-        assert int(found.steps) < 600
+@pytest.mark.parametrize(
+    ("configuration", "mode", "slope"), [(0, "brake", 15.0), (0, "speed", 20.0), (1, "speed", 20.0)]
+)
+def test_a_robot_held_on_a_slope_for_an_hour_stays(robot, configuration, mode, slope):
+    """By friction at rest where that suffices, else by the motors: less than a millimetre."""
+    found = run(robot, asked(configuration, adhesion=2.0), rows([0, 3600], mode, slope_deg=slope))
+    assert STATUSES[int(found.result.status)] == "converged"
+    assert abs(float(found.total.of["distance"])) < 1e-3
+    assert int(found.steps) < 600
+    if mode == "brake":
+        assert float(found.total.of["path"]) == 0.0
 
 
 def test_what_friction_cannot_hold_rolls_back(robot):
@@ -189,7 +189,7 @@ def test_standing_and_breaking_away_agree_with_steady(robot):
     stalled = np.asarray(steady.status) == STATUSES.index("stalled")
     assert stalled.any() and (~stalled).any()
     np.testing.assert_allclose(speed[stalled], 0.0, atol=1e-12)
-    np.testing.assert_allclose(speed[~stalled], settled[~stalled], rtol=2e-3)
+    np.testing.assert_allclose(speed[~stalled], settled[~stalled], rtol=2e-3, atol=1e-4)  # 6 s of heat
 
 
 # --- heat -------------------------------------------------------------------------------------------

@@ -124,11 +124,15 @@ def identity(posed: Problem) -> str:
 class Members:
     """Runs members, and keeps what they gave, in a file where one is named, from which a search goes on.
 
+    Args:
+        posed: the problem; file: of members; together: members that are run in one batch, None takes `TOGETHER`.
+
     Raises:
         BadConfiguration: the file is none of members, of another problem's members, or cannot be written.
     """
 
-    def __init__(self, posed: Problem, file: Path | None = None) -> None:
+    def __init__(self, posed: Problem, file: Path | None = None, together: int | None = None) -> None:
+        self._together = together or TOGETHER[jax.default_backend() != "cpu"]
         # The noise is none of it: it may be estimated anew on the way.
         bare = dataclasses.replace(posed.data, sd=jnp.ones_like(posed.data.sd), stiffness=jnp.zeros(()))
         self._posed, self._file, self._own = posed, file, identity(dataclasses.replace(posed, data=bare))
@@ -175,7 +179,7 @@ class Members:
         """What the model says of every row for each point."""
         keys = [np.ascontiguousarray(z, float).tobytes() for z in points]
         new = [z for key, z in zip(keys, points, strict=True) if key not in self._kept]
-        together = TOGETHER[jax.default_backend() != "cpu"]
+        together = self._together
         for first in range(0, len(new), together):
             part = np.array(new[first : first + together])
             filled = np.concatenate([part, np.repeat(part[-1:], together - len(part), 0)])
