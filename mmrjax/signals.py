@@ -24,8 +24,8 @@ CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, 
 DONE = (CONVERGED, REVERSES)
 
 #: Limits that a run may exceed; that it slides on average though it goes on steadily; that it leaves the ground at
-#: times. Bit k of `Result.flags` is the k-th name. `winding_hot` is after long running at this current, `too_hot` what
-#: a mission really reaches.
+#: times. Bit k of `Result.flags` is the k-th name; `winding_hot` is after long running at this current, `too_hot`
+#: what a mission really reaches.
 FLAGS = (
     "motor_overspeed", "gearbox_overspeed", "winding_hot", "slips", "jumps", "overvoltage", "cut_off",
     "battery_overcurrent", "current_limited", "gearbox_overload", "too_hot", "demand_missed",

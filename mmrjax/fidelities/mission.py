@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from mmrjax import balances, energy
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.rarely import rarely
 from mmrjax.fidelities.result import exceeded, mask, result, slips, travels, withhold
 from mmrjax.fidelities.rosenbrock import stages
 from mmrjax.params import Scalar
@@ -262,6 +263,17 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     return jnp.minimum(shafts, ground)
 
 
+def _firmly(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> tuple[Array, Array]:
+    """How firmly friction would hold the robot now, and with what current will flow then too: a controller asks for
+    less once there is no error."""
+    asked = _asked(robot, otherwise, segment, y, stands)
+    at_rest = _asked(robot, otherwise, segment, y, jnp.asarray(True))
+    state = _state(robot, y, stands)
+    settled = dataclasses.replace(state, current=_current_at_rest(at_rest.robot, at_rest.conditions, state))
+    firm = firmness(asked.robot, asked.conditions, state)
+    return jnp.asarray(firm), jnp.minimum(firm, firmness(at_rest.robot, at_rest.conditions, settled))
+
+
 def _current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current to which that of a standing robot settles [A], on the line through two of its voltage balance."""
 
@@ -328,19 +340,31 @@ def _events(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, sta
     grips = 1 - jnp.abs(rolling - state.speed) / friction.speed_static
     near = stands | ((slow > -1) & (grips > -1))
 
-    def firmly() -> tuple[Scalar, Scalar]:
-        # To rest it comes where what will flow then lets it stand: a controller asks for less without an error.
-        at_rest = _asked(robot, otherwise, segment, y, jnp.asarray(True))
-        settled = dataclasses.replace(state, current=_current_at_rest(at_rest.robot, at_rest.conditions, state))
-        firm = firmness(asked.robot, asked.conditions, state)
-        return firm, jnp.minimum(firm, firmness(at_rest.robot, at_rest.conditions, settled))
-
     none = -jnp.ones_like(slow)
-    firm, stays = jax.lax.cond(near, firmly, lambda: (none, none))
+    firm, stays = rarely(near, _firmly, (robot, otherwise, segment, y, stands), (none, none))
     standing = jnp.minimum(jnp.minimum(slow, grips), stays - FIRMLY)
     battery = asked.robot.battery
     empty = jnp.where(asked.conditions.battery > 0.5, state.discharge / battery.capacity - 1, -1.0)
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty])
+
+
+def _onto(
+    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, q: Array, stands: Array, after: Array, h: Array
+) -> tuple[Array, Array, Array]:
+    """Onto an event by a Newton step in time, which carries the derivative of its moment; and what it changes."""
+    which = jnp.argmax(after)
+    _, dy, dq, _ = _instant(robot, otherwise, segment, y, stands)
+    steep = jax.jvp(lambda y: _events(robot, otherwise, segment, y, stands), (y,), (dy,))[1][which]
+    back = jnp.where(steep > 1e-9, -after[which] / jnp.where(steep > 1e-9, steep, 1.0), 0.0)
+    back = jnp.where(jnp.abs(back) < h, back, 0.0)
+    y, q = y + back * dy, q + back * dq
+    # To rest: what is left of the motion is lost where it slid.
+    rest = y.at[_MOTOR].set(0.0).at[_SPEED].set(0.0)
+    moved, parked = (_instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
+    halts = after[0] > 0
+    lost = jnp.where(halts, energy.stored(robot, moved) - energy.stored(robot, parked), 0.0)
+    q = q.at[list(TOTALS).index("sliding")].add(lost)
+    return jnp.where(halts, rest, y), q, (stands | halts) & ~(after[1] > 0)
 
 
 def _segment(
@@ -362,22 +386,6 @@ def _segment(
 
     def events(y: Array, stands: Array) -> Array:
         return _events(robot, otherwise, segment, y, stands)
-
-    def onto(y: Array, q: Array, stands: Array, after: Array, h: Array) -> tuple[Array, Array, Array]:
-        """Onto an event by a Newton step in time, which carries the derivative of its moment; and what it changes."""
-        which = jnp.argmax(after)
-        dy, dq = rates(y, stands)
-        steep = jax.jvp(lambda y: events(y, stands), (y,), (dy,))[1][which]
-        back = jnp.where(steep > 1e-9, -after[which] / jnp.where(steep > 1e-9, steep, 1.0), 0.0)
-        back = jnp.where(jnp.abs(back) < h, back, 0.0)
-        y, q = y + back * dy, q + back * dq
-        # To rest: what is left of the motion is lost where it slid.
-        rest = y.at[_MOTOR].set(0.0).at[_SPEED].set(0.0)
-        moved, parked = (_instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
-        halts = after[0] > 0
-        lost = jnp.where(halts, energy.stored(robot, moved) - energy.stored(robot, parked), 0.0)
-        q = q.at[list(TOTALS).index("sliding")].add(lost)
-        return jnp.where(halts, rest, y), q, (stands | halts) & ~(after[1] > 0)
 
     def going(c: _Carry) -> Array:
         return (c.y[_CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
@@ -401,7 +409,8 @@ def _segment(
         far = jnp.any(between & (after > EVENT)) & (h > NEAR)
         taken = good & ~far
         event = taken & jnp.any(happened)
-        y, q, stands = jax.lax.cond(event, onto, lambda y, q, s, a, h: (y, q, s), y, q, c.stands, after, h)
+        here = (robot, otherwise, segment, y, q, c.stands, after, h)
+        y, q, stands = rarely(event, _onto, here, (y, q, c.stands))
         y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
         stands = jnp.where(taken, stands, c.stands)
         # After a step cut short by the segment's end or an event, the length from before it.
@@ -418,7 +427,8 @@ def _segment(
         tripped = low > robot.battery.delay_cutoff
         failed = c.failed | (~good & (h <= SHORTEST))
         ended = c.ended | tripped | (event & happened[2]) | failed
-        events_now = jnp.where(event, events(y, stands), jnp.where(taken, after, c.events))
+        now = (robot, otherwise, segment, y, stands)
+        events_now = rarely(event, _events, now, jnp.where(taken, after, c.events))
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
             at = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
