@@ -297,6 +297,65 @@ def test_derivatives_through_stops_and_reversals_match_differences(robot):
         assert (np.abs(np.asarray(exact[:, k]) - apart / (2 * step)) < allowed).all(), k
 
 
+@pytest.mark.slow
+def test_derivatives_by_every_parameter_and_row_match_differences(robot):
+    """Of Wh/m and peak temperature of a mission, in one Jacobian; endurance has its closed form below."""
+    time, mode, values = MANY
+    start = rows(time, mode, **values)
+    fixed = ("battery.", "6T2A", "running_gear.")  # on a supply, on wheels, with contacts lumped: not read
+    named = {p.name: float(p.value) for p in params.walk(robot) if not p.name.startswith(fixed)}
+    names = [name for name, value in named.items() if value != 0]
+    columns = [n for n in ("time", "demand", "voltage", "slope_deg", "payload") if getattr(start, n) is not None]
+
+    def outputs(x, moved):
+        changed = params.replace(robot, {name: named[name] * x[k] for k, name in enumerate(names)})
+        p = dataclasses.replace(start, **{n: getattr(start, n) + moved[n] for n in columns})
+        found = mission(changed, asked(1, adhesion=2.0), p, tolerance=1e-7)
+        return jnp.stack([found.total.energy / found.total.of["path"], found.peaks["temperature"]])
+
+    x, moved = jnp.ones(len(names)), {n: jnp.zeros(ROWS) for n in columns}
+    value = np.asarray(eqx.filter_jit(outputs)(x, moved))
+    by_robot, by_row = eqx.filter_jit(lambda *a: jax.jacfwd(outputs, argnums=(0, 1))(*a))(x, moved)
+    compiled, wrong = eqx.filter_jit(outputs), []
+
+    def check(what, exact, change, step):
+        """At one of three steps: too long ones bend, too short ones show the steps' own rounding."""
+        for h in (step, step / 3, step / 10):
+            apart = (np.asarray(compiled(*change(h))) - np.asarray(compiled(*change(-h)))) / (2 * h)
+            if (np.abs(np.asarray(exact) - apart) <= 1e-4 * np.abs(apart) + 2e-5 * np.abs(value)).all():
+                return
+        wrong.append((what, np.asarray(exact).tolist(), apart.tolist()))
+
+    for k, name in enumerate(names):
+        check(name, by_robot[:, k], lambda h, k=k: (x.at[k].add(h), moved), 1e-3)
+    for n in columns:
+        for k in range(ROWS if n == "time" else ROWS - 1):
+            if (n, k) == ("demand", 6):
+                continue  # no speed demanded: a kink, since the way grows with a demand of either sign
+            change = lambda h, n=n, k=k: (x, {**moved, n: moved[n].at[k].add(h)})  # noqa: E731
+            check(f"{n}[{k}]", by_row[n][:, k], change, 1e-4 if n == "time" else 1e-3)
+    assert not wrong, "\n".join(map(str, wrong))
+
+
+@pytest.mark.slow
+def test_fidelities_agree_on_energy_per_metre(robot):
+    """To 1 %: settled travel of a mission, of steady, and of the track model, whose share of the guides the others take."""
+    from mmrjax.fidelities.steady import steady
+    from mmrjax.fidelities.track import track_batch
+
+    for voltage, slope in ((15.0, 0.0), (24.0, 5.0)):
+        one = asked(voltage=voltage, slope_deg=slope, adhesion=2.0)
+        resolved = track_batch(robot, jax.tree.map(lambda x: jnp.asarray(x)[None], one), rolling=True)
+        shared = params.replace(robot, {"6T2A.track.guide_share": float(resolved.steady.guide_share[0])})
+        lumped = steady(shared, one)
+        p = rows([0, 3, 6], voltage=voltage, slope_deg=slope)
+        found = run(shared, one, p)
+        driven = float(found.segments.energy[0, 1] / found.segments.of["distance"][0, 1])
+        per_metre = [float(r.power_supply) / float(r.reading["speed"]) for r in (lumped,)]
+        per_metre.append(float(resolved.result.power_supply[0]) / float(resolved.result.reading["speed"][0]))
+        assert driven == pytest.approx(per_metre[0], rel=5e-3) and per_metre[1] == pytest.approx(driven, rel=1e-2)
+
+
 def test_endurance_has_the_derivative_of_its_closed_form(robot):
     def endurance(capacity):
         changed = params.replace(robot, {"battery.capacity": capacity})
