@@ -135,7 +135,7 @@ USAGE = {
     "misspelt option": (["sweep", "--slope", "5"], r"No such option: --slope"),
     "unknown command": (["swep"], r"No such command"),
     "slope of 95": (["sweep", "--slopes", "0,95"], r"option slopes_deg\.1: got 95\.0; expected -45 to 45"),
-    "negative voltage": (["sweep", "--voltages=-3"], r"option voltages_V\.0: got -3\.0; expected more than 0 to 100"),
+    "voltage below all": (["sweep", "--voltages=-300"], r"option voltages_V\.0: got -300\.0; expected -100 to 100"),
     "NaN": (["sweep", "--payloads", "nan"], r"option payloads_kg\.0: got nan"),
     "no numbers": (
         ["sweep", "--slopes", "steep"],

@@ -42,6 +42,7 @@ TIME_SETTLED = 4.0
 #: Instants of a history.
 SAMPLES = 1001
 TIME_INRUSH, SAMPLES_INRUSH = 0.04, 160  # its first instants [s], and how many of them are kept besides
+TIME_RISE, SAMPLES_RISE = 0.002, 40  # and of these the first, in which the current rises to its peak
 
 
 class Trajectory(eqx.Module):
@@ -191,13 +192,13 @@ def drive(
 def holds(robot: Robot, conditions: Conditions) -> Array:
     """Whether friction at rest holds a robot that stands.
 
-    The ground grips, and motors and gravity can turn the shafts neither at once nor at the motors' current at rest.
+    The ground grips, and motors and gravity can turn the shafts neither way at the motors' current at rest, which flows
+    a millisecond after the start.
     """
     units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
     rest = state_of(robot, jnp.zeros_like(units).at[4].set(conditions.discharge / units[4]))
     settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
-    firm = jnp.minimum(firmness(robot, conditions, rest), firmness(robot, conditions, settled))
-    return jax.lax.stop_gradient(firm) >= 0
+    return jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
@@ -240,7 +241,8 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
 def _instants(duration: float) -> np.ndarray:
     """Times of a history [s] from 0 to `duration`, close together while the current rises to its peak."""
     early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
-    return np.union1d(early, np.linspace(0.0, duration, SAMPLES))
+    first = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
+    return np.unique(np.round(np.concatenate([first, early, np.linspace(0.0, duration, SAMPLES)]), 9))
 
 
 def _histories(
