@@ -110,7 +110,7 @@ def test_a_robot_held_on_a_slope_stands_for_an_hour():
 
 
 def test_the_words_name_the_same_statuses_as_the_codes():
-    assert words.SETTLED == tuple(signals.STATUSES[k] for k in signals.DONE)
+    assert tuple(signals.STATUSES[k] for k in signals.DONE) == words.SETTLED
     assert tuple(words.STATUSES) == signals.STATUSES and tuple(words.FLAGS) == signals.FLAGS
     assert words.settled({"converged": 2, "reverses": 1, "rolls_back": 4}) == 3
 
@@ -181,7 +181,7 @@ def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
 
 
 def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
-    code, out, _ = mmrjax("sweep", "--battery", "--slopes", "0,5", "--payloads", "0,8", "--out", "a")
+    code, _, _ = mmrjax("sweep", "--battery", "--slopes", "0,5", "--payloads", "0,8", "--out", "a")
     assert code == 0
     rows = table(tmp_path / "a" / "runs.csv")
     assert len(rows) == 2 * 2 * 2 and {row["supply_voltage_V"] for row in rows} == {""}

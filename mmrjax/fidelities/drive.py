@@ -192,8 +192,8 @@ def drive(
 def holds(robot: Robot, conditions: Conditions) -> Array:
     """Whether friction at rest holds a robot that stands.
 
-    The ground grips, and motors and gravity can turn the shafts neither way at the motors' current at rest, which flows
-    a millisecond after the start.
+    The ground grips, and motors and gravity can turn the shafts neither way at the motors' current at rest, which
+    flows a millisecond after the start.
     """
     units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
     rest = state_of(robot, jnp.zeros_like(units).at[4].set(conditions.discharge / units[4]))
