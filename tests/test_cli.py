@@ -256,7 +256,7 @@ def test_drive_ends_clearly_when_the_battery_is_empty(mmrjax, tmp_path):
     ]
     assert mmrjax(*arguments, "--out", "d")[0] == 3
     (end,), history = table(tmp_path / "d" / "runs.csv"), table(tmp_path / "d" / "history.csv")
-    assert end["status"] == "battery_empty" and end["speed_mm_s"] == ""
+    assert end["status"] == "battery_empty" and float(end["speed_mm_s"]) > 0  # of the last instant before
     ran = [row["speed_mm_s"] != "" for row in history]
     assert any(ran) and not ran[-1] and ran == sorted(ran, reverse=True)  # numbers up to one instant, none after
 
@@ -336,7 +336,7 @@ def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
         code, out, err = mmrjax("render", *words)  # before the run: there is no progress bar
         assert code == 2 and out == "" and message in err and len(err.strip().splitlines()) == 1
     code, out, _ = mmrjax("render", "robot.png", "--duration", "0.05", "--begin", "0.04")
-    assert code == 3 and out.rstrip().endswith("robot.png")
+    assert code == 0 and "not_settled" in out and out.rstrip().endswith("robot.png")  # drawn as it was asked for
     assert (tmp_path / "robot.png").read_bytes().startswith(b"\x89PNG")
     assert [p.name for p in tmp_path.iterdir()] == ["robot.png"]
 

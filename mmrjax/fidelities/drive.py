@@ -198,7 +198,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
     units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
     rest = state_of(robot, jnp.zeros_like(units).at[4].set(conditions.discharge / units[4]))
     settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
-    return jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0
+    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
