@@ -121,6 +121,7 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         if turning
         else math.nan
     )
+    cell = float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
     asked = [
         ("adhesion", float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
         ("motor speed", shaft, float(robot.motor.speed_limit) / rpm, "{:.0f}", " rpm"),
@@ -128,7 +129,7 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         ("winding, long running", float(run["temperature_winding_C"]), float(robot.motor.temperature_limit), "{:.0f}",
          " °C"),
         ("gearbox torque at the driving wheel", torque, robot.gearbox.torque_limit or math.nan, "{:.2f}", " N·m"),
-        ("voltage of a cell, charged", float(run["voltage_cell_V"]), robot.battery.voltage_charge, "{:.2f}", " V"),
+        ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f}", " V"),
     ]  # fmt: skip
     return [
         {"words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(value) + unit,

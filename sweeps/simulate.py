@@ -211,7 +211,7 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
     shown = Table(show_header=False)
     absent = {"supply_voltage_V": "battery"}
     for key, (heading, form) in rows.items():
-        if key not in table or (key == "voltage_cell_V" and np.isnan(table[key]).all()):
+        if key not in table or (key == "voltage_cell_V" and not np.nan_to_num(table[key]).any()):
             continue
         cells = [
             str(v).replace(";", "\n") if not form
