@@ -18,8 +18,8 @@ class Gearbox(eqx.Module):
 
     Attributes:
         mesh_theory: η_b by the theory of the mesh, 2 - 1/η_rm; else equal to η_rm.
-        speed_limit: at the input [rad/s]; torque_limit: continuous, at the output of the gearbox [N·m], None where
-            not stated.
+        speed_limit: at the input [rad/s]; torque_limit: for long, at the driving wheel, where the total ratio ends
+            [N·m], None where not stated.
     """
 
     ratio: Scalar = parameter(
@@ -55,7 +55,8 @@ class Gearbox(eqx.Module):
         source="Table 2: 1.4e-3 mN·m·s",
     )
     speed_limit: float = eqx.field(default=8_000 * 0.10471975511965977, static=True)  # 8000 rpm input, catalogue
-    torque_limit: float | None = eqx.field(default=None, static=True)
+    # GP32C 166936, maker's sheet: 3 N·m at its output for long, 3.75 for short; times the belt stage 25/12 [N·m]
+    torque_limit: float | None = eqx.field(default=3.0 * 25 / 12, static=True)
     mesh_theory: bool = eqx.field(default=False, static=True)
 
     @property

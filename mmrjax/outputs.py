@@ -64,6 +64,7 @@ FURTHER: tuple[Output, ...] = (
         "temperature_winding", "temperature_winding_C", "°C", 1.0, "winding temperature",
         lambda r: r.temperature_winding, 1,
     ),
+    Output("voltage_cell", "voltage_cell_V", "V", 1.0, "cell voltage", lambda r: r.voltage_cell, 3),
 )  # fmt: skip
 
 

@@ -84,7 +84,7 @@ class Results(eqx.Module):
         conditions = self.conditions
         return {
             "configuration": self.configuration,
-            "supply_voltage_V": np.asarray(conditions.voltage),
+            "supply_voltage_V": np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage),
             "total_mass_kg": np.asarray(self.total_mass),
             "payload_kg": np.asarray(conditions.payload),
             "slope_deg": np.asarray(conditions.slope_deg),

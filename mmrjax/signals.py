@@ -138,7 +138,8 @@ class Result(eqx.Module):
         power_lift: against gravity [W].
         efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest
             and where power does not flow that way.
-        temperature_winding: after long running at this current [°C].
+        temperature_winding: after long running at this current [°C]; inf where none settles.
+        voltage_cell: of one cell of the battery [V]; 0 on the external supply.
         status: code into `STATUSES`.
         flags: bit mask over `FLAGS`.
     """
@@ -159,6 +160,7 @@ class Result(eqx.Module):
     efficiency_gear: Scalar
     efficiency_chassis: Scalar
     temperature_winding: Scalar
+    voltage_cell: Scalar
     status: Int[Array, "..."]
     flags: Int[Array, "..."]
 
@@ -167,6 +169,11 @@ class Result(eqx.Module):
         if isinstance(reading, dict) and name in reading:
             return reading[name]
         raise AttributeError(f"{type(self).__name__} has no {name}")
+
+
+def done(status: Array) -> Array:
+    """Whether runs ended as their conditions ask, by their codes: an operating point with numbers."""
+    return (status == CONVERGED) | (status == REVERSES)
 
 
 def quotient(part: Scalar, whole: Scalar) -> Float[Array, "..."]:

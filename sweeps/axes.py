@@ -77,6 +77,10 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
     for k, name in enumerate(design.names):
         if name in fixed or name in design.names[:k]:
             raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
+    if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
+        raise BadConfiguration(
+            f"{where}, voltage: acts without battery only, whose voltage is that of its charge; remove one of them"
+        )
     if surface is not None and "adhesion" in {*fixed, *design.names}:
         raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
     if design.points > MOST:

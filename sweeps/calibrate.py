@@ -11,6 +11,7 @@ from calibration.inference.calibrate import calibrate as run
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
 from sweeps import config as configuration
+from sweeps import words
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
@@ -43,7 +44,7 @@ def calibrate(
         path = folder.finish({"seed": found.seed, "statuses": found.counts}, runs)
         say(str(path))
         settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
-        reached = found.counts["converged"] == len(found)
+        reached = words.settled(found.counts) == len(found)
         return DONE if settled and reached else SOME_NOT_CONVERGED
 
 
@@ -64,9 +65,9 @@ def print_calibration(found: CalibrationResult) -> None:
         errors.add_column(heading, justify="right" if heading else "left")
     lines = {"before": found.errors_before, "after": found.errors_after}
     lines |= {f"after, held out by {k.replace('_', ' and ')}": h.errors for k, h in found.held_out.items()}
-    for words, by in lines.items():
+    for which, by in lines.items():
         cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
-        errors.add_row(words, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
+        errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
     say(found.starts.statement())
     for note in found.notes:

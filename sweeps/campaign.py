@@ -308,7 +308,7 @@ def finish(store: SweepStore, config: Campaign, job: scale.Job, same: Identity, 
     counts = statuses(done.values())
     print_counts(counts)
     say(str(store.path))
-    return DONE if counts["converged"] == job.plan.design.points else SOME_NOT_CONVERGED
+    return DONE if words.settled(counts) == job.plan.design.points else SOME_NOT_CONVERGED
 
 
 def leave(store: SweepStore, config: Campaign, job: scale.Job, same: Identity) -> None:

@@ -54,7 +54,10 @@ _Configuration = Annotated[
     str | None,
     typer.Option(help="One of the robot's, such as 6T2A or 4W2T of the packaged one.  \\[default: its first]"),
 ]
-_Voltage = Annotated[float, typer.Option(help="Supply voltage (V).")]
+_Voltage = Annotated[
+    float | None,
+    typer.Option(help="Supply voltage (V), negative backward.  \\[default: 33; none with --battery]"),
+]
 _Slope = Annotated[float, typer.Option(help="Slope, positive uphill (deg).")]
 _Payload = Annotated[float, typer.Option(help="Additional load mass (kg).")]
 _Mass = Annotated[
@@ -102,7 +105,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 @app.command(epilog="Example: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive")
 def simulate(
     configuration: _Configuration = None,
-    voltage: _Voltage = 33.0,
+    voltage: _Voltage = None,
     slope: _Slope = 0.0,
     payload: _Payload = 0.0,
     mass: _Mass = None,
@@ -304,11 +307,14 @@ def reproduce(
 @app.command(epilog="Example: mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20")
 def render(
     file: Annotated[Path, typer.Argument(help="What to write: its suffix is .png, .gif or .mp4.")],
-    begin: Annotated[float, typer.Option(help="Instant of a picture, first one of a film (s).")] = 0.8,
+    begin: Annotated[
+        float | None,
+        typer.Option(help="Instant of a picture, first one of a film (s).  \\[default: 0; of a picture 0.8]"),
+    ] = None,
     end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  \\[default: begin + 0.1]")] = None,
     slow: Annotated[float, typer.Option(help="How many times slower than life a film runs.", min=0.01)] = 20.0,
     configuration: _Configuration = None,
-    voltage: _Voltage = 33.0,
+    voltage: _Voltage = None,
     slope: _Slope = 0.0,
     payload: _Payload = 0.0,
     mass: _Mass = None,
@@ -342,6 +348,7 @@ def render(
     from sweeps import render as room
 
     cells = _cells(configuration, voltage, slope, payload, mass, surface)
+    begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
     end = begin + 0.1 if end is None else end
     return room.render(resolved, cells, file, begin, end, slow, force)
 
@@ -680,7 +687,7 @@ def _start_jax(no_cache: bool) -> None:
 
 
 def _cells(
-    configuration: str | None, voltage: float, slope: float, payload: float, mass: float | None, surface: str
+    configuration: str | None, voltage: float | None, slope: float, payload: float, mass: float | None, surface: str
 ) -> dict[str, Any]:
     """One run by the columns of a table of runs; None is left to the robot."""
     return {

@@ -13,9 +13,8 @@ from calibration.data import runs as records
 from calibration.inference import errors as residual
 from calibration.inference.ranges import check_ranges
 from mmrjax import channels
-from mmrjax.signals import STATUSES
 from sweeps import config as configuration
-from sweeps import run, uncertainty
+from sweeps import run, uncertainty, words
 from sweeps.console import say
 from sweeps.inputs import beside_robot, load_robot, read_runs
 from sweeps.store import open_folder
@@ -125,7 +124,7 @@ def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list
             cells = ("-" if v != v else format(v, f) for v, f in zip(figures, (".1f", ".1f", ".3f"), strict=True))
             shown.add_row(group, channel.label, str(numbers["rows"]), *cells)
     say(shown)
-    lost = int(np.sum(table["status"] != STATUSES[0]))
+    lost = int(np.sum(~np.isin(table["status"], words.SETTLED)))
     if lost:
         say(f"{lost} of {len(table['status'])} rows did not converge; rows with no simulated value are left out.")
     for note in notes:

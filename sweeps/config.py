@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +20,7 @@ from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
-Voltage = Annotated[float, Field(gt=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
+Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
 SHOWN = 5.0
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
@@ -41,7 +42,7 @@ class RobotPart(Part):
     """
 
     robot: str = "nominal"
-    set: dict[str, float] = {}
+    set: dict[str, bool | float] = {}
     effects: tuple[str, ...] = ()
 
 
@@ -90,6 +91,11 @@ class FidelityPart(ModelPart):
             usual = {option.default for option in having.values()}
             if value is not None and self.model not in having and value not in usual:
                 raise PydanticCustomError("idle", f"{name}_s acts with model {_either(having)} only")
+            if value is not None and self.model in having and value > having[self.model].most:
+                most = having[self.model]
+                raise PydanticCustomError(
+                    "idle", f"{name}_s: got {value:g}; model {self.model} takes at most {most.most:g} {most.unit}"
+                )
         return self
 
     @property
@@ -134,6 +140,10 @@ class SupplyPart(Part):
     def _feeds(self) -> Self:
         if self.discharge_mAh and not self.battery:
             raise PydanticCustomError("idle", "discharge_mAh acts with battery only")
+        if self.battery and getattr(self, "voltages_V", None) is not None:
+            raise PydanticCustomError(
+                "idle", "voltages_V acts without battery only, whose voltage is that of its charge"
+            )
         return self
 
 
@@ -142,13 +152,20 @@ class GridPart(Part):
 
     Attributes:
         configurations: of the robot, by name; None takes all that it has.
+        voltages_V: None takes those of Table 8, on the battery none.
     """
 
     configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] = VOLTAGES_V
+    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] | None = None
     payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
     slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] = SLOPES_DEG
     surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
+
+    def volts(self, battery: bool = False) -> tuple[float, ...]:
+        """The voltages, those of Table 8 where none are stated; on the battery one that is NaN."""
+        if battery:
+            return (math.nan,)
+        return VOLTAGES_V if self.voltages_V is None else self.voltages_V
 
 
 class InferencePart(Part):
@@ -352,23 +369,24 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
     ranges = {"slopes_deg": _SLOPE, "slope_deg": _SLOPE, "payloads_kg": _PAYLOAD, "voltages_V": _VOLTAGE}
     allowed = ranges.get(key)
     if allowed is not None and limits:
-        wanted = f"expected {'more than ' if key == 'voltages_V' else ''}{allowed[0]:g} to {allowed[1]:g}"
+        wanted = f"expected {allowed[0]:g} to {allowed[1]:g}"
     return f"{where}: got {first['input']!r}; {wanted}"
 
 
-def settings(options: list[str] | None) -> dict[str, float] | None:
+def settings(options: list[str] | None) -> dict[str, bool | float] | None:
     """The `--set NAME=VALUE` options as a table.
 
     Raises:
-        BadConfiguration: no equals sign, or a value that is no number.
+        BadConfiguration: no equals sign, or a value that is neither a number nor true or false.
     """
     if not options:
         return None
-    table: dict[str, float] = {}
+    table: dict[str, bool | float] = {}
     for option in options:
         name, equals, value = option.partition("=")
         try:
-            table[name.strip()] = float(value)
+            word = value.strip()
+            table[name.strip()] = word == "true" if word in ("true", "false") else float(word)
         except ValueError:
             raise BadConfiguration(
                 f"--set: got {option}; expected NAME=VALUE with a number, such as motor.resistance=0.9"

@@ -103,7 +103,8 @@ def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign:
                 )
         return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID})
     grid = resolve(Sweep, file, options)
-    axes = {"voltage": grid.voltages_V, "payload": grid.payloads_kg, "slope_deg": grid.slopes_deg}
+    volts = {} if grid.battery else {"voltage": grid.volts()}
+    axes = {**volts, "payload": grid.payloads_kg, "slope_deg": grid.slopes_deg}
     # every run of the grid with every robot drawn, which the store keeps along its last dimension
     drawn = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
     names = "all" if grid.configurations is None else list(grid.configurations)

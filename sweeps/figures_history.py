@@ -28,6 +28,7 @@ class Start:
     Attributes:
         name: heading; configuration; status.
         time: [s]; current: of all motors [A]; speed, theoretical: V and r_k ω_k [mm/s].
+        sense: of travel at the end, 1 or -1; current and speeds are drawn, and kept here, times it.
         starting: end of stage I [s]: the slide has reached its maximum, the shafts have spun up.
         slipping: end of stage II [s]: the slide is back within V_s for good; `starting` if it never left.
         settled: t' [s]: the speed within 1 % of its last value.
@@ -40,6 +41,7 @@ class Start:
     current: np.ndarray
     speed: np.ndarray
     theoretical: np.ndarray
+    sense: float
     starting: float
     slipping: float
     settled: float
@@ -47,7 +49,7 @@ class Start:
     @property
     def gets_under_way(self) -> bool:
         """Whether there are stages to tell apart."""
-        return self.status in ("converged", "not_settled")
+        return self.status in (*words.SETTLED, "rolls_back", "not_settled")
 
     @property
     def ended(self) -> tuple[float, float]:
@@ -72,6 +74,8 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
         times, sliding = np.asarray(history.time[k])[upto], np.asarray(history.signals.speed_sliding[k])[upto]
         speed = np.asarray(history.signals.speed[k])[upto] / MM
+        sense = -1.0 if finite.size and speed[-1] < -0.1 else 1.0
+        speed, sliding = sense * speed, sense * sliding
         kind = robot.configurations.names[int(which[k])]
         starting = slipping = settled = 0.0
         if finite.size:
@@ -82,10 +86,10 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
             last = speed[_end(times)].mean()
             late = np.nonzero(np.abs(speed - last) > 0.01 * np.abs(last))[0]
             settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
-        theoretical = np.asarray(history.signals.speed_theoretical[k])[upto] / MM
+        theoretical = sense * np.asarray(history.signals.speed_theoretical[k])[upto] / MM
         ended = STATUSES[int(status[k])]
         stages = (starting, max(slipping, starting), settled)
-        answer.append(Start(name, kind, ended, times, current[upto], speed, theoretical, *stages))
+        answer.append(Start(name, kind, ended, times, sense * current[upto], speed, theoretical, sense, *stages))
     return answer
 
 
@@ -95,13 +99,17 @@ def _end(time: np.ndarray) -> np.ndarray:
 
 
 def from_standstill(shown: list[Start], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
-    """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded."""
+    """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded.
+
+    Where a run ends backward, backward is drawn positive.
+    """
     fig, grid = figure(len(shown), 3, 3.1 * len(shown), width_ratios=[0.85, 1.2, 1.35])
     look = looks(start.configuration for start in shown)
     for (zoom, current, speed), start in zip(grid, shown, strict=True):
         zoom.set_title(f"{start.name}\nfirst {1e3 * INRUSH:.0f} ms")
-        current.set_title(current_title)
-        speed.set_title(speed_title)
+        backward = ", backward positive" if start.sense < 0 else ""
+        current.set_title(current_title + backward)
+        speed.set_title(speed_title + backward)
         if not start.time.size:
             note(zoom, f"no numbers: {words.short(start.status)}", color=VERMILION)
             continue
@@ -169,7 +177,7 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
         "$V_x$ (robot)", (start.time[half], start.speed[half]), xytext=(6, -12), textcoords="offset points",
         color=colour, fontsize=8.5,
     )  # fmt: skip
-    if start.status != "converged":
+    if start.status not in words.SETTLED:
         note(axes, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
 
 

@@ -25,6 +25,8 @@ def panels(voltages: np.ndarray) -> list[tuple[str, np.ndarray]]:
     Every voltage up to three; of a grid of more, the least, a middle and the greatest; where nearly every
     run has a voltage of its own, thirds of the range.
     """
+    if np.isnan(voltages).all():
+        return [("battery", np.ones(len(voltages), bool))]
     levels = np.unique(voltages)
     if levels.size > _PANELS and 4 * levels.size > voltages.size:
         bounds = np.linspace(levels[0], levels[-1], _PANELS + 1)
@@ -42,7 +44,7 @@ def is_map(runs: dict[str, np.ndarray]) -> bool:
 
 def settled(runs: dict[str, np.ndarray], channel: Channel) -> np.ndarray:
     """Which runs have a number to draw: `drive` leaves numbers of a moment with other statuses too."""
-    return (runs["status"] == "converged") & np.isfinite(runs[channel.column])
+    return np.isin(runs["status"], words.SETTLED) & np.isfinite(runs[channel.column])
 
 
 def sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:

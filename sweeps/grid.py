@@ -12,14 +12,17 @@ from sweeps.config import GridPart
 from sweeps.inputs import check_configurations
 
 
-def grid(config: GridPart, robot: Robot) -> Runs:
+def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
     """Every combination of the axes as a table of conditions, slope varying fastest.
+
+    Args:
+        battery: whether the runs are on the battery, where the axis of voltages drops out.
 
     Raises:
         BadConfiguration: a configuration that the robot does not have.
     """
     names = configurations(config, robot)
-    points = list(itertools.product(names, config.voltages_V, config.payloads_kg, config.slopes_deg))
+    points = list(itertools.product(names, config.volts(battery), config.payloads_kg, config.slopes_deg))
     configuration, voltage, payload, slope = (np.array(column) for column in zip(*points, strict=True))
     return Runs(
         source="the grid",

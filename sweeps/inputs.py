@@ -13,6 +13,9 @@ from mmrjax.robot import Robot
 from sweeps.config import RobotPart
 from sweeps.console import tell
 
+#: Supply voltage of one run where none is stated [V], the highest of Table 8.
+VOLTAGE = 33.0
+
 
 def load_robot(config: RobotPart) -> Robot:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
@@ -61,19 +64,22 @@ def check_configurations(robot: Robot, names: tuple[str, ...], where: str) -> No
             )
 
 
-def read_runs(source: str, robot: Robot, *, measured: bool, series: bool = False) -> records.Runs:
+def read_runs(
+    source: str, robot: Robot, *, measured: bool, series: bool = False, battery: bool = False
+) -> records.Runs:
     """Read a table, and say on stderr which of its columns are not used.
 
     Args:
         source: a file, or a packaged table.
         robot: has the configurations of the table.
         measured: whether readings are needed; series: whether time histories are taken.
+        battery: whether the runs are on the battery, see `records.read`.
 
     Raises:
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
-    runs = records.read(source, measured=measured)
+    runs = records.read(source, measured=measured, battery=battery)
     if not series:
         from calibration.inference import observers
 
@@ -84,14 +90,21 @@ def read_runs(source: str, robot: Robot, *, measured: bool, series: bool = False
     return runs
 
 
-def one_run(robot: Robot, cells: dict[str, Any]) -> records.Runs:
+def one_run(robot: Robot, cells: dict[str, Any], battery: bool = False) -> records.Runs:
     """One run from options by column name; without a configuration it is the robot's first.
 
     Raises:
-        BadConfiguration: a value out of range, or a configuration that the robot does not have.
+        BadConfiguration: a value out of range, a configuration that the robot does not have, or a voltage beside the
+            battery.
     """
+    if battery and cells.get("supply_voltage_V") is not None:
+        raise BadConfiguration(
+            f"--voltage: got {cells['supply_voltage_V']:g} beside --battery, whose voltage is that of its charge; "
+            "give one of them"
+        )
     stated = cells.get("configuration")
     name = robot.configurations.names[0] if stated is None else stated
     check_configurations(robot, (name,), "--configuration")
     given = {key: value for key, value in cells.items() if value is not None}
-    return records.single({**given, "configuration": name})
+    usual = {} if battery else {"supply_voltage_V": VOLTAGE}
+    return records.single({**usual, **given, "configuration": name})

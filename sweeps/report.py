@@ -106,6 +106,16 @@ def number(value: Any, form: str = "{:.2f}") -> str:
     return str(value)
 
 
+def winding(value: Any) -> str:
+    """A winding's temperature after long running [°C] as a page prints it."""
+    return words.NONE_SETTLES if math.isinf(float(value)) else number(value, "{:.0f}")
+
+
+def supply(value: Any) -> str:
+    """A supply voltage [V] as a page prints it; runs on the battery have none."""
+    return "battery" if math.isnan(float(value)) else f"{float(value):g} V"
+
+
 def reading(value: Any, channel: str) -> str:
     """A reading with the digits that matter beside others of its kind, one less than its resolution."""
     digits = {c.name: max(c.resolution - 1, 0) for c in channels.CHANNELS}[channel]
@@ -127,10 +137,11 @@ def render(folder: Path, template: str, album: Album, **known: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "reading": reading, "grade": _grade}
+    environment.filters |= {"number": number, "reading": reading, "grade": _grade, "winding": winding}
     environment.globals |= {
         "channels": {c.name: (c.label, c.unit) for c in channels.CHANNELS},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
+        "settled_words": words.SETTLED,
         "version": __version__,
     }
     page = environment.get_template(template).render(pictures=album.pictures, **known)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mmrjax import signals
 from mmrjax.variation import STATUS
 from sweeps import figures_campaign, words
 from sweeps.figures_campaign import Varied
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 #: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6
-CONVERGED = 0
 
 
 def write(folder: Path, robot: Robot, robot_name: str, layout: Layout, result: dict[str, Any]) -> Path:
@@ -32,7 +32,7 @@ def write(folder: Path, robot: Robot, robot_name: str, layout: Layout, result: d
     values, found = thinned(folder / STORE, layout)
     album = Album(folder)
     known = layout.coordinates
-    settled = found[STATUS] == CONVERGED
+    settled = np.isin(found[STATUS], signals.DONE)
     rows = []
     for variable in layout.variables:
         if "units" not in variable.attributes:

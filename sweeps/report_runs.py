@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax import channels
-from sweeps import figures_power
-from sweeps.report import Album, columns, first_rows, named, render, statuses
+from sweeps import figures_power, words
+from sweeps.report import Album, columns, first_rows, named, render, statuses, supply
 
 if TYPE_CHECKING:
     from mmrjax.fidelities.base import Run
@@ -45,7 +45,7 @@ def write(
     known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0}
     if histories is not None:
         known |= _histories(album, robot, runs, names, histories)
-    chain = np.flatnonzero(figures_power.drawable(runs) & (runs["status"] == "converged"))[:CHAINS]
+    chain = np.flatnonzero(figures_power.drawable(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
     if chain.size:
         picked = {key: value[chain] for key, value in runs.items()}
         album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain]))
@@ -73,7 +73,7 @@ def labels(runs: dict[str, np.ndarray]) -> list[str]:
     answer = []
     for k in range(len(runs["status"])):
         at = (
-            f"{runs['configuration'][k]}, {runs['supply_voltage_V'][k]:g} V, {runs['payload_kg'][k]:g} kg, "
+            f"{runs['configuration'][k]}, {supply(runs['supply_voltage_V'][k])}, {runs['payload_kg'][k]:g} kg, "
             f"{runs['slope_deg'][k]:g}°"
         )
         answer.append(f"{runs['run_id'][k]}: {at}" if "run_id" in runs else at)
@@ -115,16 +115,25 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
     radius = float(robot.configurations[str(run["configuration"])].radius)
     rpm = channels.RPM
     shaft = float(run["theoretical_speed_mm_s"]) * channels.MM / radius * float(robot.gearbox.ratio) / rpm
+    turning = abs(shaft) > 1e-9
+    torque = (
+        float(run["power_gear_W"]) / (float(robot.sides) * shaft * rpm) * float(robot.gearbox.ratio)
+        if turning
+        else math.nan
+    )
+    cell = float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
     asked = [
         ("adhesion", float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
         ("motor speed", shaft, float(robot.motor.speed_limit) / rpm, "{:.0f}", " rpm"),
         ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / rpm, "{:.0f}", " rpm"),
         ("winding, long running", float(run["temperature_winding_C"]), float(robot.motor.temperature_limit), "{:.0f}",
          " °C"),
+        ("gearbox torque at the driving wheel", torque, robot.gearbox.torque_limit or math.nan, "{:.2f}", " N·m"),
+        ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f}", " V"),
     ]  # fmt: skip
     return [
-        {"words": words, "value": form.format(value) + unit, "limit": form.format(limit) + unit,
-         "percent": 100 * abs(value) / limit}
-        for words, value, limit, form, unit in asked
-        if math.isfinite(value)
+        {"words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(value) + unit,
+         "limit": form.format(limit) + unit, "percent": 100 * abs(value) / limit}
+        for name, value, limit, form, unit in asked
+        if not (math.isnan(value) or math.isnan(limit))
     ]  # fmt: skip

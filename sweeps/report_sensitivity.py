@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
 from sweeps import figures_sensitivity
-from sweeps.report import Album, named, render
+from sweeps.report import Album, named, number, render
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -138,7 +138,7 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
     return {
         "rows": [
             {
-                "configuration": str(points.configuration[k]), "voltage": f"{points.voltage[k]:g}",
+                "configuration": str(points.configuration[k]), "voltage": number(points.voltage[k], "{:g}"),
                 "payload": f"{points.payload[k]:g}", "slope": f"{points.slope_deg[k]:g}", "gain": f"{n.gain[k]:.1f}",
             }
             for k in range(len(points))
@@ -156,7 +156,8 @@ def _ranges(found: SensitivityResult) -> str:
     p = found.points
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
     for x, unit in ((p.voltage, " V"), (p.payload, " kg"), (p.slope_deg, "°")):
-        parts.append(", ".join(f"{v:g}" for v in np.unique(x)) + unit)
+        on_battery = unit == " V" and np.isnan(x).all()
+        parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
     return "; ".join(parts)
 
 

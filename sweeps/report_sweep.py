@@ -55,7 +55,7 @@ def counts(runs: Table) -> dict[str, Any]:
     """Counts of a finished sweep per status and limit, its axes in words, and the extremes of the settled runs."""
     status = statuses(runs)
     for s in status:
-        s["where"] = "" if s["name"] == "converged" else _where(runs, runs["status"] == s["name"])
+        s["where"] = "" if s["name"] in words.SETTLED else _where(runs, runs["status"] == s["name"])
     flags = []
     for flag, meaning in words.FLAGS.items():
         over = np.array([flag in str(f).split(";") for f in runs["flags"]])
@@ -65,9 +65,14 @@ def counts(runs: Table) -> dict[str, Any]:
         "total": len(runs["status"]),
         "status": status,
         "flags": flags,
-        "axes": [{"name": name, "values": _levels(runs[c], unit)} for c, (name, unit) in _AXES.items()],
+        "axes": [{"name": name, "values": _levels(runs[c], unit)} for c, (name, unit) in _axes(runs).items()],
         "extremes": _extremes(runs),
     }
+
+
+def _axes(runs: Table) -> dict[str, tuple[str, str]]:
+    """The axes that runs have: on the battery no voltage."""
+    return {c: known for c, known in _AXES.items() if runs[c].dtype.kind not in "fiu" or not np.isnan(runs[c]).all()}
 
 
 def _levels(values: np.ndarray, unit: str) -> str:
@@ -88,6 +93,8 @@ def _where(runs: Table, pick: np.ndarray) -> str:
             ranges = []
             for column, unit in (("slope_deg", "°"), ("supply_voltage_V", " V")):
                 levels = np.unique(runs[column][mine])
+                if np.isnan(levels).all():
+                    continue
                 if levels.size <= 4:
                     ranges.append(", ".join(f"{v:.4g}" for v in levels) + unit)
                 else:
@@ -97,7 +104,7 @@ def _where(runs: Table, pick: np.ndarray) -> str:
 
 
 def _extremes(runs: Table) -> list[dict[str, str]]:
-    settled = np.nonzero(runs["status"] == "converged")[0]
+    settled = np.nonzero(np.isin(runs["status"], words.SETTLED))[0]
     asked = [(f"largest {c.label}", c.column, f"{{:.{max(c.resolution - 1, 0)}f}} {c.unit}", 1.0)
              for c in channels.CHANNELS]  # fmt: skip
     asked += [
@@ -106,14 +113,15 @@ def _extremes(runs: Table) -> list[dict[str, str]]:
     ]
     answer = []
     for name, column, form, scale in asked:
-        if column not in runs or not np.isfinite(runs[column][settled]).any():
+        if column not in runs or np.isnan(runs[column][settled]).all():
             continue
-        k = int(settled[np.nanargmax(runs[column][settled])])
+        k = int(settled[np.nanargmax(np.abs(runs[column][settled]))])
         point = ", ".join(
             str(runs[c][k]) if not unit and runs[c].dtype.kind not in "fiu" else f"{runs[c][k]:.4g}{unit}"
-            for c, (_, unit) in _AXES.items()
+            for c, (_, unit) in _axes(runs).items()
         )
-        answer.append({"words": name, "value": form.format(scale * runs[column][k]), "at": point})
+        value = words.NONE_SETTLES if np.isinf(runs[column][k]) else form.format(scale * runs[column][k])
+        answer.append({"words": name, "value": value, "at": point})
     return answer
 
 

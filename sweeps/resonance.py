@@ -301,6 +301,8 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
             "payloads_kg": tuple(sorted(set(config.payloads_kg))),
         }
     )
+    if config.voltages_V[0] <= 0:
+        raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected more than 0 to 100, forward")
     if len(config.voltages_V) < FEWEST:
         raise BadConfiguration(
             f"--voltages: got {len(config.voltages_V)} of them; expected at least {FEWEST}, or no peak over speed "

@@ -19,6 +19,7 @@ from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration
+from sweeps import words
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress as bar
 from sweeps.console import say
@@ -185,4 +186,4 @@ def leave(
     folder.write_json("result.json", result.to_json())
     path = folder.finish({"seed": None, "statuses": result.statuses}, result.runs)
     say(str(path))
-    return DONE if result.statuses["converged"] == len(result.table["status"]) else SOME_NOT_CONVERGED
+    return DONE if words.settled(result.statuses) == len(result.table["status"]) else SOME_NOT_CONVERGED

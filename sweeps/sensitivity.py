@@ -96,6 +96,8 @@ def _operating_points(
     """The grid of operating points; an axis that varies has one value, the middle of its range."""
     usual = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
     axes = {key: getattr(config, key) or values for key, values in usual.items()}
+    if config.battery and "voltage" in ranges:
+        raise BadConfiguration("--vary voltage: acts without --battery only, whose voltage is that of its charge")
     for name, (low, high) in ranges.items():
         if name in AXES:
             if getattr(config, AXES[name]) is not None:
@@ -107,7 +109,7 @@ def _operating_points(
     except ValueError:
         raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range leaves what a run may have") from None
     names = configurations(stated, robot)
-    return grid(stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot)
+    return grid(stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery)
 
 
 def _points(runs: Runs) -> Points:

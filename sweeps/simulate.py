@@ -6,15 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
-from mmrjax import channels, fidelities
+from mmrjax import channels, fidelities, outputs
 from mmrjax.fidelities.base import History, Run
+from mmrjax.fidelities.result import result
 from mmrjax.robot import Robot
-from mmrjax.signals import STATUSES
+from mmrjax.signals import BATTERY_EMPTY, STATUSES
 from sweeps import config as configuration
 from sweeps import run, uncertainty, words
 from sweeps.console import progress, say
@@ -23,6 +25,8 @@ from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
+#: Column of the largest current of all motors in a run over time.
+PEAK = "peak_current_A"
 
 
 def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
@@ -32,7 +36,10 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         BadConfiguration: more runs than histories can be kept of.
     """
     robot = load_robot(config)
-    runs = read_runs(given, robot, measured=False) if isinstance(given, str) else one_run(robot, given)
+    if isinstance(given, str):
+        runs = read_runs(given, robot, measured=False, battery=config.battery)
+    else:
+        runs = one_run(robot, given, config.battery)
     if fidelities.facts(config.model).histories and len(runs) > _HISTORIES:
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
@@ -40,11 +47,14 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         table, histories = _simulated(folder, robot, runs, config)
+        notes = remarks(robot, table)
         found = None
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             table |= found.columns
         print_runs({key: value[:_SHOWN] for key, value in table.items()})
+        for note in notes:
+            say(note)
         if found is not None:
             say(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in runs.csv")
             uncertainty.say_lost(found)
@@ -57,7 +67,10 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
                 folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
                 histories=histories,
             )  # fmt: skip
-        return run.leave(folder, config, run.SimulationResult("simulate", config.model, robot, runs, table))
+        further: dict[str, Any] = {"notes": notes}
+        if PEAK in table:
+            further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
+        return run.leave(folder, config, run.SimulationResult("simulate", config.model, robot, runs, table, further))
 
 
 def _simulated(
@@ -77,7 +90,72 @@ def _simulated(
     folder.write_table("history.csv", history_table(robot, batch.history, runs))
     if batch.history.reactions is not None:
         folder.write_table("reactions.csv", reactions_table(batch.history, runs))
-    return {**run.conditions(robot, runs), **run.ended(batch)}, batch
+    return {**run.conditions(robot, runs), **over_time(robot, batch)}, batch
+
+
+def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
+    """The columns of how runs that were kept over time ended, with what they came to.
+
+    Of a run whose battery went empty they are those of its last instant before, and `time_end_s` is when: the charge
+    left then over the current that took it.
+    """
+    history, status = batch.history, np.asarray(batch.result.status)
+    assert history is not None  # the fidelity was asked for it
+    columns = run.ended(batch)
+    current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
+    there = np.isfinite(current)
+    last = np.where(there.any(-1), there.shape[-1] - 1 - np.argmax(there[..., ::-1], -1), 0)
+    rows = np.arange(len(last))
+    columns[PEAK] = np.abs(np.where(there, current, 0.0)).max(-1)
+    columns["distance_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
+    empty = (status == BATTERY_EMPTY) & ~there[rows, -1]
+    if empty.any():
+        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
+        at_last = outputs.columns(jax.device_get(result(robot, signals, jnp.asarray(status))))
+        for name, values in at_last.items():
+            columns[name] = np.where(empty & there.any(-1), values, columns[name])
+        after = time[rows, np.minimum(last + 1, there.shape[-1] - 1)] - time[rows, last]
+        draws = np.asarray(robot.battery.current(signals.total_current))
+        left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
+        left = np.where(empty & there.any(-1), np.clip(np.nan_to_num(left), 0.0, after), 0.0)
+        columns["time_end_s"] = columns["time_end_s"] + left
+        columns["distance_m"] = np.nan_to_num(columns["distance_m"] + left * np.nan_to_num(signals.speed))
+    return columns
+
+
+def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
+    """What the numbers of the runs do not say by themselves, a sentence each, of a few runs at most."""
+    said: list[str] = []
+    several = len(table["status"]) > 1
+    for k, status in enumerate(table["status"]):
+        name = f"run {k + 1}: " if several else ""
+        flags, cell = str(table["flags"][k]).split(";"), float(table["voltage_cell_V"][k])
+        if "overvoltage" in flags:
+            back = -float(robot.battery.current(table["total_current_A"][k]))
+            said.append(
+                f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V, where "
+                f"{robot.battery.voltage_charge:g} V is the highest to charge it with"
+            )
+        if "cut_off" in flags:
+            said.append(
+                f"{name}cut_off: a cell at {cell:.2f} V, below its cut-off voltage of "
+                f"{robot.battery.voltage_cutoff:g} V"
+            )
+        if np.isinf(table["temperature_winding_C"][k]):
+            amperes = abs(float(table["total_current_A"][k])) / float(robot.sides)
+            said.append(
+                f"{name}winding, long running: {words.NONE_SETTLES} at {amperes:.2f} A a motor, as resistance "
+                "rises faster than its heat leaves; it stays permissible up to "
+                f"{float(robot.motor.current_continuous):.2f} A"
+            )
+        if status == "battery_empty" and "time_end_s" in table:
+            when, far = float(table["time_end_s"][k]), float(table["distance_m"][k])
+            said.append(
+                f"{name}battery_empty: after {when:.1f} s and {far:.2f} m; the numbers are those just before"
+                if when > 0
+                else f"{name}battery_empty: empty before the start"
+            )
+    return said[:_SHOWN] + ([f"... and {len(said) - _SHOWN} more remarks"] if len(said) > _SHOWN else [])
 
 
 def _names(runs: records.Runs) -> np.ndarray:
@@ -122,6 +200,8 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
         "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
         "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
         **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in channels.CHANNELS},
+        PEAK: ("peak of the total current [A]", ".1f"), "distance_m": ("distance [m]", ".2f"),
+        "time_end_s": ("time [s]", ".6g"), "voltage_cell_V": ("voltage of a cell [V]", ".3f"),
         "slip": ("slip", ".4f"),
         "power_supply_W": ("power from supply P_e [W]", ".2f"), "power_motor_W": ("at motor shafts N_d [W]", ".2f"),
         "power_gear_W": ("at gearbox outputs N_r [W]", ".2f"), "power_ground_W": ("to the ground N_t [W]", ".2f"),
@@ -129,8 +209,17 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
         "status": ("status", ""), "flags": ("limits exceeded", ""),
     }  # fmt: skip
     shown = Table(show_header=False)
+    absent = {"supply_voltage_V": "battery"}
     for key, (heading, form) in rows.items():
-        cells = [str(v).replace(";", "\n") if not form else "-" if v != v else format(v, form) for v in table[key]]
+        if key not in table or (key == "voltage_cell_V" and not np.nan_to_num(table[key]).any()):
+            continue
+        cells = [
+            str(v).replace(";", "\n") if not form
+            else absent.get(key, "-") if v != v
+            else words.NONE_SETTLES if np.isinf(v)
+            else format(v, form)
+            for v in table[key]
+        ]  # fmt: skip
         if form and key + uncertainty.SD in table:
             digits = int(form.strip(".f"))
             pairs = zip(table[key], table[key + uncertainty.SD], strict=True)

@@ -18,8 +18,9 @@ from sweeps.store import open_folder
 def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
     """Simulate a grid and leave a run folder; returns the exit code."""
     robot = load_robot(config)
-    config = config.model_copy(update={"configurations": configurations(config, robot)})
-    runs = grid(config, robot)
+    stated = {"voltages_V": None if config.battery else config.volts()}
+    config = config.model_copy(update={"configurations": configurations(config, robot), **stated})
+    runs = grid(config, robot, config.battery)
     drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("sweep", config, robot, out, force) as folder:
         table = run.evaluate(robot, runs, config, folder)

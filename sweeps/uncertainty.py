@@ -12,7 +12,7 @@ from calibration.data.posterior import Posterior
 from calibration.data.runs import Runs
 from mmrjax import channels, fidelities, outputs, params
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED
+from mmrjax.signals import done
 from sweeps import run
 from sweeps.config import FidelityPart
 from sweeps.console import progress, say
@@ -65,7 +65,7 @@ def intervals(robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPa
                 conditions = run.commanded(robot, runs.where(rows), config)
                 result = jax.device_get(fidelity.run(drawn, conditions, config.options, None).result)
                 count = min(size, len(runs) - first)
-                there = np.asarray(result.status)[:count] == CONVERGED
+                there = np.asarray(done(result.status))[:count]
                 for j, output in enumerate(outputs.table()):
                     reading = np.asarray(output.get(result))[:count] / output.factor
                     seen[d, first : first + count, j] = np.where(there, reading, np.nan)

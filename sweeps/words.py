@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 
@@ -16,9 +17,10 @@ class Status(NamedTuple):
 STATUSES: dict[str, Status] = {
     "converged": Status("settled", "steady travel", "found a steady operating point"),
     "stalled": Status(
-        "stalls",
-        "the motors cannot turn the load",
-        "the motors cannot turn against the load: shafts at rest at stall current",
+        "stands",
+        "friction holds it, or the motors cannot turn the load",
+        "the robot stands: friction at rest holds it, or the motors cannot turn against the load and draw "
+        "their stall current",
     ),
     "slides": Status(
         "slides",
@@ -41,8 +43,8 @@ STATUSES: dict[str, Status] = {
     "reverses": Status("reverses", "steady travel backward", "found a steady operating point, travelling backward"),
     "rolls_back": Status(
         "rolls back",
-        "gravity drives the robot against its motors",
-        "gravity drives the robot against its motors: it travels downhill steadily",
+        "gravity drives the robot, against its motors or without their voltage",
+        "gravity drives the robot, against its motors or without their voltage: it travels downhill steadily",
     ),
 }
 
@@ -51,7 +53,7 @@ FLAGS = {
     "gearbox_overspeed": "gearbox input faster than its catalogue permits",
     "winding_hot": "winding hotter than permitted after long running at this current",
     "slips": "slides faster than V_s on average, though it goes on steadily",
-    "overvoltage": "more current flows back than the battery may take (charge voltage or charging current)",
+    "overvoltage": "current flows back into the battery: its cells are above their charge voltage or take too much",
     "cut_off": "a cell below its cut-off voltage",
     "battery_overcurrent": "more current than a cell may give",
     "current_limited": "the motor driver's current limit acts",
@@ -60,6 +62,18 @@ FLAGS = {
     "demand_missed": "a demanded speed was not reached",
     "jumps": "its running gear drops between guides and pulleys and throws it off the ground at times",
 }
+
+
+#: In place of a winding's temperature after long running, at a current that heats it without an end.
+NONE_SETTLES = "none settles"
+
+#: Statuses of runs that ended as their conditions ask, with numbers; `signals.DONE` by name.
+SETTLED = ("converged", "reverses")
+
+
+def settled(counted: Mapping[str, int]) -> int:
+    """How many runs ended as their conditions ask, of counts by status."""
+    return sum(counted[status] for status in SETTLED)
 
 
 def short(status: str) -> str:

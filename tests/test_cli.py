@@ -135,7 +135,7 @@ USAGE = {
     "misspelt option": (["sweep", "--slope", "5"], r"No such option: --slope"),
     "unknown command": (["swep"], r"No such command"),
     "slope of 95": (["sweep", "--slopes", "0,95"], r"option slopes_deg\.1: got 95\.0; expected -45 to 45"),
-    "negative voltage": (["sweep", "--voltages=-3"], r"option voltages_V\.0: got -3\.0; expected more than 0 to 100"),
+    "voltage below all": (["sweep", "--voltages=-300"], r"option voltages_V\.0: got -300\.0; expected -100 to 100"),
     "NaN": (["sweep", "--payloads", "nan"], r"option payloads_kg\.0: got nan"),
     "no numbers": (
         ["sweep", "--slopes", "steep"],
@@ -256,7 +256,7 @@ def test_drive_ends_clearly_when_the_battery_is_empty(mmrjax, tmp_path):
     ]
     assert mmrjax(*arguments, "--out", "d")[0] == 3
     (end,), history = table(tmp_path / "d" / "runs.csv"), table(tmp_path / "d" / "history.csv")
-    assert end["status"] == "battery_empty" and end["speed_mm_s"] == ""
+    assert end["status"] == "battery_empty" and float(end["speed_mm_s"]) > 0  # of the last instant before
     ran = [row["speed_mm_s"] != "" for row in history]
     assert any(ran) and not ran[-1] and ran == sorted(ran, reverse=True)  # numbers up to one instant, none after
 
@@ -336,7 +336,7 @@ def test_render_writes_a_picture_and_refuses_other_names(mmrjax, tmp_path):
         code, out, err = mmrjax("render", *words)  # before the run: there is no progress bar
         assert code == 2 and out == "" and message in err and len(err.strip().splitlines()) == 1
     code, out, _ = mmrjax("render", "robot.png", "--duration", "0.05", "--begin", "0.04")
-    assert code == 3 and out.rstrip().endswith("robot.png")
+    assert code == 0 and "not_settled" in out and out.rstrip().endswith("robot.png")  # drawn as it was asked for
     assert (tmp_path / "robot.png").read_bytes().startswith(b"\x89PNG")
     assert [p.name for p in tmp_path.iterdir()] == ["robot.png"]
 

@@ -249,7 +249,7 @@ def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
     run = Conditions()
     end = balances.moving(robot, run, State(1.0, 900.0, 0.7, 0.0))
     end = dataclasses.replace(end, speed_sliding=jnp.asarray(sliding), acceleration=jnp.asarray(gain))
-    assert STATUSES[int(_status(robot, run, end, jnp.asarray(True)))] == status
+    assert STATUSES[int(_status(robot, run, end, jnp.asarray(False), jnp.asarray(True)))] == status
     assert bool(slips(robot, end)) is (sliding > 0.02)
 
 

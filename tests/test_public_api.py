@@ -305,7 +305,7 @@ WRONG_CALL = {
     "model drive, patience: got 3; this fidelity has no such option, its options: duration": dict(
         model="drive", patience=3
     ),
-    "model drive, duration: got -1; expected more than 0, at most 3600 s": dict(model="drive", duration=-1.0),
+    "model drive, duration: got -1; expected more than 0, at most 86400 s": dict(model="drive", duration=-1.0),
     "model track, duration: got 0.0015 s; expected a whole number of samples of 0.001 s": dict(
         model="track", duration=0.0015
     ),

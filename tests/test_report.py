@@ -231,7 +231,7 @@ def test_report_shows_the_runs_own_history_with_its_peak(driven):
     assert drawn(page) == {"history", "power"} and outside(folder) == []
     rows = Tables(page).tables["starts"][1:]
     assert [row[0] for row in rows] == ["6T2A, 33 V, 0 kg, 5°", "6T2A, 33 V, 0 kg, 25°", "4W2T, 0.3 V, 0 kg, 5°"]
-    assert [row[1] for row in rows] == ["settled", "slides", "stalls"]
+    assert [row[1] for row in rows] == ["settled", "slides", "stands"]
     for k, row in enumerate(rows):
         assert float(row[5]) == pytest.approx(batch.history.signals.total_current[k].max(), abs=0.06)
         assert (row[2] == "–") == (k > 0)  # no stages where it does not get under way

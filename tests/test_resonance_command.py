@@ -147,7 +147,7 @@ def test_shaking_gear_says_what_does_not_settle(tmp_path):
         (("--voltages", ""), "--voltages: got nothing; expected numbers as 0,5,10"),
         (("--voltages", "36:10:1"), "--voltages: got 36:10:1, which ends before it begins; expected first:last:step"),
         (("--voltages", "24,24,33"), "--voltages: got 2 of them; expected at least 5"),
-        (("--voltages", "0:30:5"), "option voltages_V.0: got 0.0; expected more than 0 to 100"),
+        (("--voltages", "0:30:5"), "--voltages: got 0; expected more than 0 to 100"),
         (("--payloads", "0,-1"), "option payloads_kg.1: got -1.0; expected 0 to 300"),
         (("--slope", "60"), "option slope_deg: got 60.0; expected -45 to 45"),
         (("--surface", "ice"), "surface"),

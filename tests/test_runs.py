@@ -107,7 +107,7 @@ REFUSED = {
     ),
     "zero voltage": (
         f"{HEADER}\n{ROW.replace(',15,', ',0,')}",
-        r"supply_voltage_V: got 0; expected more than 0 to 100",
+        r"row 1, supply_voltage_V: got 0; expected a voltage, in a table of readings",
     ),
     "NaN": (f"{HEADER}\n{ROW.replace('2.75', 'nan')}", r"row 1, total_current_A: got nan; expected -200 to 200"),
     "infinity": (f"{HEADER}\n{ROW.replace('4800', 'inf')}", r"motor_speed_rpm: got inf"),

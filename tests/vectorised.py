@@ -88,6 +88,7 @@ def closed_form_all(wheeled, voltage, slope_deg, payload, p=NOMINAL):
         "power_lift": SIDES * load.gravity * V,
         **dict(zip(("efficiency_motor", "efficiency_gear", "efficiency_chassis"), efficiencies, strict=True)),
         "temperature_winding": _settled(p, R * I * I),
+        "voltage_cell": np.zeros_like(V),
     }
 
 

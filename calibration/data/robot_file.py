@@ -39,6 +39,17 @@ RATINGS = {
     "motor.speed_limit": (1.0, 1e5, "rad/s", "permissible speed of the motor"),
     "motor.temperature_limit": (30.0, 400.0, "°C", "permissible temperature of the winding"),
     "gearbox.speed_limit": (1.0, 1e5, "rad/s", "permissible speed at the gearbox input"),
+    "gearbox.torque_limit": (1e-3, 1e5, "N·m", "permissible torque for long, at the driving wheel; GP32C: 3 x 25/12"),
+    "battery.voltage_charge": (0.5, 10.0, "V", "highest voltage of a cell that is charged; Section 3.3"),
+    "battery.voltage_cutoff": (0.0, 10.0, "V", "lowest voltage of a cell under load; assumed, not in the paper"),
+    "battery.delay_cutoff": (0.0, 1e3, "s", "how long a cell may be below it, since a start draws more; assumed"),
+    "battery.current_limit": (1e-3, 1e4, "A", "largest current that a cell may give; not stated: none"),
+    "battery.current_charge": (0.0, 1e4, "A", "largest current that a cell may take; not stated: none"),
+}
+#: What a robot has or has not, which no fit can free: meaning.
+SWITCHES = {
+    "gearbox.mesh_theory": "load driving the motor loses 2 - 1/η of the mesh's theory, else η",
+    "driver.returns_current": "supply and driver take back what the motors return, else a diode blocks it",
 }
 
 
@@ -71,7 +82,8 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
         configurations: names of those that the robot has, in order; else those of the base. One that the base does
             not have states `like`, the base's configuration that it starts from, or `movers` (`tracks` or
             `wheels`) and every parameter that has no default.
-        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`; and RATINGS.
+        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`; RATINGS; and SWITCHES,
+            true or false.
         effects: one is present when its table `[effects.NAME]` is, which may name the `configurations` that it acts
             on.
 
@@ -177,7 +189,7 @@ def current_values(values: Mapping[str, T], robot: Robot, where: str, notes: lis
 
 
 def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str] | None = None) -> Robot:
-    """The robot with parameters replaced, each checked against its field; `sides`, `battery.cells` and RATINGS too.
+    """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS and SWITCHES too.
 
     Args:
         values: by dotted name [SI]; where: opens the message of an error; notes: as for `load`.
@@ -188,6 +200,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     ratings = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
+    ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     known = {p.name: p for p in params.walk(robot)}
     for name, value in stated.items():
         if name not in known:
@@ -210,6 +223,12 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})
     _check_pairs(robot, where)
     return robot
+
+
+def _switch(where: str, name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise BadConfiguration(f"{where}, {name}: got {value!r}; expected true or false ({SWITCHES[name]})")
+    return value
 
 
 def _rating(where: str, name: str, value: Any) -> float:
@@ -246,6 +265,11 @@ def _parameters(name: str, known: list[str]) -> str:
 
 
 def _check_pairs(robot: Robot, where: str) -> None:
+    if robot.battery.voltage_cutoff >= robot.battery.voltage_charge:
+        raise BadConfiguration(
+            f"{where}, battery.voltage_cutoff: got {robot.battery.voltage_cutoff:g}; expected less than "
+            f"voltage_charge, {robot.battery.voltage_charge:g} V"
+        )
     for name, chassis in robot.configurations.items():
         friction = chassis.ground.friction
         if friction.speed_dynamic <= friction.speed_static:
@@ -286,6 +310,9 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         head, _, key = name.partition(".")
         stated = getattr(getattr(robot, head), key)
         tables[head] += [] if stated is None else [f"{key} = {stated!r}  # [{unit}] {what}"]
+    for name, what in SWITCHES.items():
+        head, _, key = name.partition(".")
+        tables[head].append(f"{key} = {str(getattr(getattr(robot, head), key)).lower()}  # {what}")
     lines = [f"# {line}" for line in note.splitlines()]
     lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {int(robot.sides)}  # motors driven alike"]
     lines.append(f"configurations = {json.dumps(list(robot.configurations))}")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Condition columns with the least and greatest value allowed.
 CONDITIONS: dict[str, tuple[float, float]] = {
-    "supply_voltage_V": (0.0, 100.0),
+    "supply_voltage_V": (-100.0, 100.0),  # negative: backward
     "total_mass_kg": (0.1, 500.0),
     "payload_kg": (0.0, 300.0),
     "slope_deg": (-45.0, 45.0),
@@ -159,7 +159,7 @@ class Runs:
             adhesion = np.array([adhesion_ratio(s, t) for s, t in zip(self["surface"], on_tracks, strict=True)])
         return Conditions(
             which,
-            self["supply_voltage_V"],
+            np.zeros(len(self)) if battery else self["supply_voltage_V"],
             self["slope_deg"],
             self["payload_kg"],
             battery=battery,
@@ -170,12 +170,14 @@ class Runs:
         )
 
 
-def read(source: str | Path, *, measured: bool = True) -> Runs:
+def read(source: str | Path, *, measured: bool = True, battery: bool = False) -> Runs:
     """Read a packaged table by its name, or a CSV file.
 
     Args:
         source: `measured`, `simulated_by_paper`, or a path.
         measured: whether at least one channel is required; without any `total_mass_kg` may be missing too.
+        battery: whether the runs are on the on-board battery, whose voltage no table states: its column is left out,
+            or empty.
 
     Raises:
         BadData: no such file, nothing in it, no channel, a missing, misspelt or repeated column, a row of another
@@ -184,14 +186,14 @@ def read(source: str | Path, *, measured: bool = True) -> Runs:
     """
     if str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
-            return _read(path, str(source), measured)
+            return _read(path, str(source), measured, battery)
     path = Path(source)
     if not path.exists():
         raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-    return _read(path, path.name or str(source), measured)
+    return _read(path, path.name or str(source), measured, battery)
 
 
-def _read(path: Path, name: str, measured: bool) -> Runs:
+def _read(path: Path, name: str, measured: bool, battery: bool) -> Runs:
     try:
         content = path.read_bytes()
         text = content.decode("utf-8-sig")
@@ -204,7 +206,7 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
     header = [cell.strip() for cell in rows[0]]
     if len(header) == 1 and ";" in header[0]:
         raise BadData(f"{name}: columns are separated by semicolons; expected commas, and points in numbers")
-    _check_header(name, header, measured)
+    _check_header(name, header, measured, battery)
     if len(rows) == 1:
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     for k, row in enumerate(rows[1:], 1):
@@ -214,22 +216,59 @@ def _read(path: Path, name: str, measured: bool) -> Runs:
     for j, column in enumerate(header):
         if column in known_columns():
             cells = [row[j].strip() for row in rows[1:]]
+            if battery and column == "supply_voltage_V":
+                _refuse_stated(name, cells)
+                continue
             columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
     _check_mass(name, columns)
     _check_deviations(name, columns)
+    if battery:
+        columns["supply_voltage_V"] = np.full(len(rows) - 1, np.nan)
+    elif measured:
+        _check_signs(name, columns)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c in header if c not in known_columns())
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest())
 
 
-def _check_header(name: str, header: list[str], measured: bool) -> None:
+def _refuse_stated(name: str, voltages: list[str]) -> None:
+    for row, cell in enumerate(voltages, 1):
+        if cell:
+            raise BadData(
+                f"{name} row {row}, supply_voltage_V: got {cell} beside --battery, whose charge sets the voltage; "
+                "expected an empty cell, or no such column"
+            )
+
+
+def _check_signs(name: str, columns: dict[str, np.ndarray]) -> None:
+    """Refuse readings without a sign where the supply drives the robot backward, and rows without a voltage."""
+    voltage = columns["supply_voltage_V"]
+    if (voltage == 0).any():
+        row = int(np.flatnonzero(voltage == 0)[0]) + 1
+        raise BadData(f"{name} row {row}, supply_voltage_V: got 0; expected a voltage, in a table of readings")
+    for channel in channels.CHANNELS:
+        if channel.column not in columns:
+            continue
+        # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
+        backward = (voltage < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
+        wrong = np.flatnonzero(backward & (columns[channel.column] > 0))
+        if wrong.size:
+            at = int(wrong[0])
+            raise BadData(
+                f"{name} row {at + 1}, {channel.column}: got {number(columns[channel.column][at])} at "
+                f"{number(voltage[at])} V; expected readings with their signs, negative backward"
+            )
+
+
+def _check_header(name: str, header: list[str], measured: bool, battery: bool) -> None:
     repeated = sorted({c for c in header if header.count(c) > 1})
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
     known = known_columns()
     strange = [c for c in header if c not in known]
-    required = REQUIRED if measured else tuple(c for c in REQUIRED if c not in OWN)
+    own = (() if measured else OWN) + (("supply_voltage_V",) if battery else ())
+    required = tuple(c for c in REQUIRED if c not in own)
     for column in (c for c in (*required, *measured_columns()) if c not in header):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or close:
@@ -257,7 +296,7 @@ def _cell(where: str, column: str, cell: str, kind: type[InputError] = BadData) 
     if not cell and column in (*measured_columns(), *deviations):
         return math.nan
     low, high = _ranges()[column]
-    positive = column in deviations or column == "supply_voltage_V"
+    positive = column in deviations
     allowed = f"{'more than ' if positive else ''}{number(low)} to {number(high)}"
     try:
         value = float(cell)
@@ -293,14 +332,15 @@ def _too_light(where: str, total: float, payload: float) -> str:
 
 
 def single(cells: dict[str, Any]) -> Runs:
-    """One run from options given by column name, each checked as a cell of a file would be.
+    """One run from options by column name, each checked as a cell of a file would be; without a voltage on a battery.
 
     Raises:
         BadConfiguration: an option that is out of range, not finite or an unknown word.
     """
     texts = {column: number(value) if isinstance(value, float) else str(value) for column, value in cells.items()}
     columns = {column: np.array([_cell("option", column, t, BadConfiguration)]) for column, t in texts.items()}
+    columns.setdefault("supply_voltage_V", np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
         raise BadConfiguration(_too_light("option", cells["total_mass_kg"], cells["payload_kg"]))
-    columns = {c: np.array([cells[c]]) if isinstance(cells[c], float) else v for c, v in columns.items()}
+    columns = {c: np.array([cells[c]]) if isinstance(cells.get(c), float) else v for c, v in columns.items()}
     return Runs("the options", columns)

@@ -19,7 +19,7 @@ from mmrjax import channels
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import operating_point
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, STALLED
+from mmrjax.signals import STALLED, done
 
 #: Mass of a robot whose weight is carried by stands [kg]: none, but for the sake of ratios to its load.
 UNLOADED = 1e-9
@@ -108,7 +108,7 @@ def readings(robot: Robot, experiments: Batch) -> Foreseen:
     result = jax.vmap(lambda r, c: operating_point(r, c)[0])(robots, conditions)
     every = jnp.stack([result.reading[c] for c in channels.names()], -1)
     held = np.array([setup is setups.blocked for setup, _ in experiments.set_up])[which]
-    does = result.status == jnp.where(jnp.asarray(held), STALLED, CONVERGED)
+    does = jnp.where(jnp.asarray(held), result.status == STALLED, done(result.status))
     first = 0
     for read, runs in experiments.read:
         rows = slice(first, first := first + runs)

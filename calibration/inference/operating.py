@@ -13,7 +13,7 @@ from mmrjax import channels, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED
+from mmrjax.signals import done
 
 #: Conditions are padded to a multiple of this, so that tables of about one size share what is compiled.
 PAD = 16
@@ -36,5 +36,5 @@ def operating_readings(robot: Robot, conditions: Conditions) -> Float[np.ndarray
     posed = dataclasses.replace(conditions, adhesion=jnp.full(runs, GRIPPING), total_mass=jnp.asarray(mass))
     found = steady_batch(params.strong(robot), jax.tree.map(lambda x: jnp.asarray(x)[index], posed))
     reading = np.stack([np.asarray(found.reading[c]) for c in channels.names()], 1)[:runs]
-    moving = np.asarray(found.status)[:runs] == CONVERGED
+    moving = np.asarray(done(found.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)

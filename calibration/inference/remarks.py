@@ -10,7 +10,7 @@ from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
-from mmrjax.signals import STATUSES
+from mmrjax.signals import DONE, STATUSES
 
 #: Shift from the prior above which the prior or the model is called wrong [prior sd].
 FAR = 3.0
@@ -64,8 +64,8 @@ def _search(found: CalibrationResult) -> list[str]:
 def _statuses(found: CalibrationResult) -> list[str]:
     return [
         f"rows {_rows(found.status == word)}: {word} with the calibrated robot"
-        for word in STATUSES[1:]
-        if np.any(found.status == word)
+        for k, word in enumerate(STATUSES)
+        if k not in DONE and np.any(found.status == word)
     ]
 
 

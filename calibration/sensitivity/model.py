@@ -19,7 +19,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.derived import Derived
 from mmrjax.outputs import Output
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, STATUSES
+from mmrjax.signals import STATUSES, done
 from mmrjax.variation import STATUS, Variation, evaluate
 
 #: Points of one call of few, and of many: solves, runs over time, and the derivatives of both. All calls have one of
@@ -193,7 +193,7 @@ def _outputs(
         made = evaluate(variation, source, values, conditions, options, names)
     else:
         made = _derived(variation, source, names, values, conditions)
-    there = made[STATUS] == CONVERGED
+    there = done(made[STATUS])
     return {name: x if name == STATUS else jnp.where(there, x, jnp.nan) for name, x in made.items()}
 
 

@@ -26,7 +26,7 @@ NEGLIGIBLE = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Operating points; arrays of shape (points,)."""
+    """Operating points; arrays of shape (points,). Their voltage is NaN on the battery."""
 
     configuration: np.ndarray
     voltage: np.ndarray
@@ -38,7 +38,8 @@ class Points:
 
     def label(self, k: int) -> str:
         """A point in words."""
-        return f"{self.configuration[k]}, {self.voltage[k]:g} V, {self.payload[k]:g} kg, {self.slope_deg[k]:g}°"
+        supply = "battery" if np.isnan(self.voltage[k]) else f"{self.voltage[k]:g} V"
+        return f"{self.configuration[k]}, {supply}, {self.payload[k]:g} kg, {self.slope_deg[k]:g}°"
 
     def columns(self) -> dict[str, np.ndarray]:
         """As in tables of runs."""

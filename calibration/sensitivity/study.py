@@ -53,7 +53,7 @@ class Study:
         names = robot.configurations.names
         self.conditions = Conditions(
             np.array([names.index(str(c)) for c in points.configuration]),
-            points.voltage,
+            np.nan_to_num(points.voltage),
             points.slope_deg,
             points.payload,
             battery=supply.battery,

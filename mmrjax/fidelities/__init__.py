@@ -103,8 +103,8 @@ class Facts:
         return values
 
 
-def _duration(default: float) -> Option:
-    return Option("duration", "s", default, 3600.0, "length of a run")
+def _duration(default: float, most: float) -> Option:
+    return Option("duration", "s", default, most, "length of a run")
 
 
 _STEP = Option("step", "s", 1e-4, 0.01, "integration step")
@@ -124,7 +124,7 @@ TABLE: dict[str, Facts] = {
         chunk=4_096,
         chunk_stored=(4_096, 65_536),
         effort=Effort(starts=1, profiles=False, blocks=False),
-        options=(_duration(30.0),),
+        options=(_duration(30.0, 86_400.0),),
         rollout=True,
         histories=True,
     ),
@@ -134,7 +134,7 @@ TABLE: dict[str, Facts] = {
         chunk=512,
         chunk_stored=(512, 16_384),
         effort=Effort(starts=1, profiles=False, blocks=False),
-        options=(_duration(1.5), _STEP),
+        options=(_duration(1.5, 3600.0), _STEP),
         rollout=True,
         histories=True,
         computes=("track.guide_share",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import diffrax
@@ -15,9 +16,10 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.result import result, travels, unless_slipping, withhold
+from mmrjax.fidelities.mission import current_at_rest, firmness
+from mmrjax.fidelities.result import result, stands, travels, unless_slipping, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
-from mmrjax.fidelities.steady import operating_signals
+from mmrjax.fidelities.steady import direction, operating_signals, voltage_at_rest
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
@@ -40,6 +42,7 @@ TIME_SETTLED = 4.0
 #: Instants of a history.
 SAMPLES = 1001
 TIME_INRUSH, SAMPLES_INRUSH = 0.04, 160  # its first instants [s], and how many of them are kept besides
+TIME_RISE, SAMPLES_RISE = 0.002, 40  # and of these the first, in which the current rises to its peak
 
 
 class Trajectory(eqx.Module):
@@ -137,21 +140,25 @@ def drive(
 
     Returns:
         The trajectory. Its status is `converged` when at the end the speed changes by less than 0.1 % a
-        tenth of a second, else `not_settled`; `stalled` when the shafts do not turn forward; `slides`
+        tenth of a second, else `not_settled`; `reverses` and `rolls_back` where it then travels backward as a
+        negative voltage asks, or as gravity does against the motors; `stalled` when it does not travel, and from
+        standstill exactly at rest where friction holds it; `slides`
         when the movers slide beyond V_s and the robot loses speed or stands (one that holds its speed has
         `converged`, flagged `slips`); `battery_empty` when the charge has
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     y0 = start(robot, conditions, rolling)
+    parked = jnp.asarray(False) if rolling else holds(robot, conditions)
+    moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda _, y, run: rates(run[0], run[1], y)),
+        diffrax.ODETerm(lambda _, y, run: rates(run[0], run[1], y) * run[2]),
         Rodas4(),
         times[0],
         times[-1],
         dt0=jnp.asarray(1e-4, y0.dtype),
         y0=y0,
-        args=(robot, conditions),
+        args=(robot, conditions, moves),
         saveat=diffrax.SaveAt(ts=times),
         max_steps=max_steps,
         throw=False,
@@ -163,8 +170,16 @@ def drive(
     assert solution.ys is not None
     ys = solution.ys
     signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
+    # Friction at rest carries what gravity and the motors ask of a robot that it holds.
+    still = jnp.zeros_like(signals.acceleration)
+    signals = dataclasses.replace(
+        signals,
+        traction=jnp.where(parked, signals.demand, signals.traction),
+        acceleration=jnp.where(parked, still, signals.acceleration),
+        acceleration_wheel=jnp.where(parked, still, signals.acceleration_wheel),
+    )
     end = jax.tree.map(lambda x: x[-1], signals)
-    status = _status(robot, conditions, end, solution.result == diffrax.RESULTS.successful)
+    status = _status(robot, conditions, end, parked, solution.result == diffrax.RESULTS.successful)
     # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
     going = (conditions.battery < 0.5) | ~robot.battery.empty(signals.discharge)
     signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
@@ -174,14 +189,27 @@ def drive(
     return Trajectory(times, distance, signals, time_end, answer)
 
 
-def _status(robot: Robot, conditions: Conditions, end: Signals, done: Array) -> Array:
+def holds(robot: Robot, conditions: Conditions) -> Array:
+    """Whether friction at rest holds a robot that stands.
+
+    The ground grips, and motors and gravity can turn the shafts neither way at the motors' current at rest, which
+    flows a millisecond after the start.
+    """
+    units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
+    rest = state_of(robot, jnp.zeros_like(units).at[4].set(conditions.discharge / units[4]))
+    settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
+    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
+
+
+def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
     settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, travels(end.speed, end.voltage))
-    backward = (end.direction <= -1.0) & (end.direction_travel <= -1.0)
-    stands = (jnp.minimum(end.direction, end.direction_travel) < 1.0) & ~backward
-    status = jnp.where(stands & (end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
+    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).ground.friction.speed_rest
+    still = stands(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
+    status = jnp.where(still & (sense * end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
     gain = end.acceleration * jnp.sign(end.speed_sliding)
-    status = unless_slipping(status, robot, end, gain, 1e-3, stands)
+    status = unless_slipping(status, robot, end, gain, 1e-3, still)
+    status = jnp.where(parked, STALLED, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
@@ -213,7 +241,8 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
 def _instants(duration: float) -> np.ndarray:
     """Times of a history [s] from 0 to `duration`, close together while the current rises to its peak."""
     early = np.linspace(0.0, min(TIME_INRUSH, duration), SAMPLES_INRUSH, endpoint=False)
-    return np.union1d(early, np.linspace(0.0, duration, SAMPLES))
+    first = np.linspace(0.0, min(TIME_RISE, duration), SAMPLES_RISE, endpoint=False)
+    return np.unique(np.round(np.concatenate([first, early, np.linspace(0.0, duration, SAMPLES)]), 9))
 
 
 def _histories(

@@ -21,11 +21,11 @@ from mmrjax.chassis import Chassis, inertia_reduced
 from mmrjax.conditions import Conditions
 from mmrjax.contact_sums import Linearized
 from mmrjax.fidelities.linear import Factors, factorise, substitute
-from mmrjax.fidelities.steady import steady
+from mmrjax.fidelities.steady import steady, voltage_at_rest
 from mmrjax.mjcf import Masses, mjx
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, GRAVITY, Signals, State
+from mmrjax.signals import GRAVITY, ROLLS_BACK, Signals, State, done
 from mmrjax.undercarriage import Pull, Touch
 
 
@@ -391,9 +391,9 @@ def roll(run: System) -> Motion:
     """
     start = stand(run)
     guess = steady(run.robot, run.conditions)
-    solved = guess.status == CONVERGED
+    solved = done(guess.status) | (guess.status == ROLLS_BACK)
     ratio, radius = run.robot.gearbox.ratio, run.chassis.radius
-    no_load = run.conditions.voltage / run.robot.motor.torque_constant
+    no_load = voltage_at_rest(run.robot, run.conditions) / run.robot.motor.torque_constant
     speed_wheel = guess.theoretical_speed / radius  # the reading may carry a sensor's error
     motor = jnp.where(solved, ratio * speed_wheel, no_load)
     speed = jnp.where(solved, guess.theoretical_speed * (1 - guess.slip), radius * no_load / ratio)

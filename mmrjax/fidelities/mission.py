@@ -269,12 +269,12 @@ def _firmly(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, sta
     asked = _asked(robot, otherwise, segment, y, stands)
     at_rest = _asked(robot, otherwise, segment, y, jnp.asarray(True))
     state = _state(robot, y, stands)
-    settled = dataclasses.replace(state, current=_current_at_rest(at_rest.robot, at_rest.conditions, state))
+    settled = dataclasses.replace(state, current=current_at_rest(at_rest.robot, at_rest.conditions, state))
     firm = firmness(asked.robot, asked.conditions, state)
     return jnp.asarray(firm), jnp.minimum(firm, firmness(at_rest.robot, at_rest.conditions, settled))
 
 
-def _current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current to which that of a standing robot settles [A], on the line through two of its voltage balance."""
 
     def left(current: Scalar) -> Scalar:

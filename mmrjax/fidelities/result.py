@@ -42,6 +42,7 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         efficiency_gear=_efficiency(power_gear, power_motor),
         efficiency_chassis=_efficiency(power_ground, power_gear),
         temperature_winding=temperature,
+        voltage_cell=jnp.where(signals.battery > 0.5, signals.voltage_source / robot.battery.cells, 0.0),
         status=status,
         flags=flags,
     )
@@ -77,6 +78,21 @@ def travels(speed: Scalar, voltage: Scalar) -> Array:
     backward = jnp.asarray(speed) < 0
     asked = jnp.where(backward, jnp.asarray(voltage) < 0, jnp.asarray(voltage) >= 0)
     return jnp.where(asked, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
+
+
+def stands(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
+    """Whether a robot rests, by its numbers: slower than friction at rest is resolved.
+
+    One that its motors drive travels where both shafts and robot move their way, since on a slope the contact's creep
+    takes back what slow shafts win. One that gravity drives travels where either of them does.
+
+    Args:
+        sense: in which it can travel, 1 or -1; voltage: at the motors at rest [V]; theoretical: r_k ω_k [m/s].
+        rest: speed within which friction at rest is not resolved [m/s].
+    """
+    shafts, travel = sense * theoretical, sense * speed
+    driven = sense * voltage > 0
+    return jnp.where(driven, jnp.minimum(shafts, travel), jnp.maximum(shafts, travel)) < rest
 
 
 def turned(status: Array) -> Array:

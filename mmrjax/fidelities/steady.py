@@ -18,7 +18,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
-from mmrjax.fidelities.result import result, travels, turned, withhold
+from mmrjax.fidelities.result import result, stands, travels, turned, withhold
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
@@ -82,12 +82,12 @@ def direction(robot: Robot, conditions: Conditions) -> Array:
     """
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = robot.motor.torque_electromagnetic(_voltage(robot, conditions) / robot.motor.resistance)
+    stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
     weight = ground.force_gravity(mass * (1 / robot.sides), conditions.slope, GRAVITY) * chassis.radius
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
 
 
-def _voltage(robot: Robot, conditions: Conditions) -> Array:
+def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
     """Voltage that the driver gives motors at rest [V], no current flowing."""
     battery = robot.battery.voltage(0.0, conditions.discharge)
     source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
@@ -95,7 +95,7 @@ def _voltage(robot: Robot, conditions: Conditions) -> Array:
 
 
 def _start(robot: Robot, conditions: Conditions) -> Vector:
-    nominal = _voltage(robot, conditions)
+    nominal = voltage_at_rest(robot, conditions)
     speed = nominal * (0.9 / robot.motor.torque_constant)
     return (
         robot.chassis(conditions.configuration).radius * speed * (1 / robot.gearbox.ratio / _SPEED),
@@ -142,7 +142,8 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     """
     point, sound = operating_point(robot, conditions)
     # What the contact's law gives a robot that stands as creep, friction at rest holds.
-    parked = (point.status == STALLED) & (jnp.abs(point.theoretical_speed) < 1e-9)
+    crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).ground.friction.speed_rest
+    parked = (point.status == STALLED) & ((jnp.abs(point.theoretical_speed) < 1e-9) | crept)
     held = {"speed": jnp.where(parked, 0.0, point.speed)}
     reading = {**point.reading, **held}
     point = dataclasses.replace(
@@ -169,12 +170,11 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     sense = direction(robot, conditions)
     signals, _ = _balanced(robot, conditions, state, sense)
     rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
-    shafts, travel = sense * signals.speed_theoretical, sense * signals.speed
-    # Forward both have to move; what gravity drives back moves if only it slides, shafts turning slowly.
-    stands = jnp.where(sense > 0, jnp.minimum(shafts, travel), jnp.maximum(shafts, travel)) < rest
-    stands |= shafts <= 1e-9
+    voltage = voltage_at_rest(robot, conditions)
+    still = stands(sense, voltage, signals.speed_theoretical, signals.speed, rest)
+    still |= sense * signals.speed_theoretical <= 1e-9
     # Ordered by what a person would say first.
-    status = jnp.where(stands, STALLED, travels(signals.speed, _voltage(robot, conditions)))
+    status = jnp.where(still, STALLED, travels(signals.speed, voltage))
     status = jnp.where(jnp.abs(signals.demand) > signals.adhesion_limit, SLIDES, status)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)

@@ -1,0 +1,396 @@
+"""What once gave plausible wrong answers: reverse, rollback, standing, charging, the battery's end, rated limits."""
+
+import csv
+import json
+import os
+import sys
+
+import numpy as np
+import pytest
+
+import mmrjax as api
+from calibration.data import robot_file, runs
+from calibration.data.errors import BadConfiguration, BadData
+from mmrjax import robots, signals
+from mmrjax.fidelities.drive import drive_batch
+from sweeps import cli, figures_history, report_runs, words
+from sweeps.simulate import PEAK, remarks
+
+SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
+SPEED_REST = 0.1 * SPEED_STATIC
+
+
+@pytest.fixture
+def mmrjax(monkeypatch, capsys, tmp_path):
+    """Run a command in this process; returns exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
+
+    def command(*arguments):
+        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        out = capsys.readouterr()
+        return end.value.code, out.out, out.err
+
+    return command
+
+
+def table(path):
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture(scope="module")
+def anywhere():
+    """Random conditions, parked ones among them, with what `steady` and `drive` make of them."""
+    rng, count = np.random.default_rng(14), 400
+    voltage, slope = rng.uniform(-33, 33, count), rng.uniform(-20, 20, count)
+    voltage[:80], voltage[80:160] = 0.0, rng.uniform(-3, 3, 80)  # parked, and about breaking away
+    slope[:6] = slope[-6:] = 0.0
+    kind, payload = np.where(rng.random(count) < 0.5, "6T2A", "4W2T"), rng.uniform(0, 8, count)
+    conditions = api.Conditions(kind, voltage, slope, payload)
+    robot = robots.nominal()
+    settled = api.simulate(robot, conditions)
+    return voltage, slope, settled, api.simulate(robot, conditions, "drive", history=False)
+
+
+@pytest.mark.parametrize("model", ["steady", "drive"])
+def test_a_status_agrees_with_the_numbers(anywhere, model):
+    voltage, slope, *results = anywhere
+    found = results[model == "drive"]
+    status, speed = found.statuses, np.asarray(found.speed)
+    theoretical = np.asarray(found.theoretical_speed)
+    for name in ("converged", "reverses", "rolls_back", "stalled"):
+        assert (status == name).any()
+    assert ((speed > 0) & (voltage >= 0))[status == "converged"].all()
+    assert ((speed < 0) & (voltage < 0))[status == "reverses"].all()
+    back = status == "rolls_back"
+    assert (np.where(voltage == 0, speed < 0, speed * voltage < 0) & (speed * slope < 0))[back].all()
+    assert (np.maximum(np.abs(speed), np.abs(theoretical)) >= SPEED_REST)[back].all()
+    moves = (status == "converged") | (status == "reverses")
+    assert (np.abs(theoretical)[moves & (voltage != 0)] >= SPEED_REST).all()
+    # A robot that stands: at rest in `steady`; in `drive` within the creep of its contacts.
+    assert (np.abs(speed)[status == "stalled"] < (SPEED_REST if model == "steady" else SPEED_STATIC)).all()
+    assert set(status[voltage == 0]) <= {"stalled", "rolls_back", "converged"}
+    assert (status[(voltage == 0) & (slope >= 0)] != "converged").all()
+
+
+def test_statuses_of_steady_and_drive_agree_where_both_settle(anywhere):
+    voltage, _, steady, drive = anywhere
+    settles = {"converged", "reverses", "rolls_back", "stalled"}
+    both = np.isin(steady.statuses, list(settles)) & np.isin(drive.statuses, list(settles))
+    assert both.sum() > 300
+    assert (steady.statuses[both] == drive.statuses[both]).all()
+    travels = both & (drive.statuses != "stalled") & (np.abs(drive.theoretical_speed) > SPEED_STATIC)
+    np.testing.assert_allclose(np.asarray(steady.speed)[travels], np.asarray(drive.speed)[travels], rtol=2e-3)
+    # What friction holds without voltage stands in both, exactly.
+    held = both & (voltage == 0) & (steady.statuses == "stalled")
+    assert held.any() and (np.asarray(drive.speed)[held] == 0).all() and (np.asarray(steady.speed)[held] == 0).all()
+
+
+def test_a_status_is_mirrored_with_voltage_and_slope():
+    rng, count = np.random.default_rng(3), 200
+    voltage, slope = rng.uniform(-20, 20, count), rng.uniform(-20, 20, count)
+    voltage[:60] = rng.uniform(-2, 2, 60)
+    robot, kind = robots.nominal(), np.where(rng.random(count) < 0.5, "6T2A", "4W2T")
+    one = api.simulate(robot, api.Conditions(kind, voltage, slope))
+    other = api.simulate(robot, api.Conditions(kind, -voltage, -slope))
+    swapped = {"converged": "reverses", "reverses": "converged"}
+    assert [swapped.get(s, s) for s in one.statuses] == other.statuses.tolist()
+    np.testing.assert_allclose(np.asarray(one.speed), -np.asarray(other.speed), rtol=1e-6, atol=1e-9)
+
+
+def test_a_robot_held_on_a_slope_stands_for_an_hour():
+    kept = drive_batch(robots.nominal(), api.Conditions(0, [0.0, 0.3], [15.0, 15.0]), np.linspace(0.0, 3600.0, 5))
+    assert [signals.STATUSES[k] for k in np.asarray(kept.result.status)] == ["stalled"] * 2
+    assert (np.asarray(kept.distance) == 0).all()
+    assert float(kept.result.traction[0]) == pytest.approx(13.1 * signals.GRAVITY * np.sin(np.radians(15)), rel=1e-6)
+    assert float(kept.result.reading["total_current"][1]) == pytest.approx(2 * 0.3 / 0.611, rel=1e-4)
+
+
+def test_the_words_name_the_same_statuses_as_the_codes():
+    assert tuple(signals.STATUSES[k] for k in signals.DONE) == words.SETTLED
+    assert tuple(words.STATUSES) == signals.STATUSES and tuple(words.FLAGS) == signals.FLAGS
+    assert words.settled({"converged": 2, "reverses": 1, "rolls_back": 4}) == 3
+
+
+DOWNHILL = (
+    "simulate", "--battery", "--configuration", "4W2T", "--slope", "-20", "--payload", "8", "--surface", "concrete",
+    "--set", "battery.current_other=0", "--no-report",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("model", [(), ("--model", "drive", "--duration", "20")], ids=["steady", "drive"])
+def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
+    code, out, _ = mmrjax(*DOWNHILL, *model, "--out", "a")
+    assert code == 0
+    (row,) = table(tmp_path / "a" / "runs.csv")
+    assert "overvoltage" in row["flags"].split(";") and float(row["total_current_A"]) < -0.5
+    assert float(row["voltage_cell_V"]) == pytest.approx(float(row["voltage_V"]) / 8, rel=1e-6)
+    assert float(row["voltage_cell_V"]) > 4.2 and row["supply_voltage_V"] == ""
+    (note,) = json.loads((tmp_path / "a" / "result.json").read_text())["notes"]
+    assert note in " ".join(out.split()) and "A flow into the battery, a cell at 4." in note
+    code, out, _ = mmrjax(*DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--out", "b")
+    assert code == 0 and "overvoltage" not in out
+
+
+def test_a_cell_has_no_voltage_on_the_external_supply():
+    found = api.simulate(robots.nominal(), api.Conditions(0, 24.0, 0.0, battery=[0.0, 1.0]))
+    assert (np.asarray(found.voltage_cell) > 0).tolist() == [False, True]
+    assert np.isnan(found.to_dict()["supply_voltage_V"]).tolist() == [False, True]
+
+
+def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
+    blocked = ("--configuration", "4W2T", "--slope", 20, "--payload", 200, "--surface", "concrete")
+    code, out, _ = mmrjax("simulate", *blocked, "--out", "a")
+    assert code == 0 and "none settles" in out
+    text = (tmp_path / "a" / "result.json").read_text()
+    assert "Infinity" not in text and "NaN" not in text
+    (row,) = table(tmp_path / "a" / "runs.csv")
+    said = f"winding, long running: none settles at {float(row['total_current_A']) / 2:.2f} A a motor"
+    assert json.loads(text)["notes"][0].startswith(said)
+    assert row["temperature_winding_C"] == "" and "winding_hot" in row["flags"]
+    page = (tmp_path / "a" / "report.html").read_text()
+    assert "none settles" in page and ">inf" not in page and "nan %" not in page
+
+
+def test_the_hot_winding_is_flagged_from_the_current_of_the_hot_resistance():
+    motor = robots.nominal().motor
+    assert float(motor.current_continuous) == pytest.approx(3.91, abs=0.005)
+
+
+def test_a_voltage_beside_the_battery_is_refused(mmrjax, tmp_path):
+    for command in (("simulate",), ("render", "a.png")):
+        code, _, err = mmrjax(*command, "--battery", "--voltage", "15")
+        assert code == 2
+        assert err == (
+            "mmrjax: --voltage: got 15 beside --battery, whose voltage is that of its charge; give one of them\n"
+        )
+    code, _, err = mmrjax("sweep", "--battery", "--voltages", "15,24")
+    assert code == 2 and "voltages_V acts without battery only" in err
+    code, _, err = mmrjax("sensitivity", "--battery", "--vary", "voltage=15:24")
+    assert code == 2 and "--vary voltage: acts without --battery only" in err
+    (tmp_path / "plan.toml").write_text("[axes]\nvoltage = [15, 24]\n[conditions]\nbattery = true\n")
+    code, _, err = mmrjax("sweep", "plan.toml")
+    assert code == 2 and err.startswith("mmrjax: plan.toml, voltage: acts without battery only")
+    (tmp_path / "runs.csv").write_text("configuration,supply_voltage_V,payload_kg,slope_deg\n6T2A,24,0,0\n")
+    code, _, err = mmrjax("simulate", "--battery", "--runs", "runs.csv")
+    assert code == 4
+    assert err.startswith("mmrjax: runs.csv row 1, supply_voltage_V: got 24 beside --battery, whose charge sets")
+
+
+def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
+    code, _, _ = mmrjax("sweep", "--battery", "--slopes", "0,5", "--payloads", "0,8", "--out", "a")
+    assert code == 0
+    rows = table(tmp_path / "a" / "runs.csv")
+    assert len(rows) == 2 * 2 * 2 and {row["supply_voltage_V"] for row in rows} == {""}
+    assert len({row["total_current_A"] for row in rows}) == len(rows)
+    page = (tmp_path / "a" / "report.html").read_text()
+    assert "nan V" not in page and "6T2A, battery" in (tmp_path / "a" / "figures" / "sweep_speed.svg").read_text()
+    resolved = tmp_path / "a" / "config.resolved.toml"
+    assert "voltages_V" not in resolved.read_text()
+    assert mmrjax("sweep", "--config", resolved, "--out", "b")[0] == 0  # what it left can be run again
+    assert table(tmp_path / "b" / "runs.csv") == rows
+    (tmp_path / "runs.csv").write_text("configuration,payload_kg,slope_deg\n6T2A,8,5\n")
+    assert mmrjax("simulate", "--battery", "--runs", "runs.csv", "--out", "c")[0] == 0
+    (row,) = table(tmp_path / "c" / "runs.csv")
+    assert row["total_current_A"] in {r["total_current_A"] for r in rows}
+
+
+def test_the_command_line_reverses(mmrjax, tmp_path):
+    code, out, _ = mmrjax("simulate", "--voltage", "-15", "--out", "a")
+    assert code == 0 and "reverses: steady travel backward" in out
+    code, _, _ = mmrjax("simulate", "--voltage", "15", "--out", "b", "--no-report")
+    (back,), (forth,) = table(tmp_path / "a" / "runs.csv"), table(tmp_path / "b" / "runs.csv")
+    for column in ("total_current_A", "motor_speed_rpm", "speed_mm_s"):
+        assert float(back[column]) == pytest.approx(-float(forth[column]), rel=1e-6)
+    code, out, _ = mmrjax(
+        "sweep",
+        "--voltages=-33,-15,15",
+        "--slopes",
+        "0,5",
+        "--payloads",
+        "0",
+        "--configurations",
+        "4W2T",
+        "--out",
+        "c",
+    )
+    assert code == 0
+    assert json.loads((tmp_path / "c" / "result.json").read_text())["statuses"]["reverses"] == 4
+    assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
+    code, out, _ = mmrjax("simulate", "--voltage", 0, "--slope", 20, "--model", "drive", "--out", "d")
+    assert code == 3 and "rolls_back: gravity drives the robot" in out
+    code, _, err = mmrjax("simulate", "--voltage", "-101")
+    assert code == 2 and "supply_voltage_V: got -101; expected -100 to 100" in err
+
+
+COLUMNS = "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm"
+
+
+@pytest.mark.parametrize(
+    ("row", "sentence"),
+    [
+        ("6T2A,-15,13.1,0,0,-2.1,5292", "motor_speed_rpm: got 5292 at -15 V; expected readings with their signs"),
+        ("6T2A,-15,13.1,0,-5,2.6,-5292", "total_current_A: got 2.6 at -15 V; expected readings with their signs"),
+        ("6T2A,0,13.1,0,0,0,0", "supply_voltage_V: got 0; expected a voltage, in a table of readings"),
+    ],
+)
+def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
+    (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n{row}\n")
+    with pytest.raises(BadData, match=f"mine.csv row 2, {sentence}"):
+        runs.read(tmp_path / "mine.csv")
+
+
+def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
+    (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n6T2A,-15,13.1,0,0,-2.1,-5292\n")
+    code, out, _ = mmrjax("compare", "mine.csv", "--out", "a")
+    assert code == 0 and "did not converge" not in out
+    rows = table(tmp_path / "a" / "comparison.csv")
+    assert rows[0]["error_total_current_percent"] == pytest.approx(rows[1]["error_total_current_percent"])
+    assert rows[1]["status"] == "reverses"
+
+
+@pytest.fixture(scope="module")
+def climb():
+    robot = robots.nominal()
+    return robot, api.simulate(robot, api.Conditions(0, [33.0, -33.0], [10.0, -10.0]), "drive", duration=5.0)
+
+
+def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
+    _, found = climb
+    fine = drive_batch(robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
+    peak = float(np.max(np.asarray(fine.signals.total_current)))
+    assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
+    code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a")
+    assert code == 0 and f"peak of the total current [A] │ {peak:.1f}" in out
+    (row,) = table(tmp_path / "a" / "runs.csv")
+    assert float(row[PEAK]) == pytest.approx(peak, rel=2e-3)
+    kept = [float(r["total_current_A"]) for r in table(tmp_path / "a" / "history.csv")]
+    assert max(kept) == pytest.approx(float(row[PEAK]))
+    assert json.loads((tmp_path / "a" / "result.json").read_text())[PEAK] == pytest.approx(float(row[PEAK]))
+
+
+def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
+    robot, found = climb
+    heading = report_runs.labels(found.to_dict())
+    assert heading == ["6T2A, 33 V, 0 kg, 10°", "6T2A, -33 V, 0 kg, -10°"]
+    up, back = figures_history.starts(robot, found.history, np.asarray(found.status), [0, 0], heading)
+    for k, start in enumerate((up, back)):
+        assert start.ended[0] == pytest.approx(abs(float(found.total_current[k])), rel=1e-6)
+        assert start.ended[1] == pytest.approx(1e3 * abs(float(found.speed[k])), rel=1e-6)
+        assert start.gets_under_way and start.current.max() > 90
+    assert (up.sense, back.sense) == (1.0, -1.0)  # the way back is drawn as the way there
+    assert (up.starting, up.slipping, up.settled) == pytest.approx((back.starting, back.slipping, back.settled))
+    flat = api.simulate(robot, api.Conditions(0, 33.0, 0.0), "drive", duration=5.0)
+    assert up.ended[0] > 1.2 * float(flat.total_current)
+
+
+def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
+    asked = ("simulate", "--battery", "--model", "drive", "--discharge", "2190", "--duration")
+    code, out, _ = mmrjax(*asked, "60", "--out", "a")
+    assert code == 3
+    (row,) = table(tmp_path / "a" / "runs.csv")
+    assert row["status"] == "battery_empty" and float(row["speed_mm_s"]) > 500 and float(row["total_current_A"]) > 1
+    when, far = float(row["time_end_s"]), float(row["distance_m"])
+    assert f"after {when:.1f} s and {far:.2f} m" in out and "└" in out
+    # The same run, ended just before and just after: where the charge runs out does not depend on the samples.
+    assert mmrjax(*asked, f"{when - 0.01:.4f}", "--no-report", "--out", "b")[0] == 0
+    assert mmrjax(*asked, f"{when + 0.01:.4f}", "--no-report", "--out", "c")[0] == 3
+    (before,) = table(tmp_path / "b" / "runs.csv")
+    assert float(before["distance_m"]) == pytest.approx(far, abs=0.01)
+    charge = 3.6 * 10 - np.trapezoid(
+        [float(r["total_current_A"]) + 1.5 for r in table(tmp_path / "b" / "history.csv")],
+        [float(r["time_s"]) for r in table(tmp_path / "b" / "history.csv")],
+    )
+    assert charge == pytest.approx(0.01 * (float(row["total_current_A"]) + 1.5), abs=0.05)
+    code, out, _ = mmrjax("simulate", "--battery", "--model", "drive", "--discharge", "2300", "--no-report")
+    assert code == 3 and "battery_empty: empty before the start" in out
+
+
+def test_a_run_may_last_a_day(mmrjax):
+    found = api.simulate(robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
+    assert found.statuses == "converged"
+    code, _, err = mmrjax("simulate", "--model", "drive", "--duration", "86401")
+    assert code == 2 and "86400" in err
+    code, _, err = mmrjax("simulate", "--model", "track", "--duration", "3601")
+    assert code == 2 and "duration_s: got 3601; model track takes at most 3600 s" in err
+
+
+def test_remarks_name_the_run_they_are_of():
+    found = api.simulate(robots.nominal(), api.Conditions("4W2T", 33.0, [0.0, 20.0], 200.0, adhesion=3.0))
+    shown = remarks(robots.nominal(), found.to_dict())
+    assert len(shown) == 1 and shown[0].startswith("run 2: winding, long running: none settles")
+
+
+RATED = (
+    "[gearbox]\ntorque_limit = 4.5\nmesh_theory = true\n[driver]\nreturns_current = false\n[battery]\n"
+    "voltage_charge = 4.25\nvoltage_cutoff = 3.2\ndelay_cutoff = 2.0\ncurrent_limit = 30\ncurrent_charge = 2\n"
+)
+
+
+def test_rated_limits_and_switches_are_read_and_written(tmp_path):
+    nominal = robots.nominal()
+    assert nominal.gearbox.torque_limit == pytest.approx(3.0 * 25 / 12)
+    (tmp_path / "mine.toml").write_text(RATED)
+    robot = robot_file.read(tmp_path / "mine.toml")
+    assert (robot.gearbox.torque_limit, robot.gearbox.mesh_theory, robot.driver.returns_current) == (4.5, True, False)
+    battery = robot.battery
+    assert (battery.voltage_charge, battery.voltage_cutoff, battery.delay_cutoff) == (4.25, 3.2, 2.0)
+    assert (battery.current_limit, battery.current_charge) == (30.0, 2.0)
+    for k, given in enumerate((robot, nominal)):
+        robot_file.write(given, tmp_path / f"{k}.toml")
+        again = robot_file.read(tmp_path / f"{k}.toml")
+        assert (again.gearbox, again.driver, again.battery) == (given.gearbox, given.driver, given.battery)
+    assert "current_limit = None" not in (tmp_path / "1.toml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"gearbox.mesh_theory": 1}, r"mine.toml, gearbox.mesh_theory: got 1; expected true or false \(load driving"),
+        ({"driver.returns_current": "no"}, "driver.returns_current: got 'no'; expected true or false"),
+        ({"gearbox.torque_limit": -1}, "gearbox.torque_limit: got -1; expected a number, 0.001 to"),
+        (
+            {"battery.voltage_cutoff": 4.5},
+            "battery.voltage_cutoff: got 4.5; expected less than voltage_charge, 4.2 V",
+        ),
+        ({"battery.current_charge": True}, "battery.current_charge: got True; expected a number"),
+    ],
+)
+def test_bad_limits_and_switches_are_refused(values, sentence):
+    with pytest.raises(BadConfiguration, match=sentence):
+        robot_file.change(robots.nominal(), values, where="mine.toml")
+
+
+def test_a_switch_can_be_set_on_the_command_line(mmrjax, tmp_path):
+    code, _, _ = mmrjax("simulate", "--set", "gearbox.mesh_theory=true", "--no-report", "--out", "a")
+    assert code == 0 and "mesh_theory = true" in (tmp_path / "a" / "robot.toml").read_text()
+    assert '"gearbox.mesh_theory" = true' in (tmp_path / "a" / "config.resolved.toml").read_text()
+    code, _, err = mmrjax("simulate", "--set", "gearbox.mesh_theory=2", "--out", "b")
+    assert code == 2 and "expected true or false" in err
+
+
+def test_rated_limits_stand_in_the_report():
+    robot = robots.nominal()
+    found = api.simulate(robot, api.Conditions("6T2A", 33.0, 10.0, 8.0, battery=1.0))
+    run = {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
+    shown = {line["words"]: line for line in report_runs.limits(robot, run)}
+    torque = shown["gearbox torque at the driving wheel"]
+    wheel = float(found.theoretical_speed) / float(robot.configurations["6T2A"].radius)
+    assert torque["limit"] == "6.25 N·m"
+    assert torque["value"] == f"{float(found.power_gear) / 2 / wheel:.2f} N·m"
+    assert shown["voltage of a cell, charged"]["limit"] == "4.20 V"
+
+
+def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(mmrjax, monkeypatch):
+    from sweeps import render
+
+    drawn = []
+    monkeypatch.setattr(render.pictures, "scene", lambda *a: None)
+    monkeypatch.setattr(
+        render.pictures, "render", lambda view, file, begin, *rest: (file.touch(), drawn.append(begin))
+    )
+    code, out, _ = mmrjax("render", "start.gif", "--slope", 10, "--duration", 0.1)
+    assert (code, drawn) == (0, [0.0]) and "not_settled" in out
