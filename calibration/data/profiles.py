@@ -19,7 +19,7 @@ from calibration.data import units
 from calibration.data.errors import BadConfiguration, BadData, choices, number
 from calibration.data.units import Quantity
 from mmrjax import channels
-from mmrjax.profile import MODES, VOLTAGE, profile
+from mmrjax.profile import MODES, MOTOR_SPEED, VOLTAGE, profile
 from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio
 
 if TYPE_CHECKING:
@@ -106,6 +106,19 @@ class ProfileTable:
         """Columns of conditions that it states, as a table of runs names them."""
         of = {"voltage": "supply_voltage_V", "slope_deg": "slope_deg", "payload": "payload_kg"}
         return (*(column for name, column in of.items() if name in self.values), *([SURFACE] if self.surface else []))
+
+    def demanded(self, segment: np.ndarray, elapsed: np.ndarray, per_speed: float) -> np.ndarray:
+        """Ground speed that is demanded [m/s], of a motor speed the one it rolls at; NaN where none is.
+
+        Args:
+            segment: of one cycle, from 0; elapsed: since it began [s]; both of one shape.
+            per_speed: motor speed over ground speed [rad/m].
+        """
+        before, after = self.demand[segment], self.demand[segment + 1]
+        share = elapsed / np.diff(self.time)[segment] if self.linear else 0.0
+        mode = np.array(self.modes)[segment]
+        value = (before + (after - before) * share) / np.where(mode == MODES[MOTOR_SPEED], per_speed, 1.0)
+        return np.where(np.isin(mode, CONTROLLED), value, np.nan)
 
     def check_source(self, battery: bool) -> None:
         """Refuse what does not go with the source of the run.
