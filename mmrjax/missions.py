@@ -85,6 +85,13 @@ def names() -> tuple[str, ...]:
     return tuple(output.column for output in OUTPUTS)
 
 
+#: Columns that a sweep over a profile stores where none are named.
+USUAL = (
+    "energy_Wh", "energy_per_metre_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C",
+    "state_of_charge",
+)  # fmt: skip
+
+
 def _quotient(part: Scalar, whole: Scalar) -> Array:
     """part / whole; NaN with a finite derivative where `whole` is not above 0."""
     there = whole > 0

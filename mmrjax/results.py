@@ -18,11 +18,6 @@ from mmrjax.signals import CODES, STATUSES, Result
 
 #: Columns of a printed table beside conditions and channels.
 _SHOWN = ("slip", "adhesion_used", "power_supply_W", "temperature_winding_C")
-#: Columns of a printed table of missions.
-_MISSION = (
-    "energy_Wh", "energy_per_metre_Wh", "distance_m", "rms_current_A", "peak_current_A", "winding_peak_C",
-    "state_of_charge",
-)  # fmt: skip
 #: Columns of conditions: heading, unit and digits after the point.
 _CONDITIONS = {
     "configuration": ("configuration", "", 0),
@@ -121,7 +116,7 @@ class Results(eqx.Module):
         rows_of: tuple[outputs.Output | missions.Output, ...] = (*outputs.table(), *missions.OUTPUTS)
         about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
         if columns is None and self.mission is not None:
-            columns = ["configuration", *_MISSION, "status"]
+            columns = ["configuration", *missions.USUAL, "status"]
         elif columns is None:
             shown = [
                 output.column for output in outputs.table() if output.column in _SHOWN or output.name in self.reading

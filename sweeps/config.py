@@ -216,6 +216,11 @@ class ProfilePart(FidelityPart):
             raise PydanticCustomError("idle", "duration_s acts without profile only, whose last row ends the run")
         return self
 
+    @property
+    def options(self) -> dict[str, float]:
+        """Every option of the fidelity; over a profile it has none."""
+        return super().options if self.profile is None else {}
+
 
 class Simulate(RobotPart, ProfilePart, SupplyPart, PosteriorPart, OutputPart):
     """A few given runs; those over time from standstill, or over a profile."""
@@ -228,9 +233,7 @@ class Simulate(RobotPart, ProfilePart, SupplyPart, PosteriorPart, OutputPart):
 
     @property
     def options(self) -> dict[str, float]:
-        """Every option of the fidelity, none over a profile; a run is short where its length is not stated."""
-        if self.profile is not None:
-            return {}
+        """Every option of the fidelity; a run is short where its length is not stated."""
         options = super().options
         if self.duration_s is None and "duration" in options:
             options["duration"] = min(options["duration"], SHOWN)

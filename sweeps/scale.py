@@ -26,6 +26,7 @@ from sweeps.design import Blocks
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
+    from mmrjax.profile import Profile
     from mmrjax.robot import Robot
     from sweeps.zarr_store import SweepStore
 
@@ -41,6 +42,7 @@ class Job:
     Attributes:
         robot: that is varied; model: fidelity, and its options.
         outputs: names; storage: type that they are stored in.
+        profile: that every point follows, if any.
     """
 
     robot: Robot
@@ -50,6 +52,7 @@ class Job:
     outputs: tuple[str, ...]
     storage: str
     blocks: Blocks
+    profile: Profile | None = None
 
 
 @dataclasses.dataclass
@@ -132,7 +135,7 @@ def _program(
             ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
             wide = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
             conditions = dataclasses.replace(wide, adhesion=ratio)
-        found = evaluate(variation, job.model, values, conditions, options, names)
+        found = evaluate(variation, job.model, values, conditions, options, names, job.profile)
         stored = {n: (found[n] / factors.get(n, 1.0)).astype(job.storage) for n in names if n != FLAGS}
         bits = {n: found[n].astype(jnp.uint8) for n in (STATUS, FLAGS) if n in found}
         return {**stored, **bits}
