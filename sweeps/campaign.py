@@ -171,7 +171,7 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
     for name in job.outputs:
         if name == "flags":
             about = {"long_name": "limits exceeded", "flag_masks": [1 << k for k in range(len(FLAGS))]}
-            variables.append(Variable(name, "uint8", {**about, "flag_meanings": " ".join(FLAGS)}))
+            variables.append(Variable(name, "uint16", {**about, "flag_meanings": " ".join(FLAGS)}))
             continue
         unit, label = (rows[name].unit, rows[name].label) if name in rows else ("-", name.replace("_", " "))
         variables.append(Variable(name, config.storage, {"units": _unit(unit), "long_name": label}))

@@ -125,7 +125,7 @@ def _placed(tree: Any, sharding: NamedSharding) -> Any:
 def _program(
     job: Job, surface: tuple[float, ...] | None, mesh: Mesh
 ) -> Callable[[Variation, Conditions, Array], dict[str, Array]]:
-    """Outputs as they are stored: in the units of tables, in the stored type, statuses as bytes."""
+    """Outputs as they are stored: in the units of tables, in the stored type, statuses as bytes, flags as two."""
     factors = {row.name: row.factor for row in outputs.table()}
     names, options = job.outputs, dict(job.options)
 
@@ -137,7 +137,8 @@ def _program(
             conditions = dataclasses.replace(wide, adhesion=ratio)
         found = evaluate(variation, job.model, values, conditions, options, names, job.profile)
         stored = {n: (found[n] / factors.get(n, 1.0)).astype(job.storage) for n in names if n != FLAGS}
-        bits = {n: found[n].astype(jnp.uint8) for n in (STATUS, FLAGS) if n in found}
+        kinds = {STATUS: jnp.uint8, FLAGS: jnp.uint16}
+        bits = {n: found[n].astype(kind) for n, kind in kinds.items() if n in found}
         return {**stored, **bits}
 
     def program(variation: Variation, conditions: Conditions, values: Array) -> dict[str, Array]:
