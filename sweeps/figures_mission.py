@@ -44,7 +44,8 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float) ->
         _speed(axes[0], time, shown, legend=first)
         axes[1].set_title("current of all motors, and duty of the driver")
         _current(axes[1], time, shown, legend=first)
-        axes[2].set_title("temperatures")
+        beyond = "" if _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
+        axes[2].set_title("temperatures" + (beyond if first else ""))
         _temperatures(axes[2], time, shown, limit, legend=first)
         _source(axes[3], time, shown)
         axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
@@ -101,19 +102,20 @@ def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], legen
         _legend(axes, duty)
 
 
+def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
+    """Whether the limit is near enough to be drawn; far above it would flatten what is to be seen."""
+    return bool(np.max(rows["winding_C"]) > 0.6 * limit)
+
+
 def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], limit: float, legend: bool) -> None:
     axes.plot(time, rows["winding_C"], color=VERMILION, lw=1.4, label="winding")
     axes.plot(time, rows["housing_C"], color=ORANGE, lw=1.4, label="housing")
     top, bottom = float(np.max(rows["winding_C"])), float(np.min(rows["housing_C"]))
-    # The limit is drawn where it is near; far above it would flatten what is to be seen.
-    if top > 0.6 * limit:
+    if _near(rows, limit):
         axes.axhline(limit, color=INK, lw=1.0, ls="--", label=f"limit {limit:.0f} °C")
         axes.set_ylim(bottom - 2, 1.1 * max(top, limit))
     else:
         axes.set_ylim(bottom - 0.5, top + max(1.0, 0.3 * (top - bottom)))
-        note(
-            axes, f"limit of the winding: {limit:.0f} °C, beyond the scale", x=0.02, y=0.06, va="bottom", color=FAINT
-        )
     axes.set_ylabel("temperature [°C]")
     if legend:
         _legend(axes)

@@ -59,6 +59,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
         ],
         statuses=statuses(runs),
         segments=_segments(found, name),
+        returned=max(float(first["energy_returned_Wh"]), 0.0),
         kept=len(rows["time_s"]),
         whole=found.whole,
         **named(robot, robot_name),
@@ -140,7 +141,7 @@ def _segments(found: Missions, name: str) -> list[dict[str, Any]]:
         if not len(own["status"]):
             continue
         energy = float(np.sum(own["energy_Wh"]))
-        ends = dict.fromkeys(map(str, own["status"]))
+        ends = {s: int((own["status"] == s).sum()) for s in dict.fromkeys(map(str, own["status"]))}
         flags = dict.fromkeys(flag for f in own["flags"] for flag in str(f).split(";") if flag)
         answer.append(
             {
@@ -156,7 +157,7 @@ def _segments(found: Missions, name: str) -> list[dict[str, Any]]:
                 "distance": float(np.sum(own["distance_m"])),
                 "peak": float(np.max(own["peak_current_A"])),
                 "hottest": float(np.max(own["winding_peak_C"])),
-                "ends": ", ".join(f"{words.short(s)} ({int((own['status'] == s).sum())})" for s in ends),
+                "ends": ", ".join(words.short(s) + (f" ({n})" if source.cycles > 1 else "") for s, n in ends.items()),
                 "flags": ", ".join(words.FLAGS[f] for f in flags),
             }
         )
@@ -170,7 +171,8 @@ def _demand(found: Missions, k: int) -> str:
 
     def span(values: np.ndarray, factor: float, unit: str) -> str:
         begin, end = float(values[k]) / factor, float(values[last]) / factor
-        return f"{begin:g} {unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g} {unit}"
+        unit = unit if unit == "°" else f"\u00a0{unit}"
+        return f"{begin:g}{unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g}{unit}"
 
     from calibration.data.profiles import CONTROLLED
     from mmrjax import channels

@@ -160,7 +160,7 @@ def test_report_shows_course_energy_and_segments(done):
     assert len(tables.tables["segments"]) == 2 + 7
     result = json.loads((done / "result.json").read_text())
     assert f"{result['energy_Wh']:.4g} Wh" in tables.text
-    assert "0 to 300 mm/s, 0 to 5 °" in tables.text
+    assert "0 to 300\u00a0mm/s, 0 to 5°" in tables.text
     assert outside(done) == []
 
 
