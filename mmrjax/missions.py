@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -164,35 +164,43 @@ def columns(found: Mapping[str, Any]) -> dict[str, Any]:
 def batch(
     robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None, *, history: bool = False
 ) -> Mission:
-    """Missions of a batch of runs.
-
-    Traceable without history. With one, so many runs are simulated at once that their steps fit into memory, and
-    again with more room where a mission has taken more steps than there was room for, up to `MOST_KEPT`; of a longer
-    mission the course ends there.
+    """Missions of a batch of runs; traceable.
 
     Args:
         conditions: shape (runs,); profile: fields of shape (rows,), or (runs, rows).
-        start: that all begin in; history: whether the missions over time are kept.
+        start: that all begin in; history: whether the missions over time are kept, see `parts`.
     """
     if not history:
         return together(robot, conditions, profile, start, 0)
+    if _traced((robot, conditions, profile, start)):
+        return together(robot, conditions, profile, start, _room(profile))
+    found = list(parts(robot, conditions, profile, start))
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+def parts(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None) -> Iterator[Mission]:
+    """Missions of a batch of runs, kept over time, some runs after others, so that all their steps fit into memory.
+
+    Where a mission has taken more steps than there was room for it is simulated again with more room, up to
+    `MOST_KEPT`; of a longer mission the course ends there.
+    """
     (runs,) = conditions.shape
-    keep = min(MOST_KEPT, max(LEAST_KEPT, _power(ROOM * profile.segments * profile.cycles)))
-    while True:
+    keep, first = _room(profile), 0
+    while first < runs:
         size = max(1, min(runs, MOST_KEPT // keep))
-        parts = []
-        for first in range(0, runs, size):
-            rows = np.minimum(np.arange(first, first + size), runs - 1)
-            some = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
-            part = together(robot, some, _rows_of(profile, rows), start, keep)
-            parts.append(part if _traced(part) else jax.device_get(part))
-        found = jax.tree.map(lambda *x: (jnp if _traced(x) else np).concatenate(x)[:runs], *parts)
-        if _traced(found):
-            return found
+        rows = np.minimum(np.arange(first, first + size), runs - 1)  # the last ones stand for the last run again
+        some = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
+        found = jax.device_get(together(robot, some, _rows_of(profile, rows), start, keep))
         steps = int(np.max(found.steps - found.rejected))
-        if steps <= keep or keep == MOST_KEPT:
-            return found
-        keep = min(MOST_KEPT, _power(steps))
+        if steps > keep and keep < MOST_KEPT:
+            keep = min(MOST_KEPT, _power(steps))
+            continue
+        yield jax.tree.map(lambda x, count=runs - first: x[:count], found)
+        first += size
+
+
+def _room(profile: Profile) -> int:
+    return min(MOST_KEPT, max(LEAST_KEPT, _power(ROOM * profile.segments * profile.cycles)))
 
 
 def _traced(tree: Any) -> bool:

@@ -25,7 +25,7 @@ from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration
 from sweeps import run, words
-from sweeps.console import say, tell
+from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run, read_runs
 from sweeps.store import open_folder
 
@@ -137,27 +137,45 @@ def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: co
     """Runs over a profile."""
     conditions = run.commanded(robot, runs, config)
     profile = source.profile(robot, conditions)
-    found = jax.device_get(missions.batch(robot, conditions, profile, history=True))
-    numbers = jax.device_get(missions.numbers(robot, conditions, found))
     names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
-    about = run.conditions(robot, runs)
+    rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
+    tables: list[dict[str, np.ndarray]] = []
+    segments: list[dict[str, np.ndarray]] = []
+    courses: list[dict[str, np.ndarray]] = []
+    done, whole = 0, True
+    with progress(len(runs), quiet=False) as advance:
+        for found in missions.parts(robot, conditions, profile):
+            count = len(found.steps)
+            own = slice(done, done + count)
+            at = jax.tree.map(lambda x, own=own: x[own], conditions)
+            numbers = jax.device_get(missions.numbers(robot, at, found))
+            tables.append({**missions.columns(numbers), **_codes(found.result.status, found.result.flags)})
+            segments.append(_segments(robot, at, source, found, names[own]))
+            courses += [_course(robot, at, source, found, k, str(names[done + k]), rows) for k in range(count)]
+            assert found.course is not None  # it was asked for
+            whole &= bool((found.steps - found.rejected <= found.course.time.shape[-1]).all())
+            done += count
+            advance(count)
+    about = _conditions(robot, runs, source, config)
+    return Missions({**about, **_below(tables)}, _below(segments), _below(courses), source, whole)
+
+
+def _below(tables: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Tables of the same columns one below the other."""
+    return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
+
+
+def _conditions(
+    robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
+) -> dict[str, np.ndarray]:
+    """Conditions of the runs, empty where the profile states them or the battery sets them."""
     nothing = np.full(len(runs), np.nan)
     unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
     unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
-    about = {key: nothing if key in unknown else value for key, value in about.items() if key != profiles.SURFACE}
-    if runs.has(profiles.SURFACE) and source.surface is None:
-        about[profiles.SURFACE] = runs[profiles.SURFACE]
-    table = {**about, **missions.columns(numbers), **_codes(found.result.status, found.result.flags)}
-    rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
-    course = [_course(robot, conditions, source, found, k, str(name), rows) for k, name in enumerate(names)]
-    steps = np.asarray(found.steps) - np.asarray(found.rejected)
-    return Missions(
-        table,
-        _segments(robot, conditions, source, found, names),
-        {key: np.concatenate([part[key] for part in course]) for key in course[0]},
-        source,
-        bool((steps <= found.course.time.shape[-1]).all()),
-    )
+    about = {key: nothing if key in unknown else value for key, value in run.conditions(robot, runs).items()}
+    if source.surface is not None:
+        about.pop(profiles.SURFACE, None)
+    return about
 
 
 def _codes(status: Any, flags: Any) -> dict[str, np.ndarray]:
