@@ -24,12 +24,12 @@ _BARS = {
 }  # fmt: skip
 
 
-def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float) -> Figure:
+def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool) -> Figure:
     """A run over its profile, a row a subject; beside it its first cycle, where it has several.
 
     Args:
         rows: of history.csv, of one run; cycle: end of its first cycle [s], None where it has one only.
-        limit: of the winding's temperature [°C].
+        limit: of the winding's temperature [°C]; linear: whether the profile's values are, between rows.
     """
     spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
     titles = ["the mission", "its first cycle"]
@@ -41,7 +41,7 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float) ->
         time = shown["time_s"] / size
         first = column == 0
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows["slope_deg"]) else ""))
-        _speed(axes[0], time, shown, legend=first)
+        _speed(axes[0], time, shown, linear, legend=first)
         axes[1].set_title("current of all motors, and duty of the driver")
         _current(axes[1], time, shown, legend=first)
         beyond = "" if _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
@@ -69,7 +69,7 @@ def _legend(axes: Axes, *others: Axes) -> None:
     axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
 
 
-def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], legend: bool) -> None:
+def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear: bool, legend: bool) -> None:
     axes.plot(time, rows["speed_mm_s"], color=BLUE, lw=1.4, label="speed")
     demanded = rows["demanded_speed_mm_s"]
     if np.isfinite(demanded).any():
@@ -81,7 +81,9 @@ def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], legend:
             _legend(axes)
         return
     slope = _beside(axes, "slope [°]", GREEN)
-    slope.plot(time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle="steps-post")
+    slope.plot(
+        time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle="default" if linear else "steps-post"
+    )
     most = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
     slope.set_ylim(-most, most)
     if legend:

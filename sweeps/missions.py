@@ -247,7 +247,7 @@ def _course(
     course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
     there = course.segment >= 0
     signals = course.signals
-    picked = np.flatnonzero(there)[thinned(course.segment[there], signals.total_current[there], most)]
+    picked = np.flatnonzero(there)[thinned(course.segment[there], signals.current[there], most)]
     course = jax.tree.map(lambda x: x[picked], course)
     signals, reading = course.signals, balances.sensor(robot, course.signals)
     segment = course.segment % source.segments
