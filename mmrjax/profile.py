@@ -80,6 +80,11 @@ class Profile(eqx.Module):
         return self.time.shape[-1] - 1
 
     @property
+    def stated(self) -> tuple[str, ...]:
+        """Conditions that it states."""
+        return tuple(name for name in CONDITIONS if getattr(self, name) is not None)
+
+    @property
     def duration(self) -> Scalar:
         """Of the whole mission [s]."""
         return self.cycles * (self.time[-1] - self.time[0])

@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from mmrjax import outputs
+from mmrjax import missions, outputs
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import History
+from mmrjax.fidelities.mission import Mission
 from mmrjax.params import Scalar
-from mmrjax.signals import STATUSES, Result
+from mmrjax.signals import CODES, STATUSES, Result
 
 #: Columns of a printed table beside conditions and channels.
 _SHOWN = ("slip", "adhesion_used", "power_supply_W", "temperature_winding_C")
@@ -43,6 +44,8 @@ class Results(eqx.Module):
             has none or none was asked for.
         configurations: names of the robot's configurations, in the order of their indices.
         model: the fidelity.
+        mission: of runs over a profile, totals, segments and course; None without a profile.
+        stated: conditions that the profile states, in place of those of the runs.
     """
 
     conditions: Conditions
@@ -52,6 +55,8 @@ class Results(eqx.Module):
     history: History | None
     configurations: tuple[str, ...] = eqx.field(static=True)
     model: str = eqx.field(static=True)
+    mission: Mission | None = None
+    stated: tuple[str, ...] = eqx.field(static=True, default=())
 
     def __getattr__(self, name: str) -> Any:
         result, further = self.__dict__.get("result"), self.__dict__.get("further")
@@ -80,15 +85,25 @@ class Results(eqx.Module):
         return np.array(STATUSES)[np.asarray(self.result.status)]
 
     def to_dict(self) -> dict[str, np.ndarray]:
-        """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape."""
-        conditions = self.conditions
+        """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape.
+
+        Over a profile the outcomes are the mission's numbers; conditions that the profile states are NaN.
+        """
+        conditions, nan = self.conditions, np.full(self.shape, np.nan)
+        of = {"voltage": "supply_voltage_V", "payload": "payload_kg", "slope_deg": "slope_deg"}
+        columns = {column: np.asarray(getattr(conditions, name)) for name, column in of.items()}
+        columns["supply_voltage_V"] = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
+        columns |= {of[name]: nan for name in self.stated if name in of}
+        found = outputs.columns(self.result, self.further)
+        if self.mission is not None:
+            found = {name: found[name] for name in (*missions.names(), *CODES)}
         return {
             "configuration": self.configuration,
-            "supply_voltage_V": np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage),
-            "total_mass_kg": np.asarray(self.total_mass),
-            "payload_kg": np.asarray(conditions.payload),
-            "slope_deg": np.asarray(conditions.slope_deg),
-            **outputs.columns(self.result, self.further),
+            "supply_voltage_V": columns["supply_voltage_V"],
+            "total_mass_kg": nan if "payload" in self.stated else np.asarray(self.total_mass),
+            "payload_kg": columns["payload_kg"],
+            "slope_deg": columns["slope_deg"],
+            **found,
         }
 
     def table(self, columns: Sequence[str] | None = None, rows: int = 40) -> str:
@@ -99,8 +114,11 @@ class Results(eqx.Module):
             rows: most that are shown.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
-        about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in outputs.table()}}
-        if columns is None:
+        rows_of: tuple[outputs.Output | missions.Output, ...] = (*outputs.table(), *missions.OUTPUTS)
+        about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
+        if columns is None and self.mission is not None:
+            columns = ["configuration", *missions.USUAL, "status"]
+        elif columns is None:
             shown = [
                 output.column for output in outputs.table() if output.column in _SHOWN or output.name in self.reading
             ]

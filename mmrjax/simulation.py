@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import fidelities, params
+from mmrjax import fidelities, missions, params
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError, choices
-from mmrjax.fidelities.base import Fidelity, Run
+from mmrjax.fidelities.base import Fidelity, History, Run
+from mmrjax.fidelities.mission import Start
+from mmrjax.profile import Profile
 from mmrjax.results import Results
 from mmrjax.robot import Robot
 from mmrjax.tables import CONDITION_LIMITS
@@ -26,11 +28,13 @@ HISTORIES = 1000
 def simulate(
     robot: Robot,
     conditions: Conditions,
-    model: str = "steady",
+    model: str | None = None,
     *,
     duration: float | None = None,
     step: float | None = None,
     history: bool = True,
+    profile: Profile | None = None,
+    start: Start | None = None,
     **options: float | None,
 ) -> Results:
     """Simulate one run, or a batch.
@@ -41,11 +45,15 @@ def simulate(
     Args:
         robot: any robot; its parameters may be tracers or, under `jax.vmap`, batches.
         conditions: fields of one shape, configurations by name or index.
-        model: fidelity, one of `fidelities.NAMES`.
+        model: fidelity, one of `fidelities.NAMES`; `steady` where not stated, `drive` with a profile.
         duration: of a run [s]; `drive` 30, `track` 1.5 where not stated.
         step: of integration [s]; `track` 1e-4 where not stated.
         history: whether to keep runs over time, where the fidelity can; `track` then starts from standstill, else
             rolling at the steady speed.
+        profile: a mission that every run is to follow (`mmrjax.profile.profile`), by `drive` only; what it does not
+            state the conditions do. Results then have `mission`, and the columns of `mmrjax.missions.OUTPUTS`.
+            Derivatives are forward, by its values and times too; with tracers state `history=False`.
+        start: the state that a mission begins in; None: at rest at ambient temperature.
         options: of a further fidelity, by name.
 
     Returns:
@@ -58,8 +66,11 @@ def simulate(
         raise UsageError(f"robot: got {type(robot).__name__}; expected a Robot such as mmrjax.nominal()")
     if not isinstance(conditions, Conditions):
         raise UsageError(f"conditions: got {type(conditions).__name__}; expected mmrjax.Conditions(...)")
+    model = model or (fidelities.NAMES[0] if profile is None else missions.MODEL)
     if model not in fidelities.TABLE:
         raise UsageError(f"model: got {model}; {choices(str(model), fidelities.TABLE)}")
+    if profile is not None or start is not None:
+        _check_profile(model, profile, {"duration": duration, "step": step, **options})
     try:
         stated = fidelities.facts(model).resolved(duration=duration, step=step, **options)
     except ValueError as error:
@@ -69,10 +80,46 @@ def simulate(
     total_mass = _total_mass(robot, conditions)
     _check_conditions(conditions, total_mass)
     shape, flat = conditions.shape, jax.tree.map(jnp.ravel, conditions)
+    if profile is not None:
+        return _missions(robot, conditions, total_mass, flat, profile, start, history)
     run = _run(fidelities.get(model), robot, flat, stated, history and fidelities.facts(model).histories)
     run = jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), run)
     names = robot.configurations.names
     return Results(conditions, total_mass, run.result, run.columns, run.history, names, model)
+
+
+def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
+    if profile is None:
+        raise UsageError("start: got one without a profile; expected profile=mmrjax.profile.profile(...) beside it")
+    if not isinstance(profile, Profile):
+        raise UsageError(f"profile: got {type(profile).__name__}; expected mmrjax.profile.profile(...)")
+    if model != missions.MODEL:
+        raise UsageError(f"model: got {model} beside a profile; expected {missions.MODEL}, which follows profiles")
+    for name, value in options.items():
+        if value is not None:
+            raise UsageError(f"{name}: got {value!r} beside a profile, whose last row ends the mission; leave it out")
+
+
+def _missions(
+    robot: Robot,
+    conditions: Conditions,
+    total_mass: jax.Array,
+    flat: Conditions,
+    profile: Profile,
+    start: Start | None,
+    history: bool,
+) -> Results:
+    """Every run of a batch over the same profile."""
+    found = missions.batch(robot, flat, profile, start, history=history)
+    further = missions.columns(missions.numbers(robot, flat, found))
+    course = None
+    if found.course is not None:
+        course = History.of(robot, found.course.time, found.course.distance, found.course.signals)
+    shape, names = conditions.shape, robot.configurations.names
+    found, further, course = jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), (found, further, course))
+    return Results(
+        conditions, total_mass, found.result, further, course, names, missions.MODEL, found, profile.stated
+    )
 
 
 def _run(

@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import fidelities, params
+from mmrjax import fidelities, missions, params
 from mmrjax import outputs as table_of_outputs
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Run
+from mmrjax.profile import Profile
 from mmrjax.robot import Robot
 from mmrjax.signals import CODES
 from mmrjax.tables import CONDITION_LIMITS
@@ -135,6 +136,7 @@ def evaluate(
     conditions: Conditions,
     options: Mapping[str, float],
     outputs: tuple[str, ...],
+    profile: Profile | None = None,
 ) -> dict[str, Array]:
     """Outputs of many points in one call, compiled once for each number of points.
 
@@ -144,7 +146,9 @@ def evaluate(
         fidelity: one of `fidelities.NAMES`; options: all that it has, from `Facts.resolved`.
         values: a row a point, in the order of `variation.names`.
         conditions: what does not vary, of shape () or (points,), names of configurations resolved.
-        outputs: names of `outputs.table()`, or of columns that the fidelity adds; also `flags`.
+        outputs: names of `outputs.table()`, or of columns that the fidelity adds; also `flags`. Over a profile
+            columns of `missions.OUTPUTS`.
+        profile: a mission that every point is to follow, by the fidelity `missions.MODEL`; fields of shape (rows,).
 
     Returns:
         By name in SI units (a fidelity's own column in its unit), and `status`; arrays of shape (points,).
@@ -152,7 +156,7 @@ def evaluate(
     Raises:
         UsageError: an output that the fidelity does not have.
     """
-    found = _evaluate(variation, fidelity, values, conditions, dict(options), tuple(outputs))
+    found = _evaluate(variation, fidelity, values, conditions, dict(options), tuple(outputs), profile)
     return {name: found[name] for name in (*outputs, STATUS)}  # jit sorts the names
 
 
@@ -164,23 +168,29 @@ def _evaluate(
     conditions: Conditions,
     options: dict[str, float],
     names: tuple[str, ...],
+    profile: Profile | None,
 ) -> dict[str, Array]:
     (points, _) = values.shape
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
-    if fidelity == "steady":
+    if profile is None and fidelity == "steady":
         from mmrjax.fidelities.steady import steady_outputs
 
         _known(names, table_of_outputs.names())
         robot, each = variation.at(values, conditions)
         each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
         return steady_outputs(robot, each, (*names, STATUS))
-    simulate = fidelities.get(fidelity).run
+
+    def simulate(robot: Robot, conditions: Conditions) -> Run:
+        if profile is not None:
+            return missions.run(robot, conditions, profile)
+        return fidelities.get(fidelity).run(robot, conditions, options)
+
     if not variation.varies_robot:
-        return _picked(simulate(*variation.at(values, conditions), options), names)
+        return _picked(simulate(*variation.at(values, conditions)), names)
 
     def one(values: Array, conditions: Conditions) -> Run:
         robot, point = variation.at(values, conditions)
-        run = simulate(robot, jax.tree.map(lambda x: x[None], point), options)
+        run = simulate(robot, jax.tree.map(lambda x: x[None], point))
         return jax.tree.map(lambda x: x[0], run)
 
     return _picked(jax.vmap(one)(values, conditions), names)
@@ -201,13 +211,21 @@ def _known(names: tuple[str, ...], known: tuple[str, ...]) -> None:
 
 
 def check_outputs(
-    variation: Variation, fidelity: str, conditions: Conditions, options: Mapping[str, float], names: tuple[str, ...]
+    variation: Variation,
+    fidelity: str,
+    conditions: Conditions,
+    options: Mapping[str, float],
+    names: tuple[str, ...],
+    profile: Profile | None = None,
 ) -> None:
     """Refuse an output that the fidelity does not have; traces the fidelity only for names of its own.
 
     Raises:
         UsageError: lists the outputs that there are.
     """
+    if profile is not None:
+        _known(names, missions.names())
+        return
     if set(names) <= {*table_of_outputs.names(), FLAGS}:
         return
     values = jax.ShapeDtypeStruct((1, len(variation.names)), jnp.result_type(float))

@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
-from calibration.data import robot_file, writing
+from calibration.data import profiles, robot_file, writing
 from calibration.data.errors import BadConfiguration, InputError
-from mmrjax import __version__, channels, fidelities, outputs
+from mmrjax import __version__, channels, fidelities, missions, outputs
 from mmrjax.errors import UsageError
+from mmrjax.profile import Profile
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.variation import STATUS, Variation, check_outputs
@@ -63,7 +64,7 @@ def campaign(config: Campaign, where: str, out: Path | None, force: bool, option
         config = config.model_copy(
             update={
                 "chunk": config.chunk or scale.default_chunk(config.model, accelerator, devices),
-                "outputs": config.outputs or channels.names(),
+                "outputs": config.outputs or (channels.names() if config.profile is None else missions.USUAL),
             }
         )
         job = prepare(config, robot, plan, where)
@@ -73,6 +74,7 @@ def campaign(config: Campaign, where: str, out: Path | None, force: bool, option
             dry_run(job, layout, path)
             return DONE
         files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
+        files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
         same = identity(config, robot, files, device)
         store = SweepStore(path, same, layout, force=force)
         try:
@@ -97,6 +99,7 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
         BadConfiguration: an output that the fidelity does not have, or a point that it cannot bear.
     """
     variation = Variation(robot, plan.design.names)
+    profile = None if config.profile is None else _profile(config.profile, robot, plan, where)
     repeated = [name for k, name in enumerate(config.outputs) if name in config.outputs[:k]]
     if repeated:
         raise BadConfiguration(f"{where}, outputs: got {repeated[0]} twice; expected each once")
@@ -104,13 +107,36 @@ def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scal
     if taken:
         raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which varies; expected what comes out of a run")
     try:
-        check_outputs(variation, config.model, plan.fixed(), config.options, config.outputs)
+        check_outputs(variation, config.model, plan.fixed(), config.options, config.outputs, profile)
     except UsageError as error:
         raise BadConfiguration(f"{where}, {error}") from error
     assert config.chunk is not None
     blocks = Blocks.of(plan.design.shape, config.chunk)
     _bearable(variation, config, plan)
-    return scale.Job(robot, config.model, config.options, plan, config.outputs, config.storage, blocks)
+    return scale.Job(robot, config.model, config.options, plan, config.outputs, config.storage, blocks, profile)
+
+
+def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
+    """The profile that every point follows.
+
+    Raises:
+        BadData: as `profiles.read`.
+        BadConfiguration: it states what the plan states too, a supply voltage where a point is on the battery, or
+            surfaces.
+    """
+    source = profiles.read(name)
+    if source.surface is not None:
+        raise BadConfiguration(
+            f"{where}, profile: got {source.source} with the column surface; expected the surface in conditions"
+        )
+    for field in source.values:
+        if field in (*plan.conditions, *plan.design.names):
+            raise BadConfiguration(
+                f"{where}, {field}: got it beside {source.source}, which states it; expected one of the two"
+            )
+    on_battery = plan.conditions.get("battery", 0.0) or "battery" in plan.design.names
+    source.check_source(bool(on_battery))
+    return source.profile(robot, plan.fixed())
 
 
 def _bearable(variation: Variation, config: Campaign, plan: axes.Plan) -> None:
@@ -138,12 +164,14 @@ def _bearable(variation: Variation, config: Campaign, plan: axes.Plan) -> None:
 
 def laid_out(config: Campaign, job: scale.Job) -> Layout:
     """Arrays of the store of a job, with units and long names."""
-    rows = {row.name: row for row in outputs.table()}
+    further = () if job.profile is None else missions.OUTPUTS
+    rows: dict[str, outputs.Output | missions.Output] = {row.name: row for row in outputs.table()}
+    rows |= {row.column: row for row in further}
     variables = []
     for name in job.outputs:
         if name == "flags":
             about = {"long_name": "limits exceeded", "flag_masks": [1 << k for k in range(len(FLAGS))]}
-            variables.append(Variable(name, "uint8", {**about, "flag_meanings": " ".join(FLAGS)}))
+            variables.append(Variable(name, "uint16", {**about, "flag_meanings": " ".join(FLAGS)}))
             continue
         unit, label = (rows[name].unit, rows[name].label) if name in rows else ("-", name.replace("_", " "))
         variables.append(Variable(name, config.storage, {"units": _unit(unit), "long_name": label}))

@@ -81,6 +81,15 @@ _Posterior = Annotated[
         help="Give results with ± from so many robots drawn from the posterior.nc beside the calibrated --robot.",
     ),
 ]
+_Profile = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        help="A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
+        "supply_voltage_V, slope_deg, payload_kg, surface, current_other_A, or stair, stop_and_go, shuttle, patrol "
+        "(docs/missions.md).",
+    ),
+]
 _NoCache = Annotated[
     bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
 ]
@@ -102,8 +111,12 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-@app.command(epilog="Example: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive")
+@app.command(
+    epilog="Examples: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
+    "mmrjax simulate --profile patrol --battery --payload 5"
+)
 def simulate(
+    context: typer.Context,
     configuration: _Configuration = None,
     voltage: _Voltage = None,
     slope: _Slope = 0.0,
@@ -113,6 +126,7 @@ def simulate(
     runs: Annotated[
         Path | None, typer.Option(help="CSV of runs to simulate instead; the condition columns are enough.")
     ] = None,
+    profile: _Profile = None,
     model: _Model = None,
     duration: _Duration = None,
     step: _Step = None,
@@ -130,19 +144,28 @@ def simulate(
     """Simulate one run, or the runs of a CSV file, and write a run folder.
 
     With --model drive or track the run starts from standstill, and history.csv holds current and speeds over
-    time; with track, reactions.csv holds every load inside the running gear too.
+    time; with track, reactions.csv holds every load inside the running gear too. With --profile it follows a mission:
+    energy (Wh, Wh/m), distance, peaks, temperatures and charge, of the whole and in segments.csv of each segment.
     """
     from sweeps import config
 
     options = _options(
         model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
-        discharge_mAh=discharge, posterior=posterior, report=report,
+        discharge_mAh=discharge, posterior=posterior, report=report, profile=profile,
     )  # fmt: skip
     resolved = _prepared(config.resolve(config.Simulate, None, options), no_cache)
+    cells = _cells(configuration, voltage, slope, payload, mass, surface)
+    given = cells if runs is None else str(runs)
+    if resolved.profile is not None:
+        from sweeps import missions
+
+        columns = {"voltage": "supply_voltage_V", "slope": "slope_deg", "payload": "payload_kg", "surface": "surface"}
+        sources = {option: context.get_parameter_source(option) for option in columns}
+        stated = {columns[o]: f"--{o}" for o, s in sources.items() if s is not None and s.name == "COMMANDLINE"}
+        return missions.simulate(resolved, given, stated, out, force)
     from sweeps import simulate as room
 
-    cells = _cells(configuration, voltage, slope, payload, mass, surface)
-    return room.simulate(resolved, cells if runs is None else str(runs), out, force)
+    return room.simulate(resolved, given, out, force)
 
 
 @app.command(

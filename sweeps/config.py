@@ -21,6 +21,8 @@ _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "paylo
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
+#: The fidelity that follows profiles.
+PROFILED = "drive"
 #: Longest run of `simulate` where none is stated [s]: short enough that the start is seen.
 SHOWN = 5.0
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
@@ -203,8 +205,48 @@ class OutputPart(Part):
     report: bool = True
 
 
-class Simulate(RobotPart, FidelityPart, SupplyPart, PosteriorPart, OutputPart):
-    """A few given runs; those over time from standstill."""
+class ProfilePart(FidelityPart):
+    """Which mission the runs follow.
+
+    Attributes:
+        profile: name of a packaged profile, or path of a CSV file; None for none.
+    """
+
+    profile: Annotated[str, Field(min_length=1)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _follows(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("profile") is not None:
+            return {"model": PROFILED, **values}
+        return values
+
+    @model_validator(mode="after")
+    def _profiled(self) -> Self:
+        if self.profile is None:
+            return self
+        if self.model != PROFILED:
+            raise PydanticCustomError(
+                "idle", f"profile acts with model {PROFILED} only, which follows one; got model {self.model}"
+            )
+        if self.duration_s is not None:
+            raise PydanticCustomError("idle", "duration_s acts without profile only, whose last row ends the run")
+        return self
+
+    @property
+    def options(self) -> dict[str, float]:
+        """Every option of the fidelity; over a profile it has none."""
+        return super().options if self.profile is None else {}
+
+
+class Simulate(RobotPart, ProfilePart, SupplyPart, PosteriorPart, OutputPart):
+    """A few given runs; those over time from standstill, or over a profile."""
+
+    @model_validator(mode="after")
+    def _certain(self) -> Self:
+        if self.profile is not None and self.posterior is not None:
+            raise PydanticCustomError("idle", "posterior acts without profile only")
+        return self
 
     @property
     def options(self) -> dict[str, float]:

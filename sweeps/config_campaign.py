@@ -12,10 +12,10 @@ from pydantic import Field
 
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax.tables import COULOMB_PER_MAH
-from sweeps.config import BatchPart, OutputPart, RobotPart, Sweep, read_toml, resolve
+from sweeps.config import BatchPart, OutputPart, ProfilePart, RobotPart, Sweep, read_toml, resolve
 
 #: Keys that only a sweep into a store has.
-KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression")
+KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile")
 #: Options of a grid, which a file with axes of its own has no use for.
 GRID = (
     "configurations", "voltages_V", "payloads_kg", "slopes_deg", "surface", "battery", "discharge_mAh",
@@ -23,14 +23,15 @@ GRID = (
 EXPORTS = ("csv", "parquet")
 
 
-class Campaign(RobotPart, BatchPart, OutputPart):
+class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
     """A sweep of any size over any names, into a Zarr store; `sweeps.axes` reads its tables.
 
     Attributes:
         conditions: those that do not vary, by name.
         axes: of the grid, by name: a list, `first:last:step`, or a table with start, stop, number and scale.
         samples: a sampled design: design, number, seed, over (distributions by name), posterior.
-        outputs: names of `mmrjax.outputs.table()`, of columns of the fidelity, or flags; empty: the channels.
+        outputs: names of `mmrjax.outputs.table()`, of columns of the fidelity, or flags; empty: the channels. Over a
+            profile columns of `mmrjax.missions.OUTPUTS`, or flags; empty: `missions.USUAL`.
         storage: type in which outputs are stored.
         compression: of the store's chunks.
     """

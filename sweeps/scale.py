@@ -26,6 +26,7 @@ from sweeps.design import Blocks
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
+    from mmrjax.profile import Profile
     from mmrjax.robot import Robot
     from sweeps.zarr_store import SweepStore
 
@@ -41,6 +42,7 @@ class Job:
     Attributes:
         robot: that is varied; model: fidelity, and its options.
         outputs: names; storage: type that they are stored in.
+        profile: that every point follows, if any.
     """
 
     robot: Robot
@@ -50,6 +52,7 @@ class Job:
     outputs: tuple[str, ...]
     storage: str
     blocks: Blocks
+    profile: Profile | None = None
 
 
 @dataclasses.dataclass
@@ -122,7 +125,7 @@ def _placed(tree: Any, sharding: NamedSharding) -> Any:
 def _program(
     job: Job, surface: tuple[float, ...] | None, mesh: Mesh
 ) -> Callable[[Variation, Conditions, Array], dict[str, Array]]:
-    """Outputs as they are stored: in the units of tables, in the stored type, statuses as bytes."""
+    """Outputs as they are stored: in the units of tables, in the stored type, statuses as bytes, flags as two."""
     factors = {row.name: row.factor for row in outputs.table()}
     names, options = job.outputs, dict(job.options)
 
@@ -132,9 +135,10 @@ def _program(
             ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
             wide = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
             conditions = dataclasses.replace(wide, adhesion=ratio)
-        found = evaluate(variation, job.model, values, conditions, options, names)
+        found = evaluate(variation, job.model, values, conditions, options, names, job.profile)
         stored = {n: (found[n] / factors.get(n, 1.0)).astype(job.storage) for n in names if n != FLAGS}
-        bits = {n: found[n].astype(jnp.uint8) for n in (STATUS, FLAGS) if n in found}
+        kinds = {STATUS: jnp.uint8, FLAGS: jnp.uint16}
+        bits = {n: found[n].astype(kind) for n, kind in kinds.items() if n in found}
         return {**stored, **bits}
 
     def program(variation: Variation, conditions: Conditions, values: Array) -> dict[str, Array]:

@@ -161,7 +161,7 @@ def test_outputs_storage_and_compression_are_as_stated(sweep, tmp_path, whole):
     assert sweep("s", config=config)[0] == 3
     found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
     assert set(found.data_vars) == {"slip", "efficiency_motor", "flags", "status"}
-    assert found.slip.dtype == np.float32 and found.flags.dtype == np.uint8
+    assert found.slip.dtype == np.float32 and found.flags.dtype == np.uint16
     assert (found.status.values == xr.open_zarr(whole / zarr_store.STORE).status.values).all()
     assert found.slip.attrs == {"units": "1", "long_name": "slip"}
     assert found["motor.resistance"].dtype == np.float64

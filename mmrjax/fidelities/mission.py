@@ -64,7 +64,8 @@ FIRST, SHORTEST = 1e-4, 1e-9
 EVENT, NEAR = 1e-2, 1e-7
 #: Torque [N·m] and share of the weight that scale how firmly a robot stands; and how firmly before it stands.
 FIRM_TORQUE, FIRM_WEIGHT, FIRMLY = 1.0, 1.0, 1e-3
-#: A demanded speed is missed where at the end of a segment it is off by more than this share of it [-].
+#: A demanded speed is missed where at the end of a segment it is off by more than this share of the segment's
+#: largest [-].
 MISSED = 0.02
 
 
@@ -482,10 +483,12 @@ def _ends(
     status = jnp.where(rests, STALLED, status)
     status = jnp.where(slides & ~stands, SLIDES, status)
     status = jnp.where(~wanted & rests & ~slides, CONVERGED, status)  # it stands, as it should
-    del segment
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
-    speed = asked.error + signals.speed_motor
-    missed = controlled & (jnp.abs(asked.error) > MISSED * jnp.maximum(jnp.abs(speed), 10.0))
+    per_speed = robot.gearbox.ratio / robot.chassis(signals.configuration).radius
+    # A ramp that ends in a stop is measured by where it began.
+    demanded = segment.demand if segment.linear else segment.demand[:1]
+    largest = jnp.max(jnp.abs(demanded)) * jnp.where(mode == SPEED, per_speed, 1.0)
+    missed = controlled & (jnp.abs(asked.error) > MISSED * jnp.maximum(largest, 10.0))
     status = jnp.where(controlled & rests & ~missed, CONVERGED, status)
     return status, missed
 

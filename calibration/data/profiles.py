@@ -1,0 +1,418 @@
+"""Profiles from outside: missions as CSV with units in the column names, checked cell by cell (docs/missions.md)."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import math
+import re
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data import units
+from calibration.data.errors import BadConfiguration, BadData, choices, number
+from calibration.data.units import Quantity
+from mmrjax import channels
+from mmrjax.profile import MODES, MOTOR_SPEED, VOLTAGE, profile
+from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio
+
+if TYPE_CHECKING:
+    from mmrjax.conditions import Conditions
+    from mmrjax.profile import Profile
+    from mmrjax.robot import Robot
+
+#: Profiles that come with the package, in `calibration/data/profiles/`.
+PACKAGED = ("stair", "stop_and_go", "shuttle", "patrol")
+#: Modes in which the driver's controller follows a demand, which is a channel.
+CONTROLLED = tuple(mode for mode in MODES if mode in channels.names())
+BETWEEN = ("held", "linear")
+#: Most rows in all, cycles included.
+LONGEST = 1_000_000
+#: Current of other consumers that the battery's parameter may have [A].
+_CURRENT_OTHER = (0.0, 50.0)
+
+
+def _range(condition: str) -> tuple[float, float]:
+    low, high, _ = CONDITION_LIMITS[condition]
+    return low, high
+
+
+def _speed(name: str) -> Quantity:
+    channel = channels.CHANNELS[channels.index(name)]
+    return Quantity(
+        name, units.of_channel(name), (channel.range[0] * channel.factor, channel.range[1] * channel.factor)
+    )
+
+
+#: What columns can hold, by the field of `mmrjax.profile.Profile` that it becomes; the demands become `demand`.
+QUANTITIES: dict[str, Quantity] = {
+    "time": Quantity("time", units.TIME, (0.0, 1e6)),
+    "voltage": Quantity("supply_voltage", units.VOLTAGE, _range("voltage")),
+    "duty": Quantity("duty", units.SHARE, _range("duty")),
+    **{name: _speed(name) for name in CONTROLLED},
+    "slope_deg": Quantity("slope", units.ANGLE, _range("slope_deg"), slope=True),
+    "payload": Quantity("payload", units.MASS, _range("payload")),
+    "current_other": Quantity("current_other", units.CURRENT, _CURRENT_OTHER),
+}
+#: Columns of which a row has at most one, and the mode that each means.
+DEMANDS = {"duty": MODES[VOLTAGE], **{mode: mode for mode in CONTROLLED}}
+#: What a row may not leave empty where the file has the column.
+HELD = ("voltage", "slope_deg", "payload", "current_other")
+MODE, SURFACE = "mode", "surface"
+
+
+@dataclasses.dataclass(frozen=True)
+class ProfileTable:
+    """A profile as its file states it, checked.
+
+    Attributes:
+        source: name of the file or of the packaged profile, for messages.
+        time: of the rows [s]; modes: of `MODES`, one a row.
+        demand: motor speed [rad/s] or speed [m/s], shape (rows,).
+        values: fields of `mmrjax.profile.Profile` that it states, by name, shape (rows,).
+        surface: of Table 5, one a row; None where it states none.
+        linear, cycles: as of `mmrjax.profile.Profile`.
+        digest: SHA-256 of the file.
+    """
+
+    source: str
+    time: np.ndarray
+    modes: tuple[str, ...]
+    demand: np.ndarray
+    values: dict[str, np.ndarray]
+    surface: tuple[str, ...] | None
+    linear: bool
+    cycles: int
+    digest: str
+
+    @property
+    def segments(self) -> int:
+        """Segments of one cycle."""
+        return len(self.time) - 1
+
+    @property
+    def duration(self) -> float:
+        """Of the whole mission [s]."""
+        return self.cycles * float(self.time[-1] - self.time[0])
+
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """Columns of conditions that it states, as a table of runs names them."""
+        of = {"voltage": "supply_voltage_V", "slope_deg": "slope_deg", "payload": "payload_kg"}
+        return (*(column for name, column in of.items() if name in self.values), *([SURFACE] if self.surface else []))
+
+    def demanded(self, segment: np.ndarray, elapsed: np.ndarray, per_speed: float) -> np.ndarray:
+        """Ground speed that is demanded [m/s], of a motor speed the one it rolls at; NaN where none is.
+
+        Args:
+            segment: of one cycle, from 0; elapsed: since it began [s]; both of one shape.
+            per_speed: motor speed over ground speed [rad/m].
+        """
+        before, after = self.demand[segment], self.demand[segment + 1]
+        share = elapsed / np.diff(self.time)[segment] if self.linear else 0.0
+        mode = np.array(self.modes)[segment]
+        value = (before + (after - before) * share) / np.where(mode == MODES[MOTOR_SPEED], per_speed, 1.0)
+        return np.where(np.isin(mode, CONTROLLED), value, np.nan)
+
+    def check_source(self, battery: bool) -> None:
+        """Refuse what does not go with the source of the run.
+
+        Raises:
+            BadConfiguration: it states a supply voltage, and the battery is to feed the motors.
+        """
+        if battery and "voltage" in self.values:
+            raise BadConfiguration(
+                f"--battery: got it beside {self.source}, which states supply_voltage_V; expected one of the two"
+            )
+
+    def profile(self, robot: Robot, conditions: Conditions) -> Profile:
+        """The profile that a simulation takes, for a batch of runs.
+
+        Args:
+            robot: that is to follow it; conditions: of shape (runs,), configurations as indices.
+
+        Returns:
+            Fields of shape (rows,); where surfaces are stated, `adhesion` of shape (runs, rows).
+        """
+        made = profile(
+            self.time,
+            self.modes,
+            demand=self.demand,
+            linear=self.linear,
+            cycles=self.cycles,
+            **self.values,
+        )
+        if self.surface is None:
+            return made
+        tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])
+        by_kind = np.array([[adhesion_ratio(s, kind) for s in self.surface] for kind in (False, True)])
+        which = tracks[np.asarray(conditions.configuration)].astype(int)
+        return dataclasses.replace(made, adhesion=jnp.asarray(by_kind[which]))
+
+
+def known_columns() -> dict[str, tuple[str, str]]:
+    """Every column of numbers: field that it becomes, and unit."""
+    return {
+        column: (field, unit) for field, quantity in QUANTITIES.items() for column, unit in quantity.columns().items()
+    }
+
+
+def read(source: str | Path) -> ProfileTable:
+    """Read a packaged profile by its name, or a CSV file.
+
+    Raises:
+        BadData: no such file, fewer than two rows, an unknown, misspelt or repeated column or unit, a time that does
+            not increase, a cell that is no number, not finite or out of range, an empty cell of a column that every
+            row needs, two demands in a row or none, an unknown mode, surface or setting; said with file, row (counted
+            from 1 below the header), column, value and what is allowed.
+    """
+    if str(source) in PACKAGED:
+        file = resources.files("calibration") / "data" / "profiles" / f"{source}.csv"
+        return _parsed(file.read_bytes(), str(source))
+    path = Path(source)
+    if not path.is_file():
+        raise BadData(
+            f"{source}: no such file and no packaged profile; {choices(str(source), PACKAGED)}"
+            if not path.exists()
+            else f"{source}: is no file; expected a CSV file or a packaged profile: {', '.join(PACKAGED)}"
+        )
+    return _parsed(path.read_bytes(), path.name)
+
+
+def _parsed(content: bytes, name: str) -> ProfileTable:
+    try:
+        lines = [line.strip() for line in content.decode("utf-8-sig").splitlines()]
+    except UnicodeDecodeError as error:
+        raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
+    lines = [line for line in lines if line]
+    above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    settings = _settings(name, lines[:above])
+    rows = [[cell.strip() for cell in row] for row in csv.reader(lines[above:])]
+    if not rows:
+        raise BadData(f"{name}: the file is empty; expected a header with time_s and rows")
+    header, body = rows[0], rows[1:]
+    if len(header) == 1 and ";" in header[0]:
+        raise BadData(f"{name}: columns are separated by semicolons; expected commas, and points in numbers")
+    columns = _columns(name, header)
+    if len(body) < 2:
+        got = "one row" if body else "a header and no rows"
+        raise BadData(f"{name}: got {got}; expected two rows or more, of which the last ends the mission")
+    for k, row in enumerate(body, 1):
+        if len(row) != len(header):
+            raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
+    cells = _Cells(name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"])
+    time = _time(cells)
+    modes, demand, duty = _driven(cells)
+    values = {field: cells.held(field) for field in HELD if field in columns}
+    if duty is not None:
+        values["duty"] = duty
+    if len(time) * settings["cycles"] > LONGEST:
+        raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
+    return ProfileTable(
+        name, time, modes, demand, values, cells.surfaces(), settings["linear"], settings["cycles"],
+        hashlib.sha256(content).hexdigest(),
+    )  # fmt: skip
+
+
+def _settings(name: str, comments: list[str]) -> dict[str, Any]:
+    """What the comment lines at the top set: `cycles = 40`, `between_rows = "linear"`; other lines are remarks."""
+    stated: dict[str, Any] = {}
+    for line in comments:
+        text = line.lstrip("#").strip()
+        if not re.match(r"[\w-]+\s*=", text):
+            continue
+        try:
+            found = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise BadData(f"{name}: got the line # {text}; expected TOML such as # cycles = 40 ({error})") from error
+        for key, value in found.items():
+            if key not in ("cycles", "between_rows"):
+                raise BadData(f"{name}: got the setting {key}; {choices(key, ('cycles', 'between_rows'))}")
+            if key in stated:
+                raise BadData(f"{name}: {key} is set twice; expected once")
+            stated[key] = value
+    cycles, between = stated.get("cycles", 1), stated.get("between_rows", BETWEEN[0])
+    if isinstance(cycles, bool) or not isinstance(cycles, int) or cycles < 1:
+        raise BadData(f"{name}, cycles: got {cycles!r}; expected a whole number from 1")
+    if between not in BETWEEN:
+        raise BadData(f"{name}, between_rows: got {between!r}; expected held or linear")
+    return {"cycles": cycles, "linear": between == "linear"}
+
+
+def _columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
+    """Column and unit of each field that the file has.
+
+    Raises:
+        BadData: an unknown column or unit, a field twice, no time.
+    """
+    known: dict[str, tuple[str, str]] = known_columns()
+    found: dict[str, tuple[str, str]] = {}
+    for column in header:
+        if column in (MODE, SURFACE):
+            field, unit = column, ""
+        elif column in known:
+            field, unit = known[column]
+        else:
+            _refuse_column(name, column)
+        if field in found:
+            first = found[field][0]
+            both = f"column {column} twice" if column == first else f"columns {first} and {column}"
+            raise BadData(f"{name}: got {both}; expected one of them")
+        found[field] = (column, unit)
+    if "time" not in found:
+        raise BadData(f"{name}: column time_s is missing; other columns: {', '.join(_standard())}")
+    return found
+
+
+def _standard() -> list[str]:
+    """The column of each quantity in its first unit."""
+    return [next(iter(quantity.columns())) for quantity in QUANTITIES.values()] + [MODE, SURFACE]
+
+
+def _refuse_column(name: str, column: str) -> NoReturn:
+    # The longest name that it begins with: motor_speed before speed.
+    for quantity in sorted(QUANTITIES.values(), key=lambda q: -len(q.name)):
+        if column == quantity.name or column.startswith(f"{quantity.name}_"):
+            unit = column[len(quantity.name) + 1 :] or "none"
+            raise BadData(
+                f"{name}, column {column}: got the unit {unit}; expected one of {', '.join(quantity.columns())}"
+            )
+    raise BadData(f"{name}: unknown column {column or '(without a name)'}; {choices(column, _standard(), 3)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Cells:
+    """The cells of a file by column, read one by one."""
+
+    source: str
+    columns: dict[str, tuple[str, str]]
+    cells: dict[str, list[str]]
+    linear: bool
+
+    def __len__(self) -> int:
+        return len(next(iter(self.cells.values())))
+
+    def has(self, field: str) -> bool:
+        return field in self.columns
+
+    def text(self, field: str, row: int) -> str:
+        """The cell of a field; empty where the file has no such column."""
+        return self.cells[self.columns[field][0]][row] if self.has(field) else ""
+
+    def refuse(self, field: str, row: int, allowed: str) -> NoReturn:
+        got = self.text(field, row) or "an empty cell"
+        raise BadData(f"{self.source} row {row + 1}, {self.columns[field][0]}: got {got}; expected {allowed}")
+
+    def value(self, field: str, row: int) -> float:
+        """A number in the unit of `Profile`."""
+        quantity, unit = QUANTITIES[field], self.columns[field][1]
+        low, high = quantity.limits(unit)
+        allowed = f"{number(low)} to {number(high)}"
+        try:
+            written = float(self.text(field, row))
+        except ValueError:
+            self.refuse(field, row, f"a number, {allowed}")
+        if not math.isfinite(written) or not low <= written <= high:
+            self.refuse(field, row, allowed)
+        return quantity.value(written, unit)
+
+    def held(self, field: str) -> np.ndarray:
+        """A column that every row needs; the last row of a profile whose values are held needs none."""
+        last = len(self) - 1
+        found: list[float] = []
+        for row in range(len(self)):
+            ends = row == last and not self.linear and not self.text(field, row)
+            found.append(found[-1] if ends else self.value(field, row))
+        return np.array(found)
+
+    def surfaces(self) -> tuple[str, ...] | None:
+        if not self.has(SURFACE):
+            return None
+        found: list[str] = []
+        for row in range(len(self)):
+            name = self.text(SURFACE, row)
+            if not name and row == len(self) - 1 and not self.linear:
+                name = found[-1]
+            if name not in SURFACES:
+                self.refuse(SURFACE, row, f"one of these; {choices(name, SURFACES)}")
+            found.append(name)
+        return tuple(found)
+
+
+def _time(cells: _Cells) -> np.ndarray:
+    time = np.array([cells.value("time", row) for row in range(len(cells))])
+    for row in np.flatnonzero(np.diff(time) <= 0)[:1] + 1:
+        cells.refuse("time", int(row), f"more than {cells.text('time', int(row) - 1)} of the row before")
+    return time
+
+
+def _driven(cells: _Cells) -> tuple[tuple[str, ...], np.ndarray, np.ndarray | None]:
+    """Mode, demand and duty of each row; duty None where the file states none.
+
+    A cell of a demand column in a row of another mode ends the ramp that leads to this row, where values are linear
+    between rows; else it is a second demand.
+    """
+    modes: list[str] = []
+    demand, duty = np.zeros(len(cells)), np.ones(len(cells))
+    for row in range(len(cells)):
+        before = modes[-1] if modes else ""
+        filled = [field for field in DEMANDS if cells.text(field, row)]
+        ends = {field for field in filled if cells.linear and before == DEMANDS[field]}
+        mode = _mode(cells, row, before, [f for f in filled if f not in ends] or filled)
+        own = [field for field in filled if DEMANDS[field] == mode]
+        _check_demands(cells, row, before, mode, own, [f for f in filled if f not in own and f not in ends])
+        modes.append(mode)
+        if row and cells.linear:  # what the ramp that leads here ends at, where this row does not say
+            demand[row] = 0.0 if mode in CONTROLLED else demand[row - 1]
+            duty[row] = 1.0 if mode == MODES[VOLTAGE] else duty[row - 1]
+        for field in (*(f for f in ends if f not in own), *own):
+            (duty if field == "duty" else demand)[row] = cells.value(field, row)
+    return tuple(modes), demand, duty if cells.has("duty") else None
+
+
+def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
+    """The mode that a row states, or that its demand means; without either voltage, if no row has a demand."""
+    stated = cells.text(MODE, row)
+    if stated and stated not in MODES:
+        cells.refuse(MODE, row, f"one of these; {choices(stated, MODES)}")
+    there = [cells.columns[field][0] for field in DEMANDS if cells.has(field)]
+    mode = stated or (DEMANDS[filled[0]] if filled else "" if there else MODES[VOLTAGE])
+    if not mode and row == len(cells) - 1:
+        mode = before
+    if not mode:
+        raise BadData(
+            f"{cells.source} row {row + 1}: got no demand; expected a value in one of {', '.join(there)}, or brake "
+            "or coast in the column mode"
+        )
+    return mode
+
+
+def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[str], others: list[str]) -> None:
+    """Refuse a row with two demands, one whose demand is missing, and a ramp from one kind of demand to another."""
+    if others:
+        where = cells.columns[others[0]][0]
+        beside = cells.columns[own[0]][0] if own and not cells.text(MODE, row) else f"mode {mode}"
+        raise BadData(
+            f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} beside {beside}; expected one "
+            "demand in a row"
+        )
+    if mode not in CONTROLLED:
+        return
+    if not cells.has(mode):
+        raise BadData(
+            f"{cells.source} row {row + 1}, mode: got {mode}; expected a column with that demand, such as "
+            f"{next(iter(QUANTITIES[mode].columns()))}"
+        )
+    if not own and (cells.linear or row < len(cells) - 1):
+        cells.refuse(mode, row, f"the demand of mode {mode}")
+    if cells.linear and before in CONTROLLED and before != mode:
+        raise BadData(
+            f"{cells.source} row {row + 1}: goes from a demanded {before} to a demanded {mode} where between_rows is "
+            "linear; expected one kind of demand, or a row that brakes or coasts between them"
+        )

@@ -1,0 +1,349 @@
+"""`simulate --profile`, `mm.simulate(profile=...)` and sweeps over a profile: what comes out, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+from pages import Tables, drawn, outside
+
+import mmrjax as mm
+from calibration.data import profiles
+from mmrjax import energy, missions, params
+from mmrjax.missions import OUTPUTS
+from mmrjax.profile import profile
+from mmrjax.signals import STATUSES
+from sweeps import cli
+from sweeps.missions import thinned
+
+#: Up a slope, to a stop, and back; twice.
+MISSION = """\
+# There and back.
+# cycles = 2
+# between_rows = "linear"
+time_s,speed_mm_s,mode,slope_deg
+0,0,,0
+0.5,300,,5
+2,300,,5
+2.5,0,brake,5
+3,0,,5
+3.5,-200,,5
+4.5,0,brake,0
+5,,brake,0
+"""
+SHORT = profile([0.0, 0.5, 1.5, 2.0], ["speed", "speed", "brake", "brake"], demand=[0.0, 0.3, 0.3, 0.0], linear=True)
+
+
+@pytest.fixture(scope="module")
+def mmrjax(tmp_path_factory):
+    """Run the command line in a folder of its own."""
+    folder = tmp_path_factory.mktemp("missions")
+
+    def run(capsys, monkeypatch, *words: str) -> tuple[int, str, str]:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr("sys.argv", ["mmrjax", *words])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        said = capsys.readouterr()
+        return int(ended.value.code or 0), said.out, said.err
+
+    run.folder = folder
+    (folder / "mission.csv").write_text(MISSION)
+    return run
+
+
+def rows(path) -> dict[str, np.ndarray]:
+    with path.open() as stream:
+        table = list(csv.DictReader(stream))
+
+    def cell(text: str):
+        try:
+            return float(text) if text else np.nan
+        except ValueError:
+            return text
+
+    return {name: np.array([cell(row[name]) for row in table]) for name in table[0]}
+
+
+@pytest.fixture
+def done(mmrjax, capsys, monkeypatch):
+    """The folder of one mission on the battery, made once."""
+    if not (mmrjax.folder / "one").exists():
+        code, out, _ = mmrjax(
+            capsys, monkeypatch, "simulate", "--profile", "mission.csv", "--battery", "--out", "one"
+        )
+        assert code == 0, out
+        (mmrjax.folder / "said.txt").write_text(out)
+    return mmrjax.folder / "one"
+
+
+# --- what comes out -------------------------------------------------------------------------------------------------
+
+
+def test_result_has_the_numbers_of_the_mission(done):
+    result = json.loads((done / "result.json").read_text())
+    table = {key: value[0] for key, value in rows(done / "runs.csv").items()}
+    for name in (
+        "energy_Wh", "energy_per_metre_Wh", "distance_m", "rms_current_A", "peak_current_A", "rms_torque_Nm",
+        "winding_peak_C", "state_of_charge", "energy_drawn_Wh", "energy_returned_Wh", "endurance_s", "range_m",
+    ):  # fmt: skip
+        assert result[name] == pytest.approx(table[name], rel=1e-8), name
+    assert result["status"] == "converged" and result["duration_s"] == pytest.approx(10)
+    assert set(result["energy_by_where_Wh"]) == set(energy.SINKS)
+    assert result["energy_per_metre_Wh"] == pytest.approx(result["energy_Wh"] / result["distance_m"])
+    assert result["displacement_m"] < 0.8 * result["distance_m"]  # it comes back
+    went = sum(result["energy_by_where_Wh"].values()) + result["energy_stored_Wh"]
+    assert went == pytest.approx(result["energy_drawn_Wh"] - result["energy_returned_Wh"], rel=1e-6)
+    assert abs(result["unaccounted_share"]) < 1e-6
+    assert result["profile"]["cycles"] == 2 and len(result["profile"]["sha256"]) == 64
+
+
+def test_endurance_and_range_are_those_of_the_mean_current(done):
+    result = json.loads((done / "result.json").read_text())
+    used = 1 - result["state_of_charge"]
+    assert result["endurance_s"] == pytest.approx(result["duration_s"] / used, rel=1e-9)
+    assert result["range_m"] == pytest.approx(result["distance_m"] / used, rel=1e-9)
+
+
+def test_conditions_that_the_run_does_not_have_are_empty(done):
+    table = rows(done / "runs.csv")
+    assert np.isnan(table["supply_voltage_V"]) and np.isnan(table["slope_deg"])  # on the battery; of the profile
+    assert table["payload_kg"] == 0
+
+
+def test_segments_add_up_to_the_mission(done):
+    segments, table = rows(done / "segments.csv"), rows(done / "runs.csv")
+    assert list(segments["cycle"]) == [1] * 7 + [2] * 7 and list(segments["segment"]) == [*range(1, 8)] * 2
+    assert list(segments["mode"][:7]) == ["speed"] * 3 + ["brake"] + ["speed"] * 2 + ["brake"]
+    for column in ("duration_s", "distance_m", "energy_Wh", *(f"energy_to_{name}_Wh" for name in energy.SINKS)):
+        np.testing.assert_allclose(segments[column].sum(), table[column][0], rtol=1e-6, atol=1e-9)
+    assert segments["peak_current_A"].max() == pytest.approx(table["peak_current_A"][0])
+    assert segments["state_of_charge"][-1] == pytest.approx(table["state_of_charge"][0])
+    assert (np.diff(segments["state_of_charge"]) < 0).all()
+    np.testing.assert_allclose(segments["time_s"], np.cumsum(segments["duration_s"]) - segments["duration_s"])
+
+
+def test_history_follows_the_demand_and_holds_each_segments_peak(done):
+    history, segments = rows(done / "history.csv"), rows(done / "segments.csv")
+    assert (np.diff(history["time_s"]) > 0).all() and history["time_s"][-1] == pytest.approx(10)
+    cruise = (history["segment"] == 2) & (history["time_s"] % 5 > 1)
+    np.testing.assert_allclose(history["speed_mm_s"][cruise], 300, rtol=0.01)
+    np.testing.assert_allclose(history["demanded_speed_mm_s"][cruise], 300)
+    ramp = history["segment"] == 1
+    np.testing.assert_allclose(history["demanded_speed_mm_s"][ramp], 600 * (history["time_s"][ramp] % 5), atol=1e-4)
+    assert np.isnan(history["demanded_speed_mm_s"][np.isin(history["segment"], (4, 7))]).all()  # it brakes
+    for cycle, segment, peak in zip(segments["cycle"], segments["segment"], segments["peak_current_A"], strict=True):
+        own = (history["cycle"] == cycle) & (history["segment"] == segment)
+        # the peak of a segment counts the instant that it begins in too
+        assert np.abs(history["motor_current_A"][own]).max() <= peak * (1 + 1e-9)
+    assert np.abs(history["motor_current_A"]).max() == pytest.approx(segments["peak_current_A"].max())
+    assert history["energy_Wh"][-1] == pytest.approx(segments["energy_Wh"].sum(), rel=1e-6)
+
+
+def test_console_says_the_numbers_and_the_status(done):
+    said = (done.parent / "said.txt").read_text()
+    assert "profile mission.csv: 10 s, 2 cycles, 7 segments each" in said
+    result = json.loads((done / "result.json").read_text())
+    assert re.search(rf"energy \[Wh\] +│ {result['energy_Wh']:.3f} ", said)
+    assert re.search(r"status +│ converged", said)
+
+
+def test_report_shows_course_energy_and_segments(done):
+    page = (done / "report.html").read_text()
+    assert drawn(page) == {"course", "energy"}
+    tables = Tables(page)
+    assert len(tables.tables["segments"]) == 2 + 7
+    result = json.loads((done / "result.json").read_text())
+    assert f"{result['energy_Wh']:.4g} Wh" in tables.text
+    assert "0 to 300\u00a0mm/s, 0 to 5°" in tables.text
+    assert outside(done) == []
+
+
+def test_runs_of_a_file_follow_the_same_profile(mmrjax, capsys, monkeypatch):
+    (mmrjax.folder / "plan.csv").write_text(
+        "run_id,configuration,supply_voltage_V,payload_kg,slope_deg\na,6T2A,33,0,0\nb,4W2T,24,4,0\n"
+    )
+    words = ("--profile", "mission.csv", "--runs", "plan.csv", "--out", "several")
+    code, _, err = mmrjax(capsys, monkeypatch, "simulate", *words)
+    assert code == 0, err
+    assert "plan.csv, slope_deg: not used, mission.csv states it" in err
+    folder = mmrjax.folder / "several"
+    result = json.loads((folder / "result.json").read_text())
+    assert [m["status"] for m in result["missions"]] == ["converged"] * 2
+    assert (
+        result["missions"][0]["energy_Wh"] > 1.5 * result["missions"][1]["energy_Wh"]
+    )  # tracks cost more than wheels
+    assert result["missions"][0]["state_of_charge"] is None
+    assert list(rows(folder / "segments.csv")["run_id"]) == ["a"] * 14 + ["b"] * 14
+    assert Tables((folder / "report.html").read_text()).tables["runs"][1][0].startswith("a: 6T2A")
+
+
+def test_battery_that_ends_in_the_mission_is_said(mmrjax, capsys, monkeypatch):
+    """Exit code 3, the time and the distance up to there, and no segments after it."""
+    words = ("--profile", "mission.csv", "--battery", "--discharge", "2198", "--no-report", "--out", "empty")
+    code, out, _ = mmrjax(capsys, monkeypatch, "simulate", *words)
+    assert code == 3 and "battery_empty: the battery has no charge left" in out
+    result = json.loads((mmrjax.folder / "empty" / "result.json").read_text())
+    assert result["status"] == "battery_empty" and 2 < result["duration_s"] < 5
+    assert result["endurance_s"] == pytest.approx(result["duration_s"])
+    assert result["state_of_charge"] == pytest.approx(0, abs=1e-6)
+    segments = rows(mmrjax.folder / "empty" / "segments.csv")
+    assert len(segments["status"]) < 7 and segments["status"][-1] == "battery_empty"
+
+
+# --- what is refused ------------------------------------------------------------------------------------------------
+
+REFUSED = {
+    "steady": (["--model", "steady"], 2, r"options: profile acts with model drive only, which follows one; got model steady"),
+    "track": (["--model", "track"], 2, r"got model track"),
+    "duration": (["--duration", "5"], 2, r"options: duration_s acts without profile only"),
+    "posterior": (["--posterior", "50"], 2, r"options: posterior acts without profile only"),
+    "slope twice": (["--slope", "0"], 2, r"--slope: got it beside mission.csv, which states slope_deg"),
+    "empty battery": (["--battery", "--discharge", "2300"], 2, r"--discharge: got 2300 mAh; the battery is empty at 2200 mAh"),
+    "no such profile": (["--profile", "petrol"], 4, r"petrol: no such file and no packaged profile; .*patrol"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_does_not_go_with_a_profile_is_refused(mmrjax, capsys, monkeypatch, case):
+    options, wanted, message = REFUSED[case]
+    code, out, err = mmrjax(capsys, monkeypatch, "simulate", "--profile", "mission.csv", *options, "--out", "x")
+    assert (code, out) == (wanted, "")
+    assert re.search(message, err) and err.count("\n") == 1, err
+    assert not list(mmrjax.folder.glob("x*"))
+
+
+def test_voltage_of_the_profile_beside_the_battery_is_refused(mmrjax, capsys, monkeypatch):
+    (mmrjax.folder / "volts.csv").write_text("time_s,supply_voltage_V\n0,24\n1,24\n")
+    code, _, err = mmrjax(capsys, monkeypatch, "simulate", "--profile", "volts.csv", "--battery")
+    assert code == 2 and "--battery: got it beside volts.csv, which states supply_voltage_V" in err
+
+
+def test_help_names_the_packaged_profiles_and_units(mmrjax, capsys, monkeypatch):
+    code, out, _ = mmrjax(capsys, monkeypatch, "simulate", "--help")
+    text = " ".join(re.sub(r"[│]", " ", out).split())
+    assert code == 0 and all(name in text for name in profiles.PACKAGED)
+    assert "time_s (s)" in text and "simulate --profile patrol --battery" in text
+
+
+# --- rows of the history --------------------------------------------------------------------------------------------
+
+
+def test_thinning_keeps_the_peak_of_each_segment():
+    rng = np.random.default_rng(0)
+    segment, current = np.repeat(np.arange(50), 200), rng.normal(size=10_000)
+    kept = thinned(segment, current, 400)
+    assert len(kept) <= 400 and (np.diff(kept) > 0).all()
+    peaks = [k * 200 + np.argmax(np.abs(current[k * 200 : (k + 1) * 200])) for k in range(50)]
+    assert set(peaks) <= set(kept) and kept[-1] == 9999
+    assert np.diff(kept).max() <= 30  # evenly spread beside them
+    assert (thinned(segment, current, 20_000) == np.arange(10_000)).all()
+    few = thinned(segment, current, 40)
+    assert len(few) <= 40 and np.argmax(np.abs(current)) in few
+
+
+# --- from Python ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two(robot):
+    """Two runs over a short profile, without history."""
+    at = mm.Conditions(configuration=["6T2A", "4W2T"], voltage=24.0, battery=[0.0, 1.0])
+    return mm.simulate(robot, at, profile=SHORT, history=False)
+
+
+def test_simulate_over_a_profile_has_the_columns_of_the_table(two):
+    assert two.model == "drive" and two.shape == (2,) and list(two.statuses) == ["converged"] * 2
+    table = two.to_dict()
+    assert set(missions.names()) < set(table) and not {"slip", "total_current_A"} & set(table)
+    assert two.energy_Wh.shape == (2,) and (two.energy_Wh > 0).all()
+    np.testing.assert_allclose(two.energy_Wh, two.mission.total.energy / 3600)
+    assert np.isnan(two.state_of_charge[0]) and 0.99 < two.state_of_charge[1] < 1
+    assert "energy per metre" in str(two) and two.mission.status.shape == (2, 1, 3)
+
+
+def test_numbers_are_described_once():
+    assert len({o.name for o in OUTPUTS}) == len(OUTPUTS) == len(set(missions.names()))
+    assert set(missions.USUAL) < set(missions.names())
+    assert {f"energy_to_{name}" for name in energy.SINKS} < {o.name for o in OUTPUTS}
+
+
+def test_energy_has_forward_derivatives_by_the_robot_and_by_the_profile(robot):
+    """Along one direction in both; central differences agree."""
+    at = mm.Conditions(configuration="6T2A", voltage=24.0)
+    (friction,) = (p.value for p in params.walk(robot) if p.name == "motor.friction_coulomb")
+
+    def spent(x):
+        changed = mm.replace(robot, {"motor.friction_coulomb": friction * (1 + x)})
+        course = dataclasses.replace(SHORT, demand=SHORT.demand * (1 + x))
+        return mm.simulate(changed, at, profile=course, history=False).energy_Wh
+
+    value, slope = jax.jvp(spent, (0.0,), (1.0,))
+    h = 1e-3
+    between = float((spent(h) - spent(-h)) / (2 * h))
+    assert np.isfinite(slope) and float(slope) == pytest.approx(between, rel=2e-3)
+    assert value > 0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"profile": SHORT, "model": "steady"}, r"model: got steady beside a profile; expected drive"),
+        ({"profile": SHORT, "duration": 3.0}, r"duration: got 3.0 beside a profile"),
+        ({"profile": "patrol"}, r"profile: got str; expected mmrjax.profile.profile"),
+        ({"start": missions.Start()}, r"start: got one without a profile"),
+    ],
+)
+def test_wrong_use_is_said(robot, given, message):
+    with pytest.raises(mm.UsageError, match=message):
+        mm.simulate(robot, mm.Conditions(), **given)
+
+
+# --- sweeps ---------------------------------------------------------------------------------------------------------
+
+PLAN = """\
+profile = "mission.csv"
+outputs = ["energy_Wh", "peak_current_A", "flags"]
+[conditions]
+battery = true
+configuration = "6T2A"
+[axes]
+payload = [0, 8]
+"""
+
+
+def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, done, capsys, monkeypatch):
+    import xarray as xr
+
+    (mmrjax.folder / "plan.toml").write_text(PLAN)
+    code, _, err = mmrjax(capsys, monkeypatch, "sweep", "plan.toml", "--no-report", "--out", "swept")
+    assert code == 0, err
+    found = xr.open_zarr(mmrjax.folder / "swept" / "results.zarr")
+    one = json.loads((done / "result.json").read_text())
+    assert float(found.energy_Wh.sel(payload=0)) == pytest.approx(one["energy_Wh"], rel=1e-6)
+    assert float(found.energy_Wh.sel(payload=8)) > one["energy_Wh"] and found.energy_Wh.attrs["units"] == "Wh"
+    assert [STATUSES[int(k)] for k in found.status] == ["converged"] * 2 and found.flags.dtype == np.uint16
+
+
+BAD_PLANS = {
+    "an output of a run": (PLAN.replace('"energy_Wh"', '"slip"'), r"plan.toml, outputs: got slip;"),
+    "a condition twice": (PLAN + "slope_deg = [0, 5]\n", r"plan.toml, slope_deg: got it beside mission.csv, which states it"),
+    "another model": ('model = "steady"\n' + PLAN, r"profile acts with model drive only"),
+    "a duration": ("duration_s = 3\n" + PLAN, r"duration_s acts without profile only"),
+    "no such profile": (PLAN.replace("mission.csv", "none.csv"), r"none.csv: no such file and no packaged profile"),
+    "surfaces": (PLAN.replace("mission.csv", "floors.csv"), r"profile: got floors.csv with the column surface"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_PLANS)
+def test_wrong_plan_is_refused(mmrjax, capsys, monkeypatch, case):
+    text, message = BAD_PLANS[case]
+    (mmrjax.folder / "plan.toml").write_text(text)
+    (mmrjax.folder / "floors.csv").write_text("time_s,duty,surface\n0,1,asphalt\n1,1,asphalt\n")
+    code, _, err = mmrjax(capsys, monkeypatch, "sweep", "plan.toml", "--out", "y")
+    assert code in (2, 4) and re.search(message, err), err
