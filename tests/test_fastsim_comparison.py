@@ -1,0 +1,72 @@
+"""Missions beside FASTSim (benchmarks/fastsim_comparison.py): beside the integral of rolling, climb and acceleration."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+import fastsim_comparison as comparison
+
+INSTALLED = importlib.util.find_spec("fastsim") is not None
+
+
+@pytest.fixture(scope="module")
+def missions() -> dict[str, dict[str, Any]]:
+    """Both vehicles, by one compiled mission."""
+    return {vehicle.name: comparison.mmrjax_of(vehicle, asked) for vehicle, asked in comparison.CASES}
+
+
+@pytest.mark.parametrize("case", range(len(comparison.CASES)))
+def test_mission_follows_the_integral(case: int, missions: dict[str, dict[str, Any]]) -> None:
+    """Work at the wheel both ways, distance and Wh/km; the rest is what windings and sliding take."""
+    vehicle, asked = comparison.CASES[case]
+    ours, exact = missions[vehicle.name], comparison.integral_of(vehicle, asked)
+    for name in ("wheel_J", "wheel_back_J", "distance_m", "Wh_per_km"):
+        assert ours[name] == pytest.approx(exact[name], rel=3e-4), name
+    assert ours["wheel_J"] - ours["wheel_back_J"] == pytest.approx(ours["wheel_net_by_sinks_J"], rel=1e-4)
+    assert abs(ours["unaccounted_J"]) < 1e-6 * ours["battery_J"]
+
+
+def test_comparison_can_fail(missions: dict[str, dict[str, Any]]) -> None:
+    """Rolling resistance off by 2 % or a gear lossless on the way back is beyond the goals."""
+    vehicle, asked = comparison.CASES[0]
+    ours = missions[vehicle.name]
+    rougher = comparison.integral_of(dataclasses.replace(vehicle, rolling=1.02 * vehicle.rolling), asked)
+    assert abs(comparison.percent(ours, rougher)["wheel_J"]) > 0.5
+    exact = comparison.integral_of(vehicle, asked)
+    lossless = exact["wheel_J"] / vehicle.efficiency - exact["wheel_back_J"]
+    assert abs(ours["battery_J"] / lossless - 1) > 0.01
+
+
+def test_integral_of_a_plain_ramp() -> None:
+    """m v²/2 and rolling over the way, wheels turning included."""
+    vehicle = comparison.CAR
+    ramp = comparison.Trace(np.array([0.0, 10.0]), np.array([0.0, 5.0]), np.zeros(2))
+    work = 0.5 * (vehicle.mass + vehicle.inertia / vehicle.radius**2) * 25
+    work += vehicle.rolling * vehicle.mass * comparison.GRAVITY * 25
+    assert comparison.integral_of(vehicle, ramp)["wheel_J"] == pytest.approx(work, rel=1e-6)
+
+
+@pytest.mark.skipif(INSTALLED, reason="fastsim is installed")
+def test_without_fastsim_it_says_how_to_install_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        comparison.main()
+    assert ended.value.code == 2
+    assert "pip install fastsim" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not INSTALLED, reason="fastsim is not installed")
+@pytest.mark.parametrize("case", range(len(comparison.CASES)))
+def test_fastsim_agrees(case: int, missions: dict[str, dict[str, Any]]) -> None:
+    vehicle, asked = comparison.CASES[case]
+    apart = comparison.percent(missions[vehicle.name], comparison.fastsim_of(vehicle, asked, 1.0))
+    assert abs(apart["wheel_J"]) <= 0.5
+    assert abs(apart["Wh_per_km"]) <= 1.0
