@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.mission import current_at_rest, firmness
+from mmrjax.fidelities.rest import current_at_rest, firmness
 from mmrjax.fidelities.result import result, stands, travels, unless_slipping, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
 from mmrjax.fidelities.steady import direction, operating_signals, voltage_at_rest

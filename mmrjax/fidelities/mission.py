@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from mmrjax import balances, energy
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.rarely import rarely
+from mmrjax.fidelities.rest import current_at_rest, firmness
 from mmrjax.fidelities.result import exceeded, mask, result, slips, travels, withhold
 from mmrjax.fidelities.rosenbrock import stages
 from mmrjax.params import Scalar
@@ -62,8 +63,8 @@ MOST_STEPS = 4096
 FIRST, SHORTEST = 1e-4, 1e-9
 #: How near an event a step has to end, of what its function is scaled to; or how short a step is near enough [s].
 EVENT, NEAR = 1e-2, 1e-7
-#: Torque [N·m] and share of the weight that scale how firmly a robot stands; and how firmly before it stands.
-FIRM_TORQUE, FIRM_WEIGHT, FIRMLY = 1.0, 1.0, 1e-3
+#: How firmly friction holds a robot before it stands [-].
+FIRMLY = 1e-3
 #: A demanded speed is missed where at the end of a segment it is off by more than this share of the segment's
 #: largest [-].
 MISSED = 0.02
@@ -249,21 +250,6 @@ def _instant(
     )
 
 
-def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """How firmly friction would hold the robot at rest, negative where it cannot [-].
-
-    Its shafts stand where the motors and gravity together can turn them neither way against friction at rest, its
-    movers where gravity along the slope is below the ground's adhesion.
-    """
-    at_rest = dataclasses.replace(state, speed_motor=jnp.zeros_like(state.speed), speed=jnp.zeros_like(state.speed))
-    forward, _ = balances.settled(robot, conditions, at_rest, 1.0)
-    backward, _ = balances.settled(robot, conditions, at_rest, -1.0)
-    shafts = jnp.minimum(-forward.torque_net, backward.torque_net) / FIRM_TORQUE
-    along = jnp.maximum(backward.demand, -forward.demand)
-    ground = (forward.adhesion_limit - along) / (FIRM_WEIGHT * forward.normal)
-    return jnp.minimum(shafts, ground)
-
-
 def _firmly(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> tuple[Array, Array]:
     """How firmly friction would hold the robot now, and with what current will flow then too: a controller asks for
     less once there is no error."""
@@ -273,20 +259,6 @@ def _firmly(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, sta
     settled = dataclasses.replace(state, current=current_at_rest(at_rest.robot, at_rest.conditions, state))
     firm = firmness(asked.robot, asked.conditions, state)
     return jnp.asarray(firm), jnp.minimum(firm, firmness(at_rest.robot, at_rest.conditions, settled))
-
-
-def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Current to which that of a standing robot settles [A], on the line through two of its voltage balance."""
-
-    def left(current: Scalar) -> Scalar:
-        still = jnp.zeros_like(state.speed)
-        at_rest = dataclasses.replace(state, current=current, speed_motor=still, speed=still)
-        return balances.settled(robot, conditions, at_rest, 0.0)[0].voltage_left
-
-    guess = left(jnp.zeros_like(state.current)) / robot.motor.resistance
-    first, second = left(0.5 * guess), left(guess)
-    slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
-    return guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
 
 
 class _Carry(NamedTuple):
