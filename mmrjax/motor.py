@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from mmrjax.params import Scalar, parameter
 
@@ -12,6 +14,7 @@ _SHEET = "maker's sheet of RE30 310007 (24 V, 60 W)"
 ALPHA = 0.00393  # temperature coefficient of copper's resistance at 20 °C [1/K], IEC 60028 (1925)
 #: Temperature for which makers state the resistance of a winding [°C].
 TEMPERATURE_REFERENCE = 25.0
+_LONG = 1e6  # s, many of a motor's time constants
 
 
 class Motor(eqx.Module):
@@ -171,3 +174,52 @@ class Motor(eqx.Module):
             (power - flow) * self.resistance_thermal_winding / self.time_constant_winding,
             (flow - out) * self.resistance_thermal_housing / self.time_constant_housing,
         )
+
+    def temperatures_after(
+        self, current: Scalar, time: Scalar, winding: Scalar, housing: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        """Temperatures of winding and housing [°C] after `time` [s] at `current` [A], in closed form.
+
+        `heating` with P = I² R (1 + α (T_w - 25 °C)) is linear in both temperatures: the exponential of its matrix.
+        """
+        zero = jnp.zeros(())
+
+        def rates(x: Array) -> Array:
+            power = self.voltage_winding(current, x[0]) * current
+            return jnp.stack([jnp.asarray(rate, float) for rate in self.heating(power, x[0], x[1])])
+
+        still = rates(jnp.zeros(2))
+        matrix = jax.jacfwd(rates)(jnp.zeros(2))
+        whole = jnp.block([[matrix, still[:, None]], [jnp.zeros((1, 3))]])
+        begin = jnp.stack([jnp.asarray(x, float) + zero for x in (winding, housing, 1.0)])
+        end = jax.scipy.linalg.expm(whole * time) @ begin
+        return end[0], end[1]
+
+    def time_permissible(
+        self, current: Scalar, winding: Scalar | None = None, housing: Scalar | None = None
+    ) -> Scalar:
+        """How long a `current` [A] may flow before the winding is at its limit [s]; inf: for ever, 0: it is already.
+
+        Args:
+            winding, housing: temperatures at the beginning [°C], None: ambient.
+        """
+        ambient, limit = self.temperature_ambient, self.temperature_limit
+        begin = (ambient if winding is None else winding, ambient if housing is None else housing)
+
+        def excess(time: Scalar) -> Array:
+            reached = self.temperatures_after(current, time, *begin)[0] - limit
+            return jnp.where(jnp.isfinite(reached), reached, jnp.inf)
+
+        def halve(_: int, between: tuple[Array, Array]) -> tuple[Array, Array]:
+            low, high = between
+            middle = jnp.sqrt(low * high)
+            hot = excess(middle) > 0
+            return jnp.where(hot, low, middle), jnp.where(hot, middle, high)
+
+        low, high = jax.lax.fori_loop(0, 60, halve, (jnp.asarray(1e-6), jnp.asarray(_LONG)))
+        found = jax.lax.stop_gradient(jnp.sqrt(low * high))
+        # Newton's step from there is nothing but carries the derivative.
+        value, rise = jax.jvp(excess, (found,), (jnp.ones_like(found),))
+        found = found - jnp.where(rise > 0, value / jnp.where(rise > 0, rise, 1.0), 0.0)
+        ever = (self.temperature_settled(current) > limit) & (excess(jnp.asarray(_LONG)) > 0)
+        return jnp.where(jnp.asarray(begin[0]) >= limit, 0.0, jnp.where(ever, found, jnp.inf))

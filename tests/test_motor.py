@@ -1,8 +1,10 @@
 """DC motor, eqs. (14)-(18)."""
 
+import jax
 import numpy as np
 import pytest
 import reference
+from scipy.integrate import solve_ivp
 
 from mmrjax.motor import ALPHA, Motor
 
@@ -60,3 +62,31 @@ def test_no_temperature_settles_where_every_kelvin_brings_more_than_a_kelvin():
     edge = float((ALPHA * motor.resistance_thermal * motor.resistance) ** -0.5)
     assert np.isfinite(motor.temperature_settled(0.99 * edge)) and np.isinf(motor.temperature_settled(1.01 * edge))
     assert float(motor.temperature_settled(3.91)) == pytest.approx(motor.temperature_limit, rel=5e-3)
+
+
+@pytest.mark.parametrize("current", [0.0, 3.0, 6.0, 20.0])
+def test_temperatures_in_closed_form_match_scipy(current):
+    motor, time = Motor(), 80.0
+
+    def rates(t, y):
+        power = 0.611 * (1 + 0.00393 * (y[0] - 25)) * current**2
+        flow = (y[0] - y[1]) / 1.7
+        return [(power - flow) * 1.7 / 16.3, (flow - (y[1] - 25) / 6.0) * 6.0 / 593.0]
+
+    end = solve_ivp(rates, [0, time], [40.0, 30.0], method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(motor.temperatures_after(current, time, 40.0, 30.0), end, rtol=1e-9)
+
+
+def test_permissible_time_is_when_the_limit_is_reached():
+    motor = Motor()
+    for current in (4.5, 8.0, 30.0):
+        time = float(motor.time_permissible(current))
+        assert float(motor.temperatures_after(current, time, 25.0, 25.0)[0]) == pytest.approx(125.0, rel=1e-9)
+        step = 1e-4 * current
+        apart = float(motor.time_permissible(current + step)) - float(motor.time_permissible(current - step))
+        assert float(jax.grad(lambda i: motor.time_permissible(i))(current)) == pytest.approx(
+            apart / (2 * step), rel=1e-5
+        )
+    assert float(motor.time_permissible(3.9)) == np.inf  # below the continuous current
+    assert float(motor.time_permissible(8.0, winding=130.0)) == 0.0
+    assert float(motor.time_permissible(8.0, 100.0, 80.0)) < float(motor.time_permissible(8.0))
