@@ -28,7 +28,7 @@ class Start:
     Attributes:
         name: heading; configuration; status.
         time: [s]; current: of all motors [A]; speed, theoretical: V and r_k ω_k [mm/s].
-        sense: of travel at the end, 1 or -1; current and speeds are drawn, and kept here, times it.
+        sense: in which the shafts turn at the end, 1 or -1; current and speeds are drawn, and kept here, times it.
         starting: end of stage I [s]: the slide has reached its maximum, the shafts have spun up.
         slipping: end of stage II [s]: the slide is back within V_s for good; `starting` if it never left.
         settled: t' [s]: the speed within 1 % of its last value.
@@ -50,6 +50,11 @@ class Start:
     def gets_under_way(self) -> bool:
         """Whether there are stages to tell apart."""
         return self.status in (*words.SETTLED, "rolls_back", "not_settled")
+
+    @property
+    def peak(self) -> float:
+        """Largest current [A], with the sign that it is drawn with."""
+        return float(self.current[int(np.argmax(np.abs(self.current)))])
 
     @property
     def ended(self) -> tuple[float, float]:
@@ -74,8 +79,9 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
         times, sliding = np.asarray(history.time[k])[upto], np.asarray(history.signals.speed_sliding[k])[upto]
         speed = np.asarray(history.signals.speed[k])[upto] / MM
-        sense = -1.0 if finite.size and speed[-1] < -0.1 else 1.0
-        speed, sliding = sense * speed, sense * sliding
+        theoretical = np.asarray(history.signals.speed_theoretical[k])[upto] / MM
+        sense = -1.0 if finite.size and theoretical[-1] < -0.1 else 1.0
+        speed, theoretical, sliding = sense * speed, sense * theoretical, sense * sliding
         kind = robot.configurations.names[int(which[k])]
         starting = slipping = settled = 0.0
         if finite.size:
@@ -86,7 +92,6 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
             last = speed[_end(times)].mean()
             late = np.nonzero(np.abs(speed - last) > 0.01 * np.abs(last))[0]
             settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
-        theoretical = sense * np.asarray(history.signals.speed_theoretical[k])[upto] / MM
         ended = STATUSES[int(status[k])]
         stages = (starting, max(slipping, starting), settled)
         answer.append(Start(name, kind, ended, times, sense * current[upto], speed, theoretical, sense, *stages))
