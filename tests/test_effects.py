@@ -364,7 +364,7 @@ def law_readable(effect: type[Effect]) -> None:
 #: Signals that are the same in a run in mirror image (the robot turned about on the same slope).
 EVEN = (
     *("configuration", "on_tracks", "payload", "adhesion", "battery", "discharge", "memory", "mass", "normal"),
-    *("inductance", "inertia_added", "adhesion_limit", "efficiency_load"),
+    *("inductance", "inertia_added", "adhesion_limit", "efficiency_load", "temperature", "duty"),
 )
 
 
