@@ -667,6 +667,41 @@ def resonance(
     return room.resonance(resolved, out, force)
 
 
+@app.command(epilog="Example: mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40")
+def check(
+    requirements: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[REQUIREMENTS.toml]", help="TOML file (docs/requirements.md).  \\[default: the paper's aims]"
+        ),
+    ] = None,
+    changes: Annotated[
+        bool | None,
+        typer.Option("--changes/--no-changes", help="Look for what would meet what is missed.  \\[default: changes]"),
+    ] = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+    no_cache: _NoCache = False,
+) -> int:
+    """Hold a robot against requirements: pass or fail with margin, each at the worst corner of its envelope.
+
+    Of each that is missed it says what change of one parameter would meet it. Exit code 3: one is missed.
+    """
+    from sweeps import config
+
+    options = _options(robot=robot, set=set_, effects=effects, report=report) | {
+        "requirements": None if requirements is None else str(requirements), "changes": changes,
+    }  # fmt: skip
+    resolved = _prepared(config.resolve(config.Check, None, options), no_cache)
+    from sweeps import check as room
+
+    return room.check(resolved, out, force)
+
+
 @app.command()
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""

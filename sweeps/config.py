@@ -329,6 +329,18 @@ class Loop(RobotPart, InferencePart, OutputPart):
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = None
 
 
+class Check(RobotPart, OutputPart):
+    """A robot held against requirements.
+
+    Attributes:
+        requirements: their TOML file, or `paper`: the paper's aims.
+        changes: whether to look for what would meet the missed ones.
+    """
+
+    requirements: str = "paper"
+    changes: bool = True
+
+
 class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
     """A sensitivity study.
 
