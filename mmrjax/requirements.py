@@ -166,13 +166,25 @@ def _temperature(robot: Robot, point: Point, current: Scalar) -> Scalar:
     return dataclasses.replace(robot.motor, temperature_ambient=point.ambient).temperature_settled(current)
 
 
+def heat_left(robot: Robot, point: Point, current: Scalar, limit: Scalar) -> Scalar:
+    """What is left of the loss that a winding may have for long at `current` [-]: 0 where it settles at `limit` [°C].
+
+    1 - I² R_th R (1 + α (T - 25 °C)) / (T - T_a); `robot` as stated, not as `_at` gives it.
+    """
+    motor = robot.motor
+    hot = motor.resistance * (1 + ALPHA * (limit - TEMPERATURE_REFERENCE))
+    return 1 - current**2 * motor.resistance_thermal * hot / jnp.maximum(limit - point.ambient, 1.0)
+
+
 def _cell(of: Ratings, signals: Signals, point: Point) -> Scalar:
     """By how much a cell is above its cut-off voltage [V]; inf on an external supply."""
     return jnp.where(point.battery > 0.5, signals.voltage_source / of.cells - of.voltage_cutoff, jnp.inf)
 
 
 def travel(robot: Robot, point: Point, of: Ratings) -> tuple[dict[str, Array], Array]:
-    """Steady travel: every quantity of group `travel` by name [SI], and the outcome."""
+    """Steady travel: every quantity of group `travel` by name [SI], and the outcome; beside them the
+    `current` of one motor and of the `battery` [A], what is `left` of traction and speed, of `adhesion` alone [-],
+    and by how much a `cell` is above its cut-off [V]."""
     here, conditions = _at(robot, point, of)
     signals, status, _ = operating(here, conditions)
     outcome = jnp.where((status == CONVERGED) & (_cell(of, signals, point) < 0), CUT_OFF, status)
@@ -187,6 +199,11 @@ def travel(robot: Robot, point: Point, of: Ratings) -> tuple[dict[str, Array], A
         "motor_speed_rpm": turns,
         "current_A": signals.total_current,
         "energy_per_metre_Wh": energy.source(here, conditions, signals) / moving,
+        "current": signals.current,
+        "battery": here.battery.current(signals.total_current),
+        "adhesion": 1 - signals.demand / signals.adhesion_limit,
+        "left": steepest_slope.travel_margin(here, signals),
+        "cell": _cell(of, signals, point),
     }
     return {name: jnp.asarray(x) for name, x in found.items()}, outcome
 
@@ -216,7 +233,7 @@ def _payload(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
         at = dataclasses.replace(point, payload=payload)
         here, conditions = _at(robot, at, of)
         signals, _, _ = operating(here, conditions)
-        hot = (of.temperature - _temperature(robot, at, signals.current)) / (of.temperature - point.ambient)
+        hot = heat_left(robot, at, signals.current, of.temperature)
         torque = 1 - jnp.abs(signals.torque_gear) / of.torque
         each = [steepest_slope.travel_margin(here, signals), hot, torque, _cell(of, signals, point)]
         return functools.reduce(jnp.minimum, each)

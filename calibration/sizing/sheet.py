@@ -173,39 +173,60 @@ def points(robot: Robot, requirement: Requirement) -> Point:
     )  # fmt: skip
 
 
-def _changed(robot: Robot, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
+def _changed(robot: Robot, of: Ratings, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
     """The robot with parameters from a vector, and its ratings; `battery.cells` is among the latter."""
     values = dict(zip(names, theta, strict=True))
     cells = values.pop(CELLS)
-    return params.replace(robot, values), dataclasses.replace(ratings(robot), cells=cells)
+    return params.replace(robot, values), dataclasses.replace(of, cells=cells)
 
 
-def _without_cells(robot: Robot) -> Robot:
-    """The robot with one cell, as the number of cells comes with the parameters: one program for any number."""
-    return params.strong(dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1)))
+def _unrated(robot: Robot) -> Robot:
+    """The robot with one cell and the ratings that a robot has where none are stated.
+
+    Cells and ratings come beside it, as numbers: one program for robots of any.
+    """
+    usual, shaft, gear = type(robot.battery)(), type(robot.motor)(), type(robot.gearbox)()
+    limits = ("voltage_charge", "voltage_cutoff", "delay_cutoff", "current_limit", "current_charge")
+    robot = dataclasses.replace(
+        robot,
+        battery=dataclasses.replace(robot.battery, cells=1, **{name: getattr(usual, name) for name in limits}),
+        motor=dataclasses.replace(
+            robot.motor,
+            **{n: getattr(shaft, n) for n in ("temperature_limit", "voltage_limit", "speed_limit")},
+        ),
+        gearbox=dataclasses.replace(
+            robot.gearbox, **{name: getattr(gear, name) for name in ("speed_limit", "torque_limit")}
+        ),
+    )
+    return params.strong(robot)
 
 
 @eqx.filter_jit
 def _over(
-    robot: Robot, names: tuple[str, ...], rows: Float[Array, "rows parameters"], at: Point, name: str
+    robot: Robot,
+    of: Ratings,
+    names: tuple[str, ...],
+    rows: Float[Array, "rows parameters"],
+    at: Point,
+    name: str,
 ) -> tuple[Array, Array]:
     """Values and outcomes of a quantity over robots (rows of parameters) and points, shape (rows, points)."""
 
     def one(theta: Array, point: Point) -> tuple[Array, Array]:
-        changed, of = _changed(robot, names, theta)
-        found = evaluate(changed, point, of, name)
+        changed, changed_ratings = _changed(robot, of, names, theta)
+        found = evaluate(changed, point, changed_ratings, name)
         return found.value, found.outcome
 
     return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
 
 
 @eqx.filter_jit
-def _gradient(robot: Robot, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
+def _gradient(robot: Robot, of: Ratings, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
     """Derivative of a quantity at one point by the parameters."""
 
     def value(theta: Array) -> Array:
-        changed, of = _changed(robot, names, theta)
-        return evaluate(changed, at, of, name).value
+        changed, changed_ratings = _changed(robot, of, names, theta)
+        return evaluate(changed, at, changed_ratings, name).value
 
     return jax.grad(value)(theta)
 
@@ -225,10 +246,10 @@ class _Held:
     def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values in the unit of the name, outcomes, and margins (-inf without value), shape (rows, points)."""
         r, at, parts = self.requirement, self.at, []
-        robot = _without_cells(self.robot)
+        robot, of = _unrated(self.robot), ratings(self.robot)
         for first in range(0, len(rows), ROWS):
             chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
-            found = jax.device_get(_over(robot, self.names, jnp.asarray(chosen), at, _computed(r)))
+            found = jax.device_get(_over(robot, of, self.names, jnp.asarray(chosen), at, _computed(r)))
             parts.append([x[: len(rows) - first] for x in found])
         value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
         value = value / r.quantity.factor
@@ -347,7 +368,9 @@ def _changes(held: _Held, outcome: Outcome) -> list[Change]:
     worst = int(np.argmin(held.over(now[None])[2][0]))
     point = jax.tree.map(lambda x: x[worst], held.at)
     slopes = np.asarray(
-        _gradient(_without_cells(held.robot), names, jnp.asarray(now), point, _computed(held.requirement))
+        _gradient(
+            _unrated(held.robot), ratings(held.robot), names, jnp.asarray(now), point, _computed(held.requirement)
+        )
     )
     slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
     known = {p.name: p for p in params.walk(held.robot)}
