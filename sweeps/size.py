@@ -153,7 +153,8 @@ def print_size(found: SizeResult) -> None:
         values = [f"{f.objectives[k]:.4g}" if k in f.objectives else "" for k in OBJECTIVES]
         shown.add_row(
             "meets" if f.feasible else "misses", f.drive.name, f"{f.ratio:.3g}", f"{1000 * f.radius:.1f}",
-            f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *values, ", ".join(f.binds if f.feasible else missed(f)),
+            f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *values,
+            ", ".join(f.binds if f.feasible else missed(f)),
         )  # fmt: skip
     say(shown)
     if s.front:

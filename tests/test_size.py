@@ -115,7 +115,7 @@ def test_binding_limits_are_why_it_is_no_lighter(robot, asked, found):
     (row,) = (
         k for k in range(len(choice.drive))
         if found.options.drives[choice.drive[k]] == ideal.drive
-        and found.options.cells[choice.cell[k]] == ideal.cell and choice.in_series[k] == ideal.series
+        and found.options.cells[choice.cell[k]] == ideal.cell and choice.in_series[k] == ideal.in_series
     )  # fmt: skip
     x = np.log([[ideal.ratio, ideal.radius, ideal.parallel * 0.97]])
     assert search.measured(of, choice, np.array([row]), x)[1].min() < 0
