@@ -36,6 +36,8 @@ STEPS, EVERY, RATE = 120, 12, (0.06, 0.003)
 WEIGHT, GROWTH, HEAVIEST = 5.0, 1.7, 500.0
 #: Designs that are then refined, points along each of their axes, rounds, and how the box shrinks.
 REFINED, ALONG, ROUNDS, SHRINK = 24, 7, 7, 0.45
+#: Choices of which every ratio of the sheets is tried with whole cells, the most in parallel, and how many are kept.
+WHOLE, MOST_WHOLE, KEPT_WHOLE = 600, 8, 192
 #: Margin of a limit that binds.
 BINDS = 0.01
 
@@ -265,6 +267,7 @@ def size(
     shares = [len(s) for s in np.array_split(np.arange(starts), len(columns))]
     each = [_starts(choice, rows, np.log(f[:, c]) + misses, n) for c, n in zip(columns, shares, strict=True)]
     picked = np.concatenate(each)
+    pool, pool_f = rows, f
     rows, x = rows[picked], x[picked]
     weights = np.zeros((starts, len(OBJECTIVES)))
     share = np.ones(starts) if len(columns) == 1 else np.linspace(0.98, 0.02, starts)
@@ -287,6 +290,13 @@ def size(
     cost = _cost(f, g, kept, np.tile(alone, (starts, 1)))
     # With ratios of the sheets and whole cells.
     real_rows, real_x, real_w = _real(choice, rows, x, weights, np.argsort(cost))
+    for c in columns:
+        w = np.eye(len(OBJECTIVES))[c]
+        ranked = pool[np.argsort(np.where(np.isfinite(pool_f[:, c]), np.log(pool_f[:, c]) + misses, np.inf))]
+        more_rows, more_x, count = _enumerated(of, choice, np.array(list(dict.fromkeys(ranked))[:WHOLE]), kept, w)
+        evaluated += count
+        real_rows, real_x = np.concatenate([real_rows, more_rows]), np.concatenate([real_x, more_x])
+        real_w = np.concatenate([real_w, np.tile(w, (len(more_rows), 1))])
     real_x, count = _refine(of, choice, real_rows, real_x, kept, real_w, np.array([0.0, 1.0, 0.0]))
     evaluated += count
     real_f, real_g = measured(of, choice, real_rows, real_x)
@@ -383,6 +393,24 @@ def _real(
             made.setdefault(key, (rows[k], [math.log(ratio), x[k, 1], math.log(p)], weights[k]))
     chosen, points, w = zip(*made.values(), strict=True)
     return np.array(chosen), np.array(points), np.array(w)
+
+
+def _enumerated(
+    of: Task, choice: Space, rows: np.ndarray, kept: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """The best designs of choices with every ratio of their sheets, few whole cells in parallel and three radii, and
+    how many were evaluated."""
+    of_row, points = [], []
+    for row in rows:
+        low, high = choice.low[row, 1], choice.high[row, 1]
+        ratios = choice.options.drives[choice.drive[row]].ratios
+        for ratio, p, share in itertools.product(ratios, range(1, MOST_WHOLE + 1), (0.4, 0.7, 1.0)):
+            of_row.append(row)
+            points.append([math.log(ratio), low + share * (high - low), math.log(p)])
+    every, x = np.array(of_row), np.array(points)
+    f, g = measured(of, choice, every, x)
+    best = np.argsort(_cost(f, g, kept, np.tile(weights, (len(every), 1))))[:KEPT_WHOLE]
+    return every[best], x[best], len(every)
 
 
 def _undominated(f: np.ndarray, among: list[int]) -> list[int]:
