@@ -301,6 +301,13 @@ def size(
     evaluated += count
     real_f, real_g = measured(of, choice, real_rows, real_x)
     real_cost = _cost(real_f, real_g, kept, np.tile(alone, (len(real_f), 1)))
+    # The best of these with any ratio and parts of a cell: no search may have begun from their choice of parts.
+    top = np.argsort(real_cost)[:REFINED]
+    more_x, count = _refine(of, choice, real_rows[top], real_x[top], kept, np.tile(alone, (len(top), 1)), np.ones(3))
+    evaluated += count
+    rows, x = np.concatenate([rows, real_rows[top]]), np.concatenate([x, more_x])
+    f, g = measured(of, choice, rows, x)
+    cost = _cost(f, g, kept, np.tile(alone, (len(rows), 1)))
 
     def found(rows: np.ndarray, x: np.ndarray, f: np.ndarray, g: np.ndarray, k: int) -> Found:
         return _found(robot, of, choice, rows[k], x[k], f[k], np.where(kept, g[k], np.nan))
