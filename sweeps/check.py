@@ -137,7 +137,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     with open_folder("check", config, robot, out, force) as folder:
         found = CheckResult(asked, robot, sheet.check(robot, asked, changes=config.changes))
         _write(folder, config, found)
-        print_check(found)
+        print_check(found, changes=config.changes)
         if config.report:
             from sweeps import report_check
 
@@ -171,7 +171,7 @@ def table(found: CheckResult) -> dict[str, np.ndarray]:
     }
 
 
-def print_check(found: CheckResult) -> None:
+def print_check(found: CheckResult, changes: bool = True) -> None:
     """The sheet, and what would meet what is missed; for a person."""
     shown = Table(title=f"requirements of {found.asked.source}", box=None, pad_edge=False)
     shown.title_justify = "left"
@@ -184,7 +184,7 @@ def print_check(found: CheckResult) -> None:
         shown.add_row("met" if o.met else "MISSED", label(o), wanted(o), reached(o), margin, corner(o))
     say(shown)
     say(found.statement())
-    for o in found.missed:
+    for o in found.missed if changes else ():
         if o.change:
             more = f"; {len(o.change) - SHOWN} more in result.json" if len(o.change) > SHOWN else ""
             say(f"{label(o)} {wanted(o)} would be met by: {'; or '.join(changed(c) for c in o.change[:SHOWN])}{more}")
