@@ -667,6 +667,85 @@ def resonance(
     return room.resonance(resolved, out, force)
 
 
+@app.command(epilog="Example: mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40")
+def check(
+    requirements: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[REQUIREMENTS.toml]", help="TOML file (docs/requirements.md).  \\[default: the paper's aims]"
+        ),
+    ] = None,
+    changes: Annotated[
+        bool | None,
+        typer.Option("--changes/--no-changes", help="Look for what would meet what is missed.  \\[default: changes]"),
+    ] = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+    no_cache: _NoCache = False,
+) -> int:
+    """Hold a robot against requirements: pass or fail with margin, each at the worst corner of its envelope.
+
+    Of each that is missed it says what change of one parameter would meet it. Exit code 3: one is missed.
+    """
+    from sweeps import config
+
+    options = _options(robot=robot, set=set_, effects=effects, report=report) | {
+        "requirements": None if requirements is None else str(requirements), "changes": changes,
+    }  # fmt: skip
+    resolved = _prepared(config.resolve(config.Check, None, options), no_cache)
+    from sweeps import check as room
+
+    return room.check(resolved, out, force)
+
+
+@app.command(epilog="Example: mmrjax size requirements.toml --pareto mass,energy")
+def size(
+    requirements: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[REQUIREMENTS.toml]", help="TOML file (docs/requirements.md).  \\[default: the paper's aims]"
+        ),
+    ] = None,
+    objective: Annotated[
+        str | None, typer.Option(help="What is made small: mass (kg), energy (Wh/m), cost (EUR).  \\[default: mass]")
+    ] = None,
+    pareto: Annotated[
+        str | None, typer.Option(help="Two objectives, comma-separated, for a front of both instead.")
+    ] = None,
+    motors: Annotated[
+        list[str] | None, typer.Option(help="Motors to choose from, comma-separated.  \\[default: all of the sheets]")
+    ] = None,
+    starts: Annotated[int | None, typer.Option(help="Searches in one batch.  \\[default: 256]")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the starts.  \\[default: 0]")] = None,
+    robot: _Robot = None,
+    set_: _Set = None,
+    effects: _Effects = None,
+    out: _Out = None,
+    force: _Force = False,
+    report: _Report = None,
+    no_cache: _NoCache = False,
+) -> int:
+    """Search motor, gearbox, ratio, radius and cells for a robot that meets requirements, with the makers' parts.
+
+    Leaves the best as robot.toml, alternatives, what binds each motor. Exit code 3: no design meets all of them.
+    """
+    from sweeps import config
+
+    options = _options(robot=robot, set=set_, effects=effects, report=report) | {
+        "requirements": None if requirements is None else str(requirements), "objective": objective,
+        "pareto": config.words([pareto]) if pareto else None, "motors": config.words(motors), "starts": starts,
+        "seed": seed,
+    }  # fmt: skip
+    resolved = _prepared(config.resolve(config.Size, None, options), no_cache)
+    from sweeps import size as room
+
+    return room.size(resolved, out, force)
+
+
 @app.command()
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""

@@ -329,6 +329,36 @@ class Loop(RobotPart, InferencePart, OutputPart):
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = None
 
 
+class Check(RobotPart, OutputPart):
+    """A robot held against requirements.
+
+    Attributes:
+        requirements: their TOML file, or `paper`: the paper's aims.
+        changes: whether to look for what would meet the missed ones.
+    """
+
+    requirements: str = "paper"
+    changes: bool = True
+
+
+class Size(RobotPart, OutputPart):
+    """A search for a robot that meets requirements.
+
+    Attributes:
+        requirements: their TOML file, or `paper`: the paper's aims.
+        objective: what is made small; pareto: two of them instead, for a front.
+        motors: names of those to choose from; empty: all.
+        starts: searches in one batch; seed: of them.
+    """
+
+    requirements: str = "paper"
+    objective: str = "mass"
+    pareto: tuple[str, ...] = ()
+    motors: tuple[str, ...] = ()
+    starts: Annotated[int, Field(ge=1, le=100_000)] = 256
+    seed: Seed = 0
+
+
 class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
     """A sensitivity study.
 

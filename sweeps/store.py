@@ -116,13 +116,13 @@ class RunFolder:
         """Write a table as CSV; what is not finite becomes an empty cell."""
         writing.write_table(self.partial / name, columns)
 
-    def finish(self, manifest: dict[str, Any], runs: Runs) -> Path:
+    def finish(self, manifest: dict[str, Any], runs: Runs | None = None) -> Path:
         """Write the manifest, drop the chunks, and move the folder into place; returns its path.
 
         Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added.
         """
         hashes = {"robot": digest((self.partial / "robot.toml").read_bytes())}
-        if runs.digest:
+        if runs is not None and runs.digest:
             hashes[runs.source] = runs.digest
         manifest = {**manifest, "hashes": hashes}
         now = datetime.datetime.now(datetime.UTC)

@@ -76,6 +76,18 @@ def settled(counted: Mapping[str, int]) -> int:
     return sum(counted[status] for status in SETTLED)
 
 
+#: What a requirement's quantity may come to beside a status of a run: in one line.
+OUTCOMES = {
+    "cut_off": "a cell below its cut-off voltage, where the battery switches itself off",
+    "unbounded": "no value: the temperature never settles",
+}
+
+
+def why(outcome: str) -> str:
+    """In one line why a quantity has no value."""
+    return STATUSES[outcome].why if outcome in STATUSES else OUTCOMES[outcome]
+
+
 def short(status: str) -> str:
     """A status as figures show it."""
     return STATUSES[status].short if status in STATUSES else status

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.steady import operating_point
+from mmrjax.fidelities.steady import operating, operating_point
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED
+from mmrjax.signals import CONVERGED, Signals
 from mmrjax.tables import CONDITION_LIMITS
 
 #: The steepest slope that is looked at [deg]; a robot that holds it is said to hold this.
@@ -23,15 +23,19 @@ HALVINGS = 24
 
 
 def margin(robot: Robot, conditions: Conditions, slope_deg: Scalar) -> Float[Array, ""]:
+    """What is left on a slope of the limit that is nearer [-], see `travel_margin`."""
+    conditions = dataclasses.replace(conditions, slope_deg=jnp.asarray(slope_deg))
+    return travel_margin(robot, operating(robot, conditions)[0])
+
+
+def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
     """What is left of the limit that is nearer [-]: of adhesion, 1 - demand / limit, or of speed, V / (V_s / 10) - 1.
 
     Positive where `steady` says `converged`; continuous through the edge, whichever it is.
     """
-    conditions = dataclasses.replace(conditions, slope_deg=jnp.asarray(slope_deg))
-    point, _ = operating_point(robot, conditions)
-    rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
-    slowest = point.theoretical_speed * jnp.minimum(1.0, 1.0 - point.slip)
-    return jnp.minimum(1.0 - point.adhesion_used, slowest / rest - 1.0)
+    rest = robot.chassis(signals.configuration).ground.friction.speed_rest
+    slowest = jnp.minimum(signals.speed_theoretical, signals.speed)
+    return jnp.minimum(1.0 - signals.demand / signals.adhesion_limit, slowest / rest - 1.0)
 
 
 @eqx.filter_jit

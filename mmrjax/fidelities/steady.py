@@ -165,6 +165,12 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     Returns:
         The result, and whether robot and conditions are sound (see `_sound`).
     """
+    signals, status, sound = operating(robot, conditions)
+    return result(robot, signals, status), sound
+
+
+def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
+    """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
     state, solved = _root(robot, conditions)
     sound, conditions = _sound(robot, conditions)
     sense = direction(robot, conditions)
@@ -180,7 +186,7 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
     status = jnp.where(sound, status, FAILED)
-    return result(robot, signals, status), sound
+    return signals, status, sound
 
 
 def _axes(tree: Any) -> Any:

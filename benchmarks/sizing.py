@@ -1,0 +1,72 @@
+"""Sizing: seconds of a search once compiled, and its optimum against a grid of designs of the same choices.
+
+    python benchmarks/sizing.py --starts 256 --grid 1000000
+
+The grid takes every drive, cell and number of cells with as many ratios, radii and cells in parallel as fit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np  # noqa: E402
+
+from calibration.data import requirements  # noqa: E402
+from calibration.sizing import search  # noqa: E402
+from calibration.sizing.design import OBJECTIVES, task  # noqa: E402
+from calibration.sizing.options import options  # noqa: E402
+from mmrjax import robots  # noqa: E402
+
+
+def grid(objective: str, points: int, kept: np.ndarray) -> tuple[float, int, float]:
+    """The best feasible objective of a grid, how many designs it has, and seconds."""
+    robot, asked = robots.nominal(), requirements.paper()
+    chosen = options(robot)
+    of = task(robot, asked, chosen)
+    choice = search.space(robot, of, chosen)
+    n = len(choice.drive)
+    along = max(2, round((points / n) ** (1 / 3)))
+    counts = (max(2, round(points / n / along**2)), along, along)
+    box = np.stack(np.meshgrid(*(np.linspace(0, 1, k) for k in counts), indexing="ij"), -1).reshape(-1, 3)
+    column, best, seen = list(OBJECTIVES).index(objective), np.inf, 0
+    begin = time.perf_counter()
+    for rows in np.array_split(np.arange(n), max(1, n // 200)):
+        every = np.repeat(rows, len(box))
+        x = choice.low[every] + (choice.high[every] - choice.low[every]) * np.tile(box, (len(rows), 1))
+        f, g = search.measured(of, choice, every, x)
+        good = np.all(g[:, kept] >= 0, axis=1) & np.isfinite(f[:, column])
+        best, seen = min(best, float(f[good, column].min(initial=np.inf))), seen + len(every)
+    return best, seen, time.perf_counter() - begin
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--starts", type=int, default=256)
+    parser.add_argument("--grid", type=int, default=1_000_000)
+    parser.add_argument("--objective", default="mass", choices=list(OBJECTIVES))
+    given = parser.parse_args()
+    robot, asked = robots.nominal(), requirements.paper()
+    for words in ("with compilation", "once compiled"):
+        begin, busy = time.perf_counter(), time.process_time()
+        found = search.size(robot, asked, (given.objective,), starts=given.starts)
+        seconds, busy = time.perf_counter() - begin, time.process_time() - busy
+        print(
+            f"{given.starts} starts, {found.evaluated} designs, {words}: {seconds:.1f} s, {busy:.1f} s of processors"
+        )
+    assert found.ideal is not None and found.best is not None
+    kept = np.array([label not in found.unmeetable for label in found.task.labels])
+    best, seen, seconds = grid(given.objective, given.grid, kept)
+    unit = OBJECTIVES[given.objective][0]
+    ideal, real = (f.objectives[given.objective] for f in (found.ideal, found.best))
+    print(f"grid of {seen} designs: {best:.5g} {unit} in {seconds:.1f} s; the search: {ideal:.5g} {unit}")
+    print(f"with ratios of the sheets and whole cells: {real:.5g} {unit}")
+    print("no worse than the grid" if ideal <= best else "WORSE than the grid")
+
+
+if __name__ == "__main__":
+    main()

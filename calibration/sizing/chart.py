@@ -1,0 +1,108 @@
+"""The chart of a robot's use: over payload and slope, which limit is nearest and what it leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from calibration.data.requirements import Requirement, Requirements
+from calibration.sizing import sheet
+from mmrjax import params
+from mmrjax.requirements import Point, Ratings, heat_left, ratings, travel
+from mmrjax.robot import Robot
+
+#: What can end a use, in the order of the chart.
+LIMITS = (
+    "adhesion",
+    "stall",
+    "winding",
+    "motor speed",
+    "gearbox input speed",
+    "gearbox torque",
+    "cell cut-off",
+    "speed",
+)
+#: Points along payload and slope, and how far beyond the envelope the chart goes.
+POINTS, BEYOND = 33, 1.6
+
+
+@dataclasses.dataclass(frozen=True)
+class Chart:
+    """Which limit is nearest, shape (slopes, payloads).
+
+    Attributes:
+        payload, slope: axes [kg], [deg]; nearest: index into `LIMITS`; margin: what that leaves, negative beyond it.
+    """
+
+    payload: np.ndarray
+    slope: np.ndarray
+    nearest: np.ndarray
+    margin: np.ndarray
+
+
+@eqx.filter_jit
+def _left(robot: Robot, of: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
+    """Margins by limit, shape (points, limits)."""
+
+    def one(point: Point, wanted: Array) -> Array:
+        found, _ = travel(robot, point, of)
+        turns = found["motor_speed_rpm"]
+        each = [
+            found["adhesion"], jnp.clip(found["left"], -1.0, 1.0),
+            heat_left(robot, point, found["current"], of.temperature),
+            1 - turns / speeds[0], 1 - turns / speeds[1], 1 - found["gearbox_Nm"] / of.torque,
+            jnp.minimum(found["cell"] / of.voltage_cutoff, 1.0),
+            jnp.where(wanted > 0, found["speed_m_s"] / jnp.where(wanted > 0, wanted, 1.0) - 1, 1.0),
+        ]  # fmt: skip
+        # A robot at the limit of adhesion has its margin of both; it is adhesion's.
+        each[1] = jnp.where(each[0] <= each[1], 1.0, each[1])
+        return jnp.stack([jnp.asarray(x, float) for x in each])
+
+    return jax.vmap(one)(points, wanted)
+
+
+def chart(robot: Robot, asked: Requirements, most: tuple[float, float]) -> Chart:
+    """Of a robot, at the worse of the ends of charge, in the warmest ambient of the envelope.
+
+    A required speed counts within the payloads and slopes that it is required at.
+
+    Args:
+        most: payload [kg] and slope [deg] to which the chart goes.
+    """
+    payload, slope = np.linspace(0, most[0], POINTS), np.linspace(0, most[1], POINTS)
+    e = asked.envelope
+    base = sheet.points(robot, Requirement("speed_m_s", 0.0, True, e))
+    first = jax.tree.map(lambda x: np.asarray(x)[-1], base)
+    s, p = (x.ravel() for x in np.meshgrid(slope, payload, indexing="ij"))
+    speeds = [r for r in asked.each if r.quantity.group == "travel" and r.name.startswith("speed") and r.least]
+    wanted = np.zeros(len(p))
+    for r in speeds:
+        v = r.envelope
+        inside = (p >= v.payload_kg[0]) & (p <= v.payload_kg[1]) & (s >= v.slope_deg[0]) & (s <= v.slope_deg[1])
+        wanted = np.where(inside, np.maximum(wanted, r.limit or 0.0), wanted)
+    robot = params.strong(robot)
+    permitted = jnp.asarray([robot.motor.speed_limit, robot.gearbox.speed_limit])
+    margins = None
+    for charge in e.charge:
+        points = jax.tree.map(lambda x: jnp.full(len(p), x), first)
+        points = dataclasses.replace(
+            points, payload=jnp.asarray(p), slope_deg=jnp.asarray(s), charge=jnp.full(len(p), charge)
+        )
+        left = np.asarray(_left(robot, ratings(robot), points, permitted, jnp.asarray(wanted)))
+        margins = left if margins is None else np.minimum(margins, left)
+    assert margins is not None
+    margins = np.where(np.isfinite(margins), margins, -1.0)
+    shape = (POINTS, POINTS)
+    return Chart(payload, slope, np.argmin(margins, 1).reshape(shape), margins.min(1).reshape(shape))
+
+
+def extent(asked: Requirements) -> tuple[float, float]:
+    """Payload [kg] and slope [deg] to which a chart of these requirements goes."""
+    payloads = [asked.envelope.payload_kg[1], *(r.limit or 0.0 for r in asked.each if r.name == "payload_kg")]
+    slopes = [asked.envelope.slope_deg[1], *(r.limit or 0.0 for r in asked.each if r.name == "slope_deg")]
+    return BEYOND * max(*payloads, 2.0), min(BEYOND * max(*slopes, 10.0), 40.0)

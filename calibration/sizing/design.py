@@ -1,0 +1,262 @@
+"""A design as numbers, the robot that it makes, and what requirements and parts leave of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from calibration.data.requirements import Envelope, Requirement, Requirements
+from calibration.sizing import sheet
+from calibration.sizing.options import Options
+from mmrjax import params
+from mmrjax.requirements import CHARGE, NODES, QUANTITIES, SLOPE, Point, Ratings, heat_left, travel
+from mmrjax.robot import Robot
+
+#: Continuous numbers of a design, of which the search takes logarithms: total ratio, rolling radius [m], cells in
+#: parallel.
+CONTINUOUS = ("ratio", "radius", "parallel")
+#: What can be made small: name, unit and words.
+OBJECTIVES = {
+    "mass": ("kg", "mass without payload"),
+    "energy": ("Wh/m", "energy per metre"),
+    "cost": ("EUR", "price of motors and gearboxes"),
+}
+#: Requirements that are about lasting travel: at their points the ratings of the parts hold.
+LASTING = tuple(q.name for q in QUANTITIES.values() if q.group in ("travel", "payload"))
+#: Ratings of parts: name and words.
+RATED = {
+    "winding": "winding", "motor_speed": "motor speed", "gearbox_speed": "gearbox input speed",
+    "gearbox_torque": "gearbox torque", "cell_current": "cell current",
+}  # fmt: skip
+
+
+class Design(eqx.Module):
+    """Designs in numbers; every field batchable.
+
+    Attributes:
+        continuous: logarithms of `CONTINUOUS`; drive, cell: numbers of `Options`, by name; cells: in series.
+    """
+
+    continuous: Float[Array, "... 3"]
+    drive: Mapping[str, Array]
+    cell: Mapping[str, Array]
+    cells: Array
+
+
+def build(robot: Robot, base_mass: float, configuration: str, design: Design) -> tuple[Robot, Ratings]:
+    """The robot that a design makes of a robot, with its ratings; traceable.
+
+    Motors, gearboxes and cells take the place of the robot's own in its mass. The cell's voltage falls over the share
+    of its capacity that is taken as the robot's cell's does; cells in parallel stretch that and share the resistance.
+    """
+    ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
+    d, c = design.drive, design.cell
+    own = robot.battery
+    capacity = parallel * c["capacity"]
+    stretch = capacity / own.capacity
+    more = d["mass"] + design.cells * parallel * c["mass"] - base_mass
+    values: dict[str, Any] = {
+        **{f"motor.{key}": d[key] for key in (
+            "resistance", "torque_constant", "friction_coulomb", "friction_viscous", "inertia", "inductance",
+            "resistance_thermal_winding", "resistance_thermal_housing",
+        )},
+        "gearbox.ratio": ratio, "gearbox.efficiency_load": d["efficiency"],
+        "battery.capacity": capacity, "battery.curvature": own.curvature / stretch**2,
+        "battery.slope": own.slope / stretch, "battery.voltage_full": c["voltage_full"],
+        "battery.resistance": c["resistance"] / parallel,
+        **{f"{name}.mass": chassis.mass + more for name, chassis in robot.configurations.items()},
+        f"{configuration}.radius": radius,
+    }  # fmt: skip
+    of = Ratings(design.cells, c["cutoff"], d["temperature"], d["torque"])
+    return params.replace(robot, values), of
+
+
+@dataclasses.dataclass(frozen=True)
+class Demand:
+    """What one requirement asks of its points.
+
+    Attributes:
+        requirement: as stated; None: the ratings of the parts. label: words.
+        rows: of the points that it is read at.
+    """
+
+    requirement: Requirement | None
+    label: str
+    rows: tuple[int, ...]
+
+
+class Task(eqx.Module):
+    """Requirements as points and what is asked there: one solution of the balances a point and design.
+
+    Attributes:
+        robot: that is changed, with one cell (see `sheet`); configuration: that is sized.
+        base_mass: of the parts in the robot's mass [kg].
+        points: shape (points,); middle: row of the middle of the envelope, for the energy.
+        demands: in order.
+    """
+
+    robot: Robot
+    configuration: str = eqx.field(static=True)
+    base_mass: float = eqx.field(static=True)
+    points: Point
+    middle: int = eqx.field(static=True)
+    demands: tuple[Demand, ...] = eqx.field(static=True)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What each margin of `evaluate` is of."""
+        return tuple(d.label for d in self.demands)
+
+
+def task(robot: Robot, asked: Requirements, options: Options) -> Task:
+    """The points of requirements: corners of each envelope, each point once.
+
+    Slope and payload required are taken as conditions in which the robot has to travel.
+    """
+    name = asked.envelope.configuration or robot.configurations.names[0]
+    index: dict[tuple[float, ...], int] = {}
+    kept: list[Point] = []
+
+    def row(point: Point) -> int:
+        key = tuple(float(np.asarray(x)) for x in jax.tree.leaves(point))
+        if key not in index:
+            index[key] = len(kept)
+            kept.append(point)
+        return index[key]
+
+    demands = []
+    for r in asked.each:
+        at = sheet.points(robot, r)
+        rows = [tuple(row(p) for p in corner) for corner in _corners(robot, r, at)]
+        demands.append(Demand(r, label(r), tuple(k for corner in dict.fromkeys(rows) for k in corner)))
+    travelling = sorted({k for d in demands if d.requirement and d.requirement.name in LASTING for k in d.rows})
+    demands += [Demand(None, words, tuple(travelling)) for words in RATED.values()]
+    middle = row(_middle(robot, asked.envelope))
+    points: Point = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x]), *kept)
+    one_cell = params.strong(dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=1)))
+    return Task(one_cell, name, options.base_mass, points, middle, tuple(demands))
+
+
+def label(r: Requirement) -> str:
+    extra = ""
+    if r.name == "endurance_min":
+        extra = f" driving {100 * r.share:g} % of the time" if r.share else " standing still"
+    return f"{r.quantity.label}{extra}"
+
+
+def _corners(robot: Robot, r: Requirement, at: Point) -> list[tuple[Point, ...]]:
+    """The points at which a requirement is read, those of each corner of its envelope together."""
+    count = len(np.asarray(at.payload))
+    points = [jax.tree.map(lambda x, k=k: x[k], at) for k in range(count)]
+    if r.name == "mass_kg" or (r.name == "endurance_min" and not r.share):
+        return [(points[0],)]
+    low, high = r.envelope.charge
+    ends = {SLOPE: r.envelope.slope_deg, CHARGE: (low, high)}
+    chosen = [
+        p
+        for p in points
+        if (SLOPE not in r.quantity.axes or float(p.slope_deg) in ends[SLOPE])
+        and (CHARGE not in r.quantity.axes or float(p.charge) in ends[CHARGE])
+        and float(p.payload) in r.envelope.payload_kg
+    ]
+    if r.name == "slope_deg":
+        return [(dataclasses.replace(p, slope_deg=jnp.asarray(float(r.limit or 0.0))),) for p in chosen]
+    if r.name == "payload_kg":
+        return [(dataclasses.replace(p, payload=jnp.asarray(float(r.limit or 0.0))),) for p in chosen]
+    if r.name == "endurance_min":
+        # The nodes of the integral and the end of the charge.
+        nodes = (np.polynomial.legendre.leggauss(NODES)[0] + 1) / 2
+        charges = [*(high + (r.envelope.charge_end - high) * nodes), r.envelope.charge_end]
+        return [tuple(dataclasses.replace(p, charge=jnp.asarray(float(c))) for c in charges) for p in chosen]
+    return [(p,) for p in chosen]
+
+
+def _middle(robot: Robot, e: Envelope) -> Point:
+    middle = Requirement("speed_m_s", 0.0, True, dataclasses.replace(
+        e, payload_kg=(sum(e.payload_kg) / 2,) * 2, slope_deg=(sum(e.slope_deg) / 2,) * 2,
+        state_of_charge=(sum(e.state_of_charge) / 2,) * 2,
+        supply_voltage_V=None if e.supply_voltage_V is None else (sum(e.supply_voltage_V) / 2,) * 2,
+    ))  # fmt: skip
+    return jax.tree.map(lambda x: x[0], sheet.points(robot, middle))
+
+
+def evaluate(of: Task, design: Design) -> tuple[Array, Array]:
+    """Objectives (as `OBJECTIVES`) and margins (as `Task.labels`) of one design; traceable.
+
+    Margins are shares of what is required or permitted; met where not negative.
+    """
+    robot, ratings = build(of.robot, of.base_mass, of.configuration, design)
+    found = jax.vmap(lambda p: travel(robot, p, ratings)[0])(of.points)
+    mass = jnp.asarray(robot.configurations[of.configuration].mass)
+    energy = found["energy_per_metre_Wh"][of.middle] / 3600.0
+    margins = [_margin(of, d, design, robot, ratings, found) for d in of.demands]
+    objectives = jnp.stack([mass, energy, jnp.asarray(design.drive["cost"])])
+    return objectives, jnp.stack(margins)
+
+
+def _margin(of: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings, found: Mapping[str, Array]) -> Array:
+    rows = np.array(d.rows, int)
+    at = {key: x[rows] for key, x in found.items()}
+    points = jax.tree.map(lambda x: x[rows], of.points)
+    travels = jnp.min(jnp.minimum(at["left"], 1.0))
+    above = jnp.min(jnp.minimum(at["cell"] / ratings.voltage_cutoff, 1.0))
+    r = d.requirement
+    if r is None:
+        most = {
+            "winding": jnp.min(_heat(robot, points, at["current"], design.drive["temperature"])),
+            "motor_speed": 1 - jnp.max(at["motor_speed_rpm"]) / design.drive["speed_motor"],
+            "gearbox_speed": 1 - jnp.max(at["motor_speed_rpm"]) / design.drive["speed_gearbox"],
+            "gearbox_torque": 1 - jnp.max(at["gearbox_Nm"]) / design.drive["torque"],
+            "cell_current": 1 - jnp.max(jnp.where(points.battery > 0.5, at["battery"], 0.0))
+            / (jnp.exp(design.continuous[..., 2]) * design.cell["current"]),
+        }  # fmt: skip
+        return most[next(key for key, words in RATED.items() if words == d.label)]
+    if r.name == "mass_kg":
+        share = 1 - jnp.asarray(robot.configurations[of.configuration].mass) / _limit(r)
+        return -share if r.least else share
+    if r.name == "slope_deg":
+        return jnp.minimum(travels, above)
+    if r.name == "payload_kg":
+        hot = jnp.min(_heat(robot, points, at["current"], jnp.asarray(ratings.temperature)))
+        torque = 1 - jnp.max(at["gearbox_Nm"]) / ratings.torque
+        return jnp.min(jnp.stack([travels, above, hot, torque]))
+    if r.name == "endurance_min":
+        return _endurance(r, robot, ratings, at)
+    if r.limit is None:  # as the parts are rated, which is asked of every design
+        return jnp.minimum(travels, above)
+    value = at[r.name] / r.quantity.factor
+    share = jnp.min(value / _limit(r) - 1) if r.least else jnp.min(1 - value / _limit(r))
+    if r.name == "winding_C":
+        share = jnp.min(_heat(robot, points, at["current"], jnp.asarray(_limit(r))))
+    return jnp.min(jnp.stack([share, travels, above]))
+
+
+def _limit(r: Requirement) -> float:
+    return max(float(r.limit or 0.0), 1e-9)
+
+
+def _heat(robot: Robot, points: Point, current: Array, limit: Array) -> Array:
+    return jax.vmap(lambda p, i: jnp.asarray(heat_left(robot, p, i, limit)))(points, current)
+
+
+def _endurance(r: Requirement, robot: Robot, ratings: Ratings, at: Mapping[str, Array]) -> Array:
+    """Of the time until the end of the charge, which the cells have to reach above their cut-off."""
+    battery = robot.battery
+    used = battery.capacity * (r.envelope.charge[1] - r.envelope.charge_end)
+    limit = r.quantity.factor * _limit(r)
+    if not r.share:
+        end = battery.voltage_cell(0.0, battery.capacity * (1 - r.envelope.charge_end)) / ratings.voltage_cutoff - 1
+        return jnp.minimum(used / battery.current(0.0) / limit - 1, end)
+    weights = jnp.asarray(np.polynomial.legendre.leggauss(NODES)[1] / 2)
+    motors = (at["battery"] - battery.current_other) * r.share
+    current = jnp.asarray(battery.current(motors)).reshape(-1, NODES + 1)
+    time = used * jnp.sum(weights / current[:, :NODES], axis=1)
+    travels, above = jnp.min(jnp.minimum(at["left"], 1.0)), jnp.min(at["cell"] / ratings.voltage_cutoff)
+    return jnp.min(jnp.stack([jnp.min(time) / limit - 1, travels, above]))

@@ -1,0 +1,442 @@
+"""The sheet of requirements: each at the worst corner of its envelope, with margin, and what would meet it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from calibration.data.errors import BadConfiguration, choices
+from calibration.data.requirements import Envelope, Requirement, Requirements
+from mmrjax import params
+from mmrjax.requirements import AMBIENT, AXES, CHARGE, OUTCOMES, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
+from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED
+from mmrjax.tables import adhesion_ratio
+
+#: Values along each axis of an envelope: its ends, and between them where an output may turn.
+VALUES = {PAYLOAD: 3, SLOPE: 5, CHARGE: 5, AMBIENT: 2}
+#: Of what a designer can change, the parameters; those of a configuration without its name. `battery.cells` is whole.
+CELLS = "battery.cells"
+CHANGEABLE = (
+    "gearbox.ratio", "gearbox.efficiency_load", "motor.resistance", "motor.torque_constant",
+    "motor.resistance_thermal_winding", "motor.resistance_thermal_housing", "battery.capacity", "battery.resistance",
+    "battery.current_other",
+)  # fmt: skip
+OF_CONFIGURATION = ("mass", "radius", "ground.friction.static", "ground.rolling_resistance", "track.loss_coulomb")
+#: Bounds within which a change is looked for, beside those of the field: least and greatest multiple of what it is.
+REACH = (0.1, 10.0)
+#: Values of a parameter in one call, calls along a ladder, and digits that a stated change has.
+ROWS, LADDER, DIGITS = 32, 24, 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """A change of one parameter, everything else as it is, that meets a requirement.
+
+    Attributes:
+        parameter: by dotted name; before, after: [unit]; unit: of its field.
+        gradient: derivative of the quantity by the parameter at the worst corner [unit of quantity / unit].
+        breaks: names of requirements that are met now and would not be.
+    """
+
+    parameter: str
+    before: float
+    after: float
+    unit: str
+    gradient: float
+    breaks: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `result.json`."""
+        return {
+            "parameter": self.parameter, "from": self.before, "to": self.after, "unit": self.unit,
+            "gradient": self.gradient, "breaks": list(self.breaks),
+        }  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """A requirement held against a robot.
+
+    Attributes:
+        requirement: as stated, its rating in place.
+        value: of the quantity at the worst corner, in the unit of its name; None where it has none there.
+        margin: by how much it is met, negative where it is missed; None where there is no value.
+        status: of the worst corner, of `OUTCOMES`.
+        at: the worst corner.
+        change: what single change would meet it, the smallest first; empty where it is met or nothing does.
+    """
+
+    requirement: Requirement
+    value: float | None
+    margin: float | None
+    status: str
+    at: dict[str, Any]
+    change: tuple[Change, ...] = ()
+
+    @property
+    def met(self) -> bool:
+        """Whether the requirement holds."""
+        return self.margin is not None and self.margin >= 0
+
+    def to_json(self) -> dict[str, Any]:
+        """As in `result.json`."""
+        r = self.requirement
+        return {
+            "name": r.name, "required": r.limit, "sense": r.sense, "value": self.value, "margin": self.margin,
+            "unit": r.quantity.unit, "met": self.met, "status": self.status, "at": self.at,
+            "change": [c.to_json() for c in self.change], "source": r.source,
+        }  # fmt: skip
+
+
+def rated(robot: Robot, asked: Requirements) -> Requirements:
+    """Requirements with the robot's own ratings where they state no number.
+
+    Raises:
+        BadConfiguration: the robot states no such rating.
+    """
+    known = {
+        "winding_C": robot.motor.temperature_limit, "motor_speed_rpm": robot.motor.speed_limit,
+        "gearbox_speed_rpm": robot.gearbox.speed_limit, "gearbox_Nm": robot.gearbox.torque_limit,
+    }  # fmt: skip
+    each = []
+    for r in asked.each:
+        limit = r.limit
+        if limit is None:
+            stated = known[r.name]
+            if stated is None:
+                raise BadConfiguration(f"{asked.source}, {r.name}: the robot states no rating; state a number")
+            limit = stated / r.quantity.factor
+        each.append(dataclasses.replace(r, limit=limit))
+    return dataclasses.replace(asked, each=tuple(each))
+
+
+def refuse(robot: Robot, asked: Requirements) -> None:
+    """Refuse requirements that no robot of these configurations could be held against.
+
+    Raises:
+        BadConfiguration: a configuration that the robot does not have; an envelope with a slope that the surface does
+            not hold, whatever drives the robot: tan α above μ_s.
+    """
+    for r in asked.each:
+        e = r.envelope
+        where = f"{asked.source}, {r.name}"
+        if e.configuration and e.configuration not in robot.configurations:
+            raise BadConfiguration(
+                f"{where}: the robot has no configuration {e.configuration}; "
+                f"{choices(e.configuration, robot.configurations)}"
+            )
+        chassis = robot.configurations[_configuration(robot, e)]
+        friction = float(chassis.ground.friction.static) * adhesion_ratio(e.surface, float(chassis.on_tracks) > 0.5)
+        steepest = math.degrees(math.atan(friction))
+        if SLOPE in r.quantity.axes and e.slope_deg[1] > steepest:
+            raise BadConfiguration(
+                f"{where}: the envelope's slope_deg goes up to {e.slope_deg[1]:g}; {e.surface} holds "
+                f"{_configuration(robot, e)} up to {steepest:.1f} deg at most (adhesion {friction:.2f}), whatever "
+                "drives it"
+            )
+
+
+def _configuration(robot: Robot, envelope: Envelope) -> str:
+    return envelope.configuration or robot.configurations.names[0]
+
+
+def points(robot: Robot, requirement: Requirement) -> Point:
+    """The points of a requirement's envelope: ends of each range and values between, shape (points,).
+
+    An axis on which the quantity does not depend has one value. The number of points depends on the quantity alone.
+    """
+    e, axes = requirement.envelope, requirement.quantity.axes
+    ambient = e.ambient_C or (float(robot.motor.temperature_ambient),) * 2
+    ranges = {PAYLOAD: e.payload_kg, SLOPE: e.slope_deg, CHARGE: e.charge, AMBIENT: ambient}
+    values = [np.linspace(*ranges[a], VALUES[a]) if a in axes else np.array([ranges[a][-1]]) for a in AXES]
+    payload, slope, charge, warm = (x.ravel() for x in np.meshgrid(*values, indexing="ij"))
+    name = _configuration(robot, e)
+    on_tracks = float(robot.configurations[name].on_tracks) > 0.5
+
+    def same(x: float) -> Float[Array, " points"]:
+        return jnp.full(len(payload), x, float)
+
+    return Point(
+        configuration=jnp.full(len(payload), robot.configurations.index(name)),
+        adhesion=same(adhesion_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
+        charge=jnp.asarray(charge), charge_end=same(e.charge_end), share=same(requirement.share),
+        slope_deg=jnp.asarray(slope), payload=jnp.asarray(payload), ambient=jnp.asarray(warm),
+    )  # fmt: skip
+
+
+def _changed(robot: Robot, of: Ratings, names: tuple[str, ...], theta: Array) -> tuple[Robot, Ratings]:
+    """The robot with parameters from a vector, and its ratings; `battery.cells` is among the latter."""
+    values = dict(zip(names, theta, strict=True))
+    cells = values.pop(CELLS)
+    return params.replace(robot, values), dataclasses.replace(of, cells=cells)
+
+
+def _unrated(robot: Robot) -> Robot:
+    """The robot with one cell and the ratings that a robot has where none are stated.
+
+    Cells and ratings come beside it, as numbers: one program for robots of any.
+    """
+    usual, shaft, gear = type(robot.battery)(), type(robot.motor)(), type(robot.gearbox)()
+    limits = ("voltage_charge", "voltage_cutoff", "delay_cutoff", "current_limit", "current_charge")
+    robot = dataclasses.replace(
+        robot,
+        battery=dataclasses.replace(robot.battery, cells=1, **{name: getattr(usual, name) for name in limits}),
+        motor=dataclasses.replace(
+            robot.motor,
+            **{n: getattr(shaft, n) for n in ("temperature_limit", "voltage_limit", "speed_limit")},
+        ),
+        gearbox=dataclasses.replace(
+            robot.gearbox, **{name: getattr(gear, name) for name in ("speed_limit", "torque_limit")}
+        ),
+    )
+    return params.strong(robot)
+
+
+@eqx.filter_jit
+def _over(
+    robot: Robot,
+    of: Ratings,
+    names: tuple[str, ...],
+    rows: Float[Array, "rows parameters"],
+    at: Point,
+    name: str,
+) -> tuple[Array, Array]:
+    """Values and outcomes of a quantity over robots (rows of parameters) and points, shape (rows, points)."""
+
+    def one(theta: Array, point: Point) -> tuple[Array, Array]:
+        changed, changed_ratings = _changed(robot, of, names, theta)
+        found = evaluate(changed, point, changed_ratings, name)
+        return found.value, found.outcome
+
+    return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
+
+
+@eqx.filter_jit
+def _gradient(robot: Robot, of: Ratings, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
+    """Derivative of a quantity at one point by the parameters."""
+
+    def value(theta: Array) -> Array:
+        changed, changed_ratings = _changed(robot, of, names, theta)
+        return evaluate(changed, at, changed_ratings, name).value
+
+    return jax.grad(value)(theta)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Held:
+    """A requirement's quantity over its envelope, as a function of what a designer can change."""
+
+    robot: Robot
+    requirement: Requirement
+    names: tuple[str, ...]
+
+    @property
+    def at(self) -> Point:
+        return points(self.robot, self.requirement)
+
+    def over(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values in the unit of the name, outcomes, and margins (-inf without value), shape (rows, points)."""
+        r, at, parts = self.requirement, self.at, []
+        robot, of = _unrated(self.robot), ratings(self.robot)
+        for first in range(0, len(rows), ROWS):
+            chosen = rows[np.minimum(np.arange(first, first + ROWS), len(rows) - 1)]
+            found = jax.device_get(_over(robot, of, self.names, jnp.asarray(chosen), at, _computed(r)))
+            parts.append([x[: len(rows) - first] for x in found])
+        value, outcome = (np.concatenate(x) for x in zip(*parts, strict=True))
+        value = value / r.quantity.factor
+        counts = (outcome == CONVERGED) & np.isfinite(value)
+        assert r.limit is not None  # see `rated`
+        margin = (value - r.limit) * (1 if r.least else -1)
+        return value, outcome, np.where(counts, margin, -np.inf)
+
+    def worst(self, rows: np.ndarray) -> np.ndarray:
+        """Margin at the worst corner, shape (rows,)."""
+        return self.over(rows)[2].min(axis=1)
+
+
+def _computed(requirement: Requirement) -> str:
+    """Of several names of one quantity the one that it is computed by: one program for both."""
+    return "speed_m_s" if requirement.name == "speed_end_of_charge_m_s" else requirement.name
+
+
+def parameters(robot: Robot, configuration: str) -> dict[str, params.Parameter]:
+    """What a designer can change of a robot, by name, cells left out."""
+    known = {p.name: p for p in params.walk(robot)}
+    names = (*CHANGEABLE, *(f"{configuration}.{n}" for n in OF_CONFIGURATION))
+    return {name: known[name] for name in names if name in known}
+
+
+def check(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[Outcome, ...]:
+    """Hold a robot against requirements.
+
+    Args:
+        changes: whether to look for what would meet the missed ones.
+
+    Raises:
+        BadConfiguration: see `refuse` and `rated`.
+    """
+    refuse(robot, asked)
+    asked = rated(robot, asked)
+    held = []
+    for r in asked.each:
+        configuration = _configuration(robot, r.envelope)
+        held.append(_Held(robot, r, (*parameters(robot, configuration), CELLS)))
+    found = [_outcome(h) for h in held]
+    if changes:
+        found = [o if o.met else _with_changes(h, o, held, found) for h, o in zip(held, found, strict=True)]
+    return tuple(found)
+
+
+def _now(held: _Held) -> np.ndarray:
+    known = {p.name: float(p.value) for p in params.walk(held.robot)}
+    return np.array([held.robot.battery.cells if n == CELLS else known[n] for n in held.names], float)
+
+
+def _outcome(held: _Held) -> Outcome:
+    r = held.requirement
+    value, outcome, margin = (x[0] for x in held.over(_now(held)[None]))
+    # A point without value is worse than any; the most of those with the same outcome is at its worst corner.
+    k = int(np.argmin(margin))
+    status = OUTCOMES[outcome[k]]
+    counts = np.isfinite(margin[k])
+    if not counts and status == OUTCOMES[CONVERGED]:  # a value beyond all bounds: a temperature that never settles
+        status = "unbounded"
+    return Outcome(
+        r, float(value[k]) if counts else None, float(margin[k]) if counts else None, status, _corner(held, k)
+    )
+
+
+def _corner(held: _Held, k: int) -> dict[str, Any]:
+    """A point in the words of a file."""
+    r, at = held.requirement, held.at
+    e = r.envelope
+    known = {
+        PAYLOAD: ("payload_kg", at.payload), SLOPE: ("slope_deg", at.slope_deg), AMBIENT: ("ambient_C", at.ambient),
+        CHARGE: ("state_of_charge" if e.battery else "supply_voltage_V", at.charge),
+    }  # fmt: skip
+    found: dict[str, Any] = {known[a][0]: round(float(np.asarray(known[a][1])[k]), 9) for a in r.quantity.axes}
+    if r.name == "endurance_min":
+        low = e.charge_end
+        found |= {
+            "duty": "driving" if r.share else "standing",
+            "share": r.share,
+            "state_of_charge": [low, e.charge[1]],
+        }
+    return {"configuration": _configuration(held.robot, e), "surface": e.surface, **found}
+
+
+def _with_changes(held: _Held, outcome: Outcome, every: Sequence[_Held], now: Sequence[Outcome]) -> Outcome:
+    found = _changes(held, outcome)
+    if not found:
+        return outcome
+    rows = np.stack([_with(held, c.parameter, c.after) for c in found])
+    broken: list[list[str]] = [[] for _ in found]
+    for other, before in zip(every, now, strict=True):
+        if other is held or not before.met:
+            continue
+        # Another configuration has other names: those that both have are changed.
+        own = np.tile(_now(other), (len(rows), 1))
+        for k, name in enumerate(held.names):
+            if name in other.names:
+                own[:, other.names.index(name)] = rows[:, k]
+        for of, margin in zip(broken, other.worst(own), strict=True):
+            of += [other.requirement.name] if margin < 0 else []
+    with_breaks = [dataclasses.replace(c, breaks=tuple(dict.fromkeys(b))) for c, b in zip(found, broken, strict=True)]
+    order = sorted(with_breaks, key=lambda c: (len(c.breaks) > 0, abs(math.log(c.after / c.before))))
+    return dataclasses.replace(outcome, change=tuple(order))
+
+
+def _with(held: _Held, name: str, value: float) -> np.ndarray:
+    row = _now(held)
+    row[held.names.index(name)] = value
+    return row
+
+
+def _changes(held: _Held, outcome: Outcome) -> list[Change]:
+    """What single changes meet a requirement: direction by the derivative at the worst corner, then the nearest value
+    that meets it at every corner, on a ladder and by division of its interval; each stated value is verified."""
+    now, names = _now(held), held.names
+    worst = int(np.argmin(held.over(now[None])[2][0]))
+    point = jax.tree.map(lambda x: x[worst], held.at)
+    slopes = np.asarray(
+        _gradient(
+            _unrated(held.robot), ratings(held.robot), names, jnp.asarray(now), point, _computed(held.requirement)
+        )
+    )
+    slopes = slopes / held.requirement.quantity.factor * (1 if held.requirement.least else -1)
+    known = {p.name: p for p in params.walk(held.robot)}
+    found = []
+    for k, name in enumerate(names):
+        if name == CELLS:
+            bounds, unit = (1.0, 100.0), "-"
+        else:
+            bounds, unit = known[name].spec.bounds, known[name].spec.unit
+        if now[k] <= 0:
+            continue
+        low, high = max(bounds[0], REACH[0] * now[k]), min(bounds[1], REACH[1] * now[k])
+        uphill = slopes[k] if np.isfinite(slopes[k]) else 0.0
+        if outcome.margin is not None and uphill == 0:
+            continue  # the quantity does not depend on it
+        # Where there is no value the derivative says nothing: both ways.
+        ends = (low, high) if outcome.margin is None or uphill == 0 else (high if uphill > 0 else low,)
+        options = [v for end in ends if (v := _nearest(held, name, now[k], end)) is not None]
+        if options:
+            after = min(options, key=lambda v: abs(math.log(v / now[k])))
+            sense = 1 if held.requirement.least else -1
+            found.append(Change(name, float(now[k]), after, unit, float(sense * slopes[k])))
+    return found
+
+
+def _nearest(held: _Held, name: str, begin: float, end: float) -> float | None:
+    """The value of a parameter nearest `begin` towards `end` that meets the requirement, None: there is none."""
+    if begin == end:
+        return None
+
+    def meets(values: np.ndarray) -> np.ndarray:
+        return held.worst(np.stack([_with(held, name, v) for v in values])) >= 0
+
+    def steps(a: float, b: float, count: int) -> np.ndarray:
+        if name == CELLS:
+            whole = np.arange(round(min(a, b)), round(max(a, b)) + 1, dtype=float)
+            return (whole if a < b else whole[::-1])[1:]
+        return np.geomspace(a, b, count + 1)[1:]
+
+    ladder = steps(begin, end, LADDER)
+    good = np.flatnonzero(meets(ladder))
+    if not good.size:
+        return None
+    first = int(good[0])
+    if name == CELLS:
+        return float(ladder[first])
+    a, b = (begin if first == 0 else ladder[first - 1]), ladder[first]
+    for _ in range(3):
+        finer = steps(a, b, ROWS)
+        inside = np.flatnonzero(meets(finer))
+        k = int(inside[0]) if inside.size else len(finer) - 1
+        a, b = (a if k == 0 else finer[k - 1]), finer[k]
+    # As few digits as a person would write, away from where it began; each is tried.
+    for digits in (DIGITS, DIGITS + 2, DIGITS + 4):
+        rounded = _rounded(b, digits, up=end > begin)
+        if min(begin, end) <= rounded <= max(begin, end) and meets(np.array([rounded]))[0]:
+            return rounded
+    return float(b)
+
+
+def _rounded(value: float, digits: int, up: bool) -> float:
+    step = 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)
+    return float(f"{(math.ceil if up else math.floor)(value / step - (1e-9 if up else -1e-9)) * step:.{digits}g}")
+
+
+def counts(outcomes: Sequence[Outcome]) -> Mapping[str, int]:
+    """How many are met and missed."""
+    met = sum(o.met for o in outcomes)
+    return {"met": met, "missed": len(outcomes) - met}

@@ -1,0 +1,58 @@
+"""The report of a check: the sheet, its figure, and what would meet what is missed."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sweeps import check, figures_check
+from sweeps.report import Album, named, render
+
+if TYPE_CHECKING:
+    from sweeps.check import CheckResult
+
+
+def write(folder: Path, found: CheckResult, *, robot_name: str) -> Path:
+    """Write `report.html` and `figures/` of a check; returns the path of the page."""
+    album = Album(folder)
+    album.add("margins", partial(figures_check.margins, found))
+    return render(
+        folder,
+        "check.html.j2",
+        album,
+        title="Requirements",
+        statement=found.statement(),
+        source=found.asked.source,
+        rows=[_row(o) for o in found.outcomes],
+        missed=[
+            {"label": f"{check.label(o)} {check.wanted(o)}", "changes": [_change(c) for c in o.change]}
+            for o in found.missed
+        ],
+        **named(found.robot, robot_name),
+    )
+
+
+def _row(o: check.Outcome) -> dict[str, Any]:
+    return {
+        "met": o.met,
+        "label": check.label(o),
+        "name": o.requirement.name,
+        "wanted": check.wanted(o),
+        "reached": check.reached(o),
+        "margin": "–" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{check.number(abs(o.margin))}",
+        "corner": check.corner(o),
+        "place": f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}",
+        "source": o.requirement.source,
+    }
+
+
+def _change(c: check.Change) -> dict[str, Any]:
+    return {
+        "parameter": c.parameter,
+        "before": f"{c.before:.4g}",
+        "after": f"{c.after:.6g}",
+        "unit": c.unit,
+        "percent": f"{100 * (c.after / c.before - 1):+.1f}",
+        "breaks": ", ".join(c.breaks),
+    }

@@ -1,0 +1,169 @@
+"""The command `size`: a robot searched for that meets requirements."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from calibration.data import requirements, robot_file
+from calibration.data.errors import BadConfiguration, choices
+from calibration.data.parts import motors
+from calibration.data.requirements import Requirements
+from calibration.sizing import sheet
+from calibration.sizing.design import OBJECTIVES
+from calibration.sizing.search import Found, Sizing
+from calibration.sizing.search import size as search
+from calibration.sizing.sheet import Outcome
+from mmrjax.robot import Robot
+from sweeps import check
+from sweeps import config as configuration
+from sweeps.console import say
+from sweeps.inputs import load_robot
+from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder, open_folder
+
+
+@dataclasses.dataclass(frozen=True)
+class SizeResult:
+    """What the command found.
+
+    Attributes:
+        asked: the requirements; robot: that was changed; sizing: what the search found; objectives: that were asked
+            for; outcomes: the best held against the requirements as `check` does, empty where there is none.
+    """
+
+    asked: Requirements
+    robot: Robot
+    sizing: Sizing
+    objectives: tuple[str, ...]
+    outcomes: tuple[Outcome, ...]
+
+    def statement(self) -> str:
+        """The answer in a sentence."""
+        s = self.sizing
+        left_out = f" No choice of parts meets {', '.join(s.unmeetable)}, left out." if s.unmeetable else ""
+        if s.best is None:
+            nearest = min(s.motors.values(), key=short, default=None)
+            why = f" The nearest, {described(nearest)}, misses {', '.join(missed(nearest))}." if nearest else ""
+            return f"No design of these parts meets the requirements.{why}{left_out}"
+        binds = f" What binds: {', '.join(s.best.binds)}." if s.best.binds else " Nothing binds."
+        return f"{described(s.best)}: {objective(s.best, s.objective)}.{binds}{left_out}"
+
+    def to_json(self) -> dict[str, Any]:
+        """`result.json`."""
+        s = self.sizing
+        return {
+            "schema": "mmrjax.size/1",
+            "statement": self.statement(),
+            "source": self.asked.source,
+            "objectives": list(self.objectives),
+            "unmeetable": list(s.unmeetable),
+            "best": None if s.best is None else s.best.to_json(),
+            "ideal": None if s.ideal is None else s.ideal.to_json(),
+            "alternatives": [f.to_json() for f in s.alternatives],
+            "motors": [{"motor": name, **f.to_json()} for name, f in s.motors.items()],
+            "pareto": [f.to_json() for f in s.front],
+            "requirements": [o.to_json() for o in self.outcomes],
+            "starts": s.starts,
+            "evaluated": s.evaluated,
+        }
+
+
+def short(found: Found) -> float:
+    """By how much a design misses, all margins together [-]."""
+    return sum(max(-m, 0.0) for m in found.margins.values())
+
+
+def missed(found: Found) -> list[str]:
+    """What a design misses, by how much."""
+    return [f"{label} ({100 * m:+.1f} %)" for label, m in sorted(found.margins.items(), key=lambda x: x[1]) if m < 0]
+
+
+def described(found: Found) -> str:
+    """A design in words."""
+    stages = f"{found.drive.stages} stage{'s' if found.drive.stages > 1 else ''}"
+    return (
+        f"{found.drive.motor.name}, {found.drive.family} with {stages}, ratio {found.ratio:.4g}, radius "
+        f"{1000 * found.radius:.1f} mm, {found.in_series} × {found.parallel:.3g} {found.cell.name}"
+    )
+
+
+def objective(found: Found, name: str) -> str:
+    """An objective with its unit; what no sheet states is said."""
+    unit, words = OBJECTIVES[name]
+    return f"{words} {found.objectives[name]:.4g} {unit}" if name in found.objectives else f"{words} not stated"
+
+
+def size(config: configuration.Size, out: Path | None, force: bool) -> int:
+    """Search, and leave a run folder; returns the exit code: 3 where the best misses something or there is none."""
+    asked = requirements.load(Path(config.requirements))
+    robot = load_robot(config)
+    objectives = config.pareto or (config.objective,)
+    for name in objectives:
+        if name not in OBJECTIVES:
+            where = "--pareto" if config.pareto else "--objective"
+            raise BadConfiguration(f"{where}: got {name}; {choices(name, OBJECTIVES)}")
+    if config.pareto and len(set(config.pareto)) != 2:
+        raise BadConfiguration(f"--pareto: got {', '.join(config.pareto)}; expected two different objectives")
+    known = [m.name for m in motors()]
+    for name in config.motors:
+        if name not in known:
+            raise BadConfiguration(f"--motors: got {name}; {choices(name, known)}")
+    sheet.refuse(robot, asked)
+    with open_folder("size", config, robot, out, force) as folder:
+        sizing = search(robot, asked, objectives, starts=config.starts, motors=config.motors, seed=config.seed)
+        outcomes = () if sizing.best is None else sheet.check(sizing.best.robot, asked, changes=False)
+        found = SizeResult(asked, robot, sizing, objectives, outcomes)
+        _write(folder, config, found)
+        print_size(found)
+        if config.report:
+            from sweeps import report_size
+
+            report_size.write(folder.partial, found, robot_name=config.robot)
+        path = folder.finish({"seed": config.seed, "feasible": sizing.best is not None})
+        say(str(path))
+        return DONE if outcomes and all(o.met for o in outcomes) else SOME_NOT_CONVERGED
+
+
+def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
+    best = found.sizing.best
+    folder.write_text("config.resolved.toml", configuration.as_toml(config))
+    folder.write_text("requirements.toml", found.asked.text)
+    note = f"the robot that was changed, {config.robot}: no design meets the requirements"
+    if best is not None:
+        note = f"sized for {found.asked.source} from {config.robot}: {described(best)}"
+    robot_file.write(found.robot if best is None else best.robot, folder.partial / "robot.toml", note=note)
+    folder.write_json("result.json", found.to_json())
+
+
+def print_size(found: SizeResult) -> None:
+    """The best, the alternatives and what binds each motor; for a person."""
+    s = found.sizing
+    say(found.statement())
+    shown = Table(title="by motor, the best design found of each", box=None, pad_edge=False)
+    shown.title_justify = "left"
+    shown.add_column("")
+    shown.add_column("motor and gearbox")
+    for name in ("ratio", "radius [mm]", "cells", "mass [kg]", "energy [Wh/m]", "cost [EUR]"):
+        shown.add_column(name, justify="right")
+    shown.add_column("what binds, or is missed")
+    for f in s.motors.values():
+        values = [f"{f.objectives[k]:.4g}" if k in f.objectives else "" for k in OBJECTIVES]
+        shown.add_row(
+            "meets" if f.feasible else "misses", f.drive.name, f"{f.ratio:.3g}", f"{1000 * f.radius:.1f}",
+            f"{f.in_series} × {f.parallel:.3g} {f.cell.name}", *values,
+            ", ".join(f.binds if f.feasible else missed(f)),
+        )  # fmt: skip
+    say(shown)
+    if s.front:
+        first, second = found.objectives
+        say(f"{len(s.front)} designs on the front of {first} and {second}, from {objective(s.front[0], first)} to "
+            f"{objective(s.front[-1], second)}")  # fmt: skip
+    lacking = [o for o in found.outcomes if not o.met]
+    if lacking:
+        say(
+            "the best as `check` has it misses: "
+            + "; ".join(f"{check.label(o)} {check.shortfall(o)}" for o in lacking)
+        )

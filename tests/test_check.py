@@ -1,0 +1,324 @@
+"""Requirements: the paper's robot against the paper's aims, what would meet them, what is refused."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+
+from calibration.data import requirements, robot_file
+from calibration.data.errors import BadConfiguration
+from calibration.sizing import sheet
+from mmrjax import params
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.requirements import CUT_OFF, OUTCOMES, QUANTITIES, Point, evaluate, packed, ratings
+from mmrjax.signals import CONVERGED, SLIDES, STALLED
+from sweeps import cli
+from tests.pages import Tables, drawn, outside
+
+SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json").read_text("utf-8"))
+
+
+def command(arguments):
+    """Run a command in this process; returns its exit code."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        cli.main()
+    return end.value.code
+
+
+def read(text):
+    return requirements.read(text, "r.toml")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What the command leaves of the paper's robot against the paper's aims."""
+    path = tmp_path_factory.mktemp("runs") / "check"
+    assert command(["check", "--out", path]) == 3
+    return path
+
+
+@pytest.fixture(scope="module")
+def result(folder):
+    return json.loads((folder / "result.json").read_text())
+
+
+def row(result, name, k=0):
+    return [r for r in result["requirements"] if r["name"] == name][k]
+
+
+def test_result_is_as_its_schema_says(result):
+    jsonschema.validate(result, SCHEMA)
+    assert result["met"] + result["missed"] == len(result["requirements"]) and result["missed"] > 0
+
+
+def test_papers_robot_misses_the_papers_aims(result):
+    """0.95 m/s on a full battery; 2200 mAh with 1.5 A for other consumers last 88 minutes standing still."""
+    speed, standing = row(result, "speed_m_s"), row(result, "endurance_min")
+    assert not speed["met"] and speed["value"] == pytest.approx(0.95, abs=0.005)
+    assert speed["at"] == {
+        "configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 0.0, "slope_deg": 0.0,
+        "state_of_charge": 1.0, "ambient_C": 25.0,
+    }  # fmt: skip
+    assert not standing["met"] and standing["value"] == pytest.approx(2.2 / 1.5 * 60, rel=1e-9)
+    assert standing["margin"] == pytest.approx(88 - 180, rel=1e-9) and standing["at"]["duty"] == "standing"
+    assert row(result, "mass_kg")["value"] == pytest.approx(13.1) and row(result, "mass_kg")["met"]
+    for r in result["requirements"]:
+        assert r["met"] == (r["margin"] is not None and r["margin"] >= 0)
+        if r["value"] is not None:
+            assert r["margin"] == pytest.approx((r["value"] - r["required"]) * (1 if r["sense"] == "least" else -1))
+
+
+def test_speed_is_that_of_steady(result, robot):
+    for name, charge in (("speed_m_s", 1.0), ("speed_end_of_charge_m_s", 0.0)):
+        discharge = float(robot.battery.capacity) * (1 - charge) * (1 - 1e-9)
+        run = steady_batch(robot, Conditions(0, battery=1.0, discharge=[discharge]))
+        assert row(result, name)["value"] == pytest.approx(float(run.speed[0]), rel=1e-7)
+
+
+def test_worst_corner_is_the_worst_of_a_finer_grid(result, robot):
+    """The hottest winding of a grid four times finer is the sheet's."""
+    found = row(result, "winding_C")
+    capacity = float(robot.battery.capacity)
+    axes = np.linspace(0, 8, 9), np.linspace(0, 10, 17), np.linspace(0, capacity * (1 - 1e-9), 17)
+    payload, slope, discharge = (x.ravel() for x in np.meshgrid(*axes))
+    runs = steady_batch(robot, Conditions(0, battery=1.0, payload=payload, slope_deg=slope, discharge=discharge))
+    assert found["value"] == pytest.approx(float(np.max(runs.temperature_winding)), rel=1e-7)
+    assert found["at"]["payload_kg"] == 8 and found["at"]["slope_deg"] == 10
+
+
+def test_every_change_meets_its_requirement_and_breaks_what_it_says(result, robot):
+    """Each stated value, put into the robot as `--set` does, and checked anew; and half of the change does not."""
+    asked, tried = requirements.load(None), 0
+    names = [r["name"] for r in result["requirements"]]
+    for k, r in enumerate(result["requirements"]):
+        assert bool(r["change"]) <= (not r["met"])
+        for c in r["change"]:
+            outcomes = sheet.check(robot_file.change(robot, {c["parameter"]: c["to"]}, "test"), asked, changes=False)
+            assert outcomes[k].met, (r["name"], c)
+            before = [x["met"] for x in result["requirements"]]
+            broken = {n for n, b, o in zip(names, before, outcomes, strict=True) if b and not o.met}
+            assert broken == set(c["breaks"]), (r["name"], c)
+            near = c["to"] + (-1 if c["to"] > c["from"] else 1) * (
+                1 if c["parameter"] == "battery.cells" else 0.002 * c["to"]
+            )
+            alone = dataclasses.replace(asked, each=(asked.each[k],))
+            (short,) = sheet.check(robot_file.change(robot, {c["parameter"]: near}, "test"), alone, changes=False)
+            assert not short.met, (r["name"], c, near)
+            tried += 1
+    assert tried > 8
+
+
+def test_change_follows_the_derivative(result):
+    speed = row(result, "speed_m_s")
+    by = {c["parameter"]: c for c in speed["change"]}
+    assert by["gearbox.ratio"]["gradient"] < 0 and by["gearbox.ratio"]["to"] < 48
+    assert by["6T2A.radius"]["gradient"] > 0
+    linear = by["gearbox.ratio"]["from"] - speed["margin"] / by["gearbox.ratio"]["gradient"]
+    assert by["gearbox.ratio"]["to"] == pytest.approx(linear, rel=0.02)
+
+
+def point(**given):
+    usual = {
+        "configuration": 0, "adhesion": 1.0, "battery": 1.0, "charge": 1.0, "charge_end": 0.0, "share": 0.0,
+        "slope_deg": 0.0, "payload": 0.0, "ambient": 25.0,
+    }  # fmt: skip
+    return Point(**{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()})
+
+
+@pytest.mark.parametrize("name", ["speed_m_s", "slope_deg", "payload_kg", "endurance_min", "energy_per_metre_Wh"])
+def test_derivatives_are_differences(robot, name):
+    at = point(slope_deg=5.0, share=0.5, payload=2.0, charge=0.9)
+    given = (
+        "gearbox.ratio",
+        "motor.resistance",
+        "battery.capacity",
+        "battery.current_other",
+        "6T2A.ground.friction.static",
+    )
+    known = {p.name: float(p.value) for p in params.walk(robot)}
+    theta = jnp.asarray([known[n] for n in given])
+
+    @jax.jit
+    def value(theta):
+        return evaluate(params.replace(robot, dict(zip(given, theta, strict=True))), at, ratings(robot), name).value
+
+    exact = np.asarray(jax.grad(value)(theta))
+    for k in range(len(given)):
+        up, down = (float(value(theta.at[k].multiply(1 + s * 1e-4))) for s in (1, -1))
+        difference = (up - down) / (2e-4 * float(theta[k]))
+        assert exact[k] * float(theta[k]) == pytest.approx(
+            difference * float(theta[k]), rel=1e-4, abs=1e-5 * float(value(theta))
+        )
+
+
+def test_cells_as_a_number_are_the_batterys_cells(robot):
+    other = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, cells=11))
+    for current, discharge in ((0.0, 0.0), (5.0, 4000.0)):
+        assert packed(robot, 11.0).battery.voltage(current, discharge) == pytest.approx(
+            float(other.battery.voltage(current, discharge)), rel=1e-12
+        )
+
+
+def test_endurance_is_the_integral_over_the_charge(robot):
+    """Against the trapezoidal rule over 2000 operating points."""
+    at = point(share=0.5)
+    found = evaluate(robot, at, ratings(robot), "endurance_min")
+    charge = np.linspace(0, float(robot.battery.capacity) * (1 - 1e-9), 2001)
+    runs = steady_batch(robot, Conditions(0, battery=1.0, discharge=charge))
+    flowing = 0.5 * np.asarray(runs.total_current) + 1.5
+    cell = np.asarray(robot.battery.voltage_cell(runs.total_current, jnp.asarray(charge)))
+    use = cell >= robot.battery.voltage_cutoff
+    assert float(found.value) == pytest.approx(np.trapezoid(1 / flowing[use], charge[use]), rel=1e-4)
+    assert int(found.outcome) == CONVERGED
+
+
+def test_points_without_value_are_missed_in_words(robot, tmp_path, capsys):
+    """What slides or stalls has no value: missed, with the status in words and no NaN anywhere."""
+    slides = evaluate(robot, point(slope_deg=16.0), ratings(robot), "speed_m_s")
+    assert int(slides.outcome) == SLIDES
+    weak = params.replace(robot, {"gearbox.ratio": 2.0})
+    assert int(evaluate(weak, point(slope_deg=10.0), ratings(weak), "speed_m_s").outcome) == STALLED
+    low = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=3.4))
+    assert int(evaluate(low, point(charge=0.0), ratings(low), "speed_m_s").outcome) == CUT_OFF
+    file = tmp_path / "steep.toml"
+    file.write_text("speed_m_s = 0.5\nwinding_C = 100\n[envelope]\nslope_deg = [0, 16]\n")
+    assert command(["check", file, "--out", tmp_path / "run", "--no-changes"]) == 3
+    text = (tmp_path / "run" / "result.json").read_text()
+    found = json.loads(text)
+    jsonschema.validate(found, SCHEMA)
+    for r in found["requirements"]:
+        assert not r["met"] and r["value"] is None and r["status"] == "slides" and r["at"]["slope_deg"] == 16
+    assert "NaN" not in text and "nan" not in (tmp_path / "run" / "requirements.csv").read_text()
+    shown = capsys.readouterr().out
+    assert "traction demand above the adhesion limit" in shown and "nan" not in shown.lower()
+    assert "nan" not in Tables((tmp_path / "run" / "report.html").read_text()).text.lower()
+
+
+def test_external_supply_and_another_configuration(tmp_path):
+    file = tmp_path / "wheels.toml"
+    file.write_text(
+        "speed_m_s = { least = 0.9, most = 3 }\ncurrent_A = 8\ngearbox_Nm = 6\nenergy_per_metre_Wh = 0.1\n"
+        '[envelope]\nconfiguration = "4W2T"\nsupply_voltage_V = [30, 33]\npayload_kg = 3\nambient_C = [0, 40]\n'
+    )
+    assert command(["check", file, "--out", tmp_path / "run", "--no-report"]) == 0
+    found = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert [r["met"] for r in found["requirements"]] == [True] * 5 and found["missed"] == 0
+    slow, fast = (row(found, "speed_m_s", k) for k in (0, 1))
+    assert (slow["at"]["supply_voltage_V"], fast["at"]["supply_voltage_V"]) == (30, 33)
+    assert slow["at"]["ambient_C"] == 40 and slow["at"]["configuration"] == "4W2T"
+    assert not (tmp_path / "run" / "report.html").exists()
+    again = json.loads(json.dumps(found))
+    assert again == found and (tmp_path / "run" / "requirements.toml").read_text() == file.read_text()
+
+
+def test_report_shows_the_sheet(folder, result):
+    page = (folder / "report.html").read_text()
+    tables = Tables(page)
+    assert drawn(page) == {"margins"} and outside(folder) == []
+    rows = tables.tables["requirements"][1:]
+    assert [r[0] for r in rows] == ["met" if r["met"] else "missed" for r in result["requirements"]]
+    assert "0.947 m/s" in rows[0][3] and "what would meet them" in tables.text.lower()
+    with (folder / "requirements.csv").open(newline="") as stream:
+        assert [r["name"] for r in csv.DictReader(stream)] == [r["name"] for r in result["requirements"]]
+    assert command(["check", "--out", folder]) == 2  # --force is needed
+
+
+def test_paper_file_states_where_each_aim_comes_from():
+    asked = requirements.paper()
+    assert all("Section" in r.source or "Table" in r.source or "sheet" in r.source for r in asked.each)
+    assert {r.name for r in asked.each} >= {"speed_m_s", "slope_deg", "payload_kg", "endurance_min", "mass_kg"}
+    assert set(OUTCOMES) >= {"cut_off", "slides"} and len({q.name for q in QUANTITIES.values()}) == len(QUANTITIES)
+
+
+REFUSED = {
+    "": r"^r.toml: states no requirement; expected one of speed_m_s, ",
+    "[envelope]\npayload_kg = 3": r"^r.toml: states no requirement",
+    "speed = 1.0": r"^r.toml, speed: no unit in its name; write speed_m_s$",
+    "endurance_h = 3": r"^r.toml, endurance_h: unit h is not read; write endurance_min$",
+    "speed_km_h = 3.6": r"^r.toml, speed_km_h: unit km_h is not read; write speed_m_s$",
+    "speeed_m_s = 1": r"^r.toml, speeed_m_s: no such key; did you mean speed_m_s\? allowed: speed_m_s, ",
+    "speed_m_s = nan": r"^r.toml, speed_m_s: got nan; expected 0 to 1e\+06 m/s$",
+    "speed_m_s = -1": r"^r.toml, speed_m_s: got -1; expected 0 to 1e\+06 m/s$",
+    'speed_m_s = "1 m/s"': r"^r.toml, speed_m_s: got '1 m/s'; expected a number \[m/s\]$",
+    "speed_m_s = 'rated'": r"^r.toml, speed_m_s: got 'rated'; expected a number, only winding_C, ",
+    "speed_m_s = true": r"^r.toml, speed_m_s: got True; expected a number \[m/s\]$",
+    "speed_m_s = []": r"^r.toml, speed_m_s: got an empty list; expected ",
+    "speed_m_s = {slope_deg = 3}": r"^r.toml, speed_m_s: states neither least nor most; expected one of them \[m/s\]$",
+    "speed_m_s = {least = 1, slope = 3}": r"^r.toml, speed_m_s, slope: no unit in its name; write slope_deg$",
+    "speed_m_s = {least = 1, duty = 'driving'}": r"^r.toml, speed_m_s: duty and share are of endurance_min alone$",
+    "endurance_min = {least = 1, duty = 'dancing'}": r"^r.toml, endurance_min, duty: got 'dancing'; did you mean standing\? allowed: standing, driving$",
+    "endurance_min = {least = 1, duty = 'standing', share = 0.2}": r"duty standing and a share of 0.2 contradict each other$",
+    "speed_m_s = 1\n[envelope]\npayload_kg = [8, 0]": r"^r.toml, envelope.payload_kg: got \[8, 0\], an empty range; expected ",
+    "speed_m_s = 1\n[envelope]\npayload_kg = []": r"^r.toml, envelope.payload_kg: got \[\]; expected a number or ",
+    "speed_m_s = 1\n[envelope]\npayload = 3": r"^r.toml, envelope, payload: no unit in its name; write payload_kg$",
+    "speed_m_s = 1\n[envelope]\nslope_deg = 80": r"^r.toml, envelope.slope_deg: got 80; expected 0 to 45 deg$",
+    "speed_m_s = 1\n[envelope]\nstate_of_charge = 50": r"^r.toml, envelope.state_of_charge: got 50; expected 0 to 1$",
+    "speed_m_s = 1\n[envelope]\nambient_C = nan": r"^r.toml, envelope.ambient_C: got nan; expected -50 to 80 °C$",
+    "speed_m_s = 1\n[envelope]\nsurface = 'ice'": r"^r.toml, envelope.surface: got 'ice'; allowed: linoleum, ",
+    "speed_m_s = 1\n[envelope]\nbattery = 1": r"^r.toml, envelope.battery: got 1; expected true or false$",
+    "speed_m_s = 1\n[envelope]\nbattery = false": r"^r.toml, envelope: battery = false needs supply_voltage_V, ",
+    "speed_m_s = 1\n[envelope]\nbattery = true\nsupply_voltage_V = 24": r"^r.toml, envelope: battery and supply_voltage_V contradict ",
+    "speed_m_s = 1\n[envelope]\nstate_of_charge = 1\nsupply_voltage_V = 24": r"^r.toml, envelope: state_of_charge and supply_voltage_V contradict",
+    "endurance_min = 9\n[envelope]\nsupply_voltage_V = 24": r"^r.toml, endurance_min: endurance needs the battery, ",
+    "speed_m_s = {least = 1.2, most = 1}": r"^r.toml: speed_m_s at least 1.2 m/s and speed_m_s at most 1 m/s contradict each other$",
+    "speed_m_s = {most = 1}\nspeed_end_of_charge_m_s = 1.1\n[envelope]\nstate_of_charge = [0, 1]": r"^r.toml: speed_end_of_charge_m_s at least 1.1 m/s and speed_m_s at most 1 m/s contradict",
+    "payload_kg = 5\n[envelope]\npayload_kg = [0, 8]": r"^r.toml: payload_kg of at least 5 contradicts the envelope, whose payload_kg goes up to 8$",
+    "slope_deg = 5\n[envelope]\nslope_deg = [0, 8]": r"^r.toml: slope_deg of at least 5 contradicts the envelope, whose slope_deg goes up to 8$",
+    "winding_C = 30\n[envelope]\nambient_C = [0, 40]": r"^r.toml: winding_C of at most 30 contradicts the envelope, whose ambient_C goes up to 40$",
+    "envelope = 3\nspeed_m_s = 1": r"^r.toml, envelope: got 3; expected a table of configuration, ",
+    "speed_m_s = ": r"^r.toml: not a readable TOML file \(",
+    "schema = 'mmrjax.requirements/9'": r"^r.toml, schema: got 'mmrjax.requirements/9'; expected mmrjax.requirements/1$",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_wrong_file_is_refused_in_a_sentence(text):
+    with pytest.raises(BadConfiguration, match=REFUSED[text]) as error:
+        read(text)
+    assert "\n" not in str(error.value)
+
+
+def test_what_no_robot_can_do_is_refused(robot, tmp_path, capsys):
+    file = tmp_path / "r.toml"
+    file.write_text("speed_m_s = 1\n[envelope]\nslope_deg = [0, 20]\n")
+    assert command(["check", file, "--out", tmp_path / "run"]) == 2
+    steepest = math.degrees(math.atan(0.32))
+    assert capsys.readouterr().err == (
+        "mmrjax: r.toml, speed_m_s: the envelope's slope_deg goes up to 20; lacquered_wood holds 6T2A up to "
+        f"{steepest:.1f} deg at most (adhesion 0.32), whatever drives it\n"
+    )
+    sheet.refuse(robot, read('speed_m_s = 1\n[envelope]\nslope_deg = 20\nsurface = "concrete"'))
+    file.write_text('speed_m_s = 1\n[envelope]\nconfiguration = "4W2"\n')
+    assert command(["check", file, "--out", tmp_path / "run"]) == 2
+    assert "the robot has no configuration 4W2; did you mean 4W2T?" in capsys.readouterr().err
+    assert command(["check", tmp_path / "none.toml"]) == 2
+    assert "no such file; expected a TOML file of requirements" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists() and not (tmp_path / "run.partial").exists()
+
+
+def test_rated_is_what_the_parts_permit(robot):
+    asked = sheet.rated(robot, read("winding_C = 'rated'\nmotor_speed_rpm = { most = 'rated' }"))
+    assert [r.limit for r in asked.each] == pytest.approx([125.0, 12000.0])
+    robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, torque_limit=None))
+    with pytest.raises(BadConfiguration, match=r"^r.toml, gearbox_Nm: the robot states no rating; state a number$"):
+        sheet.rated(robot, read("gearbox_Nm = 'rated'"))
+
+
+def test_contradictions_are_those_of_one_use():
+    """Elsewhere in the envelope other limits may hold."""
+    asked = read("speed_m_s = [{ least = 1, slope_deg = 0 }, { most = 0.8, slope_deg = 10 }]")
+    assert [r.sense for r in asked.each] == ["least", "most"]
+    asked = read("payload_kg = 8\nslope_deg = 8\n[envelope]\npayload_kg = [0, 8]\nslope_deg = [0, 8]")
+    assert len(asked.each) == 2

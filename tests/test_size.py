@@ -1,0 +1,235 @@
+"""Sizing: what a search finds meets the requirements, no grid is better, what binds, and what is refused."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+
+from calibration.data import requirements, robot_file
+from calibration.data.parts import gearboxes, motors
+from calibration.sizing import chart, search, sheet
+from calibration.sizing.design import OBJECTIVES, build, evaluate, task
+from calibration.sizing.options import BELT_STAGE, MOTOR, drives, options
+from mmrjax import params
+from sweeps import cli
+from tests.pages import Tables, drawn, outside
+
+SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "size.schema.json").read_text("utf-8"))
+TEXT = """
+speed_m_s = 0.9
+payload_kg = 8
+endurance_min = { least = 100, duty = "driving", share = 0.5, slope_deg = 0 }
+winding_C = "rated"
+[envelope]
+payload_kg = [0, 8]
+slope_deg = [0, 10]
+state_of_charge = [0.1, 1]
+"""
+
+
+def command(arguments):
+    """Run a command in this process; returns its exit code."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        cli.main()
+    return end.value.code
+
+
+@pytest.fixture(scope="module")
+def asked():
+    return requirements.read(TEXT, "r.toml")
+
+
+@pytest.fixture(scope="module")
+def found(robot, asked):
+    return search.size(robot, asked, ("mass",), starts=256)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """What the command leaves, for a front of two."""
+    path = tmp_path_factory.mktemp("runs")
+    (path / "r.toml").write_text(TEXT)
+    assert command(["size", path / "r.toml", "--pareto", "mass,energy", "--out", path / "run"]) == 0
+    return path / "run"
+
+
+def space(robot, asked, found):
+    of = task(robot, asked, found.options)
+    return of, search.space(robot, of, found.options)
+
+
+def test_best_meets_every_requirement_as_check_has_it(asked, found):
+    assert found.best is not None and found.best.feasible and found.unmeetable == ()
+    for f in (found.best, *found.alternatives[:3]):
+        outcomes = sheet.check(f.robot, asked, changes=False)
+        assert all(o.met for o in outcomes), (f.to_json(), outcomes)
+        assert float(f.robot.chassis(0).mass) == pytest.approx(f.objectives["mass"])
+    assert found.ideal.objectives["mass"] <= found.best.objectives["mass"]
+
+
+def test_best_is_of_the_sheets(found):
+    """A ratio that is made, with a gearbox that its source combines with the motor; whole cells."""
+    for f in (found.best, *found.alternatives):
+        made = [g.ratio * BELT_STAGE for g in gearboxes() if (g.family, g.stages) == (f.drive.family, f.drive.stages)]
+        assert f.ratio == pytest.approx(min(made, key=lambda r: abs(r - f.ratio)), rel=1e-12)
+        assert f.drive.family in f.drive.motor.gearboxes
+        assert f.parallel == pytest.approx(round(f.parallel), abs=1e-9)
+    assert {m.name for m in motors() if m.gearboxes} == set(found.motors)
+
+
+def test_no_design_of_a_grid_is_lighter(robot, asked, found):
+    """20 000 of the lightest choices, their ratio, radius and cells in parallel on a grid."""
+    of, choice = space(robot, asked, found)
+    rows = np.random.default_rng(1).choice(len(choice.drive), 160, replace=False)
+    ideal = found.ideal
+    own = [
+        k for k in range(len(choice.drive))
+        if found.options.drives[choice.drive[k]] == ideal.drive and found.options.cells[choice.cell[k]] == ideal.cell
+    ]  # fmt: skip
+    rows = np.unique(np.concatenate([rows, own]))
+    box = np.stack(np.meshgrid(*(np.linspace(0, 1, k) for k in (6, 5, 8)), indexing="ij"), -1).reshape(-1, 3)
+    every = np.repeat(rows, len(box))
+    x = choice.low[every] + (choice.high[every] - choice.low[every]) * np.tile(box, (len(rows), 1))
+    f, g = search.measured(of, choice, every, x)
+    good = np.all(g >= 0, axis=1)
+    assert good.sum() > 20 and f[good, 0].min() >= ideal.objectives["mass"]
+
+
+def test_binding_limits_are_why_it_is_no_lighter(robot, asked, found):
+    """The ideal is at a limit, and fewer cells in parallel or fewer in series violate one."""
+    ideal = found.ideal
+    assert ideal.binds and all(
+        -1e-9 <= ideal.margins[label] < search.BINDS for label in ideal.binds if label in ideal.margins
+    )
+    of, choice = space(robot, asked, found)
+    (row,) = (
+        k for k in range(len(choice.drive))
+        if found.options.drives[choice.drive[k]] == ideal.drive
+        and found.options.cells[choice.cell[k]] == ideal.cell and choice.in_series[k] == ideal.in_series
+    )  # fmt: skip
+    x = np.log([[ideal.ratio, ideal.radius, ideal.parallel * 0.97]])
+    assert search.measured(of, choice, np.array([row]), x)[1].min() < 0
+
+
+def test_margins_are_differentiable(robot, asked, found):
+    of, choice = space(robot, asked, found)
+    f = found.best
+    row = next(k for k in range(len(choice.drive)) if found.options.drives[choice.drive[k]] == f.drive)
+    x = np.log([[f.ratio * 1.01, f.radius * 0.97, f.parallel * 1.1]])
+    design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x))
+
+    @jax.jit
+    def margins(x):
+        objectives, g = evaluate(of, type(design)(x, design.drive, design.cell, design.cells))
+        return jnp.concatenate([objectives[:2], g])
+
+    exact = np.asarray(jax.jacrev(margins)(jnp.asarray(x[0])))
+    for k in range(3):
+        step = 1e-5 * np.eye(3)[k]
+        difference = (np.asarray(margins(x[0] + step)) - np.asarray(margins(x[0] - step))) / 2e-5
+        np.testing.assert_allclose(exact[:, k], difference, rtol=1e-3, atol=1e-5)
+
+
+def test_paper_parts_make_the_papers_robot(robot, asked):
+    """Its own motor, gearbox, ratio, radius and cells give back its numbers; the sheet's where the paper's are others."""
+    chosen = options(robot)
+    of = task(robot, asked, chosen)
+    choice = search.space(robot, of, chosen)
+    name = next(
+        d for d in range(len(chosen.drives)) if chosen.drives[d].motor.name == MOTOR and chosen.drives[d].stages == 2
+    )
+    row = next(
+        k for k in range(len(choice.drive)) if (choice.drive[k], choice.cell[k], choice.in_series[k]) == (name, 0, 8)
+    )
+    x = np.log([[48.0, float(robot.chassis(0).radius), 1.0]])
+    design = jax.tree.map(lambda v: v[0], choice.designs(np.array([row]), x))
+    made, _ = build(of.robot, of.base_mass, of.configuration, design)
+    own = {p.name: float(p.value) for p in params.walk(robot)}
+    other = {p.name: float(p.value) for p in params.walk(made)}
+    assert {n for n in own if not math.isclose(own[n], other[n], rel_tol=1e-9)} == set()
+
+
+def test_command_leaves_what_its_schema_says(folder):
+    result = json.loads((folder / "result.json").read_text())
+    jsonschema.validate(result, SCHEMA)
+    assert "NaN" not in (folder / "result.json").read_text()
+    front = [(f["objectives"]["mass"], f["objectives"]["energy"]) for f in result["pareto"]]
+    assert len(front) > 1 and front == sorted(front) and all(a[1] > b[1] for a, b in itertools.pairwise(front))
+    assert result["best"]["objectives"]["mass"] == pytest.approx(front[0][0])
+    assert all(r["met"] for r in result["requirements"]) and result["starts"] == 256
+    sized = robot_file.load(str(folder / "robot.toml"))
+    assert float(sized.gearbox.ratio) == pytest.approx(result["best"]["ratio"])
+    assert sized.battery.cells == result["best"]["cells"]
+    assert (
+        command(
+            [
+                "check",
+                folder / "requirements.toml",
+                "--robot",
+                folder / "robot.toml",
+                "--out",
+                folder.parent / "again",
+                "--no-report",
+            ]
+        )
+        == 0
+    )
+
+
+def test_report_shows_designs_and_what_binds_where(folder):
+    page = (folder / "report.html").read_text()
+    tables = Tables(page)
+    assert drawn(page) == {"limits", "front"} and outside(folder) == []
+    result = json.loads((folder / "result.json").read_text())
+    assert [r[1] for r in tables.tables["by_motor"][1:]] == [m["motor"] for m in result["motors"]]
+    assert tables.tables["best"][1][1] == result["best"]["motor"]
+    assert "nan" not in tables.text.lower()
+
+
+def test_chart_has_the_limits_of_the_robot(robot, asked):
+    """On the bench's surface adhesion ends at 14.6°; the required speed counts within its envelope alone."""
+    of = chart.chart(robot, requirements.read("speed_m_s = 0.1", "r.toml"), (8.0, 30.0))
+    steep = of.slope > 14.6
+    assert np.all(of.margin[steep] < 0) and chart.LIMITS[of.nearest[-1, 0]] in ("adhesion", "gearbox input speed")
+    assert of.margin.shape == (chart.POINTS, chart.POINTS) and np.isfinite(of.margin).all()
+    payload, slope = chart.extent(asked)
+    assert payload == pytest.approx(1.6 * 8) and slope == pytest.approx(16)
+
+
+def test_what_no_parts_meet_is_left_out_and_said(robot):
+    asked = requirements.read("speed_m_s = 0.5\nslope_deg = 20\n[envelope]\nstate_of_charge = [0.1, 1]", "r.toml")
+    found = search.size(robot, asked, ("mass",), starts=32, motors=(MOTOR,))
+    assert found.unmeetable == ("steepest slope held",) and found.best is not None
+    assert set(found.motors) == {MOTOR} and len(drives((MOTOR,))) == 3
+
+
+REFUSED = {
+    ("--objective", "price"): r"^mmrjax: --objective: got price; allowed: mass, energy, cost",
+    ("--pareto", "mass"): r"^mmrjax: --pareto: got mass; expected two different objectives",
+    (
+        "--pareto",
+        "mass,time",
+    ): r"^mmrjax: --pareto: got time; did you mean mass|^mmrjax: --pareto: got time; allowed: ",
+    ("--motors", "RE 31"): r"^mmrjax: --motors: got RE 31; ",
+    ("--starts", "0"): r"^mmrjax: option starts: got 0; ",
+}
+
+
+@pytest.mark.parametrize("given", REFUSED)
+def test_wrong_options_are_refused_in_a_sentence(given, tmp_path, capsys):
+    import re
+
+    assert command(["size", *given, "--out", tmp_path / "run"]) == 2
+    said = capsys.readouterr().err
+    assert re.match(REFUSED[given], said) and said.count("\n") == 1
+    assert not (tmp_path / "run").exists() and list(OBJECTIVES) == ["mass", "energy", "cost"]
