@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import posterior, robot_file
 from calibration.data.posterior import Posterior
-from calibration.data.runs import CONDITIONS, WHEN, Runs
+from calibration.data.runs import CONDITIONS, DRIVING, WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.settings import Settings
@@ -532,7 +532,7 @@ class DiscoveryResult:
         seen = self.readings_of_rows
         table = {
             "row": self.numbers,
-            **{k: self.runs[k] for k in ("run_id", *WHEN, "configuration", *CONDITIONS) if self.runs.has(k)},
+            **{k: self.runs[k] for k in ("run_id", *WHEN, "configuration", *CONDITIONS, *DRIVING) if self.runs.has(k)},
         }
         main = next(iter(seen.held_out.values()), None)
         for k, channel in enumerate(channels.CHANNELS):

@@ -20,7 +20,7 @@ def conduct(runs: Runs, robot: Robot) -> list[str]:
     """Say which runs end before they are under way, and which never grip."""
     kind = observers.kind(runs)
     ends, shown, lasts = kind.settled(runs)
-    if not kind.axis:
+    if not kind.axis or not len(ends):
         return []
     speed = shown[:, channels.index("speed")]
     turning = shown[:, channels.index("motor_speed")]
