@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,13 +18,12 @@ class Stretch:
     """Samples of a run, one after the other, under the same conditions.
 
     Attributes:
-        run: name of the run; rows: indices of the samples in the order of time, shape (samples,).
-        begin, end: since the start of the run, when these conditions began, and when others follow or the run ends [s].
+        rows: indices of the samples in the order of time, shape (samples,).
+        begin, end: when these conditions began, and when others follow or the run ends, since its start [s].
         driven: whether the motors are driven forwards.
         whole: whether the run has no other stretch.
     """
 
-    run: str
     rows: np.ndarray
     begin: float
     end: float
@@ -64,20 +64,31 @@ def varies(runs: Runs, columns: tuple[str, ...] = CHANGING) -> np.ndarray:
     return found
 
 
-def stretches(runs: Runs) -> list[Stretch]:
-    """The stretches of all runs, run by run in the order of their names."""
+def divided(
+    rows: np.ndarray, time: np.ndarray, conditions: Sequence[np.ndarray], applied: np.ndarray
+) -> list[Stretch]:
+    """The stretches of one run.
+
+    Args:
+        rows: of the run, in the order of time; time [s], conditions, applied [V]: of every row of the table.
+    """
+    differs = np.any([c[rows][1:] != c[rows][:-1] for c in conditions], 0)
+    cuts = [0, *(np.flatnonzero(differs) + 1).tolist(), len(rows)]
+    begins = [0.0, *(float(time[rows[k]]) for k in cuts[1:-1]), float(time[rows[-1]])]
+    return [
+        Stretch(rows[low:high], begin, end, bool(applied[rows[low]] > 0), len(cuts) == 2)
+        for low, high, begin, end in zip(cuts[:-1], cuts[1:], begins[:-1], begins[1:], strict=True)
+    ]
+
+
+def stretches(runs: Runs) -> list[list[Stretch]]:
+    """The stretches of every run, runs in the order of their names."""
     found = []
-    all_names, time, volts = names(runs), runs["time_s"], applied(runs)
+    every, time, volts = names(runs), runs["time_s"], applied(runs)
     columns = [runs[c] for c in CHANGING if runs.has(c)]
-    for name in np.unique(all_names):
-        rows = np.flatnonzero(all_names == name)
-        rows = rows[np.argsort(time[rows], kind="stable")]
-        differs = np.any([c[rows][1:] != c[rows][:-1] for c in columns], 0)
-        cuts = [0, *(np.flatnonzero(differs) + 1).tolist(), len(rows)]
-        for low, high in zip(cuts, cuts[1:], strict=False):
-            begin = 0.0 if low == 0 else float(time[rows[low]])
-            end = float(time[rows[min(high, len(rows) - 1)]])
-            found.append(Stretch(str(name), rows[low:high], begin, end, bool(volts[rows[low]] > 0), len(cuts) == 2))
+    for name in np.unique(every):
+        rows = np.flatnonzero(every == name)
+        found.append(divided(rows[np.argsort(time[rows], kind="stable")], time, columns, volts))
     return found
 
 
@@ -86,10 +97,7 @@ def courses(runs: Runs) -> np.ndarray:
     found = np.full(len(runs), "", dtype=object)
     if varies(runs).any():
         columns = [c for c in CHANGING if runs.has(c)]
-        said: dict[str, list[str]] = {}
-        parts = [s for s in stretches(runs) if not s.whole]
-        for s in parts:
-            said.setdefault(s.run, []).append(f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}")
-        for s in parts:
-            found[s.rows] = "; ".join(said[s.run])
+        for run in (r for r in stretches(runs) if len(r) > 1):
+            said = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
+            found[np.concatenate([s.rows for s in run])] = "; ".join(said)
     return found.astype(str)
