@@ -6,6 +6,7 @@ The conditions of a run may change from sample to sample; each value holds from 
 from __future__ import annotations
 
 import dataclasses
+import operator
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
@@ -570,7 +571,7 @@ def _in_time(
     for name in CHANGING:
         x = getattr(of_rows, name)
         if x is not None and any(np.ptp(np.asarray(x)[rows]) > 0 for rows in each):
-            conditions = dataclasses.replace(conditions, **{name: x[at]})
+            conditions = eqx.tree_at(operator.attrgetter(name), conditions, x[at])
     return conditions
 
 
