@@ -54,7 +54,7 @@ def applied(runs: Runs) -> np.ndarray:
 def varies(runs: Runs, columns: tuple[str, ...] = CHANGING) -> np.ndarray:
     """Whether one of these columns changes within the run of a row, shape (rows,)."""
     found = np.zeros(len(runs), bool)
-    if not runs.has("time_s"):
+    if not runs.sampled:
         return found
     _, run = np.unique(names(runs), return_inverse=True)
     first = np.unique(run, return_index=True)[1][run]

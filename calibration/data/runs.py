@@ -95,6 +95,11 @@ class Runs:
         """Whether the table has this column."""
         return column in self.columns
 
+    @property
+    def sampled(self) -> bool:
+        """Whether a row is a sample of a run."""
+        return all(self.has(column) for column in TIME)
+
     def where(self, rows: np.ndarray) -> Runs:
         """The rows that a mask or an index selects."""
         return dataclasses.replace(self, columns={k: v[rows] for k, v in self.columns.items()})
@@ -319,8 +324,8 @@ def _cell(where: str, column: str, cell: str, kind: type[InputError] = BadData) 
 
 
 def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
-    for column in (c for c in DRIVING if c in columns and "time_s" not in columns):
-        raise BadData(f"{name}: column {column} is for time histories; add time_s, or remove it")
+    for column in (c for c in DRIVING if c in columns and not set(TIME) <= set(columns)):
+        raise BadData(f"{name}: column {column} is for time histories; add {', '.join(TIME)}, or remove it")
     if "duty" not in columns:
         return
     modes = columns.get("mode", np.full(len(columns["duty"]), DRIVEN[0]))
