@@ -17,6 +17,7 @@ from calibration.discovery.reach import reach
 from calibration.discovery.settings import settings_for
 from calibration.inference.blocks import blocks, distinct
 from calibration.inference.calibrate import calibrate
+from calibration.inference.linearization import probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Histories, settled_ends
 from mmrjax import params, robots
@@ -195,6 +196,24 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
     t = np.asarray(observer.times[k])
     expected = np.array([12.0, 24.0, 33.0, 18.0])[np.clip(np.searchsorted(SEGMENTS, t + 1e-9, "right") - 1, 0, 3)]
     np.testing.assert_array_equal(c.voltage[k], expected)
+
+
+@pytest.mark.parametrize("balance", ["electrical", "track"])
+def test_defects_of_all_knots_are_a_constant_defect(observer, balance):
+    """Their linear response, through changes of conditions, against the derivative by an amplitude."""
+    robot, effect = robots.nominal(), probe(balance)
+
+    def readings(amplitude):
+        with_it = dataclasses.replace(effect, amplitude=amplitude)
+        return observer(dataclasses.replace(robot, effects=(with_it,))).reading
+
+    expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))
+    found = np.asarray(jax.jit(lambda r: observer.defective(r, (effect,)))(robot))[0].sum(1)
+    rows = np.asarray(observer.rows_of)
+    got = np.zeros_like(expected)
+    got[rows[rows >= 0]] = found[rows >= 0]
+    np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
+    assert (np.abs(expected).max(0) > 0).all()
 
 
 def test_stretches_are_the_segments(runs, observer):
