@@ -238,7 +238,7 @@ def _read(path: Path, name: str, measured: bool, battery: bool) -> Runs:
     _check_deviations(name, columns)
     if battery:
         columns["supply_voltage_V"] = np.full(len(rows) - 1, np.nan)
-    elif measured:
+    elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
         _check_signs(name, columns)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
