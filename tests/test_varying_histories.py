@@ -15,6 +15,7 @@ from calibration.data.errors import BadData
 from calibration.data.runs import DRIVEN, Runs
 from calibration.discovery.reach import reach
 from calibration.discovery.settings import settings_for
+from calibration.inference import checks
 from calibration.inference.blocks import blocks, distinct
 from calibration.inference.calibrate import calibrate
 from calibration.inference.linearization import probe
@@ -214,6 +215,14 @@ def test_defects_of_all_knots_are_a_constant_defect(observer, balance):
     got[rows[rows >= 0]] = found[rows >= 0]
     np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
     assert (np.abs(expected).max(0) > 0).all()
+
+
+def test_one_supply_voltage_is_said_only_where_the_duty_is_one_too(runs):
+    steady = changed(runs, supply_voltage_V=np.full(len(runs), 24.0), mode=np.full(len(runs), "voltage"))
+    said = "losses that grow with speed"
+    assert any(said in s for s in checks._constant_conditions(steady))
+    pulsed = changed(steady, duty=np.where(runs["time_s"] < 0.5, 0.4, 1.0))
+    assert not any(said in s for s in checks._constant_conditions(pulsed))
 
 
 def test_stretches_are_the_segments(runs, observer):
