@@ -65,6 +65,11 @@ def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
 RUNS_SHOWN, AVERAGED = 8, 5
 
 
+def _range(x: np.ndarray) -> str:
+    low, high = np.min(x), np.max(x)
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
 def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
     """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
     running mean as a line."""
@@ -90,8 +95,8 @@ def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
                 axes.set_ylabel(f"{channel.label} [σ]")
         first = mine[0]
         grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first]} {table['supply_voltage_V'][first]:g} V "
-            f"{table['slope_deg'][first]:g}°", fontsize=8,
+            f"{name}\n{table['configuration'][first]} {_range(table['supply_voltage_V'][mine])} V "
+            f"{_range(table['slope_deg'][mine])}°", fontsize=8,
         )  # fmt: skip
         grid[-1, column].set_xlabel("time [s]")
     words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"

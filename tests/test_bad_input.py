@@ -108,7 +108,7 @@ REFUSED = {
     "moving": "run start0 is moving at 0 s",
     "every reading equal": "total_current_A: 2.5 in every row although the conditions vary; the instrument was stuck",
     "every sample equal": "total_current_A: 2.5 in every row although the conditions vary; the instrument was stuck",
-    "two configurations": "runs.csv, configuration: run start0 has several values; a run has one condition",
+    "two configurations": "runs.csv, configuration: run start0 has several values; a run has one configuration",
 }
 
 

@@ -218,9 +218,9 @@ def test_thousands_of_rows_are_compared_at_once(measured):
     assert time.monotonic() - began < 5.0  # of all pairs: minutes
 
 
-def test_samples_of_one_run_under_two_conditions_are_refused(measured):
-    with pytest.raises(BadData, match=r"supply_voltage_V: run \(no run_id\) has several values"):
-        quick(changed(measured, time_s=np.arange(20.0), configuration=np.full(20, "6T2A")), model="drive")
+def test_samples_of_one_run_with_two_configurations_are_refused(measured):
+    with pytest.raises(BadData, match=r"configuration: run \(no run_id\) has several values"):
+        quick(changed(measured, time_s=np.arange(20.0)), model="drive")
 
 
 def test_histories_need_drive(measured):

@@ -30,11 +30,16 @@ CONDITIONS: dict[str, tuple[float, float]] = {
     "slope_deg": (-45.0, 45.0),
 }
 TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
+#: What a time history may state of its motors' driver: the share of the supply's voltage that they get, negative
+#: backward; and how they are driven: by that share, or not, their terminals shorted or their circuit open.
+DUTY: dict[str, tuple[float, float]] = {"duty": (-1.0, 1.0)}
+DRIVEN = ("voltage", "brake", "coast")
+DRIVING = ("duty", "mode")
 #: Place of a row in the sequence in which runs were made; without it that of the row in the file.
 ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
 #: Columns that say when a row was measured; a table without either was measured in the order of its rows.
 WHEN = ("time_s", "order")
-WORDS = ("configuration", "surface", "run_id")
+WORDS = ("configuration", "surface", "run_id", "mode")
 #: Columns that every table has to have, and those that a table without measurements may lack.
 REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
 
@@ -49,14 +54,14 @@ def measured_columns() -> tuple[str, ...]:
 def known_columns() -> tuple[str, ...]:
     """Every column that means something in a table of runs."""
     deviations = tuple(c.sd_column for c in channels.CHANNELS)
-    return (*REQUIRED, *measured_columns(), *deviations, "surface", "run_id", "time_s", *ORDER)
+    return (*REQUIRED, *measured_columns(), *deviations, "surface", "run_id", "time_s", *DRIVING, *ORDER)
 
 
 def _ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
     readings = {c.column: c.range for c in channels.CHANNELS}
     deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.CHANNELS}
-    return {**CONDITIONS, **readings, **deviations, **TIME, **ORDER}
+    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **ORDER}
 
 
 #: Tables that come with the package.
@@ -89,6 +94,11 @@ class Runs:
     def has(self, column: str) -> bool:
         """Whether the table has this column."""
         return column in self.columns
+
+    @property
+    def sampled(self) -> bool:
+        """Whether a row is a sample of a run."""
+        return all(self.has(column) for column in TIME)
 
     def where(self, rows: np.ndarray) -> Runs:
         """The rows that a mask or an index selects."""
@@ -153,6 +163,7 @@ class Runs:
         from mmrjax.conditions import Conditions
 
         which = self.configurations(robot)
+        held = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
         adhesion = np.ones(len(self))
         if self.has("surface"):
             on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
@@ -167,6 +178,8 @@ class Runs:
             adhesion=adhesion,
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
             order=self["order"] if self.has("order") else 0.0,
+            duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),
+            open=self["mode"] == "coast" if self.has("mode") else 0.0,
         )
 
 
@@ -220,11 +233,12 @@ def _read(path: Path, name: str, measured: bool, battery: bool) -> Runs:
                 _refuse_stated(name, cells)
                 continue
             columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
+    _check_driving(name, columns)
     _check_mass(name, columns)
     _check_deviations(name, columns)
     if battery:
         columns["supply_voltage_V"] = np.full(len(rows) - 1, np.nan)
-    elif measured:
+    elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
         _check_signs(name, columns)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
@@ -289,11 +303,13 @@ def _cell(where: str, column: str, cell: str, kind: type[InputError] = BadData) 
     if column in WORDS:
         if column == "surface" and cell not in SURFACES:
             raise refuse(f"one of these; {choices(cell, SURFACES)}")
+        if column == "mode" and cell not in DRIVEN:
+            raise refuse(f"one of these; {choices(cell, DRIVEN)}")
         if column == "configuration" and not cell:
             raise refuse("the name of one of the robot's configurations")
         return cell
     deviations = [c.sd_column for c in channels.CHANNELS]
-    if not cell and column in (*measured_columns(), *deviations):
+    if not cell and column in (*measured_columns(), *deviations, *DUTY):
         return math.nan
     low, high = _ranges()[column]
     positive = column in deviations
@@ -305,6 +321,20 @@ def _cell(where: str, column: str, cell: str, kind: type[InputError] = BadData) 
     if not math.isfinite(value) or not low <= value <= high or (positive and value == low):
         raise refuse(allowed)
     return value
+
+
+def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
+    for column in (c for c in DRIVING if c in columns and not set(TIME) <= set(columns)):
+        raise BadData(f"{name}: column {column} is for time histories; add {', '.join(TIME)}, or remove it")
+    if "duty" not in columns:
+        return
+    modes = columns.get("mode", np.full(len(columns["duty"]), DRIVEN[0]))
+    for row, (duty, mode) in enumerate(zip(columns["duty"], modes, strict=True), 1):
+        if mode == DRIVEN[0] and math.isnan(duty):
+            raise BadData(f"{name} row {row}, duty: got an empty cell; expected a number, -1 to 1")
+        if mode != DRIVEN[0] and not math.isnan(duty) and duty != 0:
+            raise BadData(f"{name} row {row}, duty: got {number(duty)} in mode {mode}; expected 0 or an empty cell")
+    columns["duty"] = np.nan_to_num(columns["duty"])
 
 
 def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:

@@ -19,7 +19,7 @@ WINDOWS = (1 / 16, 1 / 8, 1 / 4)
 #: Permutations that give the chance of a count.
 PERMUTATIONS = 1000
 #: Columns whose levels are looked at.
-LEVELS = ("configuration", "supply_voltage_V", "slope_deg", "payload_kg", "run_id", "surface")
+LEVELS = ("configuration", "supply_voltage_V", "slope_deg", "payload_kg", "run_id", "surface", "duty", "mode")
 
 
 @dataclasses.dataclass(frozen=True)

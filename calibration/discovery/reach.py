@@ -133,4 +133,4 @@ def reach_of(space: CandidateSpace, robot: Robot | None = None) -> Reach:
     """What the robot of a space may be asked for next; the robot fitted where it is given."""
     weight = space.weight
     measured = tuple(c for k, c in enumerate(channels.names()) if weight[:, k].any())
-    return reach(space.bare.base if robot is None else robot, space.bare.observe.conditions, measured)
+    return reach(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)

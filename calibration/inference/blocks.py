@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data.courses import names as runs_of
+from calibration.data.courses import varies
 from calibration.data.runs import Runs
 from calibration.inference import held_out as refits
 from calibration.inference.problem import Problem
@@ -23,11 +25,18 @@ BLOCKS: dict[str, tuple[str, ...]] = {
 
 
 def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
-    """Label → mask of its rows, for each block of `by`; empty where the data do not vary in it."""
+    """Label → mask of its rows, for each block of `by`; empty where the data do not vary in it.
+
+    A run of a history in which it changes is a block of its own; empty where that is all that there is.
+    """
     columns = [c for c in BLOCKS[by] if runs.has(c)]
     if len(columns) < len(BLOCKS[by]):
         return {}
     labels = np.array([" ".join(str(runs[c][k]) for c in columns) for k in range(len(runs))])
+    changes = varies(runs, BLOCKS[by])
+    if changes.all() and by != "run":
+        return {}
+    labels = np.where(changes, np.char.add("run ", runs_of(runs).astype(str)), labels)
     names = list(dict.fromkeys(labels))
     return {name: labels == name for name in names} if len(names) > 1 else {}
 

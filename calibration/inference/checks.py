@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data.courses import applied
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
@@ -105,7 +106,7 @@ def _constant_conditions(runs: Runs) -> list[str]:
     return [
         f"{column} is {number(runs[column][0])} in every row: {why}, and only their priors tell them apart"
         for column, why in says.items()
-        if np.ptp(runs[column]) == 0
+        if np.ptp(runs[column]) == 0 and (column != "supply_voltage_V" or np.ptp(applied(runs)) == 0)
     ]
 
 

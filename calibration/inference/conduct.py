@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from calibration.data.courses import names as runs_of
+from calibration.data.courses import varies
 from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.operating import operating_readings
@@ -20,7 +22,7 @@ def conduct(runs: Runs, robot: Robot) -> list[str]:
     """Say which runs end before they are under way, and which never grip."""
     kind = observers.kind(runs)
     ends, shown, lasts = kind.settled(runs)
-    if not kind.axis:
+    if not kind.axis or not len(ends):
         return []
     speed = shown[:, channels.index("speed")]
     turning = shown[:, channels.index("motor_speed")]
@@ -33,6 +35,7 @@ def conduct(runs: Runs, robot: Robot) -> list[str]:
     slow = known & np.isfinite(steady) & (speed < SLOW * steady)
     early = (lasts < UNDER_WAY) & (slow | ~known)
     slides = (lasts >= UNDER_WAY) & known & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
+    slides &= ~np.isin(names, runs_of(runs)[varies(runs)])  # what is shown of those is a part of them
     said = []
     if early.any():
         at = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.runs import CONDITIONS, Runs
+from calibration.data.runs import CONDITIONS, DRIVING, Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import priors
 from calibration.inference.errors import channel_errors
@@ -175,5 +175,5 @@ def chi_square(
 def conditions(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
     """Columns of the runs that say which row is which."""
     others = (axis for axis in observe.axes if axis not in CONDITIONS)
-    columns = ("run_id", *others, "configuration", *CONDITIONS, "surface")
+    columns = ("run_id", *others, "configuration", *CONDITIONS, *DRIVING, "surface")
     return {column: runs[column] for column in columns if runs.has(column)}

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy import stats
 
-from calibration.data.runs import CONDITIONS, Runs
+from calibration.data.courses import courses
+from calibration.data.runs import CONDITIONS, DUTY, Runs
 from calibration.inference.observers import Observer
 from mmrjax import channels
 
@@ -172,7 +173,7 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
 def _families(fit: Residuals) -> dict[str, np.ndarray]:
     """Columns over the readings by what they mean: for each channel, curves over each variable, by configuration."""
     observe, runs, simulated, there = fit.observe, fit.runs, fit.simulated, fit.there
-    variables = {c: (runs[c], TERMS) for c in CONDITIONS if runs.has(c)}
+    variables = {c: (runs[c], TERMS) for c in (*CONDITIONS, *DUTY) if runs.has(c)}
     if observe.axis:
         variables[observe.axis] = runs[observe.axis], OVER_TIME
     if runs.has("order"):
@@ -228,7 +229,8 @@ def _replicates(fit: Residuals) -> tuple[float, str] | None:
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
     columns = [c for c in ("configuration", *observe.axes, "surface") if runs.has(c)]
     groups: dict[tuple[str, ...], list[int]] = {}
-    for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
+    past = courses(runs).tolist()  # what a run met before counts too
+    for row, key in enumerate(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True)):
         groups.setdefault(key, []).append(row)
     pure, own = 0.0, 0
     for rows in (g for g in groups.values() if len(g) > 1):

@@ -42,6 +42,8 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
     """
     kind = observers.kind(runs)
     runs, measured, lasts = kind.settled(runs)
+    if not len(runs):
+        return []
     _check_masses(runs, robot)
     runs, measured = runs.where(lasts >= UNDER_WAY), measured[lasts >= UNDER_WAY]
     if not len(runs):
@@ -141,7 +143,7 @@ def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> Iterator[
     """
     k = channels.index("total_current")
     slope, there = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
-    columns = [c for c in ("configuration", "supply_voltage_V", "payload_kg", "surface") if runs.has(c)]
+    columns = [c for c in ("configuration", "supply_voltage_V", "payload_kg", "surface", "duty") if runs.has(c)]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row in np.flatnonzero(there):
         groups.setdefault(tuple(str(runs[c][row]) for c in columns), []).append(int(row))

@@ -9,7 +9,7 @@ rollout.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -28,29 +28,54 @@ _GAMMA = 1 - 0.5**0.5
 NEWTON, SOLVED = 30, 1e-9
 #: The first step, its growth with the time since the start [1/s · s], and the longest step [s].
 FIRST, GROWTH, LONGEST = 1e-5, 0.02, 2.5e-3
-#: Most steps of a run that LONGEST may ask for; a longer run has longer steps.
+#: Most steps of a run that LONGEST may ask for; a longer run has longer steps. And most that short steps after
+#: changes may ask for; where there are more changes, steps grow faster.
 STEPS = 8000
 
 
-def grid(times: Float[np.ndarray, " times"]) -> np.ndarray:
-    """Instants from 0 to the last of `times` [s], `times` among them, close together while a start is young."""
-    times = np.unique(np.concatenate([[0.0], np.asarray(times, float)]))
-    longest = max(LONGEST, times[-1] / STEPS)
-    knee = max((longest - FIRST) / GROWTH, 0.0)
+def growth(duration: float, changes: int) -> float:
+    """Growth of steps with the time since the last of so many changes, the start among them [1/s · s]."""
+    return max(GROWTH, changes * float(np.log(max(LONGEST, duration / STEPS) / FIRST)) / STEPS)
 
-    def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, FIRST + GROWTH t)
-        young = np.log1p(GROWTH * np.minimum(t, knee) / FIRST) / GROWTH
+
+def grid(times: Float[np.ndarray, " times"], changes: Sequence[float] | np.ndarray = ()) -> np.ndarray:
+    """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
+
+    Args:
+        changes: instants at which the motors' supply changes [s]; steps are as short after each as after the start.
+    """
+    last = float(np.max(times, initial=0.0))
+    changes = np.asarray(changes, float)
+    begins = np.unique(np.concatenate([[0.0], changes[(changes > 0) & (changes < last)]]))
+    times = np.unique(np.concatenate([begins, np.asarray(times, float)]))
+    longest = max(LONGEST, last / STEPS)
+    grows = growth(last, len(begins))
+    knee = max((longest - FIRST) / grows, 0.0)
+
+    def clock(t: np.ndarray) -> np.ndarray:  # steps taken up to t: ∫ dt / min(longest, FIRST + grows t)
+        young = np.log1p(grows * np.minimum(t, knee) / FIRST) / grows
         return young + np.maximum(t - knee, 0.0) / longest
 
-    at, at_knee = clock(times), clock(np.asarray(knee))
+    since = begins[np.searchsorted(begins, times, side="right") - 1]  # the change that acts from each instant on
+    at, ends, at_knee = clock(times - since), clock(times[1:] - since[:-1]), clock(np.asarray(knee))
     parts = []
     for k in range(len(times) - 1):
-        count = max(1, int(np.ceil(at[k + 1] - at[k] - 1e-9)))
-        wanted = np.linspace(at[k], at[k + 1], count, endpoint=False)
-        young = FIRST / GROWTH * np.expm1(GROWTH * np.minimum(wanted, at_knee))
-        parts.append(young + np.maximum(wanted - at_knee, 0.0) * longest)
+        count = max(1, int(np.ceil(ends[k] - at[k] - 1e-9)))
+        wanted = np.linspace(at[k], ends[k], count, endpoint=False)
+        young = FIRST / grows * np.expm1(grows * np.minimum(wanted, at_knee))
+        parts.append(since[k] + young + np.maximum(wanted - at_knee, 0.0) * longest)
         parts[-1][0] = times[k]
     return np.concatenate([*parts, times[-1:]])
+
+
+def _in_time(conditions: Conditions) -> tuple[Conditions, Conditions]:
+    """What of the conditions changes from instant to instant, and what does not; None elsewhere in both."""
+    return eqx.partition(conditions, lambda x: jnp.ndim(x) > 0)
+
+
+def _at_start(robot: Robot, conditions: Conditions) -> Float[Array, " unknowns"]:
+    changing, constant = _in_time(conditions)
+    return start(robot, eqx.combine(jax.tree.map(lambda x: x[0], changing), constant))
 
 
 def _matrix(robot: Robot, conditions: Conditions, y: Array, h: Array) -> tuple[Array, Array]:
@@ -89,15 +114,21 @@ def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: 
 
 @eqx.filter_custom_jvp
 def states(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> tuple[Array, Array]:
-    """Unknowns of one run from standstill at both stages of every step, shape (steps, unknowns) each."""
-    y0 = start(robot, conditions)
+    """Unknowns of one run from standstill at both stages of every step, shape (steps, unknowns) each.
 
-    def step(y: Array, h: Array) -> tuple[Array, tuple[Array, Array]]:
-        one = _stage(robot, conditions, y, y, h)
-        two = _stage(robot, conditions, y + (1 - _GAMMA) / _GAMMA * (one - y), one, h)
+    Args: as of `histories`.
+    """
+    changing, constant = _in_time(conditions)
+
+    def step(y: Array, inputs: tuple[Array, Conditions]) -> tuple[Array, tuple[Array, Array]]:
+        h, now = inputs
+        held = eqx.combine(now, constant)
+        one = _stage(robot, held, y, y, h)
+        two = _stage(robot, held, y + (1 - _GAMMA) / _GAMMA * (one - y), one, h)
         return two, (one, two)
 
-    return jax.lax.scan(step, y0, jnp.diff(times))[1]
+    steps = (jnp.diff(times), jax.tree.map(lambda x: x[:-1], changing))
+    return jax.lax.scan(step, _at_start(robot, conditions), steps)[1]
 
 
 @states.def_jvp
@@ -106,10 +137,10 @@ def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tup
     moved = tangents[0]
     stages = states(robot, conditions, times)
 
-    def source(_: Array, y: Array) -> Array:
-        return eqx.filter_jvp(lambda r: rates(r, conditions, y), (robot,), (moved,))[1]
+    def source(_: Array, y: Array, held: Conditions) -> Array:
+        return eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
 
-    return stages, respond(robot, conditions, times, stages, source, lambda y, dy: dy)
+    return stages, respond(robot, conditions, times, stages, source, lambda y, dy, _: dy)
 
 
 def respond(
@@ -117,31 +148,36 @@ def respond(
     conditions: Conditions,
     times: Float[Array, " times"],
     stages: tuple[Array, Array],
-    source: Callable[[Array, Array], Array],
-    seen: Callable[[Array, Array], Array],
+    source: Callable[[Array, Array, Conditions], Array],
+    seen: Callable[[Array, Array, Conditions], Array],
 ) -> tuple[Array, Array]:
     """What small changes of the rates do to a run.
 
     Args:
-        stages: of the run, from `states`.
-        source: (time, state) → change of the rates there, shape (unknowns, ...).
-        seen: (state, its change) → what is kept of the change, of every stage.
+        conditions, times: as of `histories`; stages: of the run, from `states`.
+        source: (time, state, conditions) → change of the rates there, shape (unknowns, ...).
+        seen: (state, its change, conditions) → what is kept of the change, of every stage.
 
     Returns:
         What is kept of the first and of the second stage of every step; the second is the step's end.
     """
 
-    def step(dy: Array, inputs: tuple) -> tuple[Array, tuple[Array, Array]]:
-        t, h, one, two = inputs
-        first = jnp.linalg.inv(_matrix(robot, conditions, one, h)[0])
-        second = jnp.linalg.inv(_matrix(robot, conditions, two, h)[0])
-        d1 = jnp.tensordot(first, dy + _GAMMA * h * source(t + _GAMMA * h, one), 1)
-        known = dy + (1 - _GAMMA) / _GAMMA * (d1 - dy)
-        d2 = jnp.tensordot(second, known + _GAMMA * h * source(t + h, two), 1)
-        return d2, (seen(one, d1), seen(two, d2))
+    changing, constant = _in_time(conditions)
 
-    still = jnp.zeros_like(source(times[0], stages[0][0]))
-    return jax.lax.scan(step, still, (times[:-1], jnp.diff(times), *stages))[1]
+    def step(dy: Array, inputs: tuple) -> tuple[Array, tuple[Array, Array]]:
+        t, h, one, two, now, then = inputs
+        held = eqx.combine(now, constant)
+        first = jnp.linalg.inv(_matrix(robot, held, one, h)[0])
+        second = jnp.linalg.inv(_matrix(robot, held, two, h)[0])
+        d1 = jnp.tensordot(first, dy + _GAMMA * h * source(t + _GAMMA * h, one, held), 1)
+        known = dy + (1 - _GAMMA) / _GAMMA * (d1 - dy)
+        d2 = jnp.tensordot(second, known + _GAMMA * h * source(t + h, two, held), 1)
+        return d2, (seen(one, d1, held), seen(two, d2, eqx.combine(then, constant)))
+
+    begins, ends = (jax.tree.map(lambda x, s=s: x[s], changing) for s in (slice(-1), slice(1, None)))
+    of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
+    still = jnp.zeros_like(source(times[0], stages[0][0], of_first))
+    return jax.lax.scan(step, still, (times[:-1], jnp.diff(times), *stages, begins, ends))[1]
 
 
 def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> Signals:
@@ -150,12 +186,14 @@ def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"
     Args:
         robot: its parameters may be tracers; derivatives by them, and by nothing else, are forward and exact
             for these steps.
-        conditions: one run, scalar fields.
+        conditions: one run; each field scalar, or of shape (times,): its value at an instant acts from there to the
+            next, and is what the signals of that instant are computed with.
         times: from 0 on, as by `grid` [s]; repeated instants are steps of no length.
 
-    A run that could not be followed is not finite from there on.
+    A run that could not be followed is not finite from there on. Friction at rest is smooth: a robot that should
+    stand creeps where gravity pulls, below a tenth of V_s.
     """
-    y0 = start(robot, conditions)
+    changing, constant = _in_time(conditions)
     _, nodes = states(robot, conditions, times)
-    ys = jnp.concatenate([y0[None], nodes])
-    return jax.vmap(lambda y: moving(robot, conditions, state_of(robot, y)))(ys)
+    ys = jnp.concatenate([_at_start(robot, conditions)[None], nodes])
+    return jax.vmap(lambda y, now: moving(robot, eqx.combine(now, constant), state_of(robot, y)))(ys, changing)

@@ -47,7 +47,7 @@ class Observer(eqx.Module):
     """What runs show, and what inference has to know of their kind.
 
     Attributes:
-        conditions: of each run, shape (runs,).
+        conditions: of each run, shape (runs,); of a history what changes within one at each of its instants.
         word: what a row is; fewest: rows in which a missing effect can be told from noise.
         axes: columns of a table over which readings vary.
         axis: of those, the one along which the rows of a run follow one another; empty where a run is one row.
@@ -163,6 +163,11 @@ class Observer(eqx.Module):
     @abc.abstractmethod
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         """Whether the model has no such operating point, by row."""
+
+    @property
+    def driven(self) -> Conditions:
+        """Under what conditions the robot was driven, as if forwards; shape (cases,)."""
+        return self.conditions
 
     def cautions(self, robot: Robot) -> list[str]:
         """What to know before the readings of a calibrated robot are trusted, as sentences."""

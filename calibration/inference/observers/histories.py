@@ -1,8 +1,12 @@
-"""Time histories: one run from standstill for each `run_id`, one row a sample."""
+"""Time histories: one run from standstill for each `run_id`, one row a sample.
+
+The conditions of a run may change from sample to sample; each value holds from its sample until the next.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import operator
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
@@ -13,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from calibration.data.courses import Stretch, applied, divided, stretches
+from calibration.data.courses import names as _names
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import CONDITIONS, Runs
 from calibration.inference import bases as bases_room
@@ -26,10 +32,11 @@ from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Optimum, linearised, searches_long
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
+from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.drive import rates, state_of
-from mmrjax.fidelities.histories import LONGEST, STEPS, grid, histories, respond, states
+from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, grid, growth, histories, respond, states
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals
@@ -45,6 +52,16 @@ LAGS = 12
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
+#: Fields of `Conditions` that may change within a run; and of those what makes for an inrush, with how much of the
+#: largest applied voltage a change has to be for steps to be short after it.
+CHANGING = ("voltage", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open")
+INRUSH = 2e-3
+#: A stretch of unchanged conditions so long may show steady travel [s].
+LASTING = 0.25
+#: Most levels of a condition that are told apart where it changes within runs.
+LEVELS = 6
+#: By how much a stated mass may change within a run beside the payload [kg].
+ROUNDING = 1e-3
 
 
 class HistoriesLinearization(Linearization):
@@ -104,7 +121,7 @@ class Histories(Observer):
     parameter, and refits of a bootstrap stay where the model is linear: there the refit is the linear one.
 
     Attributes:
-        conditions: of each run, shape (runs,).
+        conditions: of each run; a field that changes within one has shape (runs, instants), else (runs,).
         times: the grid of each run from 0 on, its last instant repeated to one length, shape (runs, instants) [s].
         run: index of each row's run; instant: of its sample in `times`; shape (rows,).
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
@@ -135,20 +152,21 @@ class Histories(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> Histories:
-        """Rows may come in any order; conditions are those of a run's first row."""
+        """Rows may come in any order; what does not change within a run is that of its first row."""
         if fidelity is not None and fidelities.get(fidelity).name != "drive":
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
         names, first, run = np.unique(_names(runs), return_index=True, return_inverse=True)
         mine = [np.flatnonzero(run == k) for k in range(len(names))]
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
-        grids = [grid(runs["time_s"][m]) for m in mine]
+        grids = [grid(runs["time_s"][m], changes) for m, changes in zip(mine, _changes(runs, mine), strict=True)]
         longest, samples = max(map(len, grids)), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
         rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         knots = np.stack([_knots(m, most) for m in mine])
-        return cls(runs.where(first).conditions(robot), *map(jnp.asarray, (times, run, instant, rows, knots)))
+        conditions = _in_time(runs.conditions(robot), first, mine, runs["time_s"], times)
+        return cls(conditions, *map(jnp.asarray, (times, run, instant, rows, knots)))
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -162,13 +180,21 @@ class Histories(Observer):
     def check(cls, runs: Runs, noise: Noise) -> list[str]:
         names = _names(runs)
         for name in np.unique(names):
-            for column in ("configuration", *CONDITIONS):
-                if runs.has(column) and len(np.unique(runs[column][names == name])) > 1:
+            mine = names == name
+            if len(np.unique(runs["configuration"][mine])) > 1:
+                raise BadData(
+                    f"{runs.source}, configuration: run {name or '(no run_id)'} has several values; "
+                    "a run has one configuration, so give each its own run_id"
+                )
+            if runs.has("total_mass_kg"):
+                own = runs["total_mass_kg"][mine] - runs["payload_kg"][mine]
+                if np.ptp(own) > ROUNDING:
                     raise BadData(
-                        f"{runs.source}, {column}: run {name or '(no run_id)'} has several values; "
-                        "a run has one condition, so give each its own run_id"
+                        f"{runs.source}, total_mass_kg: run {name or '(no run_id)'} changes by "
+                        f"{number(np.ptp(own))} kg beside its payload; within a run it may change as payload_kg does"
                     )
-        return []
+        _check_signs(runs)
+        return _stops(runs)
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise) -> list[str]:
@@ -196,13 +222,21 @@ class Histories(Observer):
                         "starts from rest when the supply is switched on, at 0 s. Settled travel is one row a run, "
                         "without time_s"
                     )
+        said = []
         step = runs["time_s"].max() / STEPS
-        if step <= 2 * LONGEST:
-            return []
-        return [
-            f"runs of {runs['time_s'].max():.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a shaft "
-            "faster than some ten steps are not resolved; cut the runs to look for them"
-        ]
+        if step > 2 * LONGEST:
+            said.append(
+                f"runs of {runs['time_s'].max():.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a "
+                "shaft faster than some ten steps are not resolved; cut the runs to look for them"
+            )
+        each = [np.flatnonzero(names == name) for name in np.unique(names)]
+        changes = max(len(c) for c in _changes(runs, each)) + 1
+        if growth(float(runs["time_s"].max()), changes) > 10 * GROWTH:
+            said.append(
+                f"a run's supply changes {changes - 1} times: inrushes after a change are followed in fewer steps "
+                "than that of a start; cut the runs where the current of an inrush matters"
+            )
+        return said
 
     @classmethod
     def check_settled(cls, runs: Runs) -> None:
@@ -212,14 +246,19 @@ class Histories(Observer):
 
     @classmethod
     def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
-        """The medians of the later half of each run, which have settled where the run is long enough."""
-        names, time, measured = _names(runs), runs["time_s"], runs.measured()
-        each = [np.flatnonzero(names == name) for name in np.unique(names)]
-        lasts = np.array([time[mine].max() for mine in each])
+        """The medians of the later half of each run, which have settled where the run is long enough; of one whose
+        conditions change, of the longest stretch in which it is driven forwards, where that lasts at all."""
+        time, measured = runs["time_s"], runs.measured()
+        each = [
+            max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
+            for run in stretches(runs)
+        ]
+        each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
-            shown = [np.nanmedian(measured[m[time[m] >= 0.5 * t]], 0) for m, t in zip(each, lasts, strict=True)]
-        return runs.where(np.array([m[np.argmin(time[m])] for m in each])), np.stack(shown), lasts
+            shown = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
+        first = np.array([s.rows[0] for s in each], int)
+        return runs.where(first), np.reshape(shown, (-1, measured.shape[1])), np.array([s.lasts for s in each])
 
     @classmethod
     def identity(cls, runs: Runs) -> tuple[str, ...]:
@@ -258,16 +297,16 @@ class Histories(Observer):
             before = jnp.concatenate([clock[:1], clock[:-1]])
             after = jnp.concatenate([clock[1:], clock[-1:] + 1.0])
 
-            def source(t: Array, y: Array) -> Array:
-                slope = jax.jacfwd(lambda a: rates(probed(a), conditions, y))(none)
+            def source(t: Array, y: Array, held: Conditions) -> Array:
+                slope = jax.jacfwd(lambda a: rates(probed(a), held, y))(none)
                 rising = ((t - before) / jnp.maximum(clock - before, 1e-12)).at[0].set(1.0)
                 falling = jnp.where(after > clock, (after - t) / jnp.where(after > clock, after - clock, 1.0), 1.0)
                 hat = real * jnp.clip(jnp.minimum(rising, falling), 0.0, 1.0)
                 return slope[:, :, None] * hat
 
-            def seen(y: Array, dy: Array) -> Array:
+            def seen(y: Array, dy: Array, held: Conditions) -> Array:
                 def reading(y: Array) -> Array:
-                    return _readings(robot, balances.moving(robot, conditions, state_of(robot, y)))
+                    return _readings(robot, balances.moving(robot, held, state_of(robot, y)))
 
                 return jnp.tensordot(jax.jacfwd(reading)(y), dy, 1)
 
@@ -298,6 +337,45 @@ class Histories(Observer):
         turned = 0.5 * (speed[:, 1:] + speed[:, :-1]) * jnp.diff(self.times)
         angle = jnp.concatenate([jnp.zeros((len(turned), 1)), jnp.cumsum(turned, 1)], 1)
         return angle[self.run, self.instant]
+
+    @property
+    def of_rows(self) -> Conditions:
+        """The conditions of every row, shape (rows,)."""
+        return jax.tree.map(lambda x: x[self.run] if x.ndim == 1 else x[self.run, self.instant], self.conditions)
+
+    @property
+    def varying(self) -> bool:
+        """Whether some conditions change within a run."""
+        return any(x.ndim > 1 for x in jax.tree.leaves(self.conditions))
+
+    def stretches(self) -> list[list[Stretch]]:
+        """Of each run, the stretches of unchanged conditions."""
+        rows_of, time = np.asarray(self.rows_of), np.asarray(self.time)
+        of_rows = jax.tree.map(np.asarray, self.of_rows)
+        volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
+        values = [x for name in CHANGING if (x := getattr(of_rows, name)) is not None]
+        return [divided(rows[rows >= 0], time, values, volts) for rows in rows_of]
+
+    @property
+    def driven(self) -> Conditions:
+        """As the protocol says. A robot that is driven backward up a slope is one that is driven forward up it; where
+        conditions change, levels that lie close together are one."""
+        if not self.varying:
+            return self.conditions
+        rows = jax.tree.map(np.asarray, self.of_rows)
+        applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
+        some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
+        turned = dataclasses.replace(
+            rows,
+            voltage=_few(np.abs(applied)),
+            slope_deg=_few(np.where(applied < 0, -1.0, 1.0) * rows.slope_deg),
+            payload=_few(rows.payload),
+            duty=np.ones_like(rows.duty),
+            open=np.zeros_like(rows.open),
+        )
+        which = np.stack([turned.configuration, turned.voltage, turned.slope_deg, turned.payload], 1)[some]
+        cases = some[np.unique(which, axis=0, return_index=True)[1]]
+        return jax.tree.map(lambda x: jnp.asarray(x[cases]), turned)
 
     def __call__(self, robot: Robot) -> Observation:
         reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(self.whole(robot)))
@@ -412,7 +490,15 @@ class Histories(Observer):
         )
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
-        """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft."""
+        """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
+        are those over the motors' voltage where that is not the supply's."""
+        rows = jax.tree.map(np.asarray, self.of_rows)
+        if (rows.duty != 1).any():
+            speed = columns["motor_speed_rpm"] * RPM
+            at_motors = np.where(
+                rows.open > 0.5, float(robot.motor.torque_constant) * speed, rows.voltage * rows.duty
+            )
+            columns = {**columns, "supply_voltage_V": at_motors}
         angle = np.nan_to_num(np.asarray(_angle(self, robot)))
         on_tracks = np.asarray(jax.vmap(robot.chassis)(self.conditions.configuration).on_tracks > 0.5)
         waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots))
@@ -454,9 +540,77 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
     return {name: [float(lag[k]) for lag in of] for k, name in enumerate(channels.names())}
 
 
-def _names(runs: Runs) -> np.ndarray:
-    """Which run each row belongs to."""
-    return runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+def _changes(runs: Runs, each: list[np.ndarray]) -> list[np.ndarray]:
+    """Instants at which the supply of the motors of each run changes [s]."""
+    volts, time = applied(runs), runs["time_s"]
+    coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
+    found = []
+    for rows in each:
+        rows = rows[np.argsort(time[rows], kind="stable")]
+        far = np.abs(np.diff(volts[rows])) > INRUSH * np.abs(volts[rows]).max()
+        found.append(time[rows[1:]][far | (coasts[rows][1:] != coasts[rows][:-1])])
+    return found
+
+
+def _in_time(
+    of_rows: Conditions, first: np.ndarray, each: list[np.ndarray], time: np.ndarray, times: np.ndarray
+) -> Conditions:
+    """Conditions of runs, from those of rows: of shape (runs,), those that change within one (runs, instants).
+
+    Args:
+        of_rows: shape (rows,); first: a row of each run; each: rows of each run in the order of time.
+        time: of rows; times: instants of each run [s].
+    """
+    at = np.stack(
+        [
+            rows[np.maximum(np.searchsorted(time[rows], t, side="right") - 1, 0)]
+            for rows, t in zip(each, times, strict=True)
+        ]
+    )
+    conditions = jax.tree.map(lambda x: x[first], of_rows)
+    for name in CHANGING:
+        x = getattr(of_rows, name)
+        if x is not None and any(np.ptp(np.asarray(x)[rows]) > 0 for rows in each):
+            conditions = eqx.tree_at(operator.attrgetter(name), conditions, x[at])
+    return conditions
+
+
+def _few(x: np.ndarray) -> np.ndarray:
+    """Numbers, each moved to the nearest of at most `LEVELS` where there are more."""
+    if len(np.unique(x)) <= LEVELS:
+        return x
+    levels = np.linspace(x.min(), x.max(), LEVELS)
+    return levels[np.argmin(np.abs(x[:, None] - levels), 1)]
+
+
+def _check_signs(runs: Runs) -> None:
+    """Refuse speeds without a sign of runs that are driven backward."""
+    volts, measured = applied(runs), runs.measured()
+    time = runs["time_s"]
+    for run in stretches(runs):
+        for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
+            rows = s.after(time, 0.5)
+            for k, channel in enumerate(channels.CHANNELS):
+                shown = measured[rows, k][np.isfinite(measured[rows, k])]
+                size = np.nanmax(np.abs(measured[:, k]), initial=0.0)
+                if channel.zero_at_rest and shown.size and np.median(shown) > RESTING * size:
+                    raise BadData(
+                        f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
+                        f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} V; "
+                        "expected readings with a sign, negative backward"
+                    )
+
+
+def _stops(runs: Runs) -> list[str]:
+    """Say what a run is followed by where its motors are not driven on a slope."""
+    still = (applied(runs) == 0) & (runs["slope_deg"] != 0)
+    if not still.any():
+        return []
+    stopped = ", ".join(dict.fromkeys(str(n) or "(no run_id)" for n in _names(runs)[still]))
+    return [
+        f"run {stopped}: the motors are not driven on a slope; histories have smooth friction at rest, and a robot "
+        "that should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer than that"
+    ]
 
 
 def _knots(rows: np.ndarray, most: int) -> np.ndarray:

@@ -25,6 +25,7 @@ from calibration.inference.optimizers import Optimum, Pin, levenberg_marquardt
 from calibration.inference.priors import TIED
 from calibration.inference.problem import Problem, data_of
 from mmrjax import channels
+from mmrjax.conditions import Conditions
 
 if TYPE_CHECKING:
     from calibration.inference.observers.histories import Histories
@@ -36,6 +37,8 @@ SURFACES = {"ground.friction.static": (0.05, 1.2), "ground.friction.speed_static
 #: Share of a run that is its end, and change of a channel between the halves of an end that is settled: as a share of
 #: the reading, and in sds of the difference.
 END, CHANGE, CHANGE_SD = 0.2, 0.02, 4.0
+#: Fewest readings of an end.
+FEWEST = 4
 #: Slip of the movers beyond which a run slides: it tells nothing of settled travel [-].
 SLIDES = 0.4
 #: Least relative sd of an end's mean: what is not quite settled is no better known [-].
@@ -53,30 +56,34 @@ STATIC, CREEP = "ground.friction.static", "ground.friction.speed_static"
 
 @dataclasses.dataclass(frozen=True)
 class Ends:
-    """Means over the settled ends of runs.
+    """Means over the settled ends of runs, and of the stretches of runs whose conditions change.
 
     Attributes:
-        mean, sd: [SI], NaN where a channel is not read or not settled, shape (runs, channels).
+        conditions: shape (ends,).
+        mean, sd: [SI], NaN where a channel is not read or not settled, shape (ends, channels).
         shown: the same means, settled or not.
     """
 
+    conditions: Conditions
     mean: np.ndarray
     sd: np.ndarray
     shown: np.ndarray
 
 
 def settled_ends(problem: Problem) -> Ends:
-    """What the runs of a problem show at their ends, as far as they are settled."""
-    observe, data = problem.observe, problem.data
+    """What the runs of a problem show at their ends, as far as they are settled, driven forwards."""
+    observe: Histories = problem.observe  # type: ignore[assignment]
+    data = problem.data
     measured, sd, weight = (np.asarray(x) for x in (data.measured, data.sd, data.weight))
-    rows_of, time = np.asarray(observe.rows_of), np.asarray(observe.time)  # type: ignore[attr-defined]
-    mean, error, shown = (np.full((len(rows_of), measured.shape[1]), np.nan) for _ in range(3))
-    for k, mine in enumerate(rows_of):
-        rows = mine[mine >= 0]
-        end = rows[time[rows] >= (1 - END) * time[rows[-1]]]
+    time = np.asarray(observe.time)
+    every = [s for run in observe.stretches() for s in run]
+    found = [s for s in every if s.whole or (s.driven and len(s.after(time, 1 - END)) >= FEWEST)] or every[:1]
+    mean, error, shown = (np.full((len(found), measured.shape[1]), np.nan) for _ in range(3))
+    for k, stretch in enumerate(found):
+        end = stretch.after(time, 1 - END) if stretch.driven else stretch.rows[:0]
         for c in range(measured.shape[1]):
             these = end[weight[end, c] > 0]
-            if len(these) < 4:
+            if len(these) < FEWEST:
                 continue
             shown[k, c] = measured[these, c].mean()
             halves = np.array_split(measured[these, c], 2)
@@ -86,7 +93,19 @@ def settled_ends(problem: Problem) -> Ends:
             if change < max(CHANGE * size, CHANGE_SD * noise):
                 mean[k, c] = shown[k, c]
                 error[k, c] = max(noise / 2, FLOOR * size)
-    return Ends(mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), shown)
+    conditions = observe.conditions
+    if observe.varying:
+        rows = np.array([s.rows[0] for s in found])
+        conditions = jax.tree.map(lambda x: x[rows], observe.of_rows)
+    # What is not driven forwards has no readings here: any conditions of steady travel do.
+    driven = jnp.asarray([s.driven for s in found])
+    conditions = dataclasses.replace(
+        conditions,
+        voltage=jnp.where(driven, conditions.voltage, 24.0),
+        duty=jnp.where(driven, conditions.duty, 1.0),
+        open=jnp.where(driven, conditions.open, 0.0),
+    )
+    return Ends(conditions, mean, np.where(np.isfinite(error), np.maximum(error, 1e-12), np.nan), shown)
 
 
 def starts(
@@ -157,7 +176,7 @@ def _at_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
     statics = [k for k, n in enumerate(names) if n.endswith(STATIC)]
     ends = settled_ends(problem)
     mean = np.where(_sliding(problem, ends)[:, None], np.nan, ends.mean)
-    observe = SettledRuns(problem.observe.conditions, "steady")
+    observe = SettledRuns(ends.conditions, "steady")
     here = Problem(problem.base, problem.coordinates, observe, data_of(mean, ends.sd, len(names)))
     pinned = np.stack([_with_adhesion(problem, np.zeros(len(names)), a) for a in ADHESIONS])
     held = np.zeros(pinned.shape, bool)
@@ -176,7 +195,7 @@ def _sliding(problem: Problem, ends: Ends) -> np.ndarray:
     turning, travelling = (ends.shown[:, channels.index(c)] for c in ("motor_speed", "speed"))
     robot = problem.base
     radius = np.array([float(c.radius) for c in robot.configurations.members])
-    circumference = radius[np.asarray(problem.observe.conditions.configuration)] * turning
+    circumference = radius[np.asarray(ends.conditions.configuration)] * turning
     with np.errstate(invalid="ignore", divide="ignore"):
         slip = 1 - travelling / (circumference / float(robot.gearbox.ratio))
     return np.nan_to_num(slip) > SLIDES

@@ -1,0 +1,103 @@
+"""Conditions that change within a run of a time history: each value holds from its sample until the next."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from calibration.data.runs import Runs
+
+#: Columns of which every sample of a run may have a value of its own. A stated mass may change as the payload does.
+CHANGING = ("supply_voltage_V", "slope_deg", "payload_kg", "total_mass_kg", "surface", "duty", "mode")
+
+
+@dataclasses.dataclass(frozen=True)
+class Stretch:
+    """Samples of a run, one after the other, under the same conditions.
+
+    Attributes:
+        rows: indices of the samples in the order of time, shape (samples,).
+        begin, end: when these conditions began, and when others follow or the run ends, since its start [s].
+        driven: whether the motors are driven forwards.
+        whole: whether the run has no other stretch.
+    """
+
+    rows: np.ndarray
+    begin: float
+    end: float
+    driven: bool
+    whole: bool
+
+    @property
+    def lasts(self) -> float:
+        """[s]."""
+        return self.end - self.begin
+
+    def after(self, time: np.ndarray, share: float) -> np.ndarray:
+        """Rows later than a share of its time; `time` is of every row of the table [s]."""
+        return self.rows[time[self.rows] >= self.begin + share * (self.end - self.begin)]
+
+
+def names(runs: Runs) -> np.ndarray:
+    """Which run each row belongs to, shape (rows,)."""
+    return runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+
+
+def applied(runs: Runs) -> np.ndarray:
+    """Voltage that the driver gives the motors in every row, 0 where they brake or coast [V], shape (rows,)."""
+    voltage = runs["supply_voltage_V"] * (runs["duty"] if runs.has("duty") else 1.0)
+    return np.where(runs["mode"] == "voltage", voltage, 0.0) if runs.has("mode") else voltage
+
+
+def varies(runs: Runs, columns: tuple[str, ...] = CHANGING) -> np.ndarray:
+    """Whether one of these columns changes within the run of a row, shape (rows,)."""
+    found = np.zeros(len(runs), bool)
+    if not runs.sampled:
+        return found
+    _, run = np.unique(names(runs), return_inverse=True)
+    first = np.unique(run, return_index=True)[1][run]
+    for column in (c for c in columns if runs.has(c)):
+        differs = runs[column] != runs[column][first]
+        found |= np.bincount(run, differs)[run] > 0
+    return found
+
+
+def divided(
+    rows: np.ndarray, time: np.ndarray, conditions: Sequence[np.ndarray], applied: np.ndarray
+) -> list[Stretch]:
+    """The stretches of one run.
+
+    Args:
+        rows: of the run, in the order of time; time [s], conditions, applied [V]: of every row of the table.
+    """
+    differs = np.any([c[rows][1:] != c[rows][:-1] for c in conditions], 0)
+    cuts = [0, *(np.flatnonzero(differs) + 1).tolist(), len(rows)]
+    begins = [0.0, *(float(time[rows[k]]) for k in cuts[1:-1]), float(time[rows[-1]])]
+    return [
+        Stretch(rows[low:high], begin, end, bool(applied[rows[low]] > 0), len(cuts) == 2)
+        for low, high, begin, end in zip(cuts[:-1], cuts[1:], begins[:-1], begins[1:], strict=True)
+    ]
+
+
+def stretches(runs: Runs) -> list[list[Stretch]]:
+    """The stretches of every run, runs in the order of their names."""
+    found = []
+    every, time, volts = names(runs), runs["time_s"], applied(runs)
+    columns = [runs[c] for c in CHANGING if runs.has(c)]
+    for name in np.unique(every):
+        rows = np.flatnonzero(every == name)
+        found.append(divided(rows[np.argsort(time[rows], kind="stable")], time, columns, volts))
+    return found
+
+
+def courses(runs: Runs) -> np.ndarray:
+    """For every row the course of its run's conditions, empty where they do not change; shape (rows,)."""
+    found = np.full(len(runs), "", dtype=object)
+    if varies(runs).any():
+        columns = [c for c in CHANGING if runs.has(c)]
+        for run in (r for r in stretches(runs) if len(r) > 1):
+            said = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
+            found[np.concatenate([s.rows for s in run])] = "; ".join(said)
+    return found.astype(str)

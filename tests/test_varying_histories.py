@@ -1,0 +1,370 @@
+"""Time histories whose conditions change within a run: followed as missions are, calibrated, traced, refused."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import Analyst
+
+from calibration.data import runs as records
+from calibration.data.courses import applied, courses, stretches, varies
+from calibration.data.errors import BadData
+from calibration.data.runs import DRIVEN, Runs
+from calibration.discovery.reach import reach
+from calibration.discovery.settings import settings_for
+from calibration.inference import checks
+from calibration.inference.blocks import blocks, distinct
+from calibration.inference.calibrate import calibrate
+from calibration.inference.linearization import probe
+from calibration.inference.noise import Noise
+from calibration.inference.observers import Histories, settled_ends
+from mmrjax import params, robots
+from mmrjax.channels import MM, RPM
+from mmrjax.conditions import Conditions
+from mmrjax.effects import BY_NAME
+from mmrjax.fidelities.histories import FIRST, GROWTH, LONGEST, STEPS, grid, growth, histories
+from mmrjax.fidelities.mission import mission
+from mmrjax.profile import MODES, profile
+
+#: Four segments a run: supply voltage [V] and mode; and the slope [deg] of the run.
+SEGMENTS = (0.0, 0.42, 0.84, 1.26, 1.6)
+STAIR = ((12.0, "voltage"), (24.0, "voltage"), (33.0, "voltage"), (18.0, "voltage")), 0.0
+REVERSAL = ((24.0, "voltage"), (24.0, "brake"), (-24.0, "voltage"), (15.0, "voltage")), 4.0
+COASTING = ((33.0, "voltage"), (33.0, "coast"), (-15.0, "voltage"), (24.0, "voltage")), -3.0
+COURSES = {"stair": STAIR, "reversal": REVERSAL, "coasting": COASTING}
+EVERY = 0.02
+SD = {"total_current_A": 0.05, "motor_speed_rpm": 15.0, "speed_mm_s": 4.0}
+#: What the robot that is measured has in place of the nominal values.
+TRUTH = {"motor.resistance": 0.68, "6T2A.track.loss_coulomb": 0.30, "6T2A.ground.rolling_resistance": 0.05}
+NOMINAL = {p.name: float(p.value) for p in params.walk(robots.nominal()) if p.name in TRUTH}
+UNDECLARED = "series_resistance"
+#: Largest difference of a derivative from differences of runs, over its largest.
+DERIVATIVES, DIFFERENCE = 1e-6, 3e-6
+
+
+@pytest.fixture(scope="module")
+def engine():
+    """(robot's changes, names of runs, noise's seed) → table of histories made by `mission`, without its heat."""
+
+    @jax.jit
+    def course(values, modes, voltage, slope):
+        known = {p.name: p for p in params.walk(robots.nominal())}
+        cold = {"motor.time_constant_winding": jnp.asarray(known["motor.time_constant_winding"].spec.bounds[1])}
+        robot = dataclasses.replace(robots.nominal(), effects=(BY_NAME[UNDECLARED](),))
+        robot = params.replace(robot, {f"effects.{UNDECLARED}.amplitude": jnp.asarray(0.0), **cold, **values})
+        asked = profile(np.asarray(SEGMENTS), voltage=np.zeros(5))
+        asked = dataclasses.replace(asked, mode=modes, voltage=voltage)
+        return mission(robot, Conditions(0, 24.0, slope, 2.0), asked, tolerance=1e-7, keep=2000).course
+
+    def table(changes, names, seed=0):
+        rng = np.random.default_rng(seed)
+        times = np.arange(1, 80) * EVERY
+        parts = []
+        for name in names:
+            rows, slope = COURSES[name]
+            modes = [MODES.index(m) for _, m in rows] + [0]
+            volts = [v for v, _ in rows] + [0.0]
+            values = {**TRUTH, f"effects.{UNDECLARED}.amplitude": 0.0, **changes}
+            kept = course(
+                {k: jnp.asarray(v) for k, v in values.items()}, jnp.asarray(modes), jnp.asarray(volts), slope
+            )
+            there = np.isfinite(np.asarray(kept.time))
+            at = np.searchsorted(SEGMENTS, times + 1e-9, side="right") - 1
+            driven = np.asarray(modes)[at] == 0
+
+            def seen(x, there=there, kept=kept):
+                return np.interp(times, np.asarray(kept.time)[there], np.asarray(x)[there])
+
+            readings = {
+                "total_current_A": 2 * seen(kept.signals.current) * driven,
+                "motor_speed_rpm": seen(kept.signals.speed_motor) / RPM,
+                "speed_mm_s": seen(kept.signals.speed) / MM,
+            }
+            parts.append(
+                {
+                    "run_id": np.full(len(times), name),
+                    "time_s": times,
+                    "configuration": np.full(len(times), "6T2A"),
+                    "supply_voltage_V": np.asarray(volts)[at],
+                    "mode": np.asarray(MODES)[np.asarray(modes)[at]],
+                    "slope_deg": np.full(len(times), slope),
+                    "payload_kg": np.full(len(times), 2.0),
+                    **{c: x + SD[c] * rng.standard_normal(len(times)) for c, x in readings.items()},
+                }
+            )
+        columns = {c: np.concatenate([p[c] for p in parts]) for c in parts[0]}
+        sds = {"total_current_A": "total_current_sd_A", "motor_speed_rpm": "motor_speed_sd_rpm"}
+        sds["speed_mm_s"] = "speed_sd_mm_s"
+        columns |= {sds[c]: np.full(len(columns["time_s"]), sd) for c, sd in SD.items()}
+        return Runs("synthetic", columns)
+
+    return table
+
+
+@pytest.fixture(scope="module")
+def runs(engine):
+    return engine({}, COURSES)
+
+
+@pytest.fixture(scope="module")
+def observer(runs):
+    return Histories.of(runs, robots.nominal())
+
+
+def changed(runs, **columns):
+    return dataclasses.replace(runs, columns=runs.columns | columns)
+
+
+# --- a run
+
+
+def test_grid_is_fine_after_every_change_and_bounded():
+    times, changes = np.arange(0.05, 2.0, 0.05), np.array([0.5, 1.2, 1.21])
+    found = grid(times, changes)
+    step = np.diff(found)
+    assert np.isin(times, found).all() and np.isin(changes, found).all() and (step > 0).all()
+    assert step.max() <= LONGEST * (1 + 1e-9)
+    for begin in (0.0, *changes):
+        assert step[np.searchsorted(found, begin)] <= 1.5 * FIRST
+    np.testing.assert_array_equal(grid(times), grid(times, [0.0, 2.5]))  # a change outside is none
+    before = grid(times)
+    np.testing.assert_array_equal(found[found < 0.5], before[before < 0.5])
+    # one change a sample: no more steps than a long run may have, besides its samples
+    often = np.arange(1, 4000) * 0.005
+    assert len(grid(often, often)) < 2 * STEPS + 2 * len(often) and growth(20.0, 4000) > GROWTH
+
+
+def test_constant_values_at_every_instant_are_those_of_a_constant_run():
+    robot, g = robots.nominal(), jnp.asarray(grid(np.arange(0.02, 0.3, 0.02)))
+    one = Conditions(0, 24.0, 5.0, 2.0)
+    many = Conditions(0, jnp.full(len(g), 24.0), 5.0, 2.0)
+    a, b = (histories(robot, c, g) for c in (one, many))
+    for name in ("current", "speed_motor", "speed"):
+        np.testing.assert_allclose(getattr(b, name), getattr(a, name), rtol=1e-12, atol=1e-15)
+
+
+def test_runs_are_those_of_missions(observer, runs):
+    """Of an engine with steps, events and friction at rest of its own; its noise is all that remains."""
+    truth = params.replace(robots.nominal(), {k: jnp.asarray(v) for k, v in TRUTH.items()})
+    seen = np.asarray(eqx.filter_jit(observer)(truth).reading)
+    sigma = (seen - runs.measured()) / runs.deviations()
+    assert np.sum(sigma**2) < sigma.size + 4 * np.sqrt(2 * sigma.size)
+    assert np.abs(sigma).max() < 5
+    assert (runs["speed_mm_s"] < -100).any() and (runs["total_current_A"] < -1).any()
+
+
+def test_derivatives_of_a_varying_run_are_differences(observer, monkeypatch):
+    monkeypatch.setattr(
+        "mmrjax.fidelities.histories.SOLVED", 1e-12
+    )  # else differences of runs are no finer than 1e-5
+    known = {p.name: float(p.value) for p in params.walk(robots.nominal())}
+    names = [*TRUTH, "motor.inertia", "motor.inductance", "6T2A.ground.friction.static"]
+    theta = jnp.asarray([TRUTH.get(n, known[n]) for n in names])
+
+    def readings(x):
+        return observer(params.replace(robots.nominal(), dict(zip(names, x, strict=True)))).reading
+
+    slopes = np.asarray(jax.jit(jax.jacfwd(readings))(theta))
+    step = DIFFERENCE * theta
+    at = jax.jit(lambda xs: jax.lax.map(readings, xs))
+    up, down = (np.asarray(at(theta + s * jnp.diag(step))) for s in (1, -1))
+    for k, name in enumerate(names):
+        expected = (up[k] - down[k]) / (2 * float(step[k]))
+        scale = np.abs(expected).max(0)
+        assert (scale > 0).all(), name
+        error = np.abs(slopes[..., k] - expected).max(0) / scale
+        assert (error < DERIVATIVES).all(), (name, error)
+
+
+# --- what inference makes of it
+
+
+def test_only_what_changes_has_a_value_an_instant(observer, runs):
+    c = observer.conditions
+    instants = observer.times.shape
+    assert c.voltage.shape == c.duty.shape == c.open.shape == instants
+    assert c.slope_deg.shape == c.payload.shape == c.configuration.shape == instants[:1]
+    rows = observer.of_rows
+    np.testing.assert_array_equal(rows.voltage, runs["supply_voltage_V"])
+    np.testing.assert_array_equal(rows.slope_deg, runs["slope_deg"])
+    np.testing.assert_array_equal(rows.duty, runs["mode"] == "voltage")
+    np.testing.assert_array_equal(rows.open, runs["mode"] == "coast")
+    # held from its sample on, also between samples
+    k = int(np.unique(runs["run_id"]).tolist().index("stair"))
+    t = np.asarray(observer.times[k])
+    expected = np.array([12.0, 24.0, 33.0, 18.0])[np.clip(np.searchsorted(SEGMENTS, t + 1e-9, "right") - 1, 0, 3)]
+    np.testing.assert_array_equal(c.voltage[k], expected)
+
+
+@pytest.mark.parametrize("balance", ["electrical", "track"])
+def test_defects_of_all_knots_are_a_constant_defect(observer, balance):
+    """Their linear response, through changes of conditions, against the derivative by an amplitude."""
+    robot, effect = robots.nominal(), probe(balance)
+
+    def readings(amplitude):
+        with_it = dataclasses.replace(effect, amplitude=amplitude)
+        return observer(dataclasses.replace(robot, effects=(with_it,))).reading
+
+    expected = np.asarray(jax.jit(jax.jacfwd(readings))(jnp.asarray(0.0)))
+    found = np.asarray(jax.jit(lambda r: observer.defective(r, (effect,)))(robot))[0].sum(1)
+    rows = np.asarray(observer.rows_of)
+    got = np.zeros_like(expected)
+    got[rows[rows >= 0]] = found[rows >= 0]
+    np.testing.assert_allclose(got, expected, rtol=1e-7, atol=1e-9 * np.abs(expected).max())
+    assert (np.abs(expected).max(0) > 0).all()
+
+
+def test_one_supply_voltage_is_said_only_where_the_duty_is_one_too(runs):
+    steady = changed(runs, supply_voltage_V=np.full(len(runs), 24.0), mode=np.full(len(runs), "voltage"))
+    said = "losses that grow with speed"
+    assert any(said in s for s in checks._constant_conditions(steady))
+    pulsed = changed(steady, duty=np.where(runs["time_s"] < 0.5, 0.4, 1.0))
+    assert not any(said in s for s in checks._constant_conditions(pulsed))
+
+
+def test_stretches_are_the_segments(runs, observer):
+    for found in (stretches(runs), observer.stretches()):
+        assert [len(run) for run in found] == [4, 4, 4]
+        for run in found:
+            np.testing.assert_allclose([s.begin for s in run], SEGMENTS[:4], atol=1e-12)
+            assert [len(s.rows) for s in run] == [20, 21, 21, 17] and not any(s.whole for s in run)
+        assert [s.driven for s in found[1]] == [True, False, False, True]
+    assert applied(runs)[runs["mode"] == "brake"].tolist() == [0.0] * 21
+
+
+def test_blocks_of_runs_that_vary_are_whole_runs(runs):
+    level = {k: np.concatenate([v, v[:5]]) for k, v in runs.columns.items()}
+    level["run_id"] = np.concatenate([runs["run_id"], np.full(5, "level")])
+    level["supply_voltage_V"][-5:], level["mode"][-5:] = 24.0, "voltage"
+    more = Runs("more", level)
+    assert set(blocks(more, "voltage")) == {"run stair", "run reversal", "run coasting", "24.0"}
+    for mask in blocks(more, "voltage").values():
+        assert len(np.unique(more["run_id"][mask])) == 1
+    assert blocks(runs, "voltage") == {} and set(blocks(runs, "slope")) == {"0.0", "4.0", "-3.0"}
+    assert "voltage" not in distinct(runs, Histories.blocks)
+    assert varies(more).sum() == len(runs) and len(set(courses(more))) == 4 and courses(more)[-1] == ""
+
+
+def test_ends_are_those_of_stretches_driven_forwards(runs):
+    analyst = Analyst(settings_for(Histories, 300), {"windage": BY_NAME["windage"]}, {})
+    ends = settled_ends.settled_ends(analyst.space(runs).bare)
+    volts = np.asarray(ends.conditions.voltage)
+    assert sorted(volts.tolist()) == [12.0, 15.0, 18.0, 24.0, 24.0, 24.0, 33.0, 33.0]  # none that brakes or reverses
+    assert np.isfinite(ends.mean).any(1).sum() >= 4
+
+
+def test_reach_takes_what_the_motors_were_given(observer):
+    driven = observer.driven
+    assert driven.shape[0] > 4 and (np.asarray(driven.voltage) > 0).all() and (np.asarray(driven.duty) == 1).all()
+    found = reach(robots.nominal(), driven, ("speed",))
+    assert found.voltages == (12.0, 15.0, 18.0, 24.0, 33.0) and found.used[0].slopes == (-4.0, -3.0, 0.0, 3.0, 4.0)
+
+
+def test_conditions_that_change_between_many_levels_are_few(observer, runs):
+    noisy = changed(runs, supply_voltage_V=runs["supply_voltage_V"] + 0.001 * np.arange(len(runs)))
+    varying = Histories.of(noisy, robots.nominal())
+    assert len(np.unique(varying.driven.voltage)) <= 6
+    assert varying.times.shape[1] < 1.5 * observer.times.shape[1]  # changes of a thousandth need no short steps
+
+
+def test_calibration_finds_the_truth_within_its_intervals(runs):
+    found = calibrate(runs, robots.nominal(), free=tuple(TRUTH), model="drive", starts=3, profiles=False, blocks=False,
+                      stated={n: (v, 0.3 * v) for n, v in NOMINAL.items()})  # fmt: skip
+    assert found.adequacy.adequate and found.converged
+    for name, truth in TRUTH.items():
+        estimate = found.parameters[name]
+        assert abs(estimate.value - truth) < 3 * estimate.sd, name
+        assert estimate.sd < 0.05 * truth, name
+    assert {"mode", "supply_voltage_V"} <= set(found.conditions)
+    assert sum("smooth friction at rest" in n for n in found.notes) == 1
+
+
+@pytest.mark.slow
+def test_loop_finds_what_was_not_declared_on_a_stair(engine):
+    stairs = engine({**NOMINAL, f"effects.{UNDECLARED}.amplitude": 0.4}, ("stair", "reversal"))
+    analyst = Analyst(
+        dataclasses.replace(settings_for(Histories, 300), slots=1),
+        {n: BY_NAME[n] for n in ("rotating_inertia", UNDECLARED, "churning", "windage")},
+        {"6T2A.ground.friction.static": (0.32, 0.05)},
+    )
+    found = analyst.discover(stairs)
+    # nothing tells it from a winding's resistance that is not what its sheet says
+    assert found.verdict == "class" and [list(e.members) for e in found.effects] == [[UNDECLARED]]
+    assert list(found.effects[0].stated) == ["motor.resistance"]
+    amplitude = found.effects[0].parameters["amplitude"]
+    assert abs(amplitude.value - 0.4) < 4 * amplitude.sd and amplitude.sd < 0.05
+    assert {"mode", "supply_voltage_V"} <= set(found.rows_table())
+
+
+# --- files
+
+HEADER = "run_id,time_s,configuration,supply_voltage_V,payload_kg,slope_deg,speed_mm_s,total_mass_kg"
+
+
+def written(tmp_path, header, *rows):
+    path = tmp_path / "runs.csv"
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_columns_of_the_driver_are_read(tmp_path):
+    rows = ("a,0,6T2A,24,0,0,0,11,0.5,voltage", "a,1,6T2A,-12,0,0,5,11,-1,voltage", "a,2,6T2A,0,0,0,5,11,,brake",
+            "a,3,6T2A,24,0,0,5,11,,coast")  # fmt: skip
+    read = records.read(written(tmp_path, f"{HEADER},duty,mode", *rows))
+    found = read.conditions(robots.nominal())
+    assert found.duty.tolist() == [0.5, -1.0, 0.0, 0.0] and found.open.tolist() == [0, 0, 0, 1]
+    assert found.voltage.tolist() == [24, -12, 0, 24] and applied(read).tolist() == [12, 12, 0, 0]
+    assert set(DRIVEN) <= set(MODES)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "says"),
+    [
+        (f"{HEADER},mode", "a,0,6T2A,24,0,0,0,11,reverse",
+         r"row 1, mode: got reverse; expected one of these; .*voltage, brake, coast"),
+        (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,2", r"row 1, duty: got 2; expected -1 to 1"),
+        (f"{HEADER},duty", "a,0,6T2A,24,0,0,0,11,", r"row 1, duty: got an empty cell; expected a number, -1 to 1"),
+        (f"{HEADER},duty,mode", "a,0,6T2A,24,0,0,0,11,0.3,brake",
+         r"row 1, duty: got 0.3 in mode brake; expected 0 or an empty cell"),
+        (HEADER, "a,0,6T2A,-101,0,0,0,11", r"row 1, supply_voltage_V: got -101; expected -100 to 100"),
+        (f"{HEADER.replace('time_s', 'order')},duty", "a,0,6T2A,24,0,0,0,11,0.5",
+         r"column duty is for time histories; add time_s, or remove it"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_said_in_one_sentence(tmp_path, header, row, says):
+    with pytest.raises(BadData, match=says):
+        records.read(written(tmp_path, header, row))
+
+
+def test_what_cannot_change_within_a_run_is_refused(runs):
+    nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
+    other = np.where(np.arange(len(runs)) % 2, "6T2A", "4W2T")
+    with pytest.raises(BadData, match=r"configuration: run coasting has several values; a run has one configuration"):
+        Histories.check(changed(runs, configuration=other), nothing)
+    mass = 11.5 + runs["payload_kg"] + 0.5 * (runs["time_s"] > 1)
+    with pytest.raises(BadData, match=r"total_mass_kg: run coasting changes by 0.5 kg beside its payload"):
+        Histories.check(changed(runs, total_mass_kg=mass), nothing)
+    payload = runs["payload_kg"] + 3.0 * (runs["time_s"] > 1)
+    Histories.check(changed(runs, payload_kg=payload, total_mass_kg=11.5 + payload), nothing)
+
+
+def test_speeds_without_a_sign_are_refused_where_a_run_is_driven_backward(runs):
+    nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
+    with pytest.raises(BadData, match=r"motor_speed_rpm: got .* rpm at -15 V; expected readings with a sign"):
+        Histories.check(changed(runs, motor_speed_rpm=np.abs(runs["motor_speed_rpm"])), nothing)
+
+
+def test_payload_that_changes_acts_from_its_sample_on(runs):
+    payload = runs["payload_kg"] + 6.0 * (runs["time_s"] >= 1.25)
+    heavier = Histories.of(changed(runs, payload_kg=payload), robots.nominal())
+    assert heavier.conditions.payload.shape == heavier.times.shape
+    seen, before = (
+        np.asarray(eqx.filter_jit(o)(robots.nominal()).reading[:, 0])
+        for o in (heavier, Histories.of(runs, robots.nominal()))
+    )
+    early = runs["time_s"] <= 1.25
+    np.testing.assert_allclose(seen[early], before[early], rtol=1e-9, atol=1e-12)
+    assert np.abs(seen - before)[runs["time_s"] > 1.4].max() > 0.1  # [A]
