@@ -27,6 +27,8 @@ _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
 #: Column of the largest current of all motors in a run over time.
 PEAK = "peak_current_A"
+#: Column of the time that a run's current may flow before its windings are at their limit.
+PERMISSIBLE = "permissible_time_s"
 
 
 def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
@@ -47,6 +49,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         table, histories = _simulated(folder, robot, runs, config)
+        table[PERMISSIBLE] = permissible(robot, table)
         notes = remarks(robot, table)
         found = None
         if drawn is not None and config.posterior is not None:
@@ -123,6 +126,14 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     return columns
 
 
+def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+    """How long the current of each run may flow from ambient temperature [s]; inf for ever, NaN without a current."""
+    current = np.abs(table["total_current_A"]) / float(robot.sides)
+    known = np.isfinite(current)
+    time = jax.vmap(robot.motor.time_permissible)(jnp.asarray(np.where(known, current, 0.0)))
+    return np.where(known, np.asarray(time), np.nan)
+
+
 def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
     """What the numbers of the runs do not say by themselves, a sentence each, of a few runs at most."""
     said: list[str] = []
@@ -140,6 +151,12 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
             said.append(
                 f"{name}cut_off: a cell at {cell:.2f} V, below its cut-off voltage of "
                 f"{robot.battery.voltage_cutoff:g} V"
+            )
+        if "winding_hot" in flags:
+            limit, ambient = robot.motor.temperature_limit, float(robot.motor.temperature_ambient)
+            said.append(
+                f"{name}winding_hot: {limit:g} °C are reached after {float(table[PERMISSIBLE][k]):.3g} s at this "
+                f"current, from {ambient:g} °C"
             )
         if np.isinf(table["temperature_winding_C"][k]):
             amperes = abs(float(table["total_current_A"][k])) / float(robot.sides)
@@ -205,7 +222,8 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
         "slip": ("slip", ".4f"),
         "power_supply_W": ("power from supply P_e [W]", ".2f"), "power_motor_W": ("at motor shafts N_d [W]", ".2f"),
         "power_gear_W": ("at gearbox outputs N_r [W]", ".2f"), "power_ground_W": ("to the ground N_t [W]", ".2f"),
-        "temperature_winding_C": ("winding, long running [°C]", ".0f"), "adhesion_used": ("adhesion used", ".3f"),
+        "temperature_winding_C": ("winding, long running [°C]", ".0f"),
+        PERMISSIBLE: ("permissible at this current for [s]", ".3g"), "adhesion_used": ("adhesion used", ".3f"),
         "status": ("status", ""), "flags": ("limits exceeded", ""),
     }  # fmt: skip
     shown = Table(show_header=False)
@@ -216,7 +234,7 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
         cells = [
             str(v).replace(";", "\n") if not form
             else absent.get(key, "-") if v != v
-            else words.NONE_SETTLES if np.isinf(v)
+            else (words.FOR_EVER if key == PERMISSIBLE else words.NONE_SETTLES) if np.isinf(v)
             else format(v, form)
             for v in table[key]
         ]  # fmt: skip

@@ -66,6 +66,8 @@ FLAGS = {
 
 #: In place of a winding's temperature after long running, at a current that heats it without an end.
 NONE_SETTLES = "none settles"
+#: A current that never brings a winding to its limit.
+FOR_EVER = "for ever"
 
 #: Statuses of runs that ended as their conditions ask, with numbers; `signals.DONE` by name.
 SETTLED = ("converged", "reverses")

@@ -51,7 +51,7 @@ NEUTRAL = {"-", "", "K", "°C", "rad"}
 #: Unit of every field of `Signals`.
 SIGNAL_UNITS = {
     "A": "current total_current",
-    "V": "voltage voltage_back voltage_drop voltage_left",
+    "V": "voltage_source voltage voltage_back voltage_drop voltage_left",
     "C": "discharge",
     "kg": "mass payload",
     "N": "normal resistance gravity demand traction adhesion_limit",
@@ -63,7 +63,7 @@ SIGNAL_UNITS = {
     "torque_input torque_gear torque_net",
     "H": "inductance",
     "kg·m^2": "inertia_added",
-    "-": "on_tracks battery slope adhesion order direction direction_travel efficiency_load",
+    "-": "duty on_tracks battery slope adhesion order direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}
@@ -711,7 +711,8 @@ def test_import_circles_are_found():
 
 def test_units_of_signals_are_all_known():
     fields = {f.name for f in dataclasses.fields(Signals)}
-    assert {*UNIT_OF, "memory", "configuration"} == fields  # each memory states its own; an index has none
+    # Each memory states its own unit, an index has none, and no temperature is followed where effects are tried.
+    assert {*UNIT_OF, "memory", "configuration", "temperature"} == fields
 
 
 def test_units_of_parameters_and_balances_are_all_known(free):

@@ -149,7 +149,12 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
     assert "Infinity" not in text and "NaN" not in text
     (row,) = table(tmp_path / "a" / "runs.csv")
     said = f"winding, long running: none settles at {float(row['total_current_A']) / 2:.2f} A a motor"
-    assert json.loads(text)["notes"][0].startswith(said)
+    notes = json.loads(text)["notes"]
+    assert notes[1].startswith(said)
+    time = float(row["permissible_time_s"])
+    motor = robots.nominal().motor
+    assert time == pytest.approx(float(motor.time_permissible(float(row["total_current_A"]) / 2)), rel=1e-4)
+    assert notes[0].startswith(f"winding_hot: 125 °C are reached after {time:.3g} s at this current")
     assert row["temperature_winding_C"] == "" and "winding_hot" in row["flags"]
     page = (tmp_path / "a" / "report.html").read_text()
     assert "none settles" in page and ">inf" not in page and "nan %" not in page
