@@ -112,7 +112,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 
 @app.command(
-    epilog="Examples: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
+    epilog="Example: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
     "mmrjax simulate --profile patrol --battery --payload 5"
 )
 def simulate(
