@@ -129,6 +129,8 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
         raise BadConfiguration(
             f"{where}, profile: got {source.source} with the column surface; expected the surface in conditions"
         )
+    if source.begins:
+        raise BadConfiguration(f"{where}, profile: got {source.source} with a start; points of a sweep begin at rest")
     for field in source.values:
         if field in (*plan.conditions, *plan.design.names):
             raise BadConfiguration(

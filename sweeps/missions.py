@@ -147,7 +147,7 @@ def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: co
     courses: list[dict[str, np.ndarray]] = []
     done, whole = 0, True
     with progress(len(runs), quiet=False) as advance:
-        for found in missions.parts(robot, conditions, profile):
+        for found in missions.parts(robot, conditions, profile, source.start):
             count = len(found.steps)
             own = slice(done, done + count)
             at = jax.tree.map(lambda x, own=own: x[own], conditions)

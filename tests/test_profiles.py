@@ -11,6 +11,7 @@ from calibration.data import profiles, units
 from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import channels, robots
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.mission import mission
 from mmrjax.profile import MODES
 from mmrjax.tables import adhesion_ratio
 
@@ -139,6 +140,10 @@ def test_supply_voltage_beside_the_battery_is_refused(read):
 
 _LINEAR = "# between_rows = 'linear'\n"
 WRONG = {
+    "a start that is no number": (
+        "# start_speed_mm_s = 'fast'\ntime_s,duty\n0,1\n1,1\n",
+        "mission.csv, start_speed_mm_s: got 'fast'; expected a number, -50000 to 50000",
+    ),
     "time that goes back": ("time_s,duty\n0,1\n5,1\n4,1\n", r"mission.csv row 3, time_s: got 4; expected more than 5"),
     "time that stands": ("time_min,duty\n0,1\n0,1\n", r"row 2, time_min: got 0; expected more than 0 of the row before"),
     "gap in a slope": ("time_s,duty,slope_deg\n0,1,0\n5,1,\n9,1,3\n", r"row 2, slope_deg: got an empty cell; expected a number, -45 to 45"),
@@ -193,6 +198,16 @@ def test_wrong_profile_is_refused_in_one_sentence(read, case):
     said = str(caught.value)
     assert re.search(message, said), said
     assert "\n" not in said
+
+
+def test_a_mission_may_begin_in_motion_and_warm(read):
+    table = read("# start_speed_mm_s = 400\n# start_winding_C = 60\ntime_s,mode\n0,coast\n1,\n")
+    assert table.start is not None and table.begins == {"speed": 0.4, "temperature_winding": 60.0}
+    assert read("time_s,mode\n0,coast\n1,\n").start is None
+    found = mission(
+        robots.nominal(), Conditions(voltage=24.0), table.profile(robots.nominal(), Conditions([0])), table.start
+    )
+    assert float(found.total.of["distance"]) > 0.01 and 59.0 < float(found.peaks["temperature"]) <= 60.0
 
 
 def test_unknown_name_lists_what_is_packaged():

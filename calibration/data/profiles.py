@@ -19,6 +19,7 @@ from calibration.data import units
 from calibration.data.errors import BadConfiguration, BadData, choices, number
 from calibration.data.units import Quantity
 from mmrjax import channels
+from mmrjax.fidelities.mission import Start
 from mmrjax.profile import MODES, MOTOR_SPEED, VOLTAGE, profile
 from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio
 
@@ -65,6 +66,15 @@ DEMANDS = {"duty": MODES[VOLTAGE], **{mode: mode for mode in CONTROLLED}}
 #: What a row may not leave empty where the file has the column.
 HELD = ("voltage", "slope_deg", "payload", "current_other")
 MODE, SURFACE = "mode", "surface"
+#: What a comment line may set of the state that a mission begins in: field of `Start`, least, greatest, and the SI
+#: value of one.
+STARTS = {
+    "start_speed_mm_s": ("speed", -50_000.0, 50_000.0, 1e-3),
+    "start_winding_C": ("temperature_winding", -50.0, 400.0, 1.0),
+    "start_housing_C": ("temperature_housing", -50.0, 400.0, 1.0),
+}
+
+SETTINGS = ("cycles", "between_rows", *STARTS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +89,7 @@ class ProfileTable:
         surface: of Table 5, one a row; None where it states none.
         linear, cycles: as of `mmrjax.profile.Profile`.
         digest: SHA-256 of the file.
+        begins: fields of `Start` that it states [SI, °C]; rolling speed, temperatures of winding and housing.
     """
 
     source: str
@@ -90,6 +101,12 @@ class ProfileTable:
     linear: bool
     cycles: int
     digest: str
+    begins: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def start(self) -> Start | None:
+        """The state that the mission begins in; None: at rest at ambient temperature."""
+        return Start(**self.begins) if self.begins else None
 
     @property
     def segments(self) -> int:
@@ -216,7 +233,7 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
         raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
     return ProfileTable(
         name, time, modes, demand, values, cells.surfaces(), settings["linear"], settings["cycles"],
-        hashlib.sha256(content).hexdigest(),
+        hashlib.sha256(content).hexdigest(), settings["begins"],
     )  # fmt: skip
 
 
@@ -232,8 +249,8 @@ def _settings(name: str, comments: list[str]) -> dict[str, Any]:
         except tomllib.TOMLDecodeError as error:
             raise BadData(f"{name}: got the line # {text}; expected TOML such as # cycles = 40 ({error})") from error
         for key, value in found.items():
-            if key not in ("cycles", "between_rows"):
-                raise BadData(f"{name}: got the setting {key}; {choices(key, ('cycles', 'between_rows'))}")
+            if key not in SETTINGS:
+                raise BadData(f"{name}: got the setting {key}; {choices(key, SETTINGS)}")
             if key in stated:
                 raise BadData(f"{name}: {key} is set twice; expected once")
             stated[key] = value
@@ -242,7 +259,15 @@ def _settings(name: str, comments: list[str]) -> dict[str, Any]:
         raise BadData(f"{name}, cycles: got {cycles!r}; expected a whole number from 1")
     if between not in BETWEEN:
         raise BadData(f"{name}, between_rows: got {between!r}; expected held or linear")
-    return {"cycles": cycles, "linear": between == "linear"}
+    begins = {}
+    for key, (field, least, greatest, one) in STARTS.items():
+        value = stated.get(key)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= greatest:
+            raise BadData(f"{name}, {key}: got {value!r}; expected a number, {least:g} to {greatest:g}")
+        begins[field] = one * value
+    return {"cycles": cycles, "linear": between == "linear", "begins": begins}
 
 
 def _columns(name: str, header: list[str]) -> dict[str, tuple[str, str]]:
