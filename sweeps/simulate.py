@@ -128,7 +128,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
 
 def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     """How long the current of each run may flow from ambient temperature [s]; inf for ever, NaN without a current."""
-    current = np.abs(table["total_current_A"]) / float(robot.sides)
+    current = np.abs(np.asarray(table["total_current_A"])) / float(robot.sides)
     known = np.isfinite(current)
     time = jax.vmap(robot.motor.time_permissible)(jnp.asarray(np.where(known, current, 0.0)))
     return np.where(known, np.asarray(time), np.nan)
@@ -138,6 +138,7 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
     """What the numbers of the runs do not say by themselves, a sentence each, of a few runs at most."""
     said: list[str] = []
     several = len(table["status"]) > 1
+    times = permissible(robot, table)
     for k, status in enumerate(table["status"]):
         name = f"run {k + 1}: " if several else ""
         flags, cell = str(table["flags"][k]).split(";"), float(table["voltage_cell_V"][k])
@@ -155,7 +156,7 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
         if "winding_hot" in flags:
             limit, ambient = robot.motor.temperature_limit, float(robot.motor.temperature_ambient)
             said.append(
-                f"{name}winding_hot: {limit:g} °C are reached after {float(table[PERMISSIBLE][k]):.3g} s at this "
+                f"{name}winding_hot: {limit:g} °C are reached after {float(times[k]):.3g} s at this "
                 f"current, from {ambient:g} °C"
             )
         if np.isinf(table["temperature_winding_C"][k]):

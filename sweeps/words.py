@@ -53,6 +53,7 @@ FLAGS = {
     "gearbox_overspeed": "gearbox input faster than its catalogue permits",
     "winding_hot": "winding hotter than permitted after long running at this current",
     "slips": "slides faster than V_s on average, though it goes on steadily",
+    "jumps": "its running gear drops between guides and pulleys and throws it off the ground at times",
     "overvoltage": "current flows back into the battery: its cells are above their charge voltage or take too much",
     "cut_off": "a cell below its cut-off voltage",
     "battery_overcurrent": "more current than a cell may give",
@@ -60,7 +61,6 @@ FLAGS = {
     "gearbox_overload": "more torque than the gearbox may carry for long",
     "too_hot": "winding hotter than permitted",
     "demand_missed": "a demanded speed was not reached",
-    "jumps": "its running gear drops between guides and pulleys and throws it off the ground at times",
 }
 
 

@@ -262,9 +262,12 @@ BAD = {
         "\n".join([f"{HEADER},time_s", *(f"{moving(t)},{t % 15 / 10}" for t in range(30))]),
         "runs.csv, time_s: run (no run_id) has 2 samples at 0 s; give each run its own run_id",
     ),
-    "two conditions in a run": (
-        "\n".join([f"{HEADER},time_s", *(f"{moving(t, 15 + t // 20)},{t / 10}" for t in range(30))]),
-        "runs.csv, supply_voltage_V: run (no run_id) has several values",
+    "two configurations in a run": (
+        "\n".join([
+            f"{HEADER},time_s",
+            *(f"{moving(t, 15).replace('6T2A', ('6T2A', '4W2T')[t // 20])},{t / 10}" for t in range(30)),
+        ]),
+        "runs.csv, configuration: run (no run_id) has several values",
     ),
 }  # fmt: skip
 
