@@ -31,6 +31,8 @@ CONDITIONS: dict[str, str] = {
     "discharge": "charge already taken from the battery",
     "adhesion": "adhesion as a ratio to the one the robot is stated for",
     "order": "place in the sequence of runs",
+    "duty": "share of the supply's voltage that the driver gives the motors",
+    "open": "1 where the motors' circuit is open",
     "total_mass": "total mass of robot and payload",
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.

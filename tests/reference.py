@@ -37,7 +37,13 @@ NOMINAL: dict[str, float] = {
     "motor.inertia": 3.35e-6,
     "motor.resistance_thermal_winding": 1.7,
     "motor.resistance_thermal_housing": 6.0,
+    "motor.time_constant_winding": 16.3,
+    "motor.time_constant_housing": 593.0,
     "motor.temperature_ambient": 25.0,
+    # assumptions: no limit, and a controller that the paper does not have
+    "driver.current_limit": 1000.0,
+    "driver.gain": 4.0,
+    "driver.time_reset": 0.05,
     # Table 2; ratio 576/25 x 25/12
     "gearbox.ratio": 576 / 25 * 25 / 12,
     "gearbox.efficiency_load": 0.74,
