@@ -91,11 +91,21 @@ def columns(result: Result, further: Mapping[str, Any] | None = None) -> dict[st
     Args:
         further: what a fidelity adds, by column, in the column's unit (`fidelities.base.Run.columns`).
     """
+    found = {output.column: np.asarray(output.get(result)) / output.factor for output in table()}
+    return {
+        **found,
+        **codes(result.status, result.flags),
+        **{name: np.asarray(values) for name, values in (further or {}).items()},
+    }
+
+
+def codes(status: Any, flags: Any) -> dict[str, np.ndarray]:
+    """Statuses and flags in the words of `runs.csv`, of the codes' shape; flags separated by semicolons."""
     from mmrjax.signals import FLAGS, STATUSES
 
-    found = {output.column: np.asarray(output.get(result)) / output.factor for output in table()}
-    found["status"] = np.array(STATUSES)[np.asarray(result.status)]
-    bits = np.asarray(result.flags)
+    bits = np.asarray(flags)
     names = [";".join(flag for k, flag in enumerate(FLAGS) if b >> k & 1) for b in bits.ravel()]
-    found["flags"] = np.array(names, dtype=str).reshape(bits.shape)
-    return {**found, **{name: np.asarray(values) for name, values in (further or {}).items()}}
+    return {
+        "status": np.array(STATUSES)[np.asarray(status)],
+        "flags": np.array(names, dtype=str).reshape(bits.shape),
+    }

@@ -15,7 +15,7 @@ from calibration.data import profiles
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
-from mmrjax import balances, channels, missions
+from mmrjax import balances, channels, missions, outputs
 from mmrjax.conditions import Conditions
 from mmrjax.energy import SINKS
 from mmrjax.fidelities.mission import Mission
@@ -152,7 +152,7 @@ def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: co
             own = slice(done, done + count)
             at = jax.tree.map(lambda x, own=own: x[own], conditions)
             numbers = jax.device_get(missions.numbers(robot, at, found))
-            tables.append({**missions.columns(numbers), **_codes(found.result.status, found.result.flags)})
+            tables.append({**missions.columns(numbers), **outputs.codes(found.result.status, found.result.flags)})
             segments.append(_segments(robot, at, source, found, names[own]))
             courses += [_course(robot, at, source, found, k, str(names[done + k]), rows) for k in range(count)]
             assert found.course is not None  # it was asked for
@@ -181,13 +181,6 @@ def _conditions(
     return about
 
 
-def _codes(status: Any, flags: Any) -> dict[str, np.ndarray]:
-    """Statuses and flags in words; flags separated by semicolons."""
-    bits = np.asarray(flags).ravel()
-    said = [";".join(flag for k, flag in enumerate(FLAGS) if b >> k & 1) for b in bits]
-    return {"status": np.array(STATUSES)[np.asarray(status).ravel()], "flags": np.array(said, dtype=str)}
-
-
 def _segments(
     robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
 ) -> dict[str, np.ndarray]:
@@ -212,7 +205,7 @@ def _segments(
         "mode": np.tile(np.array(source.modes)[of], runs),
         **{column: np.asarray(numbers[column]).ravel() for column in numbers},
         "state_of_charge": charge.ravel(),
-        **_codes(found.status, found.flags),
+        **outputs.codes(found.status.ravel(), found.flags.ravel()),
     }
     order = ["run_id", "cycle", "segment", "time_s", "mode", *(c for c in missions.names() if c in rows)]
     reached = time.ravel() > 0

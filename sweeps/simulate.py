@@ -138,7 +138,7 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
     """What the numbers of the runs do not say by themselves, a sentence each, of a few runs at most."""
     said: list[str] = []
     several = len(table["status"]) > 1
-    times = permissible(robot, table)
+    times = table[PERMISSIBLE] if PERMISSIBLE in table else permissible(robot, table)
     for k, status in enumerate(table["status"]):
         name = f"run {k + 1}: " if several else ""
         flags, cell = str(table["flags"][k]).split(";"), float(table["voltage_cell_V"][k])

@@ -298,22 +298,3 @@ def _course(robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ea
         temperature_housing=shown(ys[:, HOUSING] * UNITS[HOUSING]),
         signals=jax.tree.map(shown, every),
     )
-
-
-@eqx.filter_jit
-def mission_batch(
-    robot: Robot,
-    conditions: Conditions,
-    profile: Profile,
-    start: Start | None = None,
-    *,
-    tolerance: float = TOLERANCE,
-    most_steps: int = MOST_STEPS,
-    keep: int = 0,
-) -> Mission:
-    """`mission` over a batch of conditions (leading axis of every field) for one robot and profile, compiled."""
-
-    def one(c: Conditions) -> Mission:
-        return mission(robot, c, profile, start, tolerance=tolerance, most_steps=most_steps, keep=keep)
-
-    return jax.vmap(one)(conditions)

@@ -16,14 +16,13 @@ from mmrjax import contact, fidelities, undercarriage
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
-from mmrjax.fidelities.result import result, travels, unless_slipping, withhold
+from mmrjax.fidelities.result import mask, result, travels, unless_slipping, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
     FAILED,
-    FLAGS,
     NOT_SETTLED,
     STALLED,
     TIPS,
@@ -204,7 +203,7 @@ def _trajectory(run: System, start: Motion, end: Motion, record: Record, sample:
     window = time[1:] > time[-1] - WINDOW * (time[-1] - time[0])
     aloft = window & (record.signals.normal < ALOFT * averages.signals.normal)
     jumps = jnp.sum(aloft) > JUMPS * jnp.sum(window)
-    flags = answer.flags | jnp.where(jumps, 1 << FLAGS.index("jumps"), 0)
+    flags = answer.flags | mask({"jumps": jumps})
     answer = withhold(dataclasses.replace(answer, flags=flags), there, status != FAILED)
     return Trajectory(time[1:], motions.q, motions.v, record.signals, record.reactions, averages, answer)
 
