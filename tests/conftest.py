@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import os
+import sys
 from pathlib import Path
 
 from sweeps import compilation_cache
@@ -25,6 +27,7 @@ from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.signals import Result
+from sweeps import cli
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.
@@ -174,3 +177,21 @@ def compilations():
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield seen
     jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.fixture
+def mmrjax(monkeypatch, capsys, tmp_path):
+    """Run a command in this process; returns exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it, for this process alone
+
+    monkeypatch.setattr(os, "_exit", sys.exit)  # how an interrupted command ends; this process goes on
+
+    def command(*arguments):
+        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        out = capsys.readouterr()
+        return end.value.code, out.out, out.err
+
+    return command

@@ -21,24 +21,6 @@ HEADER = (
 CLIMBS = ["--set", "6T2A.ground.friction.static=0.6", "--set", "4W2T.ground.friction.static=0.6"]
 
 
-@pytest.fixture
-def mmrjax(monkeypatch, capsys, tmp_path):
-    """Run a command in this process; returns exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it, for this process alone
-
-    monkeypatch.setattr(os, "_exit", sys.exit)  # how an interrupted command ends; this process goes on
-
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        out = capsys.readouterr()
-        return end.value.code, out.out, out.err
-
-    return command
-
-
 def table(path):
     with path.open(newline="") as stream:
         return list(csv.DictReader(stream))

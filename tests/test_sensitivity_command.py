@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import sys
 import tomllib
 from pathlib import Path
 
@@ -28,7 +27,6 @@ from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
 from mmrjax import params
 from mmrjax.fidelities.steady import steady_batch
-from sweeps import cli
 from tests.pages import Tables
 
 ROOT = Path(__file__).parents[1]
@@ -38,21 +36,6 @@ SMALL = (
     "sensitivity", "--parameters", ",".join(NAMES), "--voltages", "24", "--payloads", "3", "--slopes", "0,5",
     "--outputs", "total_current,speed,steepest_slope", "--evaluations", "3000",
 )  # fmt: skip
-
-
-@pytest.fixture
-def mmrjax(monkeypatch, capsys, tmp_path):
-    """Run a command in this process; returns exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        out = capsys.readouterr()
-        return end.value.code, out.out, out.err
-
-    return command
 
 
 @pytest.fixture(scope="module")

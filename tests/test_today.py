@@ -2,9 +2,7 @@
 
 import csv
 import json
-import os
 import re
-import sys
 
 import numpy as np
 import pytest
@@ -14,27 +12,11 @@ from calibration.data import robot_file, runs
 from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import robots, signals
 from mmrjax.fidelities.drive import drive_batch
-from sweeps import cli, figures_history, report_runs, words
+from sweeps import figures_history, report_runs, words
 from sweeps.simulate import PEAK, remarks
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
 SPEED_REST = 0.1 * SPEED_STATIC
-
-
-@pytest.fixture
-def mmrjax(monkeypatch, capsys, tmp_path):
-    """Run a command in this process; returns exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
-
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        out = capsys.readouterr()
-        return end.value.code, out.out, out.err
-
-    return command
 
 
 def table(path):
