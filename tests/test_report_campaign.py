@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import xarray as xr
 from pages import Tables, drawn, outside
-from test_cli import mmrjax  # noqa: F401
 from test_sweep_store import CONFIG
 
 from sweeps import figures_campaign, report_campaign
@@ -15,7 +14,7 @@ REPORTED = CONFIG.replace("report = false\n", "")
 
 
 @pytest.fixture
-def page(mmrjax, tmp_path):  # noqa: F811
+def page(mmrjax, tmp_path):
     def write(config=REPORTED):
         (tmp_path / "plan.toml").write_text(config)
         assert mmrjax("sweep", "plan.toml", "--out", "s", "--force")[0] in (0, 3)

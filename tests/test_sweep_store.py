@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from test_cli import MMRJAX, mmrjax  # noqa: F401
+from test_cli import MMRJAX
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import params, robots
@@ -43,7 +43,7 @@ POINTS, CHUNKS = 300, 12
 
 
 @pytest.fixture
-def sweep(mmrjax, tmp_path):  # noqa: F811
+def sweep(mmrjax, tmp_path):
     """Sweep the configuration above, or another, into a folder; returns exit code, stdout and stderr."""
     (tmp_path / "plan.toml").write_text(CONFIG)
 
@@ -116,7 +116,7 @@ def test_result_counts_statuses_and_states_ranges(whole):
     assert manifest["statuses"] == result["statuses"] and manifest["seed"] == 7
 
 
-def test_store_agrees_with_the_table_of_the_same_grid(mmrjax, tmp_path):  # noqa: F811
+def test_store_agrees_with_the_table_of_the_same_grid(mmrjax, tmp_path):
     grid = ["--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--surface", "asphalt", "--no-report"]
     assert (
         mmrjax("sweep", *grid, "--out", "table")[0]
@@ -734,7 +734,7 @@ def test_layout_counts_its_bytes_without_writing(whole):
     assert dataclasses.replace(layout, variables=()).size == 3 * 8
 
 
-def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):  # noqa: F811
+def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
     page = (Path(__file__).resolve().parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
     (tmp_path / "plan.toml").write_text(page.split("```toml\n")[1].split("```")[0])
     code, out, err = mmrjax("sweep", "plan.toml", "--dry-run", "--chunk", "1000")
