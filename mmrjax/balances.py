@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Protocol
 
+import jax
 import jax.numpy as jnp
 
 from mmrjax import channels, contact, ground, power
@@ -16,7 +17,8 @@ from mmrjax import chassis as chassis_room
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
-from mmrjax.robot import Robot
+from mmrjax.robot import Load, Robot
+from mmrjax.shaft import Shaft
 from mmrjax.signals import GRAVITY, Signals, State
 
 #: Every balance with its unit and what it closes.
@@ -55,7 +57,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
     chassis = robot.chassis(conditions.configuration)
     speed_wheel = state.speed_motor * (1 / robot.gearbox.ratio)
     speed_theoretical = chassis.radius * speed_wheel
-    rest = chassis.ground.friction.speed_rest
+    rest = chassis.speed_still
     duty = robot.driver.duty_limited(conditions.duty, state.current)
     signals = Signals(
         configuration=conditions.configuration,
@@ -74,10 +76,13 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
         direction_travel=contact.direction(state.speed, rest) if direction is None else direction,
         speed_wheel=speed_wheel,
         speed_theoretical=speed_theoretical,
+        angle=state.distance / chassis.radius,
         temperature=state.temperature,
         duty=duty,
         total_current=robot.sides * state.current * duty,
     )
+    if isinstance(chassis, Shaft):  # no ground carries it
+        return _fill(signals, mass=jnp.zeros_like(state.speed), normal=jnp.zeros_like(state.speed))
     stated = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     mass = stated + added(robot, _fill(signals, mass=stated), "mass")
     normal = chassis_room.normal_load(mass, conditions.slope, GRAVITY, robot.sides)
@@ -86,6 +91,8 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
 
 def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     """Voltage at the motors [V]: the driver's share of what the supply gives, less the drops on the way to it."""
+    if conditions.motor_speed is not None:  # whatever the imposed speed takes
+        return signals
     source = power.voltage_source(
         robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
     )
@@ -95,10 +102,12 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
 
 
-def electrical(robot: Robot, signals: Signals) -> Signals:
-    """What of the supply voltage is left to change the current [V]."""
+def electrical(robot: Robot, signals: Signals, imposed: bool = False) -> Signals:
+    """What of the supply voltage is left to change the current [V]; or the voltage that an imposed speed takes."""
     back = robot.motor.voltage_back(signals.speed_motor)
     drop = robot.motor.voltage_winding(signals.current, signals.temperature) + added(robot, signals, "electrical")
+    if imposed:
+        signals = _fill(signals, voltage=back + drop, voltage_source=back + drop)
     return _fill(
         signals,
         voltage_back=back,
@@ -121,8 +130,12 @@ def motor(robot: Robot, signals: Signals) -> Signals:
     )
 
 
-def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
-    """Forces along the slope that traction has to overcome [N]."""
+def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
+    """Forces along the slope that traction has to overcome [N]; of a shaft what its load takes at the radius."""
+    if isinstance(chassis, Shaft):
+        demand = chassis.torque_load(signals.angle) / chassis.radius
+        none = jnp.zeros_like(demand)
+        return _fill(signals, resistance=none, gravity=demand, demand=demand, adhesion_limit=none + jnp.inf)
     resistance = chassis.ground.force_resistance(signals.normal, signals.direction_travel)
     resistance = resistance + added(robot, signals, "ground")
     gravity = ground.force_gravity(signals.mass * (1 / robot.sides), signals.slope, GRAVITY)
@@ -136,23 +149,29 @@ def travel(robot: Robot, chassis: Chassis, signals: Signals) -> Signals:
 
 
 def slip(robot: Robot, signals: Signals) -> Signals:
-    """Speed at which the contact patch slides over the ground [m/s]."""
+    """Speed at which the contact patch slides over the ground [m/s]; a shaft has none."""
+    if robot.on_shaft:
+        still = jnp.zeros_like(signals.speed)
+        return _fill(signals, speed_slip_terms=still, speed_sliding=signals.speed_theoretical - signals.speed)
     terms = added(robot, signals, "slip")
     return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
 
 
-def track(robot: Robot, chassis: Chassis, signals: Signals, guide: Scalar | None = None) -> Signals:
-    """Losses between pulley and ground, at the pulley [N·m].
+def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = None) -> Signals:
+    """Losses between pulley and ground, at the pulley; of a shaft its load's friction [N·m].
 
     `guide` is the friction on the lower guide [N]; None takes (26) on the guides' stated share.
     """
+    if isinstance(chassis, Shaft):
+        loss = chassis.torque_loss(signals.speed_wheel, signals.direction) + added(robot, signals, "track")
+        return _fill(signals, torque_track_loss=loss)
     loss = chassis.track.torque_loss(signals.speed_wheel, signals.direction)
     guide = chassis.track.force_guide(signals.normal, signals.direction) if guide is None else guide
     loss = loss + guide * chassis.radius + added(robot, signals, "track")
     return _fill(signals, torque_track_loss=loss)
 
 
-def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | None = None) -> Signals:
+def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
 
     `mover` is what the mover takes from the shaft beside the track's losses [N·m]; None: the traction.
@@ -186,9 +205,9 @@ def gearbox(robot: Robot, chassis: Chassis, signals: Signals, mover: Scalar | No
     )
 
 
-def _to_slip(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
+def _to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signals) -> Signals:
     """The balances between kinematics and traction, in their order."""
-    signals = electrical(robot, supply(robot, conditions, signals))
+    signals = electrical(robot, supply(robot, conditions, signals), conditions.motor_speed is not None)
     return slip(robot, travel(robot, chassis, motor(robot, signals)))
 
 
@@ -199,9 +218,40 @@ def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
 
 
 def moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
-    """All signals of a robot in motion: traction follows from sliding by the friction law."""
+    """All signals of a robot in motion: traction follows from sliding by the friction law; and where the motors' speed
+    is imposed, the current from torque."""
+    if conditions.motor_speed is None:
+        return _moving(robot, conditions, state)
+    return _moving(robot, conditions, dataclasses.replace(state, current=_current(robot, conditions, state)))
+
+
+#: Newton steps of the current at an imposed speed: its torque is linear but for which way power flows, and effects.
+CURRENT_STEPS = 4
+
+
+def _current(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+    """Current with which the motors accelerate as the imposed speed does [A]."""
+    asked = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
+
+    def lacking(current: Scalar) -> Scalar:
+        signals = _moving(robot, conditions, dataclasses.replace(state, current=current))
+        return signals.acceleration_wheel * robot.gearbox.ratio - asked
+
+    current = jnp.zeros_like(state.speed_motor)
+    for _ in range(CURRENT_STEPS):
+        at = jax.lax.stop_gradient(current)
+        left, rise = jax.jvp(lacking, (at,), (jnp.ones_like(at),))
+        current = at - left / jax.lax.stop_gradient(rise)
+    return current
+
+
+def _moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
     chassis = robot.chassis(conditions.configuration)
     signals = _to_slip(robot, conditions, chassis, begin(robot, conditions, state))
+    if isinstance(chassis, Shaft):
+        signals = _fill(signals, traction=signals.demand)
+        signals = gearbox(robot, chassis, track(robot, chassis, signals))
+        return _fill(signals, acceleration=chassis.radius * signals.acceleration_wheel)
     traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
     signals = _pulled(robot, signals, traction)
     return gearbox(robot, chassis, track(robot, chassis, signals))
@@ -258,10 +308,16 @@ def settled(robot: Robot, conditions: Conditions, state: State, direction: Scala
     # Nothing changes in steady travel: the rates that other fidelities compute are zero.
     still = jnp.zeros_like(signals.demand)
     signals = _fill(signals, traction=signals.demand, acceleration=still)
-    creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
+    if isinstance(chassis, Shaft):
+        creep = still
+    else:
+        creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
     return gearbox(robot, chassis, track(robot, chassis, signals)), creep
 
 
 def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """What the instruments show of every channel [SI], by its name."""
-    return {c.name: c.read(robot, signals) + added(robot, signals, "sensor", c.name) for c in channels.CHANNELS}
+    return {
+        c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals) + added(robot, signals, "sensor", c.name))
+        for c in channels.known()
+    }

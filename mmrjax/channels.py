@@ -1,13 +1,15 @@
 """The table of channels: everything that an instrument can show, one row each. No other room counts them.
 
-Importable without jax. A new channel is a row of `CHANNELS`; files, noise, fits, reports and sensor effects follow.
+Importable without jax. A new channel is a row of `EVERY`. Files, noise, fits, reports and sensor effects go by
+`CHANNELS`, those that the robot at hand has; `panel` changes them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -34,6 +36,7 @@ class Channel:
         resolution: digits after the point that a person wants to see [unit].
         unit_si: of readings inside; empty where `factor` is 1.
         zero_at_rest: whether it shows 0 until the robot moves.
+        settled, over_time: whether settled runs and histories can show it.
         other_units: what is often written in its column by mistake, and the SI value of each.
     """
 
@@ -51,12 +54,13 @@ class Channel:
     resolution: int = 1
     unit_si: str = ""
     zero_at_rest: bool = False
+    settled: bool = True
+    over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
 
 
-#: In the order of columns, arrays and reports. Read through the module (`channels.CHANNELS`), so that a row more
-#: is a row more everywhere.
-CHANNELS: tuple[Channel, ...] = (
+#: Every channel that there is.
+EVERY: tuple[Channel, ...] = (
     Channel(
         name="total_current",
         column="total_current_A",
@@ -104,11 +108,145 @@ CHANNELS: tuple[Channel, ...] = (
         zero_at_rest=True,
         other_units=(("m/s", 1.0), ("km/h", 1 / 3.6), ("cm/s", 1e-2), ("m/min", 1 / 60)),
     ),
+    Channel(
+        name="motor_current",
+        column="motor_current_A",
+        sd_column="motor_current_sd_A",
+        unit="A",
+        factor=1.0,
+        label="motor current",
+        word="motor_current",
+        range=(-200.0, 200.0),
+        sd_largest=100.0,
+        read=lambda robot, signals: signals.current,
+        sd_share=0.02,
+        resolution=3,
+        other_units=(("mA", 1e-3),),
+    ),
+    Channel(
+        name="output_speed",
+        column="output_speed_rpm",
+        sd_column="output_speed_sd_rpm",
+        unit="rpm",
+        factor=RPM,
+        label="output speed",
+        word="output_speed",
+        range=(-30_000.0, 30_000.0),
+        sd_largest=10_000.0,
+        read=lambda robot, signals: signals.speed_wheel,
+        sd_share=0.005,
+        resolution=2,
+        unit_si="rad/s",
+        zero_at_rest=True,
+        other_units=(("rad/s", 1.0), ("turns/s", 2 * math.pi), ("deg/s", math.pi / 180)),
+    ),
+    Channel(
+        name="output_angle",
+        column="output_angle_deg",
+        sd_column="output_angle_sd_deg",
+        unit="deg",
+        factor=math.pi / 180,
+        label="output angle",
+        word="output_angle",
+        range=(-1e6, 1e6),
+        sd_largest=360.0,
+        read=lambda robot, signals: signals.angle,
+        sd_share=0.01,
+        resolution=2,
+        unit_si="rad",
+        zero_at_rest=True,
+        settled=False,
+        other_units=(("rad", 1.0), ("turns", 2 * math.pi)),
+    ),
+    Channel(
+        name="motor_voltage",
+        column="motor_voltage_V",
+        sd_column="motor_voltage_sd_V",
+        unit="V",
+        factor=1.0,
+        label="motor voltage",
+        word="motor_voltage",
+        range=(-200.0, 200.0),
+        sd_largest=100.0,
+        read=lambda robot, signals: signals.voltage,
+        sd_share=0.01,
+        resolution=2,
+        other_units=(("mV", 1e-3),),
+    ),
+    Channel(
+        name="output_torque",
+        column="output_torque_Nm",
+        sd_column="output_torque_sd_Nm",
+        unit="Nm",
+        factor=1.0,
+        label="output torque",
+        word="output_torque",
+        range=(-1e4, 1e4),
+        sd_largest=1e3,
+        read=lambda robot, signals: signals.torque_gear,
+        sd_share=0.01,
+        resolution=4,
+        unit_si="N·m",
+        other_units=(("mNm", 1e-3),),
+    ),
+    Channel(
+        name="winding_temperature",
+        column="winding_temperature_C",
+        sd_column="winding_temperature_sd_C",
+        unit="C",
+        factor=1.0,
+        label="winding temperature",
+        word="temperature",
+        range=(-50.0, 500.0),
+        sd_largest=100.0,
+        read=lambda robot, signals: robot.motor.temperature_settled(signals.current),
+        sd_share=0.02,
+        unit_si="°C",
+        over_time=False,
+    ),
 )
+
+#: Of a robot whose file states none.
+USUAL = ("total_current", "motor_speed", "speed")
+
+#: Those of the robot at hand, in the order of columns, arrays and reports. Read through the module
+#: (`channels.CHANNELS`), so that a row more is a row more everywhere.
+CHANNELS: tuple[Channel, ...] = tuple(c for c in EVERY if c.name in USUAL)
+
+
+def select(names: Iterable[str]) -> None:
+    """Make channels those of the robot at hand, in the order of `EVERY`.
+
+    Raises:
+        KeyError: no such channel.
+    """
+    global CHANNELS
+    wanted = set(names)
+    if unknown := wanted - {c.name for c in (*EVERY, *CHANNELS)}:
+        raise KeyError(f"no channel {min(unknown)}; there are {', '.join(c.name for c in EVERY)}")
+    table = {c.name: c for c in (*EVERY, *CHANNELS)}
+    CHANNELS = tuple(c for name, c in table.items() if name in wanted)
+
+
+@contextlib.contextmanager
+def panel(names: Iterable[str]) -> Iterator[None]:
+    """`select` for a while."""
+    global CHANNELS
+    before = CHANNELS
+    select(names)
+    try:
+        yield
+    finally:
+        CHANNELS = before
+
+
+def known() -> tuple[Channel, ...]:
+    """Every channel that there is, those that a program has added among them."""
+    return tuple({c.name: c for c in (*EVERY, *CHANNELS)}.values())
 
 
 def names() -> tuple[str, ...]:
-    """Names of all channels, in order."""
+    """Names of the channels at hand, in order."""
     return tuple(c.name for c in CHANNELS)
 
 

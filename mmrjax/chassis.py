@@ -23,24 +23,29 @@ class Chassis(eqx.Module):
     mass: Scalar = parameter(
         unit="kg",
         meaning="mass of the robot without payload",
-        bounds=(0.5, 200.0),
+        bounds=(0.01, 1e4),
         relative_sd=0.02,
         source="Table 7 (Table A2 prints 13.1 for 4W2T; see paper-notes)",
     )
     radius: Scalar = parameter(
         unit="m",
         meaning="rolling radius of driving pulley or wheel r_k",
-        bounds=(5e-3, 0.5),
+        bounds=(1e-3, 2.0),
         relative_sd=0.005,
         source="48 teeth of 5 mm (6T2A; Table 6 prints the diameter over the grousers); D_w/2, Table 6 (4W2T)",
     )
     inertia: Scalar = parameter(
         unit="kg·m^2",
         meaning="inertia J_w of one side's parts that turn with the driving wheel, eq. (31)",
-        bounds=(0.0, 1.0),
+        bounds=(0.0, 100.0),
         relative_sd=0.1,
         source="Table 7: pulleys, wheels, and the tracks' mass at r_k",
     )
+
+    @property
+    def speed_still(self) -> Scalar:
+        """Speed within which friction at rest is not resolved [m/s]."""
+        return self.ground.friction.speed_rest
 
 
 def inertia_reduced(inertia_motor: Scalar, ratio: Scalar, efficiency: Scalar, inertia_wheel: Scalar) -> Scalar:

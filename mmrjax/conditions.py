@@ -34,6 +34,8 @@ class Conditions(eqx.Module):
         order: place in the sequence of runs; what drifts from run to run depends on it [-].
         duty: share of the supply's voltage that the driver gives the motors, negative backward [-].
         open: 1 where the motors' circuit is open, so that they coast.
+        motor_speed: imposed on the motors' shafts [rad/s], whatever voltage that takes; None: the voltage is imposed.
+        motor_acceleration: of an imposed speed [rad/s²]; None: none.
     """
 
     configuration: Int[Array, "..."] | np.ndarray
@@ -47,6 +49,8 @@ class Conditions(eqx.Module):
     order: Float[Array, "..."]
     duty: Float[Array, "..."]
     open: Float[Array, "..."]
+    motor_speed: Float[Array, "..."] | None
+    motor_acceleration: Float[Array, "..."] | None
 
     def __init__(
         self,
@@ -61,26 +65,31 @@ class Conditions(eqx.Module):
         order: Number = 0.0,
         duty: Number = 1.0,
         open: Number | bool = 0.0,
+        motor_speed: Number | None = None,
+        motor_acceleration: Number | None = None,
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
             which = jnp.asarray(which).astype(int)
         given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
         numbers = [jnp.asarray(v, float) for v in given]
-        mass = None if total_mass is None else jnp.asarray(total_mass, float)
-        shapes = [x.shape for x in (which, *numbers, *([] if mass is None else [mass]))]
+        others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
+        optional = {name: jnp.asarray(value, float) for name, value in others.items() if value is not None}
+        shapes = [x.shape for x in (which, *numbers, *optional.values())]
         try:
             shape = jnp.broadcast_shapes(*shapes)
         except ValueError:
-            names = [f.name for f in dataclasses.fields(type(self)) if f.name != "total_mass"]
-            of = dict(zip([*names, "total_mass"], shapes, strict=False))
+            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in others]
+            of = dict(zip([*names, *optional], shapes, strict=True))
             said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
         self.configuration = (np if which.dtype.kind == "U" else jnp).broadcast_to(which, shape)
         numbers = [jnp.broadcast_to(x, shape) for x in numbers]
         self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
         self.order, self.duty, self.open = numbers[6:]
-        self.total_mass = None if mass is None else jnp.broadcast_to(mass, shape)
+        held = {name: jnp.broadcast_to(x, shape) for name, x in optional.items()}
+        self.total_mass, self.motor_speed = held.get("total_mass"), held.get("motor_speed")
+        self.motor_acceleration = held.get("motor_acceleration")
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -26,7 +26,7 @@ class Gearbox(eqx.Module):
         48.0,
         unit="-",
         meaning="total ratio motor to driving wheel i_r",
-        bounds=(1.0, 1000.0),
+        bounds=(1.0, 1e4),
         relative_sd=0.002,
         source="GP32C 576/25 and a belt stage 25/12; Tables A1, A2 simulated give 47.97-48.04",
     )
@@ -42,7 +42,7 @@ class Gearbox(eqx.Module):
         0.3e-3,
         unit="N·m",
         meaning="idle Coulomb torque at the input M_rf0, eq. (20)",
-        bounds=(0.0, 0.1),
+        bounds=(0.0, 10.0),
         relative_sd=0.15,
         source="Table 2",
     )
@@ -50,7 +50,7 @@ class Gearbox(eqx.Module):
         1.4e-6,
         unit="N·m·s",
         meaning="idle viscous friction at the input K_fr, eq. (20)",
-        bounds=(0.0, 1e-3),
+        bounds=(0.0, 1.0),
         relative_sd=0.15,
         source="Table 2: 1.4e-3 mN·m·s",
     )

@@ -24,7 +24,7 @@ class Motor(eqx.Module):
         0.611,
         unit="ohm",
         meaning="terminal resistance R_rot, eq. (15)",
-        bounds=(0.01, 20.0),
+        bounds=(1e-3, 1e3),
         relative_sd=0.05,
         source=_SHEET,
     )
@@ -32,7 +32,7 @@ class Motor(eqx.Module):
         0.119e-3,
         unit="H",
         meaning="terminal inductance L_d, eq. (15)",
-        bounds=(1e-6, 0.1),
+        bounds=(1e-7, 10.0),
         relative_sd=0.1,
         source=_SHEET,
     )
@@ -40,7 +40,7 @@ class Motor(eqx.Module):
         25.9e-3,
         unit="N·m/A",
         meaning="torque constant C_m, eq. (17), and speed constant C_E in V·s/rad, eq. (16)",
-        bounds=(1e-3, 1.0),
+        bounds=(1e-4, 10.0),
         relative_sd=0.02,
         source=f"{_SHEET}; 369 rpm/V is the same number",
     )
@@ -48,7 +48,7 @@ class Motor(eqx.Module):
         2.7e-3,
         unit="N·m",
         meaning="dry friction torque M_df0, eq. (14)",
-        bounds=(0.0, 0.1),
+        bounds=(0.0, 10.0),
         relative_sd=0.15,
         source="Table 2",
     )
@@ -56,7 +56,7 @@ class Motor(eqx.Module):
         5.5e-7,
         unit="N·m·s",
         meaning="viscous friction K_fd, eq. (14)",
-        bounds=(0.0, 1e-3),
+        bounds=(0.0, 1.0),
         relative_sd=0.15,
         source="Table 2: 5.5e-4 mN·m·s",
     )
@@ -64,7 +64,7 @@ class Motor(eqx.Module):
         33.5e-7,
         unit="kg·m^2",
         meaning="rotor inertia J_d, eqs. (3), (31)",
-        bounds=(0.0, 1e-3),
+        bounds=(0.0, 1.0),
         relative_sd=0.05,
         source=f"{_SHEET}: 33.5 g·cm^2",
     )

@@ -15,24 +15,30 @@ from mmrjax.gearbox import Gearbox
 from mmrjax.motor import Motor
 from mmrjax.params import Index, Scalar, as_float
 from mmrjax.power import Battery
+from mmrjax.rig import Rig
 from mmrjax.running_gear import RunningGear
+from mmrjax.shaft import Shaft
 from mmrjax.tables import RADIUS_PULLEY
 
 if TYPE_CHECKING:
     from mmrjax.effects import Effect
 
 
+#: What the drives of a configuration move: a vehicle's chassis, or a shaft on a bench.
+Load = Chassis | Shaft
+
+
 class Configurations(eqx.Module):
-    """Chassis by name, in a fixed order; conditions hold the index of one.
+    """Loads by name, in a fixed order; conditions hold the index of one.
 
     Attributes:
-        names: in order; members: the chassis, alike.
+        names: in order; members: the loads, all vehicles' or all shafts'.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    members: tuple[Chassis, ...]
+    members: tuple[Any, ...]  # Load
 
-    def __init__(self, by_name: Mapping[str, Chassis]) -> None:
+    def __init__(self, by_name: Mapping[str, Load]) -> None:
         self.names, self.members = tuple(by_name), tuple(by_name.values())
 
     def index(self, name: str) -> int:
@@ -45,7 +51,7 @@ class Configurations(eqx.Module):
             raise KeyError(f"no configuration {name}; the robot has {', '.join(self.names)}")
         return self.names.index(name)
 
-    def __getitem__(self, name: str) -> Chassis:
+    def __getitem__(self, name: str) -> Any:
         return self.members[self.index(name)]
 
     def __contains__(self, name: object) -> bool:
@@ -57,8 +63,8 @@ class Configurations(eqx.Module):
     def __len__(self) -> int:
         return len(self.names)
 
-    def items(self) -> Iterator[tuple[str, Chassis]]:
-        """Names with their chassis, in order."""
+    def items(self) -> Iterator[tuple[str, Any]]:
+        """Names with their loads, in order."""
         return zip(self.names, self.members, strict=True)
 
 
@@ -67,14 +73,15 @@ def _configurations(value: Any) -> Any:
 
 
 class Robot(eqx.Module):
-    """Battery, one motor and gearbox per side, a chassis for each configuration, and effects.
+    """Battery, one motor and gearbox per side, a load for each configuration, and effects.
 
     Attributes:
-        configurations: chassis by name, at least one; given as a mapping.
+        configurations: loads by name, at least one; given as a mapping.
         effects: terms beyond the paper's model; the empty tuple is the paper's model.
         sides: how many motors are driven alike; all per-side quantities are of one of them (assumption 3).
         running_gear: of one side, what the track model needs beside the rest.
         driver: of the motors.
+        rig: what is imposed on it and what its instruments show.
     """
 
     battery: Battery
@@ -85,9 +92,15 @@ class Robot(eqx.Module):
     sides: Scalar = eqx.field(default=2.0, converter=as_float)
     running_gear: RunningGear = eqx.field(default_factory=RunningGear)
     driver: Driver = eqx.field(default_factory=Driver)
+    rig: Rig = eqx.field(default_factory=Rig)
 
-    def chassis(self, configuration: Index) -> Chassis:
-        """The chassis of the configuration with this index; traceable and batchable."""
+    @property
+    def on_shaft(self) -> bool:
+        """Whether its load is a shaft, else a vehicle."""
+        return isinstance(self.configurations.members[0], Shaft)
+
+    def chassis(self, configuration: Index) -> Any:
+        """The load of the configuration with this index; traceable and batchable."""
         first, *others = self.configurations.members
         chosen = first
         for k, other in enumerate(others, 1):
@@ -100,7 +113,7 @@ class Robot(eqx.Module):
         tracks, 48 teeth of 5 mm for a robot that has none."""
         radius: Scalar = jnp.asarray(RADIUS_PULLEY)
         for chassis in reversed(self.configurations.members):
-            radius = jnp.where(chassis.on_tracks > 0.5, chassis.radius, radius)
+            radius = jnp.where(jnp.asarray(chassis.on_tracks) > 0.5, chassis.radius, radius)
         return radius
 
     @property

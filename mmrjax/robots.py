@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 from mmrjax import params
@@ -11,6 +12,7 @@ from mmrjax.gearbox import Gearbox
 from mmrjax.ground import Ground
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
+from mmrjax.rig import Rig
 from mmrjax.robot import Configurations, Robot
 from mmrjax.tables import (
     BENCH,
@@ -33,6 +35,7 @@ __all__ = [
     "SURFACES",
     "VOLTAGES_V",
     "adhesion_ratio",
+    "blank",
     "nominal",
     "sm1",
     "sm2",
@@ -70,6 +73,31 @@ def nominal() -> Robot:
         inertia=75e-6 + 140e-6 + belt + 2 * 152e-6,
     )
     return Robot(Battery(), Motor(), Gearbox(), Configurations({TRACKED: tracked, WHEELED: wheeled}))
+
+
+#: Of a drive that nobody has stated more of: no friction, no loss, no limits.
+_NOTHING = {
+    "motor.friction_coulomb": 0.0,
+    "motor.friction_viscous": 0.0,
+    "gearbox.friction_coulomb": 0.0,
+    "gearbox.friction_viscous": 0.0,
+    "gearbox.efficiency_load": 1.0,
+    "gearbox.ratio": 1.0,
+}
+_UNLIMITED = 1e9
+
+
+def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = None) -> Robot:
+    """A robot of which nothing is known but its loads: no losses in its drive and no limits; what a rig's file states
+    comes on top.
+
+    Args:
+        configurations: its loads; sides: motors driven alike; rig: how it is driven and measured.
+    """
+    motor = dataclasses.replace(Motor(), speed_limit=_UNLIMITED, temperature_limit=_UNLIMITED)
+    gearbox = dataclasses.replace(Gearbox(), speed_limit=_UNLIMITED, torque_limit=None)
+    rig = dataclasses.replace(rig or Rig(), blank=True)
+    return params.replace(Robot(Battery(), motor, gearbox, configurations, sides=sides, rig=rig), _NOTHING)
 
 
 def _simplified(track_torque: float) -> Robot:

@@ -46,6 +46,7 @@ class State(eqx.Module):
         discharge: charge taken from the battery C_b [C].
         memory: of each effect that has one, by the effect's name, in its own unit; empty where none is kept.
         temperature: of the winding [°C], whose resistance follows it; None: not followed, resistance as stated.
+        distance: travelled since the start of the run [m]; read where a load depends on its angle.
     """
 
     current: Scalar
@@ -54,6 +55,7 @@ class State(eqx.Module):
     discharge: Scalar
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
     temperature: Scalar | None = None
+    distance: Scalar = 0.0
 
 
 class Signals(eqx.Module):
@@ -81,6 +83,7 @@ class Signals(eqx.Module):
     direction_travel: Scalar = UNSET  # of the robot, -1..1 [-]
     speed_wheel: Scalar = UNSET  # of driving wheel or pulley [rad/s]
     speed_theoretical: Scalar = UNSET  # r_k ω_k, eq. (32) [m/s]
+    angle: Scalar = UNSET  # of the output since the start of the run, of a load on a shaft [rad]
     # mass
     mass: Scalar = UNSET  # total M [kg]; to effects of balance `mass`, the stated one
     normal: Scalar = UNSET  # normal load of one side [N]

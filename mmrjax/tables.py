@@ -33,6 +33,8 @@ CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
     "duty": (-1.0, 1.0, ""),
     "open": (0.0, 1.0, ""),
     "total_mass": (0.1, 500.0, "kg"),
+    "motor_speed": (-1e4, 1e4, "rad/s"),
+    "motor_acceleration": (-1e7, 1e7, "rad/s^2"),
 }
 
 

@@ -13,14 +13,14 @@ class Track(eqx.Module):
     loss_coulomb: Scalar = parameter(
         unit="N·m",
         meaning="static loss torque of a side's tracks M_t0, eq. (24)",
-        bounds=(0.0, 20.0),
+        bounds=(0.0, 1e3),
         relative_sd=0.15,
         source="Table 3: 350 mN·m for three tracks, 70 for one",
     )
     loss_viscous: Scalar = parameter(
         unit="N·m·s",
         meaning="pseudo-viscous loss of a side's tracks K_ft, eq. (24)",
-        bounds=(0.0, 2.0),
+        bounds=(0.0, 100.0),
         relative_sd=0.15,
         source="Table 3: 16 mN·m·s for three tracks, 3 for one",
     )

@@ -34,6 +34,8 @@ CONDITIONS: dict[str, str] = {
     "duty": "share of the supply's voltage that the driver gives the motors",
     "open": "1 where the motors' circuit is open",
     "total_mass": "total mass of robot and payload",
+    "motor_speed": "motor speed imposed on the shafts",
+    "motor_acceleration": "acceleration of an imposed motor speed",
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
 STATUS, FLAGS = CODES

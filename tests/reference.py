@@ -44,6 +44,7 @@ NOMINAL: dict[str, float] = {
     "driver.current_limit": 1000.0,
     "driver.gain": 4.0,
     "driver.time_reset": 0.05,
+    "rig.delay": 0.0,
     # Table 2; ratio 576/25 x 25/12
     "gearbox.ratio": 576 / 25 * 25 / 12,
     "gearbox.efficiency_load": 0.74,

@@ -33,7 +33,7 @@ def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
 
     Positive where `steady` says `converged`; continuous through the edge, whichever it is.
     """
-    rest = robot.chassis(signals.configuration).ground.friction.speed_rest
+    rest = robot.chassis(signals.configuration).speed_still
     slowest = jnp.minimum(signals.speed_theoretical, signals.speed)
     return jnp.minimum(1.0 - signals.demand / signals.adhesion_limit, slowest / rest - 1.0)
 

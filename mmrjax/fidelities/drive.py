@@ -71,7 +71,7 @@ def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     """The state that a vector of unknowns stands for."""
     y = y * jnp.asarray(_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
-    return State(y[0], y[1], y[2], y[4], memory)
+    return State(y[0], y[1], y[2], y[4], memory, distance=y[3])
 
 
 #: The signals of an instant, traced once for each kind of robot however often a program asks for them.
@@ -83,9 +83,14 @@ def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
     """Rates of the unknowns, in their units [1/s]."""
     signals = moving(robot, conditions, state_of(robot, y))
     current_battery = robot.battery.current(signals.total_current) * (conditions.battery > 0.5)  # eq. (11)
+    winding = signals.voltage_left / signals.inductance
+    shaft = signals.acceleration_wheel * robot.gearbox.ratio
+    if conditions.motor_speed is not None:  # the current follows from torque, the shaft from what is imposed
+        imposed = conditions.motor_acceleration
+        winding, shaft = jnp.zeros_like(winding), jnp.zeros_like(shaft) if imposed is None else imposed
     rates = [
-        signals.voltage_left / signals.inductance,
-        signals.acceleration_wheel * robot.gearbox.ratio,
+        winding,
+        shaft,
         signals.acceleration,
         signals.speed,
         current_battery,
@@ -109,6 +114,11 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
     """At rest; or as the steady fidelity travels, what effects remember settled too, at rest where it has no root."""
     units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
     rest = jnp.zeros_like(units).at[4].set(conditions.discharge / units[4])
+    if conditions.motor_speed is not None:
+        rest = rest.at[1].set(conditions.motor_speed / units[1])
+        if robot.on_shaft:
+            radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
+            rest = rest.at[2].set(radius * conditions.motor_speed / units[2])
     if not rolling:
         return rest
     settled = operating_signals(robot, conditions)
@@ -149,7 +159,8 @@ def drive(
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
     y0 = start(robot, conditions, rolling)
-    parked = jnp.asarray(False) if rolling else holds(robot, conditions)
+    imposed = conditions.motor_speed is not None
+    parked = jnp.asarray(False) if rolling or imposed else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(lambda _, y, run: rates(run[0], run[1], y) * run[2]),
@@ -204,7 +215,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
     settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
     status = jnp.where(settling, NOT_SETTLED, travels(end.speed, end.voltage))
-    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).ground.friction.speed_rest
+    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
     still = stands(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
     status = jnp.where(still & (sense * end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
     gain = end.acceleration * jnp.sign(end.speed_sliding)

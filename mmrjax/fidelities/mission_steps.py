@@ -196,10 +196,13 @@ def events_of(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, s
     """Three functions that are positive once their event has happened: standing, breaking away, empty [-]."""
     asked = asked_at(robot, otherwise, segment, y, stands)
     state = state_of(robot, y, stands)
-    friction = robot.chassis(asked.conditions.configuration).ground.friction
-    rolling = robot.chassis(asked.conditions.configuration).radius * state.speed_motor / robot.gearbox.ratio
-    slow = 1 - jnp.abs(rolling) / friction.speed_rest
-    grips = 1 - jnp.abs(rolling - state.speed) / friction.speed_static
+    load = robot.chassis(asked.conditions.configuration)
+    rolling = load.radius * state.speed_motor / robot.gearbox.ratio
+    slow = 1 - jnp.abs(rolling) / load.speed_still
+    if robot.on_shaft:  # nothing slides
+        grips = jnp.ones_like(slow)
+    else:
+        grips = 1 - jnp.abs(rolling - state.speed) / load.ground.friction.speed_static
     near = stands | ((slow > -1) & (grips > -1))
 
     none = -jnp.ones_like(slow)

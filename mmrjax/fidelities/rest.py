@@ -27,6 +27,8 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     backward, _ = balances.settled(robot, conditions, at_rest, -1.0)
     shafts = jnp.minimum(-forward.torque_net, backward.torque_net) / TORQUE
     along = jnp.maximum(backward.demand, -forward.demand)
+    if robot.on_shaft:
+        return shafts
     ground = (forward.adhesion_limit - along) / forward.normal
     return jnp.minimum(shafts, ground)
 

@@ -102,6 +102,8 @@ def turned(status: Array) -> Array:
 
 def slips(robot: Robot, signals: Signals) -> Array:
     """Whether the movers slide over the ground faster than V_s."""
+    if robot.on_shaft:
+        return jnp.zeros_like(jnp.asarray(signals.speed), bool)
     friction = robot.chassis(signals.configuration).ground.friction
     return jnp.abs(signals.speed_sliding) > friction.speed_static
 

@@ -57,6 +57,9 @@ def _residual(unknowns: Vector, robot: Robot, conditions: Conditions) -> Vector:
     lacking, moving = -sense * signals.torque_net / _TORQUE, sense * unknowns[2]
     torque = sense * jnp.where(moving < lacking, moving, lacking)
     slip, voltage = signals.speed_sliding - creep, signals.voltage_left / _VOLTAGE
+    if conditions.motor_speed is not None:  # the torque determines the current, and the motor speed is known
+        known = unknowns[2] - conditions.motor_speed / _SPEED_MOTOR
+        return jnp.asarray(slip), jnp.asarray(signals.torque_net / _TORQUE), jnp.asarray(known)
     return jnp.asarray(slip), jnp.asarray(voltage), torque
 
 
@@ -67,7 +70,7 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     """
     stated = conditions.total_mass
     mass = robot.chassis(conditions.configuration).mass + conditions.payload if stated is None else stated
-    sound = mass > 0
+    sound = jnp.asarray(mass) > 0 if not robot.on_shaft else jnp.asarray(True)
     for number in jax.tree.leaves(conditions):
         sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
@@ -78,17 +81,25 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
 def direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward: of the torque on its shafts at rest.
 
-    That of the motors at their stall current less gravity's; friction can hold the robot, not turn it round.
+    That of the motors at their stall current less gravity's; friction can hold the robot, not turn it round. That of
+    the motors' speed where it is imposed.
     """
+    if conditions.motor_speed is not None:
+        return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
-    weight = ground.force_gravity(mass * (1 / robot.sides), conditions.slope, GRAVITY) * chassis.radius
+    if robot.on_shaft:
+        weight = chassis.torque_load(0.0)
+    else:
+        weight = ground.force_gravity(mass * (1 / robot.sides), conditions.slope, GRAVITY) * chassis.radius
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
 
 
 def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
     """Voltage that the driver gives motors at rest [V], no current flowing."""
+    if conditions.motor_speed is not None:  # that which makes for the imposed speed
+        return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
     battery = robot.battery.voltage(0.0, conditions.discharge)
     source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
     return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, source)
@@ -97,6 +108,8 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
 def _start(robot: Robot, conditions: Conditions) -> Vector:
     nominal = voltage_at_rest(robot, conditions)
     speed = nominal * (0.9 / robot.motor.torque_constant)
+    if conditions.motor_speed is not None:
+        speed = conditions.motor_speed
     return (
         robot.chassis(conditions.configuration).radius * speed * (1 / robot.gearbox.ratio / _SPEED),
         nominal * (0.05 / robot.motor.resistance / _CURRENT),
@@ -142,7 +155,7 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     """
     point, sound = operating_point(robot, conditions)
     # What the contact's law gives a robot that stands as creep, friction at rest holds.
-    crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).ground.friction.speed_rest
+    crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
     parked = (point.status == STALLED) & ((jnp.abs(point.theoretical_speed) < 1e-9) | crept)
     held = {"speed": jnp.where(parked, 0.0, point.speed)}
     reading = {**point.reading, **held}
@@ -175,7 +188,7 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
     sound, conditions = _sound(robot, conditions)
     sense = direction(robot, conditions)
     signals, _ = _balanced(robot, conditions, state, sense)
-    rest = robot.chassis(conditions.configuration).ground.friction.speed_rest
+    rest = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
     still = stands(sense, voltage, signals.speed_theoretical, signals.speed, rest)
     still |= sense * signals.speed_theoretical <= 1e-9

@@ -1,0 +1,101 @@
+"""Load on a bench: a shaft with inertia, friction, a constant torque and one that gravity makes of its angle."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from mmrjax.params import Scalar, parameter
+
+_STATED = "stated by whoever owns the rig"
+
+
+class Shaft(eqx.Module):
+    """J dω/dt = M_r - (M_0 sign ω + K ω) - M_c - m g l sin(θ - θ_0), at the output of one drive.
+
+    One law for bench, winch, screw, pendulum and carriage: a winch has M_c = m g r; a screw of lead p with a carriage
+    of mass m has J = m (p / 2π)² and travels p / 2π a radian. Newton's law for rotation; friction as of the tracks,
+    eq. (24).
+
+    Attributes:
+        speed_rest: of the output, within which friction is smoothed through rest [rad/s].
+    """
+
+    inertia: Scalar = parameter(
+        unit="kg·m^2",
+        meaning="inertia J of all that turns with the output of one drive",
+        bounds=(0.0, 1e4),
+        relative_sd=0.2,
+        source=_STATED,
+    )
+    loss_coulomb: Scalar = parameter(
+        unit="N·m",
+        meaning="dry friction torque M_0 at the output",
+        bounds=(0.0, 1e4),
+        relative_sd=0.5,
+        source=_STATED,
+    )
+    loss_viscous: Scalar = parameter(
+        0.0,
+        unit="N·m·s",
+        meaning="viscous friction K at the output",
+        bounds=(0.0, 1e4),
+        relative_sd=0.5,
+        source=_STATED,
+    )
+    torque_constant: Scalar = parameter(
+        0.0,
+        unit="N·m",
+        meaning="torque M_c that acts against forward rotation whatever the speed, as a winch's weight",
+        bounds=(-1e4, 1e4),
+        relative_sd=0.2,
+        source=_STATED,
+    )
+    torque_gravity: Scalar = parameter(
+        0.0,
+        unit="N·m",
+        meaning="largest torque of gravity on an arm m g l",
+        bounds=(0.0, 1e4),
+        relative_sd=0.1,
+        source=_STATED,
+    )
+    angle_zero: Scalar = parameter(
+        0.0,
+        unit="rad",
+        meaning="angle θ_0 at which the arm hangs, from where a run starts",
+        bounds=(-6.3, 6.3),
+        sd=0.05,
+        source=_STATED,
+    )
+    radius: Scalar = parameter(
+        1.0,
+        unit="m",
+        meaning="travel per radian of the output: radius of a drum, lead of a screw / 2π",
+        bounds=(1e-6, 10.0),
+        relative_sd=0.005,
+        source=_STATED,
+    )
+    speed_rest: float = eqx.field(default=0.01, static=True)
+
+    @property
+    def speed_still(self) -> Scalar:
+        """Speed within which friction at rest is not resolved [m/s]."""
+        return self.radius * self.speed_rest
+
+    @property
+    def on_tracks(self) -> Scalar:
+        """Neither on tracks nor on wheels: 0."""
+        return 0.0
+
+    @property
+    def mass(self) -> Scalar:
+        """Of a robot; none here [kg]."""
+        return 0.0
+
+    def torque_loss(self, speed: Scalar, direction: Scalar) -> Scalar:
+        """Friction torque M_0 sign ω + K ω [N·m] at `speed` [rad/s] and its `direction` (-1..1)."""
+        return self.loss_coulomb * direction + self.loss_viscous * speed
+
+    def torque_load(self, angle: Scalar) -> Scalar:
+        """Torque that acts against forward rotation M_c + m g l sin(θ - θ_0) [N·m]."""
+        return self.torque_constant + self.torque_gravity * jnp.sin(angle - self.angle_zero)
