@@ -218,8 +218,8 @@ def _pulled(robot: Robot, signals: Signals, traction: Scalar) -> Signals:
 
 
 def moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
-    """All signals of a robot in motion: traction follows from sliding by the friction law; and where the motors' speed
-    is imposed, the current from torque."""
+    """All signals of a robot in motion: traction follows from sliding by the friction law, and the current from
+    torque where the speed of the motors is imposed."""
     if conditions.motor_speed is None:
         return _moving(robot, conditions, state)
     return _moving(robot, conditions, dataclasses.replace(state, current=_current(robot, conditions, state)))
