@@ -17,7 +17,7 @@ from calibration.data import own_mass, robot_file
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import findings, menu, preference
+from calibration.discovery import findings, menu, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
@@ -104,6 +104,7 @@ def discover(
     for sentence in foreign:
         progress(sentence)
     notes += foreign
+    library = scales.library_for(robot, distinct.conditions(robot), library)
     settings = settings_for(kind, replicates, seed, prefer)
     settings = dataclasses.replace(settings, forbidden=tuple(forbidden))
 
@@ -330,7 +331,11 @@ def pose(
 def visible(library: Library, robot: Robot, kind: type[observers.Observer]) -> tuple[Effect, ...]:
     """The effects of a library that such data can show and the robot does not have yet."""
     have = {e.name for e in robot.effects}
-    return tuple(effect() for name, effect in library.items() if name not in have and kind.shows(effect))
+    return tuple(
+        effect()
+        for name, effect in library.items()
+        if name not in have and kind.shows(effect) and scales.present(effect, robot)
+    )
 
 
 def padded(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -29,6 +29,8 @@ KINDS = (
 )  # fmt: skip
 #: Share of the adhesion that a slope steeper than the table's may take by the fitted robot [-].
 GRIP = 0.95
+#: Temperature of a winding from which nobody has stated a limit [°C].
+UNLIMITED = 1e6
 #: How near to what is allowed something has to come to be watched: of a winding [K], of a speed [-].
 WARM, FAST = 25.0, 0.85
 
@@ -74,6 +76,7 @@ class Run:
         steepest: whether only the steepest slope that the robot climbs is worth while.
         repeats: readings that are averaged.
         watch: what can be damaged, and what shows that it will be.
+        imposed: what is in the place of the voltage, see `Rig`; `motor_speed`: [rad/s].
     """
 
     name: str
@@ -91,6 +94,7 @@ class Run:
     steepest: bool = False
     repeats: int = 3
     watch: str = ""
+    imposed: str = "voltage"
 
     @property
     def read(self) -> tuple[int, ...]:
@@ -100,10 +104,13 @@ class Run:
     @property
     def description(self) -> str:
         """For an engineer: what to do, what to read, and what to watch."""
-        where = "" if self.setup in setups.WEIGHTLESS else f" {_slopes(self.slope)}"
+        level = self.imposed != "voltage" and not any(self.slope)
+        where = "" if self.setup in setups.WEIGHTLESS or level else f" {_slopes(self.slope)}"
         labels = {c.name: c.label for c in channels.CHANNELS}
         read = _both([labels[c] for c in self.channels])
-        text = f"{self.doing}{where} at {_amounts(self.voltage, 'V')}; read {read}"
+        turning = [near(v / RPM) for v in self.voltage]
+        at = _amounts(self.voltage, "V") if self.imposed == "voltage" else _amounts(turning, "rpm of the motor")
+        text = f"{self.doing}{where} at {at}; read {read}"
         return f"{text}. Watch {self.watch}" if self.watch else text
 
 
@@ -210,7 +217,7 @@ def acts(reach: Reach) -> tuple[Act, ...]:
         f"Time the robot by light gates over a distance measured with a tape, at {_amounts(paces, 'm/s')}; read the "
         "speed that the bench shows", _timed, _each(paces), 3e-3,
     )  # fmt: skip
-    found = [weighing]
+    found = [] if reach.on_shaft else [weighing]
     found += ammeter * ("total_current" in reach.measured)
     found += [strobe] * ("motor_speed" in reach.measured)
     found += [timing] * ("speed" in reach.measured)
@@ -327,8 +334,29 @@ def menu(reach: Reach) -> tuple[Experiment, ...]:
 
     What the robot cannot do (climb that slope, move at that voltage) only its readings show: see `possible`.
     """
-    runs = (*_alone(reach), *(r for used in reach.used for r in _travels(reach, used)))
+    if reach.imposed == "motor_speed" or reach.on_shaft:
+        runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _turns(reach, used))
+    else:
+        runs = (*_alone(reach), *(r for used in reach.used for r in _travels(reach, used)))
     return (*acts(reach), *(r for r in runs if r.channels))
+
+
+def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
+    """Runs of a load on a shaft, or of motors whose speed is imposed: at other levels, and the other way round."""
+    speeds = reach.imposed == "motor_speed"
+    levels = reach.speeds if speeds else used.voltages
+    sizes = tuple(sorted({near(abs(x)) for x in levels if x})) or (1.0,)
+    others = tuple(sorted({near(0.4 * sizes[0]), near(0.5 * (sizes[0] + sizes[-1])), near(1.3 * sizes[-1])}))
+    both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
+    found = [
+        _runs(reach, "other speeds" if speeds else "other voltages", "run", kinds=("other voltages",), at=used,
+              voltages=others),
+        *([] if both else [
+            _runs(reach, "reverse", "run the other way round", at=used,
+                  voltages=[-x if levels[-1] > 0 else x for x in (sizes[0], sizes[-1])])
+        ]),
+    ]  # fmt: skip
+    return tuple(dataclasses.replace(r, imposed=reach.imposed) for r in found)
 
 
 def check_forbidden(forbidden: Sequence[str], robot: Robot) -> None:
@@ -376,7 +404,8 @@ def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.n
     warnings = []
     hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
     would = f"would reach {hottest:.0f} °C" if np.isfinite(hottest) else "would burn: no temperature settles"
-    heats = f"a winding left on {would} ({reach.hot:.0f} °C is allowed)"
+    allowed = f" ({reach.hot:.0f} °C is allowed)" if reach.hot < UNLIMITED else ""
+    heats = f"a winding left on {would}{allowed}"
     if run.setup is setups.blocked:
         current = highest / reach.resistance
         warnings.append(
@@ -393,6 +422,6 @@ def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.n
             f"the motor speed: about {fastest / RPM:.0f} rpm without load at {highest:g} V, and no more than "
             f"{limit / RPM:.0f} rpm; raise the voltage slowly"
         )
-    if highest > reach.voltages[-1]:
+    if run.imposed == "voltage" and highest > reach.voltages[-1]:
         warnings.append(f"the supply: {highest:g} V is more than the table's {reach.voltages[-1]:g} V")
     return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, watch="; ".join(warnings))

@@ -64,6 +64,8 @@ class Reach:
         motors: how many are driven alike.
         resistance [ohm], torque_constant [N·m/A]: of one.
         hot: temperature of a winding that is too hot [°C].
+        imposed: on the motors, see `Rig`; speeds: of the motors that the table used [rad/s], where they are imposed.
+        on_shaft: whether the load is a shaft.
     """
 
     used: tuple[Used, ...]
@@ -80,6 +82,9 @@ class Reach:
     resistance: float
     torque_constant: float
     hot: float
+    imposed: str = "voltage"
+    speeds: tuple[float, ...] = ()
+    on_shaft: bool = False
 
     @property
     def voltages(self) -> tuple[float, ...]:
@@ -113,8 +118,8 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     motor, highest = robot.motor, float(volts.max())
     constant, resistance = float(motor.torque_constant), float(motor.resistance)
     motors = int(robot.sides)
-    travel = operating_readings(robot, conditions)
-    largest = {c: float(np.nanmax(travel[:, k], initial=0.0)) for k, c in enumerate(channels.names())}
+    travel = operating_readings(robot, conditions, channels.USUAL)
+    largest = {c: float(np.nanmax(travel[:, k], initial=0.0)) for k, c in enumerate(channels.USUAL)}
     bears = float(motor.current_continuous)
     current = min(largest["total_current"] / motors or LOADED * highest / resistance, bears)
     motor_speed = largest["motor_speed"] or RUNNING * highest / constant
@@ -125,7 +130,8 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     geared = max(min(motor.speed_limit, robot.gearbox.speed_limit), motor_speed)
     return Reach(
         used, measured, voltage, min(voltage, constant * geared), min(voltage, constant * alone), current,
-        motor_speed, speed, geared, alone, motors, resistance, constant, motor.temperature_limit,
+        motor_speed, speed, geared, alone, motors, resistance, constant, motor.temperature_limit, robot.rig.imposed,
+        () if conditions.motor_speed is None else _levels(np.asarray(conditions.motor_speed)), robot.on_shaft,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from numpy.polynomial import legendre
 from calibration.inference.linearization import PROBED, Linearization
 from mmrjax import channels
 from mmrjax.effects import UNNAMED
+from mmrjax.robot import Robot
 
 #: Balances that carry curves: one for each equation that the channels close, and the ground's, whose defect
 #: also loads the contact; and those for which they stand, as what these lack has the same shape in them.
@@ -133,13 +134,25 @@ def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
-def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
+def balances_of(robot: Robot | None) -> tuple[str, ...]:
+    """Those of `BALANCES` that a robot has; None: any."""
+    if robot is None:
+        return BALANCES
+    lacks = {"ground", "slip"} if robot.on_shaft else set()
+    if robot.rig.imposed != "voltage" and "motor_voltage" not in robot.rig.channels:
+        lacks |= {"electrical"}
+    return tuple(b for b in BALANCES if b not in lacks)
+
+
+def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> Bases:
     """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
     of what the readings of a channel are off by, over the reading and over what time or order brings.
 
     Args:
         columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,).
+        robot: whose balances can lack something.
     """
+    balances = balances_of(robot)
     over: dict[str, tuple[str, np.ndarray]] = {}
     for variable, column in VARIABLES.items():
         if column not in columns:
@@ -150,8 +163,8 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
             continue
         basis = legendre.legvander(scaled(columns[column], weight), TERMS - 1) * np.exp(-0.35 * np.arange(TERMS))
         over[variable] = variable, basis
-    names = [(balance, variable) for variable, _ in over.values() for balance in BALANCES]
-    bases = [basis for _, basis in over.values() for _ in BALANCES]
+    names = [(balance, variable) for variable, _ in over.values() for balance in balances]
+    bases = [basis for _, basis in over.values() for _ in balances]
     shown = [
         (c.name, v)
         for c in channels.CHANNELS
@@ -171,7 +184,7 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
     wide = np.stack(terms, 1)
     groups = [
         (names, bases),
-        ([(b, CONDITIONS) for b in BALANCES], [wide] * len(BALANCES)),
+        ([(b, CONDITIONS) for b in balances], [wide] * len(balances)),
         (read, [over[v][1] for _, v in read]),
     ]
     return tuple(Basis.of(np.stack(b), ns) for ns, b in groups if ns)
@@ -206,12 +219,13 @@ def window(variable: str) -> Window | None:
     return None if found is None else Window(found[1], float(found[2]), float(found[3]))
 
 
-def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
+def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> Bases:
     """Windows in time (at the same instants of all runs) or in the order of runs, and levels of conditions, in every
     balance and channel.
 
     Args:
         columns: of the table; weight: 0 for rows that do not count, shape (rows,).
+        robot: whose balances can lack something.
     """
     counts = weight > 0
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
@@ -246,7 +260,7 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> Bases:
             np.stack([s for s, _ in shapes] * len(places))[:, :, None],
             [(place, name) for place in places for _, name in shapes],
         )
-        for places in (BALANCES, read)
+        for places in (balances_of(robot), read)
         if places
     )
 
@@ -271,7 +285,9 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> float
     return float(1 - freedom * np.sum(left**2) / np.sum((x - x.mean()) ** 2))
 
 
-def waves(on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.ndarray) -> Bases:
+def waves(
+    on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.ndarray, robot: Robot | None = None
+) -> Bases:
     """Waves of the orders that the samples of histories resolve, in every balance.
 
     A wave has its own amplitude and phase in each run: how the parts stood at its start is not known.
@@ -280,6 +296,7 @@ def waves(on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.
         on_tracks: whether each row's run is on tracks; angle: of the driving shaft [rad]; shape (rows,).
         rows: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is linear, shape (runs, knots).
+        robot: whose balances can lack something.
     """
     bases, words = [], []
     for word, (order, belted) in ORDERS.items():
@@ -298,8 +315,8 @@ def waves(on_tracks: np.ndarray, angle: np.ndarray, rows: np.ndarray, knots: np.
             words.append(word)
     if not words:
         return ()
-    every = [(b, w) for b in BALANCES for w in words]
-    return (Basis.of(np.stack(bases * len(BALANCES)), every),)
+    every = [(b, w) for b in balances_of(robot) for w in words]
+    return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
 
 
 def names(bases: Bases) -> tuple[tuple[str, str], ...]:

@@ -21,11 +21,14 @@ PAD = 16
 GRIPPING = 20.0
 
 
-def operating_readings(robot: Robot, conditions: Conditions) -> Float[np.ndarray, "runs channels"]:
+def operating_readings(
+    robot: Robot, conditions: Conditions, names: tuple[str, ...] | None = None
+) -> Float[np.ndarray, "runs channels"]:
     """Readings of steady travel on a surface that grips [SI]; NaN where the robot does not get under way.
 
     Args:
         conditions: shape (runs,).
+        names: of the channels; None: those of the table.
     """
     runs = conditions.shape[0]
     index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])
@@ -35,6 +38,6 @@ def operating_readings(robot: Robot, conditions: Conditions) -> Float[np.ndarray
         mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
     posed = dataclasses.replace(conditions, adhesion=jnp.full(runs, GRIPPING), total_mass=jnp.asarray(mass))
     found = steady_batch(params.strong(robot), jax.tree.map(lambda x: jnp.asarray(x)[index], posed))
-    reading = np.stack([np.asarray(found.reading[c]) for c in channels.names()], 1)[:runs]
+    reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names()], 1)[:runs]
     moving = np.asarray(done(found.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)

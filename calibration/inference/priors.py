@@ -26,6 +26,8 @@ FRICTION = (
     "ground.friction.static",
     "ground.friction.speed_static",
 )
+#: Freed by default of a load on a shaft.
+SHAFT = ("loss_coulomb", "loss_viscous", "torque_constant", "torque_gravity", "angle_zero")
 #: And of configurations on tracks, after the losses; guide friction μ_t stays at Table 4 because only its product
 #: with the share of the guides acts.
 GUIDE_SHARE, GUIDE_FRICTION = "track.guide_share", "track.guide_friction"
@@ -46,6 +48,11 @@ SURFACE = {
     "ground.friction.speed_static": 3.0,
     "ground.friction.speed_dynamic": 3.0,
 }
+
+#: Friction of which a rig's file states no tolerance, by the end of its name, and its relative sd: rigs are alike
+#: within a factor of two or three. The fields' own are those of Tables 2 to 4.
+FRICTION_OF_RIGS = (".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous", ".rolling_resistance")
+RELATIVE_OF_RIGS = 0.5
 
 SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
 
@@ -118,11 +125,20 @@ def known(robot: Robot) -> dict[str, Parameter]:
 
 
 def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
-    """The friction parameters of a configuration that are free by default."""
-    names = list(FRICTION)
+    """The friction parameters of a configuration that are free by default: a load on a shaft has others, and what no
+    channel can show or is zero is held."""
+    names = list(SHAFT if robot.on_shaft else FRICTION)
     if float(robot.configurations[configuration].on_tracks) > 0.5:
         names.insert(2, GUIDE_SHARE)
-    return tuple(f"{configuration}.{name}" for name in names)
+    if robot.rig.blank and "speed" not in robot.rig.channels:
+        names = [n for n in names if not n.startswith("ground.friction.")]
+    return _not_zero(robot, (f"{configuration}.{name}" for name in names))
+
+
+def _not_zero(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+    """Those of a robot's parameters that are not zero: one that is set to zero is held there."""
+    fields = known(robot)
+    return tuple(n for n in names if float(fields[n].value) != 0.0)
 
 
 def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = ()) -> tuple[str, ...]:
@@ -164,9 +180,32 @@ def free_names(
         name
         for c in robot.configurations
         if c in present
-        for name in (*friction(robot, c), f"{c}.radius", *(f"{c}.{n}" for n in chassis))
+        for name in (*friction(robot, c), *_radius(robot, c), *(f"{c}.{n}" for n in chassis if _has(robot, c, n)))
     ]
-    return (*BENCH, *drive, *own)
+    return (*_not_zero(robot, _drive(robot, (*BENCH, *drive))), *own)
+
+
+def _has(robot: Robot, configuration: str, name: str) -> bool:
+    """Whether a load has a parameter, and one that is not zero."""
+    field = known(robot).get(f"{configuration}.{name}")
+    return field is not None and float(field.value) != 0.0
+
+
+def _radius(robot: Robot, configuration: str) -> tuple[str, ...]:
+    """The radius of a configuration, unless nothing shows the travel of what turns on a shaft."""
+    shown = not robot.on_shaft or "speed" in robot.rig.channels
+    return (f"{configuration}.radius",) if shown else ()
+
+
+#: What of the drive acts on the voltage alone.
+ELECTRICAL = ("motor.resistance", "motor.inductance")
+
+
+def _drive(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+    """Parameters of the drive, less those that only the voltage shows where it is neither imposed nor read."""
+    if robot.rig.imposed == "voltage" or "motor_voltage" in robot.rig.channels:
+        return tuple(names)
+    return tuple(n for n in names if n not in ELECTRICAL)
 
 
 def guided(robot: Robot, configuration: str) -> tuple[Robot, dict[str, tuple[float, float]]]:
@@ -289,7 +328,7 @@ def coordinates(
     Args:
         robot: its values are the prior means (medians for scales).
         names: of the free parameters, from `choose`.
-        stated: name → (mean, sd) [SI] that replace the field's.
+        stated: name → (mean, sd) [SI] that replace the file's (`Rig.priors`), which replace the field's.
         any_surface: whether the friction of the ground has the priors of `SURFACE` where none is stated.
 
     Raises:
@@ -304,7 +343,10 @@ def coordinates(
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
     wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
-    known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()} | stated
+    if robot.rig.blank:
+        wide = {n: RELATIVE_OF_RIGS for n in names if n.endswith(FRICTION_OF_RIGS)} | wide
+    known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
+    known_sds |= {n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names} | stated
     rows = [_row(fields[name], known_sds.get(name)) for name in names]
     location, spread, low, high, scale = zip(*rows, strict=True)
     tied = tuple(

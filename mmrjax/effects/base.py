@@ -62,6 +62,7 @@ class Effect(eqx.Module):
             a robot that is turned about, so that its travel is forward again, meets minus its amplitude.
         resolved: whether the track model has by itself what it stands for.
         movers: `tracks` or `wheels` where it acts on configurations of that kind alone.
+        needs_belt: whether it is of a belt, which no load on a shaft has.
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
             temperature, a phase); None has none. A run starts with memory 0.
         memory_unit: unit of its memory.
@@ -83,6 +84,7 @@ class Effect(eqx.Module):
     odd_in_travel: ClassVar[bool] = False
     resolved: ClassVar[bool] = False
     movers: ClassVar[str] = ""
+    needs_belt: ClassVar[bool] = False
     memory_size: ClassVar[float | None] = None
     memory_unit: ClassVar[str] = "-"
 

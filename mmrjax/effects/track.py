@@ -109,6 +109,7 @@ class CentrifugalTension(TrackEffect):
     the pulley, which drives the belt in both.
     """
 
+    needs_belt = True
     driver = "speed"
     dissipative = True
 
@@ -136,6 +137,7 @@ class BendingLoss(TrackEffect):
     Far from ω_r it is like eq. (24)'s terms.
     """
 
+    needs_belt = True
     driver = "speed"
     dissipative = True
 

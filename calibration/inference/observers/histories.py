@@ -501,9 +501,9 @@ class Histories(Observer):
             columns = {**columns, "supply_voltage_V": at_motors}
         angle = np.nan_to_num(np.asarray(_angle(self, robot)))
         on_tracks = np.asarray(jax.vmap(robot.chassis)(self.conditions.configuration).on_tracks > 0.5)
-        waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots))
+        waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
         weight = included.astype(float)
-        return (*bases_room.families(columns, weight), *bases_room.windows(columns, weight), *waves)
+        return (*bases_room.families(columns, weight, robot), *bases_room.windows(columns, weight, robot), *waves)
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> TimeStatistics:
         names = bases_room.names(bases)

@@ -225,7 +225,7 @@ class SettledRuns(Observer):
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         weight = included.astype(float)
-        return (*bases_room.families(columns, weight), *bases_room.windows(columns, weight))
+        return (*bases_room.families(columns, weight, robot), *bases_room.windows(columns, weight, robot))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
         """As the protocol says: a row's residual (simulated less measured) is split among the defects of the

@@ -1,0 +1,185 @@
+"""How large effects may be on a rig: the library's priors are those of the nominal robot, brought to the rig's size.
+
+A loss of 0.7 mN·m is a fifth of the friction of a motor of 60 W and nothing beside that of one of 1 kW. What carries
+over from rig to rig is how much of its balance a term is. So the prior sd of an amplitude is scaled until a term of
+one sd is the same share of its balance at the rig's operating points as at those of the nominal robot over Table 8;
+and a shape parameter that is a speed or a current is scaled with those of the rig.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data.effect_file import Library
+from calibration.inference.linearization import amplitude_of, shape_of
+from mmrjax import params, robots
+from mmrjax.balances import BALANCES
+from mmrjax.conditions import Conditions
+from mmrjax.effects import Effect
+from mmrjax.fidelities.steady import operating
+from mmrjax.params import Parameter
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals
+
+#: What the terms of a balance are a share of.
+WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
+    "supply": lambda robot, s: s.voltage,
+    "electrical": lambda robot, s: s.voltage,
+    "motor": lambda robot, s: s.torque_electromagnetic,
+    "gearbox": lambda robot, s: s.torque_load,
+    "track": lambda robot, s: s.torque_load,
+    "ground": lambda robot, s: s.demand,
+    "slip": lambda robot, s: s.speed_theoretical,
+    "mass": lambda robot, s: s.mass,
+    "inertia": lambda robot, s: (
+        robot.configurations.members[0].inertia + robot.motor.inertia * robot.gearbox.ratio**2
+    ),
+    "inductance": lambda robot, s: robot.motor.inductance,
+}
+#: Readings that sensor effects are a share of.
+READ: dict[str, Callable[[Signals], object]] = {
+    "total_current": lambda s: s.total_current,
+    "motor_speed": lambda s: s.speed_motor,
+    "speed": lambda s: s.speed,
+}
+#: What a shape parameter is scaled with, by its unit; a speed in rad/s by the shaft of its balance.
+SCALED_WITH: dict[str, Callable[[Signals], object]] = {
+    "A": lambda s: s.current,
+    "m/s": lambda s: s.speed_theoretical,
+    "N": lambda s: s.demand,
+    "V": lambda s: s.voltage,
+}
+AT_THE_OUTPUT = ("track", "ground", "slip")
+#: Factors are powers of this one: rigs of about one size share what is compiled.
+STEP = 2.0
+
+
+def library_for(robot: Robot, conditions: Conditions, library: Library) -> Library:
+    """`library` with the priors of a rig's size; as it is for robots that are not a rig's from nothing.
+
+    Args:
+        robot: of the rig; conditions: of its table, shape (runs,).
+    """
+    if not robot.rig.blank:
+        return library
+    mine = _signals(robot, _steady(robot, conditions))
+    nominal, theirs = _nominal()
+    sized = {}
+    for name, kind in library.items():
+        if not present(kind, robot):
+            continue
+        sized[name] = _sized(kind, (robot, mine), (nominal, theirs))
+    return sized
+
+
+def present(kind: type[Effect], robot: Robot) -> bool:
+    """Whether a rig has the balance that an effect enters, and what it needs there."""
+    nowhere: set[str] = set()
+    if robot.on_shaft:
+        nowhere |= {"ground", "slip", "mass"}
+    voltage = robot.rig.imposed == "voltage"
+    if not voltage:
+        nowhere |= {"supply"} if "motor_voltage" in robot.rig.channels else {"supply", "electrical", "inductance"}
+    if kind.balance in nowhere or (robot.on_shaft and (kind.movers or kind.needs_belt)):
+        return False
+    return kind.balance != "sensor" or kind.channel in robot.rig.channels
+
+
+def _steady(robot: Robot, conditions: Conditions) -> Conditions:
+    """One instant a run, of conditions that may change over time."""
+    return jax.tree.map(lambda x: x if jnp.ndim(x) < 2 else x[:, x.shape[1] // 2], conditions)
+
+
+def _signals(robot: Robot, conditions: Conditions) -> Signals:
+    return jax.vmap(lambda c: operating(robot, c)[0])(conditions)
+
+
+@functools.cache
+def _nominal() -> tuple[Robot, Signals]:
+    """The nominal robot and its signals over Table 8."""
+    robot = params.strong(robots.nominal())
+    axes = np.meshgrid(robots.VOLTAGES_V, robots.SLOPES_DEG, robots.PAYLOADS_KG, (0, 1), indexing="ij")
+    volts, slopes, payloads, which = (a.ravel() for a in axes)
+    return robot, _signals(robot, Conditions(which.astype(int), volts, slopes, payloads))
+
+
+def _size(x: object) -> float:
+    """Root mean square of what is finite and not zero; NaN for nothing."""
+    sizes = np.abs(np.ravel(np.asarray(x, float)))
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+    return float(np.sqrt(np.mean(sizes**2))) if sizes.size else math.nan
+
+
+def _rounded(factor: float) -> float:
+    return STEP ** round(math.log(factor, STEP)) if math.isfinite(factor) and factor > 0 else 1.0
+
+
+def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot, Signals]) -> type[Effect]:
+    """The effect with its priors scaled from one robot to another."""
+    effect = kind()
+    shape, amplitude = shape_of(effect), amplitude_of(effect)
+    stretch = 1.0
+    if shape is not None:
+        with_ = SCALED_WITH.get(shape.spec.unit)
+        if shape.spec.unit == "rad/s":
+            output = kind.balance in AT_THE_OUTPUT
+            with_ = (lambda s: s.speed_wheel) if output else (lambda s: s.speed_motor)
+        if with_ is not None:
+            stretch = _rounded(_size(with_(mine[1])) / _size(with_(theirs[1])))
+    grown = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
+    factor = 1.0
+    if (
+        amplitude.spec.unit == BALANCES[kind.balance][0]
+    ):  # a term of its own size, also where operating points show none
+        whole = WHOLE[kind.balance]
+        factor = _rounded(_size(whole(*mine)) / _size(whole(*theirs)))
+    elif amplitude.spec.unit != "-":
+        factor = _rounded(_unit_share(effect, *theirs) / _unit_share(grown, *mine))
+    if factor == stretch == 1.0:
+        return kind
+    return _scaled(kind, factor, stretch)
+
+
+def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
+    """How much of its balance a term of amplitude one is [1/unit of the amplitude]."""
+    one = params.replace(effect, {amplitude_of(effect).name: jnp.asarray(1.0)})
+    whole = READ[effect.channel] if effect.channel else (lambda s: WHOLE[effect.balance](robot, s))
+    term = jax.vmap(lambda s: jnp.asarray(one.term(robot, s), float))(signals)
+    total = jax.vmap(lambda s: jnp.asarray(whole(s), float))(signals)
+    return _size(term) / _size(total)
+
+
+@functools.cache
+def _scaled(kind: type[Effect], factor: float, stretch: float) -> type[Effect]:
+    """A class of the same effect whose amplitude's prior is `factor` times as wide, and its shape `stretch` times."""
+    effect = kind()
+    fields: dict[str, object] = {amplitude_of(effect).name: _field(amplitude_of(effect), factor)}
+    if (shape := shape_of(effect)) is not None and stretch != 1.0:
+        fields[shape.name] = _field(shape, stretch)
+    body: Mapping[str, object] = {
+        "__annotations__": dict.fromkeys(fields, "Scalar"),
+        "__module__": kind.__module__,
+        "__doc__": kind.__doc__,
+        "name": kind.name,
+        **fields,
+    }
+    return type(kind.__name__, (kind,), dict(body))
+
+
+def _field(parameter: Parameter, factor: float) -> object:
+    spec = parameter.spec
+    low, high = spec.bounds
+    sd = None if spec.sd is None else spec.sd * factor
+    scaled = dataclasses.replace(spec, bounds=(low * factor, high * factor), sd=sd)
+    value = factor * float(parameter.value)
+    return params.parameter(
+        value, unit=scaled.unit, meaning=scaled.meaning, bounds=scaled.bounds, source=scaled.source,
+        relative_sd=scaled.relative_sd, sd=scaled.sd, amplitude=scaled.amplitude,
+    )  # fmt: skip
