@@ -20,13 +20,16 @@ DIFFERS = 0.2
 
 
 def foreign_priors(robot: Robot, stated: Collection[str] = ()) -> list[str]:
-    """A sentence for each part that is not the nominal robot's while friction of it still is.
+    """A sentence for each part that is not the nominal robot's while friction of it still is; none of a rig that starts
+    from nothing.
 
     A configuration is compared with that of the nominal robot whose friction it has.
 
     Args:
         stated: names of parameters whose priors the user states.
     """
+    if robot.rig.blank:  # nothing in it is another robot's
+        return []
     mine, nominal = ({name: float(p.value) for name, p in known(r).items()} for r in (robot, robots.nominal()))
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in robots.nominal().configurations]
