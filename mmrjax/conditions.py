@@ -36,6 +36,7 @@ class Conditions(eqx.Module):
         open: 1 where the motors' circuit is open, so that they coast.
         motor_speed: imposed on the motors' shafts [rad/s], whatever voltage that takes; None: the voltage is imposed.
         motor_acceleration: of an imposed speed [rad/s²]; None: none.
+        begin: which of the beginnings of `Rig.begins` is a history's, its index; None: it starts from rest.
     """
 
     configuration: Int[Array, "..."] | np.ndarray
@@ -51,6 +52,7 @@ class Conditions(eqx.Module):
     open: Float[Array, "..."]
     motor_speed: Float[Array, "..."] | None
     motor_acceleration: Float[Array, "..."] | None
+    begin: Int[Array, "..."] | None
 
     def __init__(
         self,
@@ -67,6 +69,7 @@ class Conditions(eqx.Module):
         open: Number | bool = 0.0,
         motor_speed: Number | None = None,
         motor_acceleration: Number | None = None,
+        begin: Number | None = None,
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
@@ -90,6 +93,7 @@ class Conditions(eqx.Module):
         held = {name: jnp.broadcast_to(x, shape) for name, x in optional.items()}
         self.total_mass, self.motor_speed = held.get("total_mass"), held.get("motor_speed")
         self.motor_acceleration = held.get("motor_acceleration")
+        self.begin = None if begin is None else jnp.broadcast_to(jnp.asarray(begin, int), shape)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from mmrjax import channels
-from mmrjax.params import Scalar, parameter
+from mmrjax.params import Index, Scalar, parameter
 
+#: How histories may begin.
+STARTS = ("rest", "measured", "free")
 #: What may be imposed: the voltage of supply or battery (times the duty), or the speed of the motors' shafts.
 IMPOSED = ("voltage", "motor_speed")
 
@@ -38,6 +42,46 @@ class Instrument:
         return self.quantum**2 / 12
 
 
+class Begin(eqx.Module):
+    """How a run begins that does not begin at rest: its shafts turn, and its load rolls with them."""
+
+    motor_speed: Scalar = parameter(
+        0.0,
+        unit="rad/s",
+        meaning="speed of the motor shafts at the first sample",
+        bounds=(-1e5, 1e5),
+        sd=10.0,
+        source="the first samples of the run",
+    )
+    angle: Scalar = parameter(
+        0.0,
+        unit="rad",
+        meaning="angle of the output at the first sample",
+        bounds=(-1e5, 1e5),
+        sd=0.1,
+        source="the first samples of the run",
+    )
+
+
+class Begins(eqx.Module):
+    """The beginnings of runs by their names, in a fixed order; conditions hold the index of one."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    members: tuple[Begin, ...]
+
+    def __init__(self, by_name: Mapping[str, Begin]) -> None:
+        self.names, self.members = tuple(by_name), tuple(by_name.values())
+
+    def items(self) -> Iterator[tuple[str, Begin]]:
+        """Names with their beginnings, in order."""
+        return zip(self.names, self.members, strict=True)
+
+    def of(self, index: Index) -> Begin:
+        """That of a run by its index; traceable."""
+        stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v, float) for v in x]), *self.members)
+        return jax.tree.map(lambda x: x[jnp.asarray(index)], stacked)
+
+
 class Rig(eqx.Module):
     """How a robot is driven and measured.
 
@@ -48,7 +92,8 @@ class Rig(eqx.Module):
         delay: by which what is imposed acts later than its column says [s].
         columns: of tables: (column as this program calls it, column of the file, factor from its unit).
         priors: (parameter, mean, sd) [SI] that the file states, in place of the parameters' own.
-        start: of histories: `rest`, `measured` (by the first samples) or `free`.
+        start: of histories: `rest`, `measured` (by the first samples) or `free`, which those are the prior of.
+        begins: of histories that do not begin at rest, once their table is known.
         blank: whether it starts from nothing, so that nothing in it is another robot's.
     """
 
@@ -60,6 +105,7 @@ class Rig(eqx.Module):
         sd=0.02,
         source="stated by whoever owns the rig",
     )
+    begins: Begins | None = None
     imposed: str = eqx.field(default=IMPOSED[0], static=True)
     channels: tuple[str, ...] = eqx.field(default=channels.USUAL, static=True)
     instruments: tuple[Instrument, ...] = eqx.field(default=(), static=True)

@@ -259,8 +259,8 @@ def test_histories_that_do_not_start_from_rest_are_refused(clean):
     late = runs.where(runs["time_s"] > 0.3)
     late.columns["time_s"] = late["time_s"] - 0.32
     with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* starts from rest"):
-        Histories.check_start(late, known(late))
-    Histories.check_start(runs, known(runs))
+        Histories.check_start(late, known(late), robots.nominal())
+    Histories.check_start(runs, known(runs), robots.nominal())
 
 
 def test_assumed_noise_of_histories_does_not_vanish_at_the_start(clean):

@@ -16,6 +16,7 @@ from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.inference import noise, observers
 from mmrjax import params
+from mmrjax import robots as mm_robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 
@@ -148,7 +149,11 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         runs = records.read(tmp_path / "runs.csv")
         kind = observers.kind(runs)
         known = noise.of(runs, kind.sizes(runs))
-        assert runs.has("time_s") and kind.check(runs, known) == [] and kind.check_start(runs, known) == []
+        assert (
+            runs.has("time_s")
+            and kind.check(runs, known) == []
+            and kind.check_start(runs, known, mm_robots.nominal()) == []
+        )
         assert len(runs) == made.label["rows"]
         assert np.isnan(runs.measured()).sum() == made.label["missing"]
         assert set(runs["configuration"]) <= set(w.machine.names.values())

@@ -98,7 +98,8 @@ def discover(
             "needed"
         )
     known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
-    notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known)]
+    notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known, robot)]
+    robot = kind.begun(robot, distinct, known)
     notes += own_mass.remarks(robot, distinct)
     foreign = foreign_priors(robot, stated)
     for sentence in foreign:

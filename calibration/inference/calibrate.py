@@ -110,6 +110,8 @@ def calibrate(
     weights = own_mass.remarks(robot, runs)
     robot = own_mass.weighed(robot, runs)
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
+    known = noise_room.of(runs, observe.sizes(runs), noise)
+    robot = observe.begun(robot, runs, known)
     default = priors.default_names(present, robot, computed=facts.computes)
     names = priors.choose(robot, default, free, fix)
     unread = fidelities.unread(model, names)
@@ -122,13 +124,12 @@ def calibrate(
         base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
     coordinates = dataclasses.replace(coordinates, stated=tuple(stated))
-    known = noise_room.of(runs, observe.sizes(runs), noise)
     foreign = foreign_priors(robot, stated)
     for sentence in foreign:
         tell(sentence)
     notes = [*foreign, *checks.check(runs, robot, names, known), *weights, *_of_product(of_product)]
     posed = observers.pose(runs, base, coordinates, known.sd, model)
-    notes += observe.check_start(runs, known)
+    notes += observe.check_start(runs, known, robot)
 
     if population is None:
         population = POPULATION if fidelities.unread("steady", names) else 0

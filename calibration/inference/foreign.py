@@ -20,8 +20,9 @@ DIFFERS = 0.2
 
 
 def foreign_priors(robot: Robot, stated: Collection[str] = ()) -> list[str]:
-    """A sentence for each part that is not the nominal robot's while friction of it still is; none of a rig that starts
-    from nothing.
+    """A sentence for each part that is not the nominal robot's while friction of it still is.
+
+    None of a rig that starts from nothing.
 
     A configuration is compared with that of the nominal robot whose friction it has.
 

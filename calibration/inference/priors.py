@@ -152,7 +152,16 @@ def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequ
     names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
     if GUIDE_SHARE in computed:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
-    return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects))
+    return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *begins(robot))
+
+
+def begins(robot: Robot) -> tuple[str, ...]:
+    """Speeds and angles at which histories begin, where a rig leaves them free."""
+    if robot.rig.begins is None or robot.rig.start != "free":
+        return ()
+    stated = {name for name, _, _ in robot.rig.priors}
+    every = (f"rig.{run}.{field}" for run in robot.rig.begins.names for field in ("motor_speed", "angle"))
+    return tuple(name for name in every if name in stated)
 
 
 #: Freed by the loop beside friction: what benches and makers state, with their tolerances.
@@ -182,7 +191,7 @@ def free_names(
         if c in present
         for name in (*friction(robot, c), *_radius(robot, c), *(f"{c}.{n}" for n in chassis if _has(robot, c, n)))
     ]
-    return (*_not_zero(robot, _drive(robot, (*BENCH, *drive))), *own)
+    return (*_not_zero(robot, _drive(robot, (*BENCH, *drive))), *own, *begins(robot))
 
 
 def _has(robot: Robot, configuration: str, name: str) -> bool:

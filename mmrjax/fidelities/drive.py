@@ -119,6 +119,8 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
         if robot.on_shaft:
             radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
             rest = rest.at[2].set(radius * conditions.motor_speed / units[2])
+    if robot.rig.begins is not None and conditions.begin is not None:
+        rest = rest.at[:4].set(_begun(robot, conditions) / units[:4])
     if not rolling:
         return rest
     settled = operating_signals(robot, conditions)
@@ -126,6 +128,23 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
     y = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
+
+
+def _begun(robot: Robot, conditions: Conditions) -> Array:
+    """Current, motor speed, speed and distance [SI] at the beginning of a history that does not begin at rest.
+
+    The load rolls with the shafts, and the current is that at which the voltage balances: it follows within
+    milliseconds.
+    """
+    assert robot.rig.begins is not None and conditions.begin is not None
+    begin = robot.rig.begins.of(conditions.begin)
+    radius = robot.chassis(conditions.configuration).radius
+    turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
+    rolling = radius * turning / robot.gearbox.ratio
+    left = voltage_at_rest(robot, conditions) - robot.motor.voltage_back(turning)
+    open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
+    current = jnp.where(open_circuit, 0.0, left / robot.motor.resistance)
+    return jnp.stack([jnp.asarray(x, float) for x in (current, turning, rolling, radius * begin.angle)])
 
 
 def drive(

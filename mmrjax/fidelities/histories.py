@@ -136,11 +136,14 @@ def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tup
     robot, conditions, times = primals
     moved = tangents[0]
     stages = states(robot, conditions, times)
+    begin = None
+    if robot.rig.begins is not None:
+        begin = eqx.filter_jvp(lambda r: _at_start(r, conditions), (robot,), (moved,))[1]
 
     def source(_: Array, y: Array, held: Conditions) -> Array:
         return eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
 
-    return stages, respond(robot, conditions, times, stages, source, lambda y, dy, _: dy)
+    return stages, respond(robot, conditions, times, stages, source, lambda y, dy, _: dy, begin)
 
 
 def respond(
@@ -150,6 +153,7 @@ def respond(
     stages: tuple[Array, Array],
     source: Callable[[Array, Array, Conditions], Array],
     seen: Callable[[Array, Array, Conditions], Array],
+    begin: Array | None = None,
 ) -> tuple[Array, Array]:
     """What small changes of the rates do to a run.
 
@@ -157,6 +161,7 @@ def respond(
         conditions, times: as of `histories`; stages: of the run, from `states`.
         source: (time, state, conditions) → change of the rates there, shape (unknowns, ...).
         seen: (state, its change, conditions) → what is kept of the change, of every stage.
+        begin: change of the state at the first instant; None: none.
 
     Returns:
         What is kept of the first and of the second stage of every step; the second is the step's end.
@@ -176,12 +181,13 @@ def respond(
 
     begins, ends = (jax.tree.map(lambda x, s=s: x[s], changing) for s in (slice(-1), slice(1, None)))
     of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
-    still = jnp.zeros_like(source(times[0], stages[0][0], of_first))
+    still = jnp.zeros_like(source(times[0], stages[0][0], of_first)) if begin is None else begin
     return jax.lax.scan(step, still, (times[:-1], jnp.diff(times), *stages, begins, ends))[1]
 
 
 def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> Signals:
-    """Signals of one run from standstill at every instant of a grid; fields have shape (times,).
+    """Signals of one run from standstill (or as `Rig.begins` says) at every instant of a grid; fields have shape
+    (times,).
 
     Args:
         robot: its parameters may be tracers; derivatives by them, and by nothing else, are forward and exact

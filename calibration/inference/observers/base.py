@@ -103,12 +103,17 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def check_start(cls, runs: Runs, noise: Noise) -> list[str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[str]:
         """Refuse runs whose beginning the model cannot follow; return what should be said of their length.
 
         Raises:
             BadData: a run that does not begin as the model does.
         """
+
+    @classmethod
+    def begun(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
+        """`robot` with the beginnings of runs that do not begin at rest; as it is where runs are settled."""
+        return robot
 
     @classmethod
     @abc.abstractmethod

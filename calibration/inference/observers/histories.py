@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import operator
+import re
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
@@ -38,6 +39,7 @@ from mmrjax.effects import Effect
 from mmrjax.fidelities.drive import rates, state_of
 from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, grid, growth, histories, respond, states
 from mmrjax.params import Scalar
+from mmrjax.rig import Begin, Begins
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals
 
@@ -126,6 +128,8 @@ class Histories(Observer):
         run: index of each row's run; instant: of its sample in `times`; shape (rows,).
         rows_of: indices of each run's rows in the order of time, -1 beyond its last, shape (runs, samples).
         knots: rows between which a defect is taken to be linear, a run's last repeated, shape (runs, knots).
+        delayed: whether what is imposed may act later than its column says (`Rig.delay`), so that readings are read
+            that much earlier between the instants.
     """
 
     word: ClassVar[str] = "samples"
@@ -145,6 +149,7 @@ class Histories(Observer):
     instant: Int[Array, " rows"]
     rows_of: Int[Array, "runs samples"]
     knots: Int[Array, "runs knots"]
+    delayed: bool = eqx.field(default=False, static=True)
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -166,7 +171,11 @@ class Histories(Observer):
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         knots = np.stack([_knots(m, most) for m in mine])
         conditions = _in_time(runs.conditions(robot), first, mine, runs["time_s"], times)
-        return cls(conditions, *map(jnp.asarray, (times, run, instant, rows, knots)))
+        if robot.rig.begins is not None:
+            order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
+            conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
+        index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
+        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=robot.rig.blank)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -197,11 +206,21 @@ class Histories(Observer):
         return _stops(runs)
 
     @classmethod
-    def check_start(cls, runs: Runs, noise: Noise) -> list[str]:
+    def begun(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
+        return with_begins(robot, runs, noise)
+
+    @classmethod
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[str]:
         """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
         names, measured = _names(runs), runs.measured()
         # Current rises within a millisecond; what moves does not.
-        moving = [k for k, c in enumerate(channels.CHANNELS) if c.zero_at_rest]
+        resting = robot.rig.start == "rest" and robot.rig.imposed == "voltage"
+        moving = [k for k, c in enumerate(channels.CHANNELS) if c.zero_at_rest and resting]
+        for channel in (c for c in channels.CHANNELS if not c.over_time and runs.has(c.column)):
+            raise BadData(
+                f"{runs.source}, {channel.column}: histories do not follow it; remove the column, or give settled "
+                "runs without time_s"
+            )
         for name in np.unique(names):
             mine = np.flatnonzero(names == name)
             first = mine[np.argmin(runs["time_s"][mine])]
@@ -220,7 +239,7 @@ class Histories(Observer):
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
                         f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
                         "starts from rest when the supply is switched on, at 0 s. Settled travel is one row a run, "
-                        "without time_s"
+                        'without time_s; a rig\'s file may say start = "measured" or "free"'
                     )
         said = []
         step = runs["time_s"].max() / STEPS
@@ -363,6 +382,13 @@ class Histories(Observer):
         if not self.varying:
             return self.conditions
         rows = jax.tree.map(np.asarray, self.of_rows)
+        if rows.motor_speed is not None:
+            speeds = _few(rows.motor_speed)
+            which = np.stack([rows.configuration, speeds, rows.slope_deg, rows.payload], 1)
+            cases = np.unique(which[speeds != 0], axis=0, return_index=True)[1]
+            cases = np.flatnonzero(speeds != 0)[cases] if len(cases) else np.arange(1)
+            steady = dataclasses.replace(rows, motor_speed=speeds, motor_acceleration=np.zeros_like(speeds))
+            return jax.tree.map(lambda x: jnp.asarray(x[cases]), steady)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
         turned = dataclasses.replace(
@@ -377,8 +403,26 @@ class Histories(Observer):
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
         return jax.tree.map(lambda x: jnp.asarray(x[cases]), turned)
 
+    def _delayed(self, robot: Robot, whole: Signals) -> Float[Array, "rows channels"]:
+        """Readings of every row, between the instants before and after it less the delay."""
+        every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(whole)  # runs, instants, channels
+        wanted = self.time - robot.rig.delay
+
+        def between(run: Array, t: Array) -> Array:
+            times = self.times[run]
+            k = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, times.shape[0] - 2)
+            gap = times[k + 1] - times[k]
+            share = jnp.where(gap > 0, (t - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0)
+            return every[run, k] + jnp.clip(share, 0.0, 1.0) * (every[run, k + 1] - every[run, k])
+
+        return jax.vmap(between)(self.run, wanted)
+
     def __call__(self, robot: Robot) -> Observation:
-        reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(self.whole(robot)))
+        whole = self.whole(robot)
+        if self.delayed:
+            reading = self._delayed(robot, whole)
+        else:
+            reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(whole))
         followed = jnp.all(jnp.isfinite(reading), 1)
         status = jnp.where(followed, CONVERGED, FAILED)
         return Observation(reading, jnp.zeros(self.run.shape), status, jnp.zeros_like(status))
@@ -473,6 +517,8 @@ class Histories(Observer):
             ]
             return jax.tree.map(lambda *x: np.concatenate(x), *jax.device_get(parts))
 
+        if problem.base.on_shaft or problem.base.rig.imposed != "voltage":  # no ground whose grip makes for valleys
+            return super().starts(problem, random, count)
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
         return settled_ends.starts(problem, draws, search)[:count]
 
@@ -543,6 +589,8 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
 def _changes(runs: Runs, each: list[np.ndarray]) -> list[np.ndarray]:
     """Instants at which the supply of the motors of each run changes [s]."""
     volts, time = applied(runs), runs["time_s"]
+    if not np.isfinite(volts).all() or not volts.any():
+        return [np.zeros(0)] * len(each)
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
     found = []
     for rows in each:
@@ -572,7 +620,63 @@ def _in_time(
         x = getattr(of_rows, name)
         if x is not None and any(np.ptp(np.asarray(x)[rows]) > 0 for rows in each):
             conditions = eqx.tree_at(operator.attrgetter(name), conditions, x[at])
-    return conditions
+    if of_rows.motor_speed is None:
+        return conditions
+    speed = np.stack(
+        [np.interp(t, time[rows], np.asarray(of_rows.motor_speed)[rows]) for rows, t in zip(each, times, strict=True)]
+    )
+    step = np.diff(times, axis=1)
+    slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
+    slope = np.concatenate([slope, np.zeros((len(slope), 1))], 1)
+    return dataclasses.replace(conditions, motor_speed=jnp.asarray(speed), motor_acceleration=jnp.asarray(slope))
+
+
+def begin_name(run: str) -> str:
+    """What the beginning of a run is called among the parameters of a rig."""
+    return f"begin_{re.sub(r'[^A-Za-z0-9_-]', '_', run)}"
+
+
+#: Samples at the beginning of a run from which its beginning is measured, at most.
+FIRST_SAMPLES = 5
+
+
+def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
+    """`robot` with the beginnings of a table's runs, where its rig says that they do not begin at rest: speed and
+    angle of the first samples, extrapolated to the first; free ones have the error of that as their prior."""
+    if robot.rig.start == "rest" or not runs.sampled:
+        return robot
+    names, measured = _names(runs), runs.measured()
+    ratio, found, known = float(robot.gearbox.ratio), dict[str, Begin](), []
+    radius = np.array([float(c.radius) for c in robot.configurations.members])[runs.configurations(robot)]
+    for name in np.unique(names):
+        mine = np.flatnonzero(names == name)
+        mine = mine[np.argsort(runs["time_s"][mine], kind="stable")]
+        key = begin_name(str(name))
+        per = {"motor_speed": 1.0, "output_speed": ratio, "speed": ratio / radius[mine[0]]}
+        at: dict[str, tuple[float, float]] = {}
+        for field, factors in (("motor_speed", per), ("angle", {"output_angle": 1.0})):
+            for k, channel in enumerate(channels.CHANNELS):
+                there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES] if channel.name in factors else mine[:0]
+                if len(there):
+                    factor = factors[channel.name]
+                    value, sd = _extrapolated(runs["time_s"][there] - runs["time_s"][mine[0]], measured[there, k])
+                    least = float(np.median(noise.sd[there, k]))
+                    at[field] = factor * value, abs(factor) * max(sd, least)
+                    break
+        found[key] = Begin(**{field: value for field, (value, _) in at.items()})
+        known += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in at.items()]
+    priors = (*robot.rig.priors, *known) if robot.rig.start == "free" else robot.rig.priors
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(found), priors=priors))
+
+
+def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
+    """Value at time 0 of a line through samples, and its error; of fewer than three their mean."""
+    if len(time) < 3:
+        return float(np.mean(shown)), 0.0
+    matrix = np.stack([np.ones_like(time), time], 1)
+    line, *_ = np.linalg.lstsq(matrix, shown, rcond=None)
+    scatter = float(np.sum((shown - matrix @ line) ** 2) / (len(time) - 2))
+    return float(line[0]), float(np.sqrt(scatter * np.linalg.inv(matrix.T @ matrix)[0, 0]))
 
 
 def _few(x: np.ndarray) -> np.ndarray:

@@ -109,7 +109,9 @@ class SettledRuns(Observer):
         return []
 
     @classmethod
-    def check_start(cls, runs: Runs, noise: Noise) -> list[str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[str]:
+        for channel in (c for c in channels.CHANNELS if not c.settled and runs.has(c.column)):
+            raise BadData(f"{runs.source}, {channel.column}: settled runs have none; remove the column")
         return []
 
     @classmethod
