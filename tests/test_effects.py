@@ -31,6 +31,8 @@ from mmrjax.fidelities.drive import drive, rates
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Configurations
+from mmrjax.shaft import Shaft
 from mmrjax.signals import CONVERGED, STALLED, Signals, State
 
 # --- units --------------------------------------------------------------------------------------------
@@ -63,6 +65,7 @@ SIGNAL_UNITS = {
     "torque_input torque_gear torque_net",
     "H": "inductance",
     "kg·m^2": "inertia_added",
+    "rad": "angle",
     "-": "duty on_tracks battery slope adhesion order direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
@@ -126,7 +129,11 @@ def random_states(n=400):
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
-    return moving(robots.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge)), memory))
+    return moving(
+        robots.nominal(),
+        run,
+        State(*map(jnp.asarray, (current, motor, speed, charge)), memory, distance=jnp.zeros(n)),
+    )
 
 
 STATES = random_states()
@@ -937,11 +944,42 @@ def test_backdriving_loss_changes_nothing_where_no_load_drives():
     _same(found, plain)
 
 
+def _on_shaft(torque_constant, *present):
+    """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
+    load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
+    robot = robots.blank(Configurations({"bench": load}))
+    robot = params.replace(robot, {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8})
+    runs = Conditions(0, voltage=0.0, motor_speed=[100.0, -100.0, 300.0, -300.0])
+    return np.asarray(steady_batch(with_effects(*present, robot=robot), runs).total_current)
+
+
+def test_new_effects_of_a_load_on_a_shaft_are_torques_at_its_output():
+    """C_m I i = M / η where the motor drives M, η M (1 - a) where it is driven; M = M_c + dry, viscous and added loss."""
+    speed = np.array([100.0, -100.0, 300.0, -300.0])
+    sign, output = np.sign(speed), speed / 20.0
+
+    def current(constant, dry, share=0.0):
+        load = constant + dry + 1e-3 * output
+        return load * np.where(load * sign > 0, 1 / 0.8, 0.8 * (1 - share)) / 20.0 / 0.0259
+
+    for constant in (0.0, 0.3):  # a winch that is let down drives its motor
+        found = _on_shaft(constant, fitted(BY_NAME["directional_friction"], 0.02))
+        np.testing.assert_allclose(found, current(constant, 0.05 * sign + 0.02), rtol=1e-9)
+        found = _on_shaft(constant, fitted(BY_NAME["stribeck_exponent"], 0.1))
+        np.testing.assert_allclose(
+            found, current(constant, (0.05 + 0.1 * np.exp(-((output / 8) ** 2))) * sign), rtol=1e-5
+        )
+        found = _on_shaft(constant, fitted(BY_NAME["backdriving_loss"], 0.3))
+        np.testing.assert_allclose(found, current(constant, 0.05 * sign, 0.3), rtol=1e-9)
+    assert (current(0.3, 0.05 * sign)[1::2] * sign[1::2] < 0).all()
+
+
 # --- what effects declare, so that nobody needs their names ---------------------------------------------
 
 
 def test_library_declares_what_the_loop_asks_for():
     assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
+    assert [e.name for e in ALL if e.needs_reverse] == ["directional_friction"]
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {"thermal_drift": "winding_heating"}
     assert [e.name for e in ALL if e.odd_in_travel] == ["directional_friction", "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {

@@ -232,6 +232,7 @@ class DirectionalFriction(TrackEffect):
 
     driver = "direction"
     odd_in_travel = True
+    needs_reverse = True
 
     amplitude: Scalar = amplitude(
         unit="N·m",
