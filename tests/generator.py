@@ -137,7 +137,7 @@ def _lag(x, x_c):
 COPPER = 0.00393  # [1/K]
 _W_S, _WK_S = {"fade": (150.0, 600.0)}, {"fade": (5.0, 16.0)}
 
-#: Every effect of the library that steady runs can show, by its equation.
+#: Every effect of the library that steady runs forward, up slopes, can show, by its equation.
 LIBRARY: dict[str, Form] = {
     "mass_error": Form("mass_error", "mass", lambda s, q: s.M, 0.03, either=True),
     "mass_offset": Form("mass_offset", "mass", lambda s, q: s.wheeled, 1.0, either=True),
@@ -157,6 +157,7 @@ LIBRARY: dict[str, Form] = {
     "tension_friction": Form("tension_friction", "track", lambda s, q: s.r * abs(s.P), 0.1),
     "centrifugal_tension": Form("centrifugal_tension", "track", lambda s, q: s.M_t0 * (s.r_pulley * s.w_k) ** 2, 0.05),
     "bending_loss": Form("bending_loss", "track", lambda s, q: _lag(s.w_k, q["relaxation"]), 0.05, {"relaxation": (4.0, 16.0)}),
+    "stribeck_exponent": Form("stribeck_exponent", "track", lambda s, q: np.exp(-(np.hypot(s.w_k / q["fade"], 1e-3) ** q["exponent"])), 0.1, _WK_S | {"exponent": (1.5, 2.5)}),
     "speed_rolling": Form("speed_rolling", "ground", lambda s, q: s.N * s.V**2, 0.01),
     "adhesive_drag": Form("adhesive_drag", "ground", lambda s, q: (1 + (s.V / q["peel"]) ** 2) ** 0.3, 0.02, {"peel": (5e-4, 5e-3)}),
     "weight_transfer": Form("weight_transfer", "ground", lambda s, q: s.N * np.tan(s.slope) ** 2, 0.2),
@@ -186,7 +187,7 @@ VARIANTS: dict[str, Form] = {
     "gear_quadratic_loss.power": Form("gear_quadratic_loss", "gearbox", lambda s, q: abs(s.B) ** 1.5, 0.04),
     "stribeck_gear.gauss": Form("stribeck_gear", "gearbox", lambda s, q: np.exp(-((s.w / 600) ** 2)), 0.05),
     "churning.power": Form("churning", "track", lambda s, q: s.w_k**2.5, 1e-4),
-    "stribeck_track.gauss": Form("stribeck_track", "track", lambda s, q: np.exp(-((s.w_k / 14) ** 2)), 0.1),
+    "stribeck_track.lorentz": Form("stribeck_track", "track", lambda s, q: 1 / (1 + (s.w_k / 14) ** 2), 0.1),
     "tension_friction.power": Form("tension_friction", "track", lambda s, q: s.r * abs(s.P) ** 1.3, 0.04),
     "bending_loss.power": Form("bending_loss", "track", lambda s, q: (abs(s.w_k) / 10) ** 0.3, 0.05),
     "speed_rolling.linear": Form("speed_rolling", "ground", lambda s, q: s.N * abs(s.V), 0.01),

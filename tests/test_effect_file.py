@@ -147,6 +147,7 @@ REFUSED = {
         r"needs_battery: its term is 0\.1 on an external supply; expected 0",
     ),
     "odd": (stating("odd_in_travel = None"), r"odd_in_travel: got None; expected a bool"),
+    "reverse": (stating("needs_reverse = 1"), r"needs_reverse: got 1; expected a bool"),
     "movers": (
         stating('movers = "track"'),
         r"movers: got track; did you mean tracks\? allowed: tracks, wheels, or none",

@@ -31,6 +31,8 @@ from mmrjax.fidelities.drive import drive, rates
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.params import Scalar, parameter
+from mmrjax.robot import Configurations
+from mmrjax.shaft import Shaft
 from mmrjax.signals import CONVERGED, STALLED, Signals, State
 
 # --- units --------------------------------------------------------------------------------------------
@@ -63,6 +65,7 @@ SIGNAL_UNITS = {
     "torque_input torque_gear torque_net",
     "H": "inductance",
     "kg·m^2": "inertia_added",
+    "rad": "angle",
     "-": "duty on_tracks battery slope adhesion order direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
@@ -126,7 +129,11 @@ def random_states(n=400):
     configuration, battery = rng.integers(0, 2, (2, n))
     run = Conditions(configuration, voltage, np.degrees(slope), payload, battery, charge, adhesion)
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
-    return moving(robots.nominal(), run, State(*map(jnp.asarray, (current, motor, speed, charge)), memory))
+    return moving(
+        robots.nominal(),
+        run,
+        State(*map(jnp.asarray, (current, motor, speed, charge)), memory, distance=jnp.zeros(n)),
+    )
 
 
 STATES = random_states()
@@ -232,6 +239,7 @@ DRIVERS = {
     "weight": ("normal", "mass"),
     "slope": ("slope",),
     "configuration": ("configuration", "on_tracks"),
+    "direction": ("direction",),
     "angle": (),
 }  # fmt: skip
 #: Of what a term without a driver is the same share everywhere, by its balance or channel; 1: the same everywhere.
@@ -618,9 +626,10 @@ def test_law_rejects_mutant(law, mutant):
 ORDER = """
 mass_error mass_offset rotating_inertia supply_sag battery_sag series_resistance brush_drop winding_heating
 thermal_drift armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
-gear_quadratic_loss stribeck_gear churning stribeck_track tension_friction centrifugal_tension bending_loss stick_slip
-speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip
-speed_slip load_slip pulley_eccentricity vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain
+gear_quadratic_loss stribeck_gear backdriving_loss churning stribeck_track tension_friction centrifugal_tension
+bending_loss stick_slip directional_friction stribeck_exponent speed_rolling adhesive_drag weight_transfer
+sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
+vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain
 """.split()  # noqa: SIM905
 MODULES = [m.name for m in pkgutil.iter_modules(effects.__path__, "mmrjax.effects.")]
 
@@ -650,19 +659,20 @@ def test_name_follows_from_the_class_unless_stated():
 FIRST = """
 import importlib, sys
 import diffrax, equinox, jax, optimistix
-for name in sys.argv[1:]:
+count, *names = sys.argv[1:]
+for name in names:
     for known in [n for n in sys.modules if n.partition(".")[0] == "mmrjax"]:
         del sys.modules[known]
     importlib.import_module(name)
     from mmrjax.effects import ALL
-    assert len(ALL) == 40
+    assert len(ALL) == int(count)
 """
 
 
 @pytest.mark.slow
 def test_every_file_of_effects_can_be_imported_first():
     first = ["mmrjax.robot", "mmrjax.balances", "mmrjax.effects", *MODULES]
-    done = subprocess.run([sys.executable, "-c", FIRST, *first], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", FIRST, str(len(ALL)), *first], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -831,13 +841,147 @@ def test_rolling_radius_changes_the_distance_and_no_torque():
     np.testing.assert_allclose(gained, 0.03 * np.asarray(without.theoretical_speed), rtol=1e-9)
 
 
+def _term(name, at=STATES, **values):
+    """The term of an effect in each of the states, plainly from its fields."""
+    return terms(params.replace(BY_NAME[name](), {k: jnp.asarray(float(v)) for k, v in values.items()}), signals=at)
+
+
+def _travel(voltage, slope_deg=0.0, changes=None, gearbox=None, **amplitudes):
+    """Steady travel of both configurations under each voltage and slope, effects by their amplitudes."""
+    robot = params.replace(robots.nominal(), changes or {})
+    robot = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, **(gearbox or {})))
+    present = tuple(fitted(BY_NAME[name], value) for name, value in amplitudes.items())
+    voltage, slope, configuration = (x.ravel() for x in np.meshgrid(voltage, slope_deg, [0, 1], indexing="ij"))
+    runs = Conditions(configuration, voltage, slope)
+    return runs, steady_batch(with_effects(*present, robot=robot), runs)
+
+
+def test_directional_friction_is_dry_loss_with_a_size_for_each_direction():
+    def with_loss(change, voltage):
+        loss = {f"{c}.track.loss_coulomb": m + change for c, m in (("6T2A", 0.350), ("4W2T", 0.070))}
+        return _travel([voltage], changes=loss)[1]
+
+    for voltage, change in ((24.0, 0.03), (-24.0, -0.03)):
+        _, found = _travel([voltage], directional_friction=0.03)
+        assert (np.sign(found.motor_speed) == np.sign(voltage)).all()
+        _same(found, with_loss(change, voltage))
+        assert (np.abs(found.total_current - with_loss(0.0, voltage).total_current) > 0.01).all()
+
+
+def test_directional_friction_fades_at_rest_and_does_not_turn_round():
+    turning = np.asarray(STATES.direction)
+    np.testing.assert_allclose(_term("directional_friction", amplitude=0.2), 0.2 * turning**2, rtol=1e-12)
+    assert (turning > 0.99).any() and (turning < -0.99).any() and (np.abs(turning) < 0.5).any()
+
+
+def test_backdriving_loss_is_a_share_of_a_load_that_drives():
+    """Against the load of each state, and steady travel: (C_m I - losses) i = η_b (1 - a) M_load down, M_load / η up."""
+    load = np.asarray(STATES.torque_track_loss) + np.where(STATES.configuration == 0, 0.24 / (2 * np.pi), 0.05) * (
+        np.asarray(STATES.traction)
+    )
+    turning = np.asarray(STATES.direction)
+    driven = load * turning < 0
+    assert 40 < driven.sum() < 360
+    expected = np.where(driven, 0.2 * np.abs(load) * np.abs(turning) * turning, 0.0)
+    np.testing.assert_allclose(_term("backdriving_loss", amplitude=0.2), expected, rtol=1e-12, atol=1e-15)
+
+    runs, found = _travel([24.0, -24.0], [-20.0, -10.0, 0.0, 10.0, 20.0], {f"{c}.{k}": v for c in ("6T2A", "4W2T")
+                          for k, v in (("ground.friction.static", 0.9), ("ground.friction.dynamic", 0.7))},
+                          backdriving_loss=0.2)  # fmt: skip
+    speed, sign, wheeled = np.asarray(found.motor_speed), np.sign(runs.voltage), np.asarray(runs.configuration) == 1
+    weight = np.where(wheeled, 11.5, 13.1) * 9.80665 / 2
+    slope = np.radians(runs.slope_deg)
+    pull = weight * (np.sin(slope) + sign * np.where(wheeled, 0.03, 0.06) * np.cos(slope))
+    guide = sign * np.where(wheeled, 0.0, 0.2 * 0.3) * weight * np.cos(slope)
+    radius = np.where(wheeled, 0.05, 0.24 / (2 * np.pi))
+    load = (
+        sign * np.where(wheeled, 0.07, 0.35) + np.where(wheeled, 0.003, 0.016) * speed / 48 + radius * (pull + guide)
+    )
+    motor = 0.0259 * np.asarray(found.total_current) / 2 - sign * 3e-3 - (5.5e-7 + 1.4e-6) * speed
+    driven = load * sign < 0
+    assert 4 <= driven.sum() <= 16 and np.isfinite(speed).all()
+    np.testing.assert_allclose(48 * motor, load * np.where(driven, 0.74 * (1 - 0.2), 1 / 0.74), rtol=1e-6)
+
+
+def test_backdriving_loss_can_be_the_theory_of_the_mesh():
+    down = dict(voltage=[24.0], slope_deg=[-20.0, -10.0], changes={"4W2T.ground.friction.static": 0.9})
+    _, stated = _travel(**down, backdriving_loss=1 - (2 - 1 / 0.74) / 0.74)
+    _, theory = _travel(**down, gearbox={"mesh_theory": True})
+    _same(jax.tree.map(lambda x: x[1::2], stated), jax.tree.map(lambda x: x[1::2], theory))  # on wheels
+    _, without = _travel(**down)
+    assert (np.asarray(without.total_current) < np.asarray(stated.total_current) - 1e-3)[1::2].all()
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.0, 2.0])
+def test_stribeck_exponent_is_its_formula(exponent):
+    speed, sign = np.asarray(STATES.speed_wheel), np.asarray(STATES.direction)
+    expected = 0.1 * np.exp(-((np.abs(speed) / 5.0) ** exponent)) * sign
+    found = _term("stribeck_exponent", amplitude=0.1, speed_fade=5.0, exponent=exponent)
+    np.testing.assert_allclose(found[40:], expected[40:], rtol=1e-3 if exponent < 1 else 1e-4)
+    if exponent == 1:
+        np.testing.assert_allclose(found, _term("stribeck_track", amplitude=0.1, speed_fade=5.0), atol=1e-4)
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5, 4.0])
+def test_stribeck_exponent_has_finite_derivatives_through_rest(exponent):
+    def term(speed, fade, power):
+        effect = params.replace(BY_NAME["stribeck_exponent"](), {"speed_fade": fade, "exponent": power})
+        effect = params.replace(effect, {"amplitude": jnp.asarray(1.0)})
+        return effect.term(robots.nominal(), Signals(speed_wheel=speed, direction=jnp.asarray(1.0)))
+
+    slopes = jax.vmap(jax.grad(term, (0, 1, 2)), (0, None, None))
+    speeds = jnp.asarray([-1e-3, -1e-12, 0.0, 1e-12, 1e-3, 1.0, 30.0])
+    found = np.stack(slopes(speeds, jnp.asarray(8.0), jnp.asarray(exponent)))
+    assert np.isfinite(found).all() and np.abs(found).max() < 20
+    step = 1e-6
+    at = [term(jnp.asarray(1.0 + s), jnp.asarray(8.0), jnp.asarray(exponent)) for s in (-step, step)]
+    np.testing.assert_allclose(found[0, 5], (at[1] - at[0]) / (2 * step), rtol=1e-6)
+
+
+def test_backdriving_loss_changes_nothing_where_no_load_drives():
+    _, plain = _travel([15.0, 33.0], [0.0, 5.0])
+    _, found = _travel([15.0, 33.0], [0.0, 5.0], backdriving_loss=0.5)
+    _same(found, plain)
+
+
+def _on_shaft(torque_constant, *present):
+    """A winch or a bench of one drive with losses, the motor's speed imposed forward and backward."""
+    load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3, torque_constant=torque_constant)
+    robot = robots.blank(Configurations({"bench": load}))
+    robot = params.replace(robot, {"gearbox.ratio": 20.0, "gearbox.efficiency_load": 0.8})
+    runs = Conditions(0, voltage=0.0, motor_speed=[100.0, -100.0, 300.0, -300.0])
+    return np.asarray(steady_batch(with_effects(*present, robot=robot), runs).total_current)
+
+
+def test_new_effects_of_a_load_on_a_shaft_are_torques_at_its_output():
+    """C_m I i = M / η where the motor drives M, η M (1 - a) where it is driven; M = M_c + dry, viscous and added loss."""
+    speed = np.array([100.0, -100.0, 300.0, -300.0])
+    sign, output = np.sign(speed), speed / 20.0
+
+    def current(constant, dry, share=0.0):
+        load = constant + dry + 1e-3 * output
+        return load * np.where(load * sign > 0, 1 / 0.8, 0.8 * (1 - share)) / 20.0 / 0.0259
+
+    for constant in (0.0, 0.3):  # a winch that is let down drives its motor
+        found = _on_shaft(constant, fitted(BY_NAME["directional_friction"], 0.02))
+        np.testing.assert_allclose(found, current(constant, 0.05 * sign + 0.02), rtol=1e-9)
+        found = _on_shaft(constant, fitted(BY_NAME["stribeck_exponent"], 0.1))
+        np.testing.assert_allclose(
+            found, current(constant, (0.05 + 0.1 * np.exp(-((output / 8) ** 2))) * sign), rtol=1e-5
+        )
+        found = _on_shaft(constant, fitted(BY_NAME["backdriving_loss"], 0.3))
+        np.testing.assert_allclose(found, current(constant, 0.05 * sign, 0.3), rtol=1e-9)
+    assert (current(0.3, 0.05 * sign)[1::2] * sign[1::2] < 0).all()
+
+
 # --- what effects declare, so that nobody needs their names ---------------------------------------------
 
 
 def test_library_declares_what_the_loop_asks_for():
     assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
+    assert [e.name for e in ALL if e.needs_reverse] == ["directional_friction"]
     assert {e.name: e.settles_to for e in ALL if e.settles_to} == {"thermal_drift": "winding_heating"}
-    assert [e.name for e in ALL if e.odd_in_travel] == ["slope_bias"]
+    assert [e.name for e in ALL if e.odd_in_travel] == ["directional_friction", "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {
         "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",
     }  # fmt: skip

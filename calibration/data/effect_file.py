@@ -35,6 +35,7 @@ _STATED = {
     "transient": bool,
     "settles_to": str,
     "needs_battery": bool,
+    "needs_reverse": bool,
     "odd_in_travel": bool,
     "movers": str,
     "memory_unit": str,

@@ -54,6 +54,8 @@ from mmrjax.robot import Robot
 FACTORS = (0.5, 2.0)
 #: Times that rows are looked through for such as stand alone, with what was found.
 SCREENINGS = 4
+#: Share of the largest speed or voltage that is no noise about rest [-].
+EITHER_WAY = 0.05
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
 
@@ -325,18 +327,36 @@ def pose(
     names = priors.free_names(robot, runs["configuration"], *kind.free())
     coordinates = priors.coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose(runs.where(index), robot, coordinates, sd[index])
-    space = candidate_space(bare, visible(library, robot, kind), library, settings.slots, settings.width)
+    shown = visible(library, robot, kind, both_ways(runs))
+    space = candidate_space(bare, shown, library, settings.slots, settings.width)
     return space.without(~real)
 
 
-def visible(library: Library, robot: Robot, kind: type[observers.Observer]) -> tuple[Effect, ...]:
-    """The effects of a library that such data can show and the robot does not have yet."""
+def visible(
+    library: Library, robot: Robot, kind: type[observers.Observer], either_way: bool = True
+) -> tuple[Effect, ...]:
+    """The effects of a library that such data can show and the robot does not have yet.
+
+    Args:
+        either_way: whether the runs go both ways, see `both_ways`.
+    """
     have = {e.name for e in robot.effects}
     return tuple(
         effect()
         for name, effect in library.items()
-        if name not in have and kind.shows(effect) and scales.present(effect, robot)
+        if name not in have
+        and kind.shows(effect)
+        and scales.present(effect, robot)
+        and (either_way or not effect.needs_reverse)
     )
+
+
+def both_ways(runs: Runs) -> bool:
+    """Whether runs go forward as well as backward, by any speed that they state or by what drives them."""
+    moved = [c.column for c in channels.known() if c.zero_at_rest]
+    columns = [runs[name] for name in (*moved, "supply_voltage_V", "duty") if runs.has(name)]
+    found = [x[np.isfinite(x)] for x in columns]
+    return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in found if x.size)
 
 
 def padded(rows: int, sizes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -493,6 +513,7 @@ def finished(
         next_experiment=findings.next_experiment(_proposal(space, traced, settings)),
         cannot_see=findings.invisible(space, left.scores, settings),
         needs_histories=_needs_histories(library, type(observe)),
+        needs_reverse=_needs_reverse(library, runs),
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
@@ -544,6 +565,11 @@ def _proposal(space: CandidateSpace, traced: Traced, settings: Settings) -> Prop
 def _needs_histories(library: Library, kind: type[observers.Observer]) -> tuple[str, ...]:
     """Effects of the library that data of this kind cannot show at all, and a history could."""
     return tuple(sorted(name for name, e in library.items() if e.transient and not kind.shows(e)))
+
+
+def _needs_reverse(library: Library, runs: Runs) -> tuple[str, ...]:
+    """Effects of the library that these runs cannot show since they all go one way."""
+    return tuple(sorted(name for name, e in library.items() if e.needs_reverse and not both_ways(runs)))
 
 
 def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str, dict[str, object]]:

@@ -403,7 +403,8 @@ class DiscoveryResult:
         included: whether a row counts; outliers, unusable: numbers of rows set aside.
         effects: found; unnamed: the discrepancy of that verdict; remains: what the effects leave.
         next_experiment: what would tell more; None where nothing is left to tell apart.
-        cannot_see: effects that the data cannot show; needs_histories: that only histories can.
+        cannot_see: effects that the data cannot show; needs_histories: that only histories can; needs_reverse: that
+            only runs both ways can.
         alternatives, implausible: candidates nearly as good; such that would be but for their size or sign.
         hidden: effects that what was found could hide, the largest first.
         standing: why names do not stand, or beside what they do; "" where there is nothing to say.
@@ -443,6 +444,7 @@ class DiscoveryResult:
     next_experiment: NextExperiment | None
     cannot_see: tuple[str, ...]
     needs_histories: tuple[str, ...]
+    needs_reverse: tuple[str, ...]
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
     hidden: tuple[HiddenEffect, ...]
@@ -493,6 +495,7 @@ class DiscoveryResult:
             "remains": None if self.remains is None else dataclasses.asdict(self.remains),
             "cannot_see": list(self.cannot_see),
             "needs_series": list(self.needs_histories),
+            "needs_reverse": list(self.needs_reverse),
             **self.detail.to_json(),
             "alternatives": [dataclasses.asdict(a) for a in self.alternatives],
             "implausible": [dataclasses.asdict(a) for a in self.implausible],

@@ -47,9 +47,9 @@ class Effect(eqx.Module):
         balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has; has no default. A
             positive term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
             `inertia` and `inductance` it adds, and in `sensor` it adds to the reading of `channel`.
-        driver: what its term changes with, besides the direction: `speed`, `current`, `load`, ... Effects of one
-            equation with one driver are a family: the forms of a law that data may not tell apart. Empty where it
-            is the same share everywhere.
+        driver: what its term changes with: `speed`, `current`, `load`, ...; `direction` if with that alone. Effects
+            of one equation with one driver are a family: the forms of a law that data may not tell apart. Empty where
+            it is the same share everywhere.
         rests_on: dotted names of parameters of the robot in proportion to which its term is, for whoever finds its
             amplitude too large.
         dissipative: whether a positive amplitude may only take power out.
@@ -58,8 +58,10 @@ class Effect(eqx.Module):
         settles_to: name of the effect from which settled travel cannot tell it, so that only histories can.
         needs_battery: whether it acts with the on-board battery alone, so that no run on an external supply
             shows it.
+        needs_reverse: whether runs one way alone cannot tell it from a parameter of the robot, so that no such table
+            shows it.
         odd_in_travel: whether it keeps its sign in space and not in the frame of travel, as a wrong slope does:
-            a robot that is turned about, so that its travel is forward again, meets minus its amplitude.
+            a robot that travels backward, looked at so that its travel is forward again, meets minus its amplitude.
         resolved: whether the track model has by itself what it stands for.
         movers: `tracks` or `wheels` where it acts on configurations of that kind alone.
         needs_belt: whether it is of a belt, which no load on a shaft has.
@@ -81,6 +83,7 @@ class Effect(eqx.Module):
     transient: ClassVar[bool] = False
     settles_to: ClassVar[str] = ""
     needs_battery: ClassVar[bool] = False
+    needs_reverse: ClassVar[bool] = False
     odd_in_travel: ClassVar[bool] = False
     resolved: ClassVar[bool] = False
     movers: ClassVar[str] = ""

@@ -102,3 +102,31 @@ class StribeckGear(GearboxEffect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * jnp.exp(-jnp.abs(signals.speed_motor) / self.speed_fade) * signals.direction
+
+
+class BackdrivingLoss(GearboxEffect):
+    """ΔM_r = a |M_load| where the load drives the motor, 0 where the motor drives the load.
+
+    Teeth lose more of the load, or less, while power flows back through them, as down a slope.
+
+    Source: Duclusaud, Passault, Padois and Ly, Extended friction models for the physics simulation of servo
+    actuators (2024, arXiv:2410.08650), whose directional models give motor and load a share of friction each;
+    Niemann and Winter, Maschinenelemente II (2003): the efficiency backward 2 - 1/η is below η. Of the load's
+    torque a share 1 - a gets to the gear, and of that eq. (19)'s η_b to the motor; at a = 1 the gear locks itself.
+    The load that it goes by is without the rotor's inertia; it fades at rest with the shaft's smooth sign.
+    """
+
+    driver = "load"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="share of the load's torque lost beyond eq. (19) while the load drives",
+        bounds=(-0.2, 1.0),
+        sd=0.1,
+        source="η - (2 - 1/η) = 0.09 for η_rm of Table 2",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        driving = jnp.maximum(-torque_output(robot, signals) * signals.direction, 0.0)
+        return self.amplitude * driving * signals.direction

@@ -1,0 +1,98 @@
+"""What shows only where a robot goes both ways, or where its load drives it, through the stages of the loop."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from synthetic import Analyst
+
+from calibration.data.runs import Runs, read
+from calibration.discovery import discover
+from calibration.discovery.settings import settings_for
+from calibration.inference.observers import Histories, SettledRuns
+from mmrjax import channels, params, robots
+from mmrjax.conditions import Conditions
+from mmrjax.effects import BY_NAME
+from mmrjax.fidelities.steady import steady_batch
+
+FORWARD, EITHER = (15.0, 20.0, 27.0, 33.0), (15.0, 33.0, -15.0, -33.0)
+CLIMBING = {f"{c}.ground.friction.{k}": v for c in ("6T2A", "4W2T") for k, v in (("static", 0.9), ("dynamic", 0.7))}
+SEARCHED = ("directional_friction", "backdriving_loss", "churning", "tension_friction", "slope_bias")
+ANALYST = Analyst(
+    dataclasses.replace(settings_for(SettledRuns, 192), slots=1),
+    {name: BY_NAME[name] for name in SEARCHED},
+    {f"{c}.ground.friction.static": (0.9, 0.1) for c in ("6T2A", "4W2T")},
+)
+
+
+def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
+    """80 noisy runs up and down slopes with one effect."""
+    wheeled, slope, payload, voltage = (
+        x.ravel() for x in np.meshgrid([0, 1], [0.0, 5.0, 10.0, 20.0, -10.0], [0.0, 5.0], voltages, indexing="ij")
+    )
+    slope = slope * np.sign(voltage)
+    effect = params.replace(BY_NAME[name](), {"amplitude": amplitude})
+    robot = dataclasses.replace(params.replace(robots.nominal(), CLIMBING), effects=(effect,))
+    shown = steady_batch(robot, Conditions(wheeled, voltage, slope, payload)).reading
+    columns = {
+        "configuration": np.where(wheeled == 1, "4W2T", "6T2A"),
+        "slope_deg": slope,
+        "payload_kg": payload,
+        "supply_voltage_V": voltage,
+    }
+    rng = np.random.default_rng(1)
+    for channel in channels.CHANNELS:
+        reading = np.asarray(shown[channel.name]) / channel.factor
+        sd = channel.sd_share * np.maximum(np.abs(reading), 0.2 * np.abs(reading).max())
+        columns |= {channel.column: reading + sd * rng.normal(size=sd.size), channel.sd_column: sd}
+    return Runs("synthetic", columns)
+
+
+def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
+    measured = read("measured")
+    assert not discover.both_ways(measured)
+    columns, rows = dict(measured.columns), len(measured)
+    speeds = [c.column for c in channels.CHANNELS if c.zero_at_rest]
+
+    def changed(**values):
+        return dataclasses.replace(measured, columns={**columns, **values})
+
+    turned = np.where(np.arange(rows) == 3, -1.0, 1.0)
+    for name in ("supply_voltage_V", *speeds):
+        assert discover.both_ways(changed(**{name: columns[name] * turned}))
+        assert not discover.both_ways(changed(**{name: np.full(rows, np.nan)}))
+    noise = np.where(turned < 0, -0.01, 1.0) * np.nanmax(columns[speeds[0]])  # about rest
+    assert not discover.both_ways(changed(**{speeds[0]: noise}))
+
+
+@pytest.mark.parametrize("kind", [SettledRuns, Histories])
+def test_what_needs_runs_both_ways_is_looked_for_in_such_alone(kind):
+    names = [{e.name for e in discover.visible(BY_NAME, robots.nominal(), kind, way)} for way in (True, False)]
+    assert names[0] - names[1] == {"directional_friction"} and names[1] < names[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "amplitude", "voltages"),
+    [("directional_friction", 0.06, EITHER), ("backdriving_loss", 0.3, FORWARD)],
+)
+def test_loop_names_it(name, amplitude, voltages):
+    traced = ANALYST.trace(table(name, amplitude, voltages))
+    assert traced.verdict == "named" and traced.members == ((name,),)
+    assert traced.best.amplitude[0] * _sd(name) == pytest.approx(amplitude, rel=0.2)
+
+
+@pytest.mark.slow
+def test_loop_takes_friction_of_one_direction_for_dry_friction():
+    runs = table("directional_friction", 0.06, FORWARD)
+    found = ANALYST.discover(runs)
+    assert found.verdict == "none" and found.needs_reverse == ("directional_friction",)
+    shift = found.base_shift["6T2A.track.loss_coulomb"]
+    assert 0.350 + 0.02 < shift.after < 0.350 + 0.08  # beside its prior, and what else resists
+    assert "directional_friction" not in {s.name for s in found.scores}
+
+
+def _sd(name: str) -> float:
+    return next(p for p in params.walk(BY_NAME[name]()) if p.spec.amplitude).spec.prior_sd(0.0)
