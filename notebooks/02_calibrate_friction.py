@@ -70,7 +70,8 @@ found = calibration.calibrate(runs, base)
 print(found.starts.statement(), f"({found.starts.infeasible} began where a row slides)")
 for name, p in found.parameters.items():
     low, high = p.interval
-    print(f"{name:<40}{p.value:>9.4g}  [{low:.3g}, {high:.3g}]  {p.shift:+.1f} sd, held by the {p.held_by}")
+    held = ", held by its prior" if p.held_by_prior else ""
+    print(f"{name:<40}{p.value:>9.4g}  [{low:.3g}, {high:.3g}]  {p.shift:+.1f} sd{held}")
 
 # %%
 from sweeps import figures_calibration, figures_comparison

@@ -27,7 +27,7 @@ def parameters(found: CalibrationResult) -> Figure:
     axes.axvspan(-Z95, Z95, color="#eeeeee", lw=0, zorder=0)
     axes.axvline(0, color=FAINT, lw=0.9)
     for row, p in enumerate(found.parameters.values()):
-        colour = FAINT if p.held_by == "prior" else BLUE
+        colour = FAINT if p.held_by_prior else BLUE
         axes.plot(p.interval_shift, [row, row], color=colour, lw=2.4, solid_capstyle="butt")
         axes.plot(p.shift, row, "o", color=colour, ms=6)
         words = f"{p.value:.3g} {p.unit}".removesuffix(" -")
@@ -36,7 +36,7 @@ def parameters(found: CalibrationResult) -> Figure:
     axes.set(xlabel="shift from the prior [prior sds]")
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set_title("blue: the data say more; grey: the prior says more; band: the prior's 95 %")
+    axes.set_title("grey: held by its prior; band: the prior's 95 %")
     return fig
 
 

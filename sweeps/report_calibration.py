@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
-from sweeps import figures_calibration, figures_comparison
+from sweeps import figures_calibration, figures_clusters, figures_comparison
 from sweeps.report import Album, columns, first_rows, render, words_shown
 
 
@@ -29,6 +30,8 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         album.add("histories", lambda: figures_calibration.histories(table))
     album.add("parity", lambda: figures_comparison.parity(table))
     album.add("residuals", lambda: figures_comparison.errors_over(table))
+    if found.residual_clusters:
+        album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
     if found.profiled:
         album.add("profiles", lambda: figures_calibration.profiles(found))
     album.add("correlations", lambda: figures_calibration.correlations(found))
@@ -40,5 +43,6 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         document=found.to_json(),
         rows=first_rows(table),
         columns=columns(),
+        held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

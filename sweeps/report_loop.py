@@ -8,7 +8,7 @@ from pathlib import Path
 from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from sweeps import figures_loop
+from sweeps import figures_clusters, figures_loop
 from sweeps.report import Album, columns, first_rows, render, words_shown
 
 Section = Callable[[Album, DiscoveryResult], None]
@@ -50,6 +50,8 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
     """
     album = Album(Path(folder))
     SECTIONS[type(found.detail)](album, found)
+    if found.residual_clusters:
+        album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
     album.add("errors", lambda: figures_loop.errors(found))
     if found.unnamed is not None:
         curve = found.unnamed

@@ -119,7 +119,7 @@ def test_saved_result_has_a_robot_that_reaches_every_row(found, measured, tmp_pa
 def test_result_is_by_name_and_says_all_of_a_parameter(found):
     p = found.parameters["6T2A.ground.friction.static"]
     assert p.interval[0] < p.value < p.interval[1] and p.interval_shift[0] < p.shift < p.interval_shift[1]
-    assert p.unit == "-" and p.held_by in ("data", "prior") and p.prior.family == "log-normal"
+    assert p.unit == "-" and p.held_by_prior in (True, False) and p.prior.family == "log-normal"
     assert p.profile.rise.min() == 0.0 and p.profile.value[p.profile.rise.argmin()] == pytest.approx(p.value)
     assert found.tied["6T2A.ground.friction.dynamic"].leader == "6T2A.ground.friction.static"
     assert found.main_blocks is found.held_out["slope"]
@@ -250,7 +250,7 @@ def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
     assert "motor.inductance: nothing in these data measures it" in said and "start-up current" in said
     assert "6T2A.mass: nothing in these data measures it" in said and "a scale" in said
     entry = made.parameters["motor.inductance"]
-    assert entry.held_by == "prior" and not entry.measured_by_data
+    assert entry.held_by_prior and not entry.measured_by_data
     assert entry.variance_ratio == pytest.approx(1.0)
 
 

@@ -18,6 +18,7 @@ from calibration.data.writing import finite
 from calibration.discovery import findings
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.result import Estimate, HiddenEffect, Resolved
+from calibration.inference.identifiability import HELD
 from sweeps import loop as room
 from sweeps import report_loop
 
@@ -188,6 +189,24 @@ def test_names_say_what_would_explain_more_than_they():
     )
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, name):
+    seen = shown(name, capsys)
+    made, sd = seen.found, np.sqrt(np.diag(seen.found.posterior.covariance))  # of coordinates whose prior sd is 1
+    of_posterior = {n for n, x in zip(made.posterior.coordinates, sd, strict=True) if x > HELD}
+    assert set(made.held_by_prior) == {n for n in of_posterior if not n.startswith("effects.unnamed")} != set()
+    held = {n for n, p in seen.document["base_shift"].items() if p["held_by_prior"]}
+    assert held == {n for n in made.held_by_prior if n in made.base_shift}
+    assert all("held_by_prior" in p for e in seen.document["effects"] for p in e["parameters"].values())
+    (note,) = [n for n in made.notes if n.startswith("held by ")]
+    assert tuple(note.split("): ")[1].split(", ")) == made.held_by_prior
+    assert " ".join(note.split()) in seen.printed
+    head, *rows = seen.page.tables["base"]
+    assert {row[0] for row in rows if row[head.index("held by its prior")] == "yes"} == held
+    made.save(tmp_path)
+    assert note in (tmp_path / "robot.toml").read_text("utf-8")
+
+
 @pytest.mark.parametrize(
     ("p", "outside", "settled", "says"),
     [
@@ -201,8 +220,10 @@ def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside,
     found = shown("leads", capsys).found
     resolved = Resolved(
         asked="what is missing in the balance slip over slope", rows=10, robot=found.robot,
-        constants={"running_gear.guide_recess": Estimate(3.1e-4, 4e-5, "m"), "x.static": Estimate(0.58, 0.02, "-")},
-        known_from_rows=("running_gear.guide_recess",), alike=(("a", "b", -0.95),),
+        constants={
+            "running_gear.guide_recess": Estimate(3.1e-4, 4e-5, "m", False), "x.static": Estimate(0.58, 0.02, "-", True)
+        },
+        alike=(("a", "b", -0.95),),
         outside=outside, settled=settled, fall=61.0, p=p,
         chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)}, slip_rms=(3.3, 0.6), notes=("said too",),
     )  # fmt: skip
@@ -216,7 +237,7 @@ def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside,
     page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
     assert says in page.text and "slip of the 10 rows on tracks 3.3 → 0.6 points rms" in page.text
     assert page.tables["resolved_constants"][1][0] == "running_gear.guide_recess"
-    assert [row[-1] for row in page.tables["resolved_constants"][1:]] == ["the rows", "its prior"]
+    assert [row[-1] for row in page.tables["resolved_constants"][1:]] == ["no", "yes"]
     capsys.readouterr()
     room.print_discovery(found)
     assert says in " ".join(capsys.readouterr().out.split())

@@ -7,6 +7,7 @@ import dataclasses
 import difflib
 import hashlib
 import math
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,14 +77,17 @@ class Runs:
         source: where it came from, for messages.
         columns: name → array of shape (rows,); numbers in the unit of the name, words as str; NaN for a reading
             that is missing.
-        unknown: columns of the file that this program does not know, kept out.
+        unknown: columns of the file that this program does not know.
         digest: SHA-256 of the file, empty for a table that came from none.
+        extras: cells of `unknown` columns, shape (rows,): numbers, NaN where empty, or words; not in `columns`, as
+            they have no role, and looked at only for what residuals go with.
     """
 
     source: str
     columns: dict[str, np.ndarray]
     unknown: tuple[str, ...] = ()
     digest: str = ""
+    extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.columns["configuration"])
@@ -102,7 +106,8 @@ class Runs:
 
     def where(self, rows: np.ndarray) -> Runs:
         """The rows that a mask or an index selects."""
-        return dataclasses.replace(self, columns={k: v[rows] for k, v in self.columns.items()})
+        columns, extras = ({k: v[rows] for k, v in of.items()} for of in (self.columns, self.extras))
+        return dataclasses.replace(self, columns=columns, extras=extras)
 
     def measured(self) -> np.ndarray:
         """Measured readings [SI], NaN where one is missing, shape (rows, channels)."""
@@ -243,7 +248,16 @@ def _read(path: Path, name: str, measured: bool, battery: bool) -> Runs:
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c in header if c not in known_columns())
-    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest())
+    extras = {c: _extra([row[header.index(c)].strip() for row in rows[1:]]) for c in unknown}
+    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras)
+
+
+def _extra(cells: list[str]) -> np.ndarray:
+    """A column without a role: numbers where every cell that is not empty is one, else words."""
+    try:
+        return np.array([float(cell) if cell else math.nan for cell in cells])
+    except ValueError:
+        return np.array(cells)
 
 
 def _refuse_stated(name: str, voltages: list[str]) -> None:

@@ -43,9 +43,12 @@ from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
 from calibration.inference.bases import Bases, in_words
 from calibration.inference.foreign import foreign_priors
+from calibration.inference.identifiability import said_held
 from calibration.inference.lack_of_fit import Residuals
+from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
+from calibration.inference.residual_clusters import residual_clusters
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
@@ -519,6 +522,7 @@ def finished(
         hidden=concealed,
         standing="" if traced.standing is None else traced.standing.reason,
         cluster=screened.cluster,
+        residual_clusters=residual_clusters(_residuals(space, runs, ends.linear, seen.after, z), settings.seed),
         before=findings.evidence(left.test, adequate=not left.test.rejected),
         after=findings.evidence(ends.test, adequate=not ends.test.rejected_with_margin),
         chi2=(2 * base.cost, 2 * cost),
@@ -545,14 +549,25 @@ def finished(
 
 def residuals_of(screened: Screening, runs: Runs) -> Residuals:
     """What the base fit leaves of every reading."""
-    base, linear = screened.base, screened.diagnosed[0]
-    rows, count, free = len(runs), len(channels.CHANNELS), base.space.free
-    weight = base.space.weight[:rows]
-    there = (weight > 0) & np.isfinite(base.reading[:rows])
-    jacobian = np.asarray(linear.jacobian)[: rows * count, :free]
+    base, free = screened.base, screened.base.space.free
+    return _residuals(base.space, runs, screened.diagnosed[0], base.reading, base.candidate.z[:free])
+
+
+def _residuals(
+    space: CandidateSpace, runs: Runs, linear: Linearization, reading: np.ndarray, z: np.ndarray
+) -> Residuals:
+    """What a fit leaves of every reading.
+
+    Args:
+        linear: the fit at z, linearised; reading: what it says of every row [SI], shape (rows or more, channels).
+    """
+    rows, count = len(runs), len(channels.CHANNELS)
+    there = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
+    jacobian = np.asarray(linear.jacobian)[: rows * count, : len(z)]
     whitened = np.where(there, np.asarray(linear.by_row())[:rows], 0.0)
-    kind = type(base.space.bare.observe)
-    return Residuals(kind, runs, base.reading[:rows], whitened, there, jacobian, base.candidate.z[:free])
+    return Residuals(
+        type(space.bare.observe), runs, reading[:rows], whitened, there, jacobian, z[: jacobian.shape[1]]
+    )
 
 
 def _proposal(space: CandidateSpace, traced: Traced, settings: Settings) -> Proposal | None:
@@ -595,6 +610,8 @@ def remarks(found: DiscoveryResult) -> tuple[str, ...]:
     for name, p in found.base_shift.items():
         if abs(p.shift_after) > 3:
             said.append(f"{name} lies {abs(p.shift_after):.1f} prior sds from its prior: it stands in for something")
+    said += said_held(found.held_by_prior)
+    said += [c.statement for c in found.residual_clusters]
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
         said.append(

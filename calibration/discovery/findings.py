@@ -48,6 +48,7 @@ from calibration.inference import blocks as blocks_room
 from calibration.inference import priors
 from calibration.inference.errors import summary
 from calibration.inference.held_out import held_out
+from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import amplitude_of, shape_of, shape_scales, shaped
 from calibration.inference.optimizers import read
 from calibration.inference.problem import Problem
@@ -107,12 +108,17 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
     effect, p = space.library[best.active[slot]], space.free
     amplitude, unit = amplitude_of(effect), size_of(effect)
     sd = settings.width * best.sd[p + slot] * unit
-    values = {amplitude.name: Estimate(float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit)}
+    held = held_by_prior(best.sd)
+    values = {
+        amplitude.name: Estimate(
+            float(best.amplitude[slot] * unit), float(sd), amplitude.spec.unit, bool(held[p + slot])
+        )
+    }
     shape = shape_of(effect)
     if shape is not None:
         k, scales = p + settings.slots + slot, shape_scales(shape)
         value, slope = jax.value_and_grad(lambda z: shaped(scales, z))(jnp.asarray(best.z[k]))
-        values[shape.name] = Estimate(float(value), float(slope) * float(best.sd[k]), shape.spec.unit)
+        values[shape.name] = Estimate(float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held[k]))
     return values
 
 
@@ -270,7 +276,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     z = [np.asarray(x[:p]) for x in (before, after)]
     value = [np.asarray(coordinates.value(jnp.asarray(x))) for x in (np.zeros(p), *z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
-    fields = priors.known(space.bare.base)
+    fields, held = priors.known(space.bare.base), held_by_prior(sd)
     return {
         name: BaseShift(
             prior=float(value[0][k]),
@@ -281,6 +287,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
             meaning=fields[name].spec.meaning,
             shift_before=float(z[0][k]),
             shift_after=float(z[1][k]),
+            held_by_prior=bool(held[k]),
         )
         for k, name in enumerate(coordinates.names)
     }

@@ -15,6 +15,8 @@ from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
+from calibration.inference.identifiability import said_held
+from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax import channels
 from mmrjax.robot import Robot
 
@@ -29,11 +31,12 @@ PLAUSIBLE = 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """A parameter with its standard deviation, both in `unit`."""
+    """A parameter with its standard deviation, both in `unit`, and whether it is held by its prior."""
 
     value: float
     sd: float
     unit: str
+    held_by_prior: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +188,11 @@ class Alternative:
 
 @dataclasses.dataclass(frozen=True)
 class BaseShift:
-    """A base parameter before and after, in its unit, and as shifts from its prior [prior sds]."""
+    """A base parameter before and after, in its unit, and as shifts from its prior [prior sds].
+
+    Attributes:
+        held_by_prior: whether it is so after, see `identifiability.held_by_prior`.
+    """
 
     prior: float
     before: float
@@ -195,6 +202,7 @@ class BaseShift:
     meaning: str
     shift_before: float
     shift_after: float
+    held_by_prior: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,7 +326,6 @@ class Resolved:
         rows: on tracks that were fitted.
         robot: for `--model track`, with the running gear that fits best.
         constants: of the running gear and the friction, by name.
-        known_from_rows: constants of which the rows say more than their priors.
         alike: pairs of constants that trade against one another, with their correlation.
         outside: constants further than `PLAUSIBLE` prior sds from their priors; settled: whether both searches ended.
         fall: of twice the objective by the running gear, priors counted [σ²]; p: of as large a fall by chance.
@@ -332,7 +339,6 @@ class Resolved:
     rows: int
     robot: Robot
     constants: dict[str, Estimate]
-    known_from_rows: tuple[str, ...]
     alike: tuple[tuple[str, str, float], ...]
     outside: tuple[str, ...]
     settled: bool
@@ -343,6 +349,11 @@ class Resolved:
     rms_percent: dict[str, tuple[float, float]]
     slip_rms: tuple[float, float]
     notes: tuple[str, ...]
+
+    @property
+    def known_from_rows(self) -> tuple[str, ...]:
+        """Constants that are not held by their priors."""
+        return tuple(name for name, e in self.constants.items() if not e.held_by_prior)
 
     @property
     def explains(self) -> bool:
@@ -365,7 +376,8 @@ class Resolved:
                 f"The track model was asked about {self.asked}: no running gear within its priors was found to leave "
                 f"it ({slip}, χ² falls by {self.fall:.0f}, p = {self.p:.2g}{why}){on}"
             )
-        known = f"the rows determine {len(self.known_from_rows)} of {len(self.constants)} constants"
+        held = len(self.constants) - len(self.known_from_rows)
+        known = f"held by their priors: {held} of {len(self.constants)} constants"
         return (
             f"The track model was asked about {self.asked}: a running gear within its priors leaves it ({slip}, χ² "
             f"falls by {self.fall:.0f}, p = {self.p:.2g}): {gear}; {known}{on}"
@@ -409,6 +421,7 @@ class DiscoveryResult:
         hidden: effects that what was found could hide, the largest first.
         standing: why names do not stand, or beside what they do; "" where there is nothing to say.
         cluster: what rows that lie off have in common, so that they were not set aside; None for nothing.
+        residual_clusters: columns without a role by which what the proposed robot leaves clusters.
         before, after: evidence in what base and proposed robot leave.
         chi2: twice the objective before and after [σ²]; readings: that count.
         base_shift: of every base parameter; scores: of the library at the base fit, strongest first.
@@ -450,6 +463,7 @@ class DiscoveryResult:
     hidden: tuple[HiddenEffect, ...]
     standing: str
     cluster: Cluster | None
+    residual_clusters: tuple[ResidualCluster, ...]
     before: Evidence
     after: Evidence
     chi2: tuple[float, float]
@@ -471,6 +485,13 @@ class DiscoveryResult:
     notes: tuple[str, ...] = ()
     sensitivity: tuple[Sensitivity, ...] = ()
     resolved: Resolved | None = None
+
+    @property
+    def held_by_prior(self) -> tuple[str, ...]:
+        """Names of the parameters of the proposed robot that were fitted and are held by their priors."""
+        base = [name for name, p in self.base_shift.items() if p.held_by_prior]
+        each = [(f"effects.{e.name}.{name}", p) for e in self.effects for name, p in e.parameters.items()]
+        return (*base, *(name for name, p in each if p.held_by_prior))
 
     def to_json(self) -> dict[str, Any]:
         """Everything as JSON-able data, as docs/schemas/loop.schema.json describes it."""
@@ -502,6 +523,7 @@ class DiscoveryResult:
             "hidden": [dataclasses.asdict(h) for h in self.hidden],
             "standing": self.standing,
             "cluster": None if self.cluster is None else dataclasses.asdict(self.cluster),
+            "residual_clusters": [c.to_json() for c in self.residual_clusters],
             "errors": {
                 # nothing is fitted as stated, so both are the same
                 "as_stated": {"fitted": self.errors_as_stated, "held_out": self.errors_as_stated},
@@ -563,6 +585,7 @@ class DiscoveryResult:
         write_table(folder / "rows.csv", self.rows_table())
         start = f" from {robot_name}" if robot_name else ""
         note = f"found by the loop{start} with {self.runs.source}: {self.statement}"
+        note = "\n".join([note, *said_held(self.held_by_prior)])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         posterior.write(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:

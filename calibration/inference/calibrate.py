@@ -34,6 +34,7 @@ from calibration.inference.population import GENERATIONS, LEAST
 from calibration.inference.posterior import of_coordinates
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
+from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
 from mmrjax import fidelities
 from mmrjax.robot import Robot
@@ -200,6 +201,7 @@ def calibrate(
         searched=searched,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
         adequacy=lack_of_fit.adequacy(left, known=not known.estimated.any()),
+        residual_clusters=residual_clusters(left, seed),
         identifiability=about,
         posterior=of_coordinates(posed.coordinates, z, about.covariance),
         notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),

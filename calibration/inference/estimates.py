@@ -85,7 +85,7 @@ def parameters(
             ),
             shift=float(z[k]),
             variance_ratio=float(about.sd[k] ** 2),
-            held_by="prior" if about.held_by_prior[k] else "data",
+            held_by_prior=bool(about.held_by_prior[k]),
             at_bound=_SIDE[int(bound[k])],
             measured_by_data=bool(about.sensitivity[k] > SENSITIVE),
             profile=None if profile is None else ProfileCurve(profile.value[k], profile.rise[k]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
@@ -16,12 +17,28 @@ from calibration.inference.problem import Data, Problem
 
 #: Two-sided 95 % of the standard normal distribution.
 Z95 = 1.959963984540054
-#: Posterior over prior variance above which the prior says more of a parameter than the data do [-].
-HELD = 0.5
+#: Posterior over prior sd above which a parameter is held by its prior [-].
+HELD = 0.9
 #: Correlations reported.
 CORRELATED = 0.9
 #: Steps of a profile, in posterior sds from the optimum.
 PROFILE_STEPS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0)
+
+
+def held_by_prior(sd: np.ndarray) -> np.ndarray:
+    """Whether each parameter is held by its prior: its posterior sd is above `HELD` of its prior's, or is not known.
+
+    Args:
+        sd: posterior, of coordinates whose prior sd is 1 (of a log-normal prior: of the logarithm), any shape.
+    """
+    return ~(np.asarray(sd) <= HELD)
+
+
+def said_held(names: Iterable[str]) -> list[str]:
+    """Which parameters are held by their priors, in a sentence; none for none."""
+    names = list(names)
+    whose = "its prior" if len(names) == 1 else "their priors"
+    return [f"held by {whose} (posterior sd above {HELD:g} of the prior's): {', '.join(names)}"] if names else []
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +76,8 @@ class Identifiability:
 
     @property
     def held_by_prior(self) -> np.ndarray:
-        """Whether the prior says more of a parameter than the data do."""
-        return self.sd**2 > HELD
+        """Whether each parameter is held by its prior, shape (parameters,)."""
+        return held_by_prior(self.sd)
 
     def correlated(self) -> list[tuple[str, str, float]]:
         """Pairs with |correlation| above `CORRELATED`, strongest first."""

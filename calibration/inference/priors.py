@@ -74,7 +74,7 @@ class Coordinates(eqx.Module):
     log-normal with the nominal value as median. Every other one is normal. The clip is the identity
     inside the bounds (to e^-20 an sd away), has slope ½ on a bound, and is never flat: an amplitude with
     prior mean zero, or a share whose nominal value is its bound, starts with a live gradient. What lies
-    beyond a bound is held by the prior, which is on z and pulls wherever z is.
+    beyond a bound is held by its prior, which is on z and pulls wherever z is.
 
     Attributes:
         location, spread, low, high: in units of θ, or of log θ for a scale; shape (parameters,).

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.inference import priors
-from calibration.inference.identifiability import Z95
+from calibration.inference.identifiability import Z95, said_held
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
@@ -21,6 +21,7 @@ def remarks(found: CalibrationResult) -> list[str]:
     return [
         *_noise(found),
         *_search(found),
+        *(c.statement for c in found.residual_clusters),
         *_statuses(found),
         *_parameters(found),
         *_limits(found),
@@ -70,10 +71,7 @@ def _statuses(found: CalibrationResult) -> list[str]:
 
 
 def _parameters(found: CalibrationResult) -> list[str]:
-    said = []
-    held = [name for name, p in found.parameters.items() if p.held_by == "prior"]
-    if held:
-        said.append(f"the prior says more than the data of: {', '.join(held)}")
+    said = said_held(found.held_by_prior)
     said += [
         f"{name} lies {abs(p.shift):.1f} prior sds from its prior: the prior or the model is wrong"
         for name, p in found.parameters.items()

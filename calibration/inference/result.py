@@ -11,10 +11,11 @@ import numpy as np
 
 from calibration.data import posterior, writing
 from calibration.data.posterior import Posterior
-from calibration.inference.identifiability import Identifiability
+from calibration.inference.identifiability import Identifiability, said_held
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
 from calibration.inference.population import Searched
+from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax import channels
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
@@ -78,7 +79,7 @@ class Estimate:
         unit, meaning: of its field.
         prior: what was known beforehand; shift: of the value from it [prior sd].
         variance_ratio: posterior over prior variance [-].
-        held_by: `data` or `prior`, whichever says more of it.
+        held_by_prior: whether it is, see `identifiability.held_by_prior`.
         at_bound: `lower`, `upper` or None.
         measured_by_data: whether any reading depends on it.
         profile: None where none was made.
@@ -96,7 +97,7 @@ class Estimate:
     prior: Prior
     shift: float
     variance_ratio: float
-    held_by: str
+    held_by_prior: bool
     at_bound: str | None
     measured_by_data: bool
     profile: ProfileCurve | None = None
@@ -115,7 +116,7 @@ class Estimate:
             "prior": dataclasses.asdict(self.prior),
             "shift_in_prior_sd": self.shift,
             "variance_ratio": self.variance_ratio,
-            "held_by_prior": self.held_by == "prior",
+            "held_by_prior": self.held_by_prior,
             "at_bound": self.at_bound,
             "measured_by_data": self.measured_by_data,
         }
@@ -259,6 +260,7 @@ class CalibrationResult:
         objective: at the optimum [½σ²]; converged: whether the search did.
         starts: how all searches ended; searched: the population that came before them, None without.
         chi_square: of the readings that are there; adequacy: whether they are what noise leaves.
+        residual_clusters: columns without a role by which residuals cluster.
         identifiability: the linear analysis; posterior: of the free parameters.
         notes: sentences worth reading before it is used.
     """
@@ -286,6 +288,7 @@ class CalibrationResult:
     searched: Searched | None
     chi_square: ChiSquare
     adequacy: Adequacy
+    residual_clusters: tuple[ResidualCluster, ...]
     identifiability: Identifiability
     posterior: Posterior
     notes: tuple[str, ...]
@@ -298,6 +301,11 @@ class CalibrationResult:
     def profiled(self) -> bool:
         """Whether profiles were made."""
         return any(p.profile is not None for p in self.parameters.values())
+
+    @property
+    def held_by_prior(self) -> tuple[str, ...]:
+        """Names of the parameters that are held by their priors."""
+        return tuple(name for name, p in self.parameters.items() if p.held_by_prior)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -343,6 +351,7 @@ class CalibrationResult:
                 },
                 "chi2": dataclasses.asdict(self.chi_square),
                 "adequate": self.adequacy.to_json(),
+                "residual_clusters": [c.to_json() for c in self.residual_clusters],
                 "identifiability": {
                     "singular_values": about.singular_values,
                     "rank": about.rank,
@@ -386,6 +395,7 @@ class CalibrationResult:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         note = f"calibrated from {robot_name} with {self.source}; the free parameters: {', '.join(self.parameters)}"
+        note = "\n".join([note, *said_held(self.held_by_prior)])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows())

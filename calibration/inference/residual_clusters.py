@@ -1,0 +1,532 @@
+"""Whether what a fit leaves clusters by a column of the table that has no role.
+
+A column that nothing in the model reads may still say which rows differ: which wheel idles, who measured, which
+battery was in. For each channel the residuals are compared over the levels of each such column by a variance ratio
+(Seber and Lee, Linear Regression Analysis (2003), 4.3): over all rows, within the levels of each label of the
+conditions, and with opposite signs in the two directions of travel; columns of many numbers by their ranks. What the
+free parameters, the labels and smooth curves over the conditions take up is cleared away on both sides first. The
+error is family-wise over all columns, channels and tests, by Bonferroni and by the strongest test of permuted
+residuals (Freedman and Lane 1983), so that neither few rows nor wild ones make a finding.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+
+import numpy as np
+from scipy import stats
+
+from calibration.data.runs import CONDITIONS, WHEN, Runs
+from calibration.inference.lack_of_fit import CLEAR, Residuals
+from mmrjax import channels
+
+#: Family-wise error of reporting a cluster where there is none.
+LEVEL = 0.005
+#: Most distinct numbers of a column whose values are taken for levels.
+LEVELS = 12
+#: Fewest rows (of histories: runs) of a channel, and degrees of freedom that a test has to leave.
+FEWEST, LEAST = 8, 5
+#: Permutations; numbers that are held at once.
+PERMUTATIONS, AT_ONCE = 1000, 4_000_000
+#: Degree of curves over the conditions that are cleared away, and largest share of the rows that they take up.
+DEGREE, SHARE = 2, 1 / 3
+#: Share of a column (sine of its angle) that conditions and parameters have to leave for it to be one of its own.
+OWN = 0.3
+#: Names of columns that say when a row was measured.
+_TIMES = re.compile(r"(^|_)(time|date|datetime|timestamp|stamp|epoch|clock)(_|$)", re.IGNORECASE)
+#: Levels that a sentence lists.
+_LISTED = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class LevelMean:
+    """Mean residual of the rows at one level of a column.
+
+    Attributes:
+        level: of the column; within: of the label within which it was compared, "" for all rows.
+        mean: simulated less measured [unit of the channel]; rows: that it is of.
+    """
+
+    level: str
+    within: str
+    mean: float
+    rows: int
+
+
+@dataclasses.dataclass(frozen=True)
+class ResidualCluster:
+    """Residuals of a channel that go with a column without a role.
+
+    Attributes:
+        column: its name; channel: whose residuals; unit: of the channel.
+        within: label within whose levels the column matters, "" where it does over all rows.
+        reversing: whether with opposite signs in the two directions of travel; the means are then of the residual
+            times the sign of the reading.
+        levels: means by level; empty for a column of many numbers.
+        correlation: of ranks, for such a column; else None.
+        p: family-wise.
+        alike: other columns that go with these residuals no better once this one is known.
+        at: the column; residual: simulated less measured [unit]; shape (rows,), of histories (runs,).
+    """
+
+    column: str
+    channel: str
+    unit: str
+    within: str
+    reversing: bool
+    levels: tuple[LevelMean, ...]
+    correlation: float | None
+    p: float
+    alike: tuple[str, ...]
+    at: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def statement(self) -> str:
+        """In a sentence."""
+        label = {c.name: c.label for c in channels.CHANNELS}[self.channel]
+        what = f"residuals of {label}"
+        within = f" within {self.within}" if self.within else ""
+        signs = ", with opposite signs in the two directions of travel" if self.reversing else ""
+        p = f"p = {self.p:.1g}"
+        role = "a column without a role" + (f" (as well by {', '.join(self.alike)})" if self.alike else "")
+        if self.correlation is not None:
+            return (
+                f"{what} go with {self.column}{within}{signs} (rank correlation {self.correlation:+.2f}; {p}), "
+                f"{role}: find what differs with it"
+            )
+        ordered = sorted(self.levels, key=lambda m: -abs(m.mean))[:_LISTED]
+        kept = [m for m in self.levels if m in ordered]
+        each = ", ".join(f"{m.level}{f' at {m.within}' * bool(m.within)}: {m.mean:+.2g} {self.unit}" for m in kept)
+        more = ", ..." if len(kept) < len(self.levels) else ""
+        return (
+            f"{what} cluster by {self.column}{within}{signs} (simulated less measured at levels {each}{more}; {p}), "
+            f"{role}: give each level its own configuration, or find what differs"
+        )
+
+    def to_json(self) -> dict[str, object]:
+        """As in `residual_clusters` of result.json."""
+        document = {
+            f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("at", "residual")
+        }
+        document |= {"levels": [dataclasses.asdict(m) for m in self.levels], "alike": list(self.alike)}
+        return {**document, "statement": self.statement}
+
+
+def residual_clusters(fit: Residuals, seed: int = 0) -> tuple[ResidualCluster, ...]:
+    """Columns without a role by which the residuals of a fit cluster, the most improbable first.
+
+    Args:
+        fit: what is left; of histories the mean of each run is tested.
+        seed: of the permutations.
+    """
+    whole = _by_run(fit) if fit.runs.sampled else _by_row(fit)
+    columns = _without_role(whole)
+    if not columns:
+        return ()
+    made = [(k, of) for k in range(fit.there.shape[1]) if (of := _channel(whole, k, columns)) is not None]
+    count = sum(len(tested.tests) for _, tested in made)
+    every = [(count * float(p[0]), k, test) for k, of in made for test, p in of.p_values(of.left[:, None])]
+    found = [one for one in every if one[0] < LEVEL]
+    if not found:
+        return ()
+    strongest = _permuted(made, seed)
+    floor = 1 / (1 + len(strongest))
+    answer: list[ResidualCluster] = []
+    for k, tested in made:
+        chances = [(p, test, floor * (1 + int(np.sum(strongest <= p / count)))) for p, of, test in found if of == k]
+        mine = sorted(((p if c <= floor else max(p, c)), test) for p, test, c in chances if c <= LEVEL)
+        taken: list[tuple[float, _Comparison, list[str]]] = []
+        for p, test in _coarse_first(mine, columns):
+            if any(test.column in (t.column, *names) for _, t, names in taken):
+                continue
+            explains = next((t for t in taken if tested.beside(test, t[1]) * count >= LEVEL), None)
+            if explains is None:
+                taken.append((p, test, []))
+            else:
+                explains[2].append(test.column)
+        answer += [_reported(whole, k, test, p, tuple(names)) for p, test, names in taken]
+    return tuple(sorted(answer, key=lambda c: c.p))
+
+
+def _coarse_first(
+    found: list[tuple[float, _Comparison]], columns: Mapping[str, np.ndarray]
+) -> list[tuple[float, _Comparison]]:
+    """Findings in the order of their probability, but a column before such as divide its levels further."""
+    words = {test.column: _words(columns[test.column]) for _, test in found}
+    levels = {name for name in words if not _numbers(columns[name])}
+    ordered: list[tuple[float, _Comparison]] = []
+    waiting = list(found)
+    while waiting:
+        first = waiting[0]
+        name = first[1].column
+        coarser = [one for one in waiting if name in levels and _divides(words[name], words[one[1].column])]
+        first = coarser[0] if coarser else first
+        ordered.append(first)
+        waiting = [one for one in waiting if one is not first]
+    return ordered
+
+
+def _divides(fine: np.ndarray, coarse: np.ndarray) -> bool:
+    """Whether each level of one column fixes that of another, which has fewer."""
+    pairs = len(set(zip(fine.tolist(), coarse.tolist(), strict=True)))
+    return len(np.unique(coarse)) < len(np.unique(fine)) == pairs
+
+
+# --- what is tested -------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class _Units:
+    """What is compared, a settled row or a run of a history each.
+
+    Attributes:
+        runs: their table; there: whether a reading counts; whitened: residuals; jacobian: by the free parameters,
+            shape (units, channels, parameters); residual, simulated: [SI]; covariance: of z, (JᵀJ + 1)⁻¹.
+    """
+
+    runs: Runs
+    there: np.ndarray
+    whitened: np.ndarray
+    jacobian: np.ndarray
+    residual: np.ndarray
+    simulated: np.ndarray
+    covariance: np.ndarray
+
+
+def _by_row(fit: Residuals) -> _Units:
+    jacobian = np.where(fit.there[..., None], fit.jacobian.reshape(*fit.there.shape, -1), 0.0)
+    flat = jacobian.reshape(fit.there.size, -1)
+    covariance = np.linalg.inv(flat.T @ flat + np.eye(flat.shape[1]))
+    residual = np.where(fit.there, fit.simulated - fit.runs.measured(), np.nan)
+    return _Units(fit.runs, fit.there, fit.whitened, jacobian, residual, fit.simulated, covariance)
+
+
+def _by_run(fit: Residuals) -> _Units:
+    """Means of each run; whitened ones times the root of how many samples they are of, so that noise has the sd 1."""
+    rows = _by_row(fit)
+    run = fit.runs["run_id"] if fit.runs.has("run_id") else np.zeros(len(fit.runs), str)
+    _, first, of = np.unique(run, return_index=True, return_inverse=True)
+    member = of[:, None] == np.arange(len(first))  # (samples, runs)
+    counts = member.T.astype(float) @ rows.there
+    weight = np.sqrt(np.maximum(counts, 1.0))
+
+    def total(x: np.ndarray) -> np.ndarray:
+        return np.einsum("sr,sc...->rc...", member.astype(float), np.nan_to_num(x))
+
+    each = [member[:, r] for r in range(len(first))]
+    one = {c: v[first] for c, v in fit.runs.extras.items() if all(len(np.unique(v[m])) == 1 for m in each)}
+    # A condition that changes within a run is there as its mean.
+    columns = {
+        c: np.array([v[m].mean() for m in each]) if v.dtype.kind == "f" else v[first]
+        for c, v in fit.runs.columns.items()
+    }
+    mean = np.maximum(counts, 1.0)
+    return _Units(
+        runs=dataclasses.replace(fit.runs, columns=columns, extras=one),
+        there=counts > 0,
+        whitened=total(rows.whitened) / weight,
+        jacobian=total(rows.jacobian) / weight[..., None],
+        residual=np.where(counts > 0, total(rows.residual) / mean, np.nan),
+        simulated=np.where(counts > 0, total(np.where(rows.there, rows.simulated, 0.0)) / mean, np.nan),
+        covariance=rows.covariance,
+    )
+
+
+def _without_role(whole: _Units) -> dict[str, np.ndarray]:
+    """Columns to look at: not ids, times or aliases of a condition, and of more than one level."""
+    runs, kept = whole.runs, {}
+    # What is simulated follows from the conditions alone.
+    conditions = [runs[c] for c in CONDITIONS if runs.has(c)] + list(whole.simulated.T)
+    for name, cells in runs.extras.items():
+        words = _words(cells)
+        levels = np.unique(words[words != ""])
+        if len(levels) < 2 or _is_time(name, cells) or _is_id(cells, len(levels)):
+            continue
+        if any(_same(words, alias) for alias in _known(runs)) or _steps(cells, words, conditions):
+            continue
+        kept[name] = cells
+    return kept
+
+
+def _words(cells: np.ndarray) -> np.ndarray:
+    """A column as words, "" where a cell is empty."""
+    if cells.dtype.kind == "f":
+        return np.array(["" if np.isnan(x) else f"{x:g}" for x in cells])
+    return cells.astype(str)
+
+
+def _known(runs: Runs) -> Iterator[np.ndarray]:
+    """Columns that have a role, but for readings and their sds, and what labels say together."""
+    readings = {name for c in channels.CHANNELS for name in (c.column, c.sd_column)}
+    known = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
+    labels = [known[name] for name in _labels(runs)]
+    yield from known.values()
+    if len(labels) > 1:
+        yield np.array(["|".join(words) for words in zip(*labels, strict=True)])
+
+
+def _labels(runs: Runs) -> list[str]:
+    """Columns of words that say under what a row was measured, of more than one level."""
+    return [
+        name for name, v in runs.columns.items()
+        if v.dtype.kind == "U" and name not in ("run_id", "mode") and len(np.unique(v)) > 1
+    ]  # fmt: skip
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether each level of one column fixes that of the other, and the reverse."""
+    pairs = len(set(zip(one.tolist(), other.tolist(), strict=True)))
+    return pairs == len(np.unique(one)) == len(np.unique(other))
+
+
+def _steps(cells: np.ndarray, words: np.ndarray, conditions: Sequence[np.ndarray]) -> bool:
+    """Whether numbers are steps of a condition: its values at one level lie all on one side of those at another."""
+    if cells.dtype.kind != "f" or len(np.unique(words)) > LEVELS:
+        return False
+    for x in conditions:
+        fine = np.isfinite(x) & np.isfinite(cells)
+        levels = [x[fine & (words == w)] for w in np.unique(words[fine])]
+        ends = sorted((level.min(), level.max()) for level in levels)
+        if len(ends) > 1 and all(a[1] < b[0] for a, b in itertools.pairwise(ends)):
+            return True
+    return False
+
+
+def _is_time(name: str, cells: np.ndarray) -> bool:
+    """Whether a column says when: by its name, by its words, or as numbers that only rise or only fall."""
+    if _TIMES.search(name):
+        return True
+    if cells.dtype.kind == "f":
+        steps = np.diff(cells)
+        return len(cells) > 2 and bool(np.all(steps > 0) or np.all(steps < 0))
+    try:
+        for cell in cells[cells != ""]:
+            datetime.fromisoformat(str(cell))
+    except ValueError:
+        return False
+    return True
+
+
+def _is_id(cells: np.ndarray, levels: int) -> bool:
+    """Whether a column only numbers or names the rows: as many levels as rows, of words or whole numbers."""
+    if cells.dtype.kind == "f":
+        return levels == len(cells) and bool(np.all(cells == np.round(cells)))
+    return levels > len(cells) / 2
+
+
+@dataclasses.dataclass(frozen=True, order=True)
+class _Comparison:
+    """One test of one channel: a column, within the levels of a label or not, reversing with the travel or not."""
+
+    column: str
+    within: str
+    reversing: bool
+    basis: np.ndarray = dataclasses.field(compare=False, repr=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Channel:
+    """Residuals of a channel as independent ones of one variance, and what is compared with them.
+
+    Attributes:
+        left: residuals less what conditions and parameters take up, shape (units,); freedom: their degrees.
+        taken: orthonormal directions of the latter, shape (units, directions).
+        tests: with orthonormal bases, cleared of the same.
+    """
+
+    left: np.ndarray
+    freedom: int
+    taken: np.ndarray
+    tests: tuple[_Comparison, ...]
+
+    def p_values(self, residuals: np.ndarray) -> list[tuple[_Comparison, np.ndarray]]:
+        """Of each test, of columns of residuals, shape (units, tables)."""
+        total = np.sum(residuals**2, 0)
+        return [(test, _ratio(test.basis, residuals, total, self.freedom)) for test in self.tests]
+
+    def cleared(self, residuals: np.ndarray) -> np.ndarray:
+        """Residuals less what conditions and parameters take up."""
+        return residuals - self.taken @ (self.taken.T @ residuals)
+
+    def beside(self, test: _Comparison, other: _Comparison) -> float:
+        """Probability of a test where what another one shows is taken up too; 1 where nothing is left to test."""
+        own = _orthonormal(test.basis - other.basis @ (other.basis.T @ test.basis))
+        left = self.left - other.basis @ (other.basis.T @ self.left)
+        freedom = self.freedom - other.basis.shape[1]
+        if own.shape[1] == 0 or freedom - own.shape[1] < LEAST:
+            return 1.0
+        return float(_ratio(own, left[:, None], np.array([left @ left]), freedom)[0])
+
+
+def _ratio(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom: int) -> np.ndarray:
+    """Probability of what an orthonormal basis explains of residuals, by the variance ratio."""
+    terms = basis.shape[1]
+    explained = np.sum((basis.T @ residuals) ** 2, 0)
+    rest = np.maximum(total - explained, 1e-300) / (freedom - terms)
+    return np.asarray(stats.f.sf(explained / terms / rest, terms, freedom - terms))
+
+
+def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
+    """Orthonormal directions of columns, such as are smaller than `least` left out."""
+    if columns.shape[1] == 0:
+        return columns
+    directions, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return directions[:, size > least]
+
+
+def _channel(whole: _Units, k: int, columns: dict[str, np.ndarray]) -> _Channel | None:
+    """A channel and its tests; None where too little is measured."""
+    there = whole.there[:, k]
+    if there.sum() < FEWEST:
+        return None
+    runs = whole.runs.where(there)
+    # The residuals' covariance is 1 - J (JᵀJ + 1)⁻¹ Jᵀ, of which only a few directions are not 1.
+    j = whole.jacobian[there, k]
+    root = np.linalg.cholesky(whole.covariance)
+    directions, size, _ = np.linalg.svd(j @ root, full_matrices=False)
+    share = np.clip(size**2, 0.0, 1.0)
+    open_ = share < 1 - CLEAR
+    forth = np.where(open_, np.sqrt(1 - share), 0.0)
+    back = np.where(open_, 1 / np.sqrt(np.maximum(1 - share, CLEAR)), 0.0)
+
+    def scaled(x: np.ndarray, by: np.ndarray) -> np.ndarray:
+        return x + directions @ ((by - 1)[:, None] * (directions.T @ x))
+
+    travel = np.sign(whole.simulated[there, k])
+    both = min(np.sum(travel > 0), np.sum(travel < 0)) >= 2
+    smooth = _smooth(runs, whole.simulated[there], travel if both else None)
+    taken = _orthonormal(np.concatenate([directions[:, ~open_], _unit(scaled(smooth, forth))], 1))
+    whitened = scaled(whole.whitened[there, k][:, None], back)[:, 0]
+    left = whitened - taken @ (taken.T @ whitened)
+    freedom = len(left) - taken.shape[1]
+    tests = []
+    for name, cells in columns.items():
+        for within in ("", *_labels(runs)):
+            for reversing in (False, True)[: 1 + both]:
+                shape = _shape(cells[there], runs[within] if within else None)
+                basis = scaled(shape * travel[:, None] if reversing else shape, forth)
+                basis = _orthonormal(_unit(basis))
+                basis = _orthonormal(basis - taken @ (taken.T @ basis), OWN)
+                if basis.shape[1] and freedom - basis.shape[1] >= LEAST:
+                    tests.append(_Comparison(name, within, reversing, basis))
+    return _Channel(left, freedom, taken, tuple(tests)) if tests else None
+
+
+def _unit(columns: np.ndarray) -> np.ndarray:
+    """Columns of length 1, such as are next to nothing left out."""
+    size = np.linalg.norm(columns, axis=0)
+    return columns[:, size > 1e-9] / size[size > 1e-9]
+
+
+def _numbers(cells: np.ndarray) -> bool:
+    """Whether a column is compared by ranks."""
+    return cells.dtype.kind == "f" and len(np.unique(cells[np.isfinite(cells)])) > LEVELS
+
+
+def _ranks(cells: np.ndarray) -> np.ndarray:
+    """Ranks about their mean, 0 where a number is missing."""
+    fine = np.isfinite(cells)
+    ranks = np.zeros(len(cells))
+    if fine.any():
+        ranks[fine] = stats.rankdata(cells[fine]) - (fine.sum() + 1) / 2
+    return ranks
+
+
+def _shape(cells: np.ndarray, within: np.ndarray | None) -> np.ndarray:
+    """What a column may explain: a mean of each level, or a slope over ranks, at each level of `within`."""
+    cell = np.zeros(len(cells), str) if within is None else within
+    if _numbers(cells):
+        return np.stack(
+            [np.where(cell == c, _ranks(np.where(cell == c, cells, np.nan)), 0.0) for c in np.unique(cell)], 1
+        )
+    words = _words(cells)
+    both = [(words == w) & (cell == c) for w in np.unique(words) for c in np.unique(cell)]
+    return np.stack([b for b in both if b.any()], 1).astype(float)
+
+
+def _smooth(runs: Runs, simulated: np.ndarray, travel: np.ndarray | None) -> np.ndarray:
+    """What the conditions may explain: a mean of each set of labels and direction, then smooth curves over conditions
+    and readings, as far as there are rows for them; shape (units, columns)."""
+    labels = [runs[name] for name in _labels(runs)] + ([] if travel is None else [travel.astype(str)])
+    cells = (
+        np.array(["|".join(map(str, words)) for words in zip(*labels, strict=True)])
+        if labels
+        else np.zeros(len(runs), str)
+    )
+    made = np.stack([cells == c for c in np.unique(cells)], 1).astype(float)
+    if made.shape[1] > SHARE * len(runs):
+        made = np.ones((len(runs), 1))
+    variables = [runs[name] for name in (*CONDITIONS, *WHEN) if runs.has(name)] + list(simulated.T)
+    variables = [x for x in variables if np.isfinite(x).all() and np.ptp(x) > 1e-9 * np.abs(x).max()]
+    for power in range(1, DEGREE + 1):
+        for x in variables:
+            scaled = 2 * (x - x.min()) / np.ptp(x) - 1
+            more = np.concatenate([made, scaled[:, None] ** power], 1)
+            if np.linalg.matrix_rank(more, 1e-6 * len(more)) > SHARE * len(runs):
+                return made
+            made = more
+    return made
+
+
+def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
+    """Probability of the strongest test of each table of permuted residuals, shape (permutations,)."""
+    random = np.random.default_rng(seed)
+    longest = max(len(tested.left) for _, tested in made)
+    times = max(PERMUTATIONS // 4, min(PERMUTATIONS, AT_ONCE // longest))
+    strongest = np.ones(times)
+    for _, tested in made:
+        drawn = random.permuted(np.repeat(tested.left[:, None], times, 1), axis=0)
+        for _, p in tested.p_values(tested.cleared(drawn)):
+            strongest = np.minimum(strongest, p)
+    return strongest
+
+
+def levels_of(cells: np.ndarray) -> np.ndarray:
+    """Name of the level of each row, as `LevelMean` has it."""
+    words = _words(cells)
+    return np.where(words == "", "not stated", words)
+
+
+def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
+    """A finding in the units of its channel."""
+    channel, there = channels.CHANNELS[k], whole.there[:, k]
+    cells, residual = whole.runs.extras[test.column][there], whole.residual[there, k] / channel.factor
+    signed = residual * np.sign(whole.simulated[there, k]) if test.reversing else residual
+    within = whole.runs[test.within][there] if test.within else np.zeros(int(there.sum()), str)
+    words, correlation = levels_of(cells), None
+    levels: tuple[LevelMean, ...] = ()
+    if _numbers(cells):
+        fine = np.isfinite(cells)
+        correlation = float(stats.spearmanr(cells[fine], signed[fine]).statistic)
+    else:
+        keys = sorted(set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _place(x[1])))
+        levels = tuple(
+            LevelMean(w, c, float(signed[mine].mean()), int(mine.sum()))
+            for c, w in keys if (mine := (within == c) & (words == w)).any()
+        )  # fmt: skip
+    return ResidualCluster(
+        test.column,
+        channel.name,
+        channel.unit,
+        test.within,
+        test.reversing,
+        levels,
+        correlation,
+        p,
+        alike,
+        cells,
+        residual,
+    )
+
+
+def _place(word: str) -> tuple[float, str]:
+    """Order of levels: numbers by size, then words."""
+    try:
+        return float(word), ""
+    except ValueError:
+        return float("inf"), word
