@@ -746,6 +746,28 @@ def size(
     return room.size(resolved, out, force)
 
 
+rig = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="rich",
+    help="A rig of your own, bench or robot: a file to fill in, and what the program makes of it (docs/rigs).",
+)  # fmt: skip
+app.add_typer(rig, name="rig")
+
+
+@rig.command(epilog="Example: mmrjax rig new my-rig.toml --kind wheeled")
+def new(
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
+    kind: Annotated[str, typer.Option(help="tracked, wheeled, bench, pendulum or linear.")] = "bench",
+    force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
+) -> int:
+    """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
+
+    As written it can be read, with numbers of an example. Units are SI but where a comment says another.
+    """
+    from sweeps import rig_new
+
+    return rig_new.new(file, kind, force)
+
+
 @app.command()
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""

@@ -9,6 +9,7 @@ from calibration.data import effect_file, posterior, robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
+from mmrjax import channels
 from mmrjax.robot import Robot
 from sweeps.config import RobotPart
 from sweeps.console import tell
@@ -20,7 +21,8 @@ VOLTAGE = 33.0
 def load_robot(config: RobotPart) -> Robot:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
 
-    Former names of parameters are taken, and said on stderr.
+    Former names of parameters are taken, and said on stderr. Its channels, and those
+    that a program has added, become those of the command.
 
     Raises:
         BadConfiguration: no such robot, a file or a change that is refused.
@@ -28,6 +30,8 @@ def load_robot(config: RobotPart) -> Robot:
     notes: list[str] = []
     robot = robot_file.load(config.robot, effect_file.library(config.effects), notes)
     robot = robot_file.change(robot, config.set, where="--set", notes=notes)
+    added = {c.name for c in channels.CHANNELS} - {c.name for c in channels.EVERY}
+    channels.select({*robot.rig.channels, *added})
     for note in notes:
         tell(note)
     return robot

@@ -137,7 +137,7 @@ REFUSED = {
         "[motor]\nresistanc = 1",
         r"motor\.resistanc: no such parameter; did you mean motor\.resistance",
     ),
-    "negative mass": ("[6T2A]\nmass = -3", r"6T2A\.mass: got -3; expected 0\.5 to 200 kg"),
+    "negative mass": ("[6T2A]\nmass = -3", r"6T2A\.mass: got -3; expected 0\.01 to 10000 kg"),
     "NaN": ("[motor]\nresistance = nan", r"motor\.resistance: got nan"),
     "word": ("[motor]\nresistance = 'low'", r"motor\.resistance: got 'low'; expected a number"),
     "boolean": ("[motor]\nresistance = true", r"got True; expected a number"),

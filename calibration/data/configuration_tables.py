@@ -9,41 +9,185 @@ from typing import Any
 
 import equinox as eqx
 
+from calibration.data import rig_file
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax import params
 from mmrjax.chassis import Chassis
-from mmrjax.robot import Configurations, Robot
+from mmrjax.contact import Friction
+from mmrjax.ground import Ground
+from mmrjax.robot import Load, Robot
+from mmrjax.shaft import Shaft
+from mmrjax.track import Track
 
 #: What a configuration moves on, and its `on_tracks`.
 MOVERS = {"tracks": 1.0, "wheels": 0.0}
 #: Names that a configuration cannot have: the other keys of a robot file.
-TAKEN = ("schema", "base", "sides", "configurations", "battery", "motor", "gearbox", "effects")
+TAKEN = (
+    *("schema", "base", "sides", "configurations", "battery", "motor", "gearbox", "running_gear", "driver", "rig"),
+    *("effects", *rig_file.KEYS),
+)
+_KINDS = ("load", "like", "movers")
 _EXAMPLE = 'configurations = ["rover"]'
 
 
-def configured(robot: Robot, content: dict[str, Any], where: str) -> Robot:
-    """`robot` with the configurations that the file's content states, in its order.
+@dataclasses.dataclass(frozen=True)
+class Loads:
+    """The loads of a robot file, before the parameters that it states.
 
-    Takes `configurations` and every configuration's `like` and `movers` out of `content`; what is left are
-    parameters. Without `configurations` the robot keeps its own.
+    Attributes:
+        by_name: in order; on_shaft: whether they are shafts, else vehicles.
+        linear: whether one is a linear unit.
+        missing: parameters without default that the file does not state.
+    """
+
+    by_name: dict[str, Load]
+    on_shaft: bool
+    linear: bool
+    missing: tuple[str, ...]
+
+
+def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], where: str) -> Loads:
+    """The loads that the file's content states, in its order.
+
+    Takes `configurations` and every configuration's `load`, `like` and `movers` out of `content`, and puts shafts in
+    the place of linear units; what is left are parameters. Without `configurations` a robot keeps those of its base,
+    or has those whose tables say what they are.
 
     Args:
-        robot: the base; `like` names one of its configurations.
-        where: opens the message of an error.
+        base: None starts from nothing; else `like` names one of its configurations.
+        sds: stated ±, by dotted name; where: opens the message of an error.
 
     Raises:
         BadConfiguration: no list of names, a name twice or one that cannot be, a table that is no configuration's, an
-            unknown `like` or `movers`, both of them or neither, or a parameter without default that is not stated.
+            unknown `load`, `like` or `movers`, those that contradict each other, none of them, shafts beside
+            vehicles, or with a base a parameter without default that is not stated.
     """
-    names = _names(content.pop("configurations", list(robot.configurations)), where)
-    for name, table in content.items():
-        if name not in (*names, *TAKEN) and isinstance(table, dict) and {"like", "movers"} & set(table):
+    found = [n for n, table in content.items() if n not in TAKEN and isinstance(table, dict)]
+    usual = found if base is None else list(base.configurations)
+    if not usual and "configurations" not in content:
+        raise BadConfiguration(
+            f"{where}: no load; expected a table such as [bench] with load = one of {', '.join(rig_file.LOADS)}"
+        )
+    names = _names(content.pop("configurations", usual), where)
+    for name in found:
+        if name not in names and set(_KINDS) & set(content[name]):
             raise BadConfiguration(
                 f"{where}, {name}: not among the configurations, {', '.join(names)}; add it to configurations = [...]"
             )
-    return dataclasses.replace(
-        robot, configurations=Configurations({name: _chassis(robot, name, content, where) for name in names})
+    by_name: dict[str, Load] = {}
+    missing: list[str] = []
+    linear = False
+    for name in names:
+        table, here = content.get(name, {}), f"{where}, {name}"
+        if not isinstance(table, dict):
+            raise BadConfiguration(f"{here}: got {table!r}; expected a table [{name}]")
+        kind = _kind(table, here)
+        if kind == "linear":
+            rig_file.linear(table, name, here, sds, _sides(content, base))
+            linear = True
+        if kind in ("linear", "shaft"):
+            by_name[name], lacking = _shaft(table)
+        elif base is None:
+            by_name[name], lacking = _vehicle(table, here)
+        else:
+            by_name[name], lacking = _chassis(base, name, table, here), []
+        if lacking and base is not None:
+            raise BadConfiguration(f"{here}: load starts from nothing; {_listed(lacking)} missing")
+        missing += [f"{name}.{key}" for key in lacking]
+    shafts = [name for name, load in by_name.items() if isinstance(load, Shaft)]
+    vehicles = [name for name in names if name not in shafts]
+    if shafts and vehicles:
+        raise BadConfiguration(
+            f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; expected loads of one kind, one file each"
+        )
+    return Loads(by_name, bool(shafts), linear, tuple(missing))
+
+
+def resolved_likes(content: dict[str, Any], where: str) -> None:
+    """Put what each `like` of a file that starts from nothing stands for in its place: the other table of the file.
+
+    Raises:
+        BadConfiguration: a `like` that names no other table, or one with a `like` of its own.
+    """
+    tables = {n: dict(table) for n, table in content.items() if n not in TAKEN and isinstance(table, dict)}
+    own = [name for name, table in tables.items() if "like" not in table]
+    for name, table in tables.items():
+        if "like" in table:
+            like = table.pop("like")
+            if like not in own:
+                raise BadConfiguration(f"{where}, {name}.like: got {like}; {choices(str(like), own)}")
+            content[name] = _over(tables[like], table)
+
+
+def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Two tables as one; `above` wins."""
+    both = {
+        key: value for key, value in below.items() if isinstance(value, dict) and isinstance(above.get(key), dict)
+    }
+    return {**below, **above, **{key: _over(value, above[key]) for key, value in both.items()}}
+
+
+def _kind(table: dict[str, Any], where: str) -> str:
+    """The load that a table states; a vehicle where it says nothing."""
+    if "load" not in table:
+        return "vehicle"
+    load = table.pop("load")
+    if load not in rig_file.LOADS:
+        raise BadConfiguration(f"{where}.load: got {load}; {choices(str(load), rig_file.LOADS)}")
+    for key in ("like", "movers"):
+        if load != "vehicle" and key in table:
+            raise BadConfiguration(f"{where}: states both load = {load!r} and {key}; state one of them")
+    if load == "vehicle":
+        table.setdefault("movers", "wheels") if "like" not in table else None
+    return str(load)
+
+
+def _sides(content: Mapping[str, Any], base: Robot | None) -> float:
+    """Drives of a file; what is no count is refused later."""
+    sides = content.get("sides", 1.0 if base is None else float(base.sides))
+    return float(sides) if isinstance(sides, int | float) and sides >= 1 else 1.0
+
+
+def _shaft(table: Mapping[str, Any]) -> tuple[Shaft, list[str]]:
+    """A shaft before the parameters that its table states, and those that it does not state but should."""
+    missing = [
+        field.name
+        for field in dataclasses.fields(Shaft)
+        if "spec" in field.metadata and field.default is dataclasses.MISSING and field.name not in table
+    ]
+    return Shaft(inertia=0.0, loss_coulomb=0.0), missing
+
+
+def _vehicle(table: dict[str, Any], where: str) -> tuple[Chassis, list[str]]:
+    """A vehicle that starts from nothing, before the parameters that its table states, and those that it should."""
+    if "movers" not in table:
+        raise BadConfiguration(
+            f"{where}: what it is is missing; state load = one of {', '.join(rig_file.LOADS)}, or movers = one of "
+            f"{', '.join(MOVERS)}"
+        )
+    on_tracks = _movers(table.pop("movers"), where)
+    nothing = Chassis(
+        track=Track(loss_coulomb=0.0, loss_viscous=0.0, guide_share=0.0),
+        ground=Ground(Friction(static=0.0, dynamic=0.0), rolling_resistance=0.0),
+        on_tracks=on_tracks,
+        mass=0.0,
+        radius=0.0,
+        inertia=0.0,
     )
+    static = table.get("ground", {}).get("friction", {}) if isinstance(table.get("ground", {}), dict) else {}
+    known = rig_file.vehicle_defaults(on_tracks > 0.5, static.get("static") if isinstance(static, dict) else None)
+    missing = [p.name for p in params.walk(nothing) if p.name not in known and not _states(table, p.name)]
+    return params.replace(nothing, {name: params.as_float(value) for name, value in known.items()}), missing
+
+
+def _movers(stated: Any, where: str) -> float:
+    if stated not in MOVERS:
+        raise BadConfiguration(f"{where}.movers: got {stated}; {choices(str(stated), MOVERS)}")
+    return MOVERS[stated]
+
+
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names)} {'are' if len(names) > 1 else 'is'}"
 
 
 def _names(stated: Any, where: str) -> list[str]:
@@ -62,11 +206,8 @@ def _names(stated: Any, where: str) -> list[str]:
     return stated
 
 
-def _chassis(robot: Robot, name: str, content: Mapping[str, Any], where: str) -> Chassis:
-    """What a configuration starts from, before the parameters that its table states."""
-    table, where = content.get(name, {}), f"{where}, {name}"
-    if not isinstance(table, dict):
-        raise BadConfiguration(f"{where}: got {table!r}; expected a table [{name}]")
+def _chassis(robot: Robot, name: str, table: dict[str, Any], where: str) -> Chassis:
+    """What a configuration of a robot with a base starts from, before the parameters that its table states."""
     like, movers = table.pop("like", None), table.pop("movers", None)
     have = robot.configurations
     if like is not None and movers is not None:
@@ -76,9 +217,7 @@ def _chassis(robot: Robot, name: str, content: Mapping[str, Any], where: str) ->
             raise BadConfiguration(f"{where}.like: got {like}; {choices(str(like), have)}")
         return have[like]
     if movers is not None:
-        if movers not in MOVERS:
-            raise BadConfiguration(f"{where}.movers: got {movers}; {choices(str(movers), MOVERS)}")
-        return _blank(have.members[0], MOVERS[movers], table, where)
+        return _blank(have.members[0], _movers(movers, where), table, where)
     if name in have:
         return have[name]
     raise BadConfiguration(
@@ -92,10 +231,7 @@ def _blank(pattern: Chassis, on_tracks: float, table: Mapping[str, Any], where: 
     defaults = dict(_defaults(pattern))
     missing = [name for name, default in defaults.items() if default is None and not _states(table, name)]
     if missing:
-        raise BadConfiguration(
-            f"{where}: movers without like starts from nothing; {', '.join(missing)} "
-            f"{'are' if len(missing) > 1 else 'is'} missing"
-        )
+        raise BadConfiguration(f"{where}: movers without like starts from nothing; {_listed(missing)} missing")
     known = {name: params.as_float(default) for name, default in defaults.items() if default is not None}
     return params.replace(dataclasses.replace(pattern, on_tracks=on_tracks), known)
 

@@ -13,11 +13,13 @@ from typing import Any, TypeVar
 
 import jax.numpy as jnp
 
-from calibration.data.configuration_tables import configured
+from calibration.data import rig_file, stated
+from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadConfiguration, choices, number
 from mmrjax import effects, params, robots
-from mmrjax.robot import Robot
+from mmrjax.robot import Configurations, Robot
+from mmrjax.shaft import Shaft
 from mmrjax.tables import TRACKED, WHEELED
 
 T = TypeVar("T")
@@ -77,13 +79,14 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
 
     The file states, all optional:
         schema: version of this form.
-        base: name of the robot that it starts from, `nominal` if left out.
+        base: name of the robot that it starts from, `nominal` if left out; `none` starts from nothing.
+        imposed, channels, start, columns, instruments: how it is driven and measured, see `rig_file`.
         sides: motors driven alike; `battery.cells`: cells in series.
-        configurations: names of those that the robot has, in order; else those of the base. One that the base does
-            not have states `like`, the base's configuration that it starts from, or `movers` (`tracks` or
-            `wheels`) and every parameter that has no default.
-        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`; RATINGS; and SWITCHES,
-            true or false.
+        configurations: names of those that the robot has, in order; else those of the base, or those that have
+            tables. One that the base does not have states `like`, the base's configuration that it starts from, or
+            `movers` (`tracks` or `wheels`) or `load` (see `rig_file.LOADS`) and every parameter that has no default.
+        parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
+            prior as `"0.9 ± 5 %"`; RATINGS; and SWITCHES, true or false.
         effects: one is present when its table `[effects.NAME]` is, which may name the `configurations` that it acts
             on.
 
@@ -102,9 +105,11 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
     if schema not in SCHEMAS:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
     base = content.pop("base", "nominal")
-    if base not in robots.ROBOTS:
-        raise BadConfiguration(f"{path.name}, base: got {base}; {choices(str(base), robots.ROBOTS)}")
-    robot = configured(robots.ROBOTS[base](), content, path.name)
+    if base not in (*robots.ROBOTS, rig_file.NONE):
+        raise BadConfiguration(
+            f"{path.name}, base: got {base}; {choices(str(base), (*robots.ROBOTS, rig_file.NONE))}"
+        )
+    robot, sds = _without_parameters(None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name)
     present = content.get("effects", {})
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
@@ -114,7 +119,36 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
     robot = with_effects(robot, tuple(present), library, acting, where=path.name)
-    return change(robot, dict(_flatten(content)), where=path.name, notes=notes)
+    robot = change(robot, dict(_flatten(content)), where=path.name, notes=notes)
+    return rig_file.with_priors(robot, sds, path.name)
+
+
+def _without_parameters(base: Robot | None, content: dict[str, Any], where: str) -> tuple[Robot, dict[str, float]]:
+    """The robot of a file's content before the parameters that it states, and the sds stated of those.
+
+    Args:
+        base: None starts from nothing; content: what is left of it are parameters.
+    """
+    if base is None:
+        resolved_likes(content, where)
+    tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
+    sds = stated.taken_apart(tables, where)
+    found = loads(base, content, sds, where)
+    shared = {"on_shaft": found.on_shaft, "linear": found.linear}
+    if base is not None:
+        robot = dataclasses.replace(base, configurations=Configurations(found.by_name))
+        changed = found.on_shaft or any(key in content for key in rig_file.KEYS)
+        rig = rig_file.rig(content, where, **shared, blank=False) if changed else robot.rig
+        return dataclasses.replace(robot, rig=rig), sds
+    rig = rig_file.rig(content, where, **shared, blank=True)
+    robot = robots.blank(Configurations(found.by_name), rig=rig)
+    robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
+    given = dict(_flatten(content))
+    missing = [name for name in rig_file.needed(rig) if name not in given]
+    if found.on_shaft and not found.linear and "speed" in rig.channels:
+        missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
+    rig_file.refuse_missing([*missing, *found.missing], {p.name: p for p in params.walk(robot)}, where)
+    return robot, sds
 
 
 def with_effects(
@@ -210,9 +244,15 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed}")
+        if name == "gearbox.ratio" and 0 < value < 1:
+            raise BadConfiguration(
+                f"{where}, {name}: got {number(value)}; expected turns of the motor for one of the output, at least "
+                f"1; is {number(1 / value)} meant?"
+            )
         if not math.isfinite(value) or not low <= value <= high:
             raise BadConfiguration(f"{where}, {name}: got {number(value)}; expected {allowed}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
+    robot = rig_file.moved_priors(robot, stated)
     robot = dataclasses.replace(
         robot,
         sides=counts.get("sides", robot.sides),
@@ -270,8 +310,10 @@ def _check_pairs(robot: Robot, where: str) -> None:
             f"{where}, battery.voltage_cutoff: got {robot.battery.voltage_cutoff:g}; expected less than "
             f"voltage_charge, {robot.battery.voltage_charge:g} V"
         )
-    for name, chassis in robot.configurations.items():
-        friction = chassis.ground.friction
+    for name, load in robot.configurations.items():
+        if isinstance(load, Shaft):
+            continue
+        friction = load.ground.friction
         if friction.speed_dynamic <= friction.speed_static:
             raise BadConfiguration(
                 f"{where}, {name}.ground.friction.speed_dynamic: got {float(friction.speed_dynamic):g}; "
@@ -286,39 +328,69 @@ def _check_pairs(robot: Robot, where: str) -> None:
 
 
 def write(robot: Robot, path: Path, *, note: str = "") -> None:
-    """Write a robot with everything that it states, unit, meaning and source beside each; `read` gives it back."""
+    """Write a robot with everything that it states, unit, meaning and source beside each; `read` gives it back.
+
+    Of a robot that starts from nothing, what it leaves open is left out.
+    """
+    blank = robot.rig.blank
+    nothing = _start(robot)
+    pack = blank and robot.battery.cells == nothing.battery.cells
     tables: dict[str, list[str]] = {
-        "battery": [f"cells = {robot.battery.cells}  # in series"],
+        "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
         "motor": [],
         "gearbox": [],
     }
-    for name, chassis in robot.configurations.items():
-        tables[name] = ['movers = "tracks"' if float(chassis.on_tracks) > 0.5 else 'movers = "wheels"']
+    head, more = rig_file.lines(robot.rig)
+    if rig_file.same_rig(robot.rig) and not blank and not robot.on_shaft:
+        head, more = [], {}
+    for name, load in robot.configurations.items():
+        moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
+        tables[name] = ['load = "shaft"'] if isinstance(load, Shaft) else [f'movers = "{moves}"']
     for effect in robot.effects:
         named = effect.configurations or type(effect)().configurations
         acting = f"configurations = {json.dumps(effect.configurations)}  # on which it acts"
         tables[f"effects.{effect.name}"] = [acting] if named else []
-    start = {p.name: float(p.value) for p in params.walk(robots.nominal())}
+    start = {p.name: float(p.value) for p in params.walk(nothing)}
+    needed, always = rig_file.needed(robot.rig), (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk(robot):
-        head, _, key = parameter.name.rpartition(".")
+        head_, _, key = parameter.name.rpartition(".")
         spec, value = parameter.spec, float(parameter.value)
-        was = start.get(parameter.name, 0.0 if head.startswith("effects.") else None)
+        was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
+        same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
+        if same and (blank or head_ == "rig"):
+            continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
         origin = f"; {spec.source}" if value == was else origin
-        tables.setdefault(head, []).append(f"{key} = {value!r}  # [{spec.unit}] {spec.meaning}{origin}")
+        text = rig_file.value_text(parameter.name, value, robot.rig)
+        line = f"{key} = {text}  # [{spec.unit}] {spec.meaning}"
+        tables.setdefault(head_, []).append(line if blank else f"{line}{origin}")
     for name, (_, _, unit, what) in RATINGS.items():
-        head, _, key = name.partition(".")
-        stated = getattr(getattr(robot, head), key)
-        tables[head] += [] if stated is None else [f"{key} = {stated!r}  # [{unit}] {what}"]
+        part, _, key = name.partition(".")
+        rating = getattr(getattr(robot, part), key)
+        if rating is not None and not (blank and rating == getattr(getattr(nothing, part), key)):
+            tables[part].append(f"{key} = {rating!r}  # [{unit}] {what.partition(';')[0] if blank else what}")
     for name, what in SWITCHES.items():
-        head, _, key = name.partition(".")
-        tables[head].append(f"{key} = {str(getattr(getattr(robot, head), key)).lower()}  # {what}")
+        part, _, key = name.partition(".")
+        switch = getattr(getattr(robot, part), key)
+        if not (blank and switch == getattr(getattr(nothing, part), key)):
+            tables.setdefault(part, []).append(f"{key} = {str(switch).lower()}  # {what}")
     lines = [f"# {line}" for line in note.splitlines()]
-    lines += [f'schema = "{SCHEMA}"', 'base = "nominal"', f"sides = {int(robot.sides)}  # motors driven alike"]
+    lines += [f'schema = "{SCHEMA}"', f'base = "{rig_file.NONE if blank else "nominal"}"']
+    lines += [f"sides = {int(robot.sides)}  # motors driven alike", *head]
     lines.append(f"configurations = {json.dumps(list(robot.configurations))}")
-    for head, table in tables.items():
-        lines += ["", f"[{head}]", *table]
+    for title, table in {**tables, **more}.items():
+        if blank and not table and title not in robot.configurations:
+            continue
+        lines += ["", f"[{title}]", *table]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _start(robot: Robot) -> Robot:
+    """What the file of a robot starts from."""
+    if not robot.rig.blank:
+        return robots.nominal()
+    nothing = robots.blank(robot.configurations)
+    return params.replace(nothing, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
 
 
 def _flatten(content: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -1,0 +1,334 @@
+"""What a robot file states of a rig: its loads, what is imposed, its channels, their columns and instruments."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from calibration.data import runs as records
+from calibration.data import units
+from calibration.data.errors import BadConfiguration, choices
+from mmrjax import channels, params
+from mmrjax.rig import IMPOSED, Instrument, Rig
+from mmrjax.robot import Robot
+from mmrjax.robots import DYNAMIC_SHARE
+from mmrjax.signals import GRAVITY
+
+#: Base of a robot that starts from nothing.
+NONE = "none"
+#: Keys and tables of a robot file that state the rig.
+KEYS = ("imposed", "channels", "start", "columns", "instruments")
+#: How the histories of a rig start.
+STARTS = ("rest", "measured", "free")
+#: What a configuration may be.
+LOADS = ("shaft", "linear", "vehicle")
+
+#: Keys of a linear unit: unit and meaning. It has a lead or a drum.
+LINEAR = {
+    "mass_kg": "mass that it moves",
+    "lead_mm": "travel of one turn of the output",
+    "drum_radius_mm": "radius of the drum or pulley, in place of the lead",
+    "force_coulomb_N": "dry friction of guide and screw",
+    "force_viscous_N_s_m": "viscous friction of guide and screw",
+    "force_constant_N": "force that acts against forward travel whatever the speed",
+    "incline_deg": "angle at which forward travel climbs",
+    "inertia": "inertia of what turns with the output, beside the mass [kg·m^2]",
+}
+_TRAVEL = ("lead_mm", "drum_radius_mm")
+_LEAST = {"mass_kg", *_TRAVEL}  # these must be more than 0
+
+#: What a robot that starts from nothing has where its file says nothing: value, and why. Limits and all other losses
+#: are none (`robots.blank`).
+DEFAULTS: dict[str, tuple[float, str]] = {
+    "motor.inertia": (0.0, "not stated: the load's inertia alone; histories from rest need it"),
+    "battery.current_other": (0.0, "not stated: nothing else is on the battery"),
+}
+#: The same of a vehicle, below its configuration.
+VEHICLE: dict[str, tuple[float, str]] = {
+    "inertia": (0.0, "not stated: what turns with a wheel is small beside the mass"),
+    "track.loss_coulomb": (0.0, "not stated: wheels lose nothing beside rolling"),
+    "track.loss_viscous": (0.0, "not stated: no loss that rises with speed"),
+    "track.guide_friction": (0.0, "not stated: nothing rubs on a guide"),
+    "track.guide_share": (0.0, "not stated: pulleys or wheels carry all of the weight"),
+    "ground.friction.speed_static": (0.02, "not stated: assumed, a contact creeps up to this speed as it grips"),
+    "ground.friction.speed_dynamic": (0.2, "not stated: assumed, ten times speed_static"),
+}
+#: Those of VEHICLE that tracks have to state.
+_OF_TRACKS = ("track.loss_coulomb",)
+_DYNAMIC = "ground.friction.dynamic"
+DYNAMIC_WHY = f"not stated: assumed, {DYNAMIC_SHARE:g} of static"
+
+
+def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], sides: float) -> None:
+    """Turn the table of a linear unit into that of the shaft of one of its drives, and its sds with it.
+
+    Travel r a radian is lead / 2π or the drum's radius; of n drives each has J = J_0 + m r² / n, M_0 = F_0 r / n,
+    K = b r² / n, M_c = (F_c + m g sin α) r / n. Their sds are those of first order, of independent inputs.
+
+    Args:
+        table: of the configuration `name`, without `load`; where: opens the message of an error.
+        sds: stated, by dotted name; sides: drives that move it together.
+
+    Raises:
+        BadConfiguration: an unknown key, no number, no mass, no travel or two, or one that is not positive.
+    """
+    at = {key: _linear_value(table, key, where) for key in list(table) if _known_key(key, where)}
+    travels = [key for key in _TRAVEL if key in at]
+    if len(travels) != 1:
+        raise BadConfiguration(
+            f"{where}: got {' and '.join(travels) or 'neither lead_mm nor drum_radius_mm'}; expected one of them, "
+            "the travel of one turn, or the radius of a drum or pulley"
+        )
+    if "mass_kg" not in at:
+        raise BadConfiguration(f"{where}.mass_kg: missing; expected the mass that it moves [kg]")
+    table.clear()
+    table.update(_shaft(at, sides))
+    inputs = {key: sds.pop(f"{name}.{key}") for key in at if f"{name}.{key}" in sds}
+    for result in table:
+        steps = [_shaft({**at, key: at[key] + sd}, sides)[result] - table[result] for key, sd in inputs.items()]
+        sd = math.hypot(*steps)
+        if sd > 0:
+            sds[f"{name}.{result}"] = float(f"{sd:.12g}")
+
+
+def _known_key(key: str, where: str) -> bool:
+    if key not in LINEAR:
+        raise BadConfiguration(f"{where}.{key}: no such key of a linear unit; {choices(key, LINEAR)}")
+    return True
+
+
+def _linear_value(table: Mapping[str, Any], key: str, where: str) -> float:
+    value = table[key]
+    fine = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if not fine or (key in _LEAST and value <= 0):
+        least = "a number more than 0" if key in _LEAST else "a number"
+        raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {least} ({LINEAR[key]})")
+    return float(value)
+
+
+def _shaft(at: Mapping[str, float], sides: float) -> dict[str, float]:
+    travel = (at["lead_mm"] / (2 * math.pi) if "lead_mm" in at else at["drum_radius_mm"]) * 1e-3
+    weight = at["mass_kg"] * GRAVITY * math.sin(math.radians(at.get("incline_deg", 0.0)))
+    return {
+        "inertia": at.get("inertia", 0.0) + at["mass_kg"] * travel**2 / sides,
+        "loss_coulomb": at.get("force_coulomb_N", 0.0) * travel / sides,
+        "loss_viscous": at.get("force_viscous_N_s_m", 0.0) * travel**2 / sides,
+        "torque_constant": (at.get("force_constant_N", 0.0) + weight) * travel / sides,
+        "radius": travel,
+    }
+
+
+def vehicle_defaults(on_tracks: bool, static: Any) -> dict[str, float]:
+    """What a vehicle that starts from nothing has where its file says nothing.
+
+    Args:
+        static: friction that its file states; no number where it states none.
+    """
+    found = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
+    return found | {_DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
+
+
+def rig(content: dict[str, Any], where: str, *, on_shaft: bool, linear: bool, blank: bool) -> Rig:
+    """The rig that a file's content states; takes the `KEYS` out of it.
+
+    Args:
+        on_shaft: whether the loads are shafts; linear: whether one is a linear unit, whose travel can be measured;
+        blank: whether the robot starts from nothing.
+
+    Raises:
+        BadConfiguration: an unknown word, channel or column, a channel that is imposed, or an instrument of a channel
+            that the rig does not have.
+    """
+    imposed = _one_of(content.pop("imposed", IMPOSED[0]), IMPOSED, f"{where}, imposed")
+    start = _one_of(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
+    usual = [name for name in channels.USUAL if linear or not on_shaft or name != "speed"]
+    names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
+    if imposed in names:
+        raise BadConfiguration(
+            f"{where}, channels: {imposed} is imposed, so it is no reading; remove it, or state imposed = "
+            f'"{next(word for word in IMPOSED if word != imposed)}"'
+        )
+    return Rig(
+        imposed=imposed,
+        channels=names,
+        instruments=_instruments(content.pop("instruments", {}), names, where),
+        columns=_columns(content.pop("columns", {}), where),
+        start=start,
+        blank=blank,
+    )
+
+
+def _one_of(word: Any, known: Sequence[str], where: str) -> str:
+    if word not in known:
+        raise BadConfiguration(f"{where}: got {word}; {choices(str(word), known)}")
+    return str(word)
+
+
+def _channels(stated: Any, where: str) -> tuple[str, ...]:
+    every = [c.name for c in channels.known()]
+    if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
+        raise BadConfiguration(
+            f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(every)}"
+        )
+    for name in stated:
+        if name not in every:
+            raise BadConfiguration(f"{where}: got {name}; {choices(name, every)}")
+    return tuple(name for name in every if name in stated)
+
+
+def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
+    here = f"{where}, instruments"
+    if not isinstance(stated, dict):
+        raise BadConfiguration(f"{here}: got {stated!r}; expected tables such as [instruments.{names[0]}]")
+    found = []
+    for name, table in stated.items():
+        if name not in names:
+            raise BadConfiguration(f"{here}.{name}: the rig has no such channel; {choices(name, names)}")
+        if not isinstance(table, dict):
+            raise BadConfiguration(f"{here}.{name}: got {table!r}; expected a table [instruments.{name}]")
+        for key in table:
+            if key not in ("signed", "quantum"):
+                raise BadConfiguration(f"{here}.{name}.{key}: no such key; {choices(key, ('signed', 'quantum'))}")
+        signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
+        channel = next(c for c in channels.known() if c.name == name)
+        if not isinstance(signed, bool):
+            raise BadConfiguration(
+                f"{here}.{name}.signed: got {signed!r}; expected true, or false: shows magnitude alone"
+            )
+        if isinstance(quantum, bool) or not isinstance(quantum, int | float) or not 0 <= quantum < math.inf:
+            raise BadConfiguration(
+                f"{here}.{name}.quantum: got {quantum!r}; expected the step of its readings, 0 or more {channel.unit}"
+            )
+        found.append(Instrument(name, signed, float(quantum) * channel.factor))
+    return tuple(found)
+
+
+def _known_columns() -> list[str]:
+    """Columns of tables by the names of this program, in every unit."""
+    with channels.panel(c.name for c in channels.known()):
+        known = list(records.known_columns())
+        for channel in channels.CHANNELS:
+            known += [f"{channel.name}_{unit}" for unit in units.of_channel(channel.name)]
+    return list(dict.fromkeys(known))
+
+
+def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
+    here = f"{where}, columns"
+    form = 'expected MINE = "THEIRS", or MINE = {column = "THEIRS", factor = 0.001}'
+    if not isinstance(stated, dict):
+        raise BadConfiguration(f"{here}: got {stated!r}; expected a table [columns]")
+    known, found = _known_columns(), []
+    for mine, theirs in stated.items():
+        if mine not in known:
+            raise BadConfiguration(f"{here}.{mine}: no such column of a table; {choices(mine, known)}")
+        table = {"column": theirs} if isinstance(theirs, str) else theirs
+        if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
+            raise BadConfiguration(f"{here}.{mine}: got {theirs!r}; {form}")
+        factor = table.get("factor", 1.0)
+        if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor) or not factor:
+            raise BadConfiguration(f"{here}.{mine}.factor: got {factor!r}; expected a number that is not 0")
+        found.append((mine, table["column"], float(factor)))
+    return tuple(found)
+
+
+def needed(rig: Rig) -> tuple[str, ...]:
+    """Parameters of the drive that a robot which starts from nothing has to state."""
+    current = {"total_current", "motor_current", "winding_temperature"} & set(rig.channels)
+    voltage = rig.imposed == "voltage" or "motor_voltage" in rig.channels
+    hot = "winding_temperature" in rig.channels
+    conditions: tuple[tuple[str, Any], ...] = (
+        ("gearbox.ratio", True),
+        ("gearbox.efficiency_load", True),
+        ("motor.torque_constant", current or voltage),
+        ("motor.resistance", voltage or hot),
+        ("motor.resistance_thermal_winding", hot),
+        ("motor.resistance_thermal_housing", hot),
+    )
+    return tuple(name for name, wanted in conditions if wanted)
+
+
+def refuse_missing(missing: Sequence[str], known: Mapping[str, params.Parameter], where: str) -> None:
+    """Refuse a robot that starts from nothing and does not state what it must.
+
+    Args:
+        missing: names of parameters; known: every parameter of the robot.
+
+    Raises:
+        BadConfiguration: one sentence that lists all of them.
+    """
+    if missing:
+        each = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
+        verb = "is" if len(missing) == 1 else "are"
+        raise BadConfiguration(
+            f'{where}: {each} {verb} missing, which a robot with base = "none" has to state (mmrjax rig new writes a '
+            "file with every one)"
+        )
+
+
+def with_priors(robot: Robot, sds: Mapping[str, float], where: str) -> Robot:
+    """The robot with the sds that its file states as priors around its values.
+
+    Args:
+        sds: by dotted name [SI].
+
+    Raises:
+        BadConfiguration: an sd of what is no parameter.
+    """
+    known = {p.name: p for p in params.walk(robot)}
+    for name in sds:
+        if name not in known:
+            raise BadConfiguration(f"{where}, {name}: a ± stands with parameters alone; state the number")
+    priors = tuple((name, float(p.value), sds[name]) for name, p in known.items() if name in sds)
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
+
+
+def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
+    """The robot with the stated priors of parameters that are given other values around those, as wide as before."""
+    if not set(values) & {name for name, _, _ in robot.rig.priors}:
+        return robot
+    priors = tuple((name, float(values.get(name, mean)), sd) for name, mean, sd in robot.rig.priors)
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, priors=priors))
+
+
+def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
+    """Lines of a robot file that state a rig: of its head, and by table."""
+    head = [
+        f'imposed = "{rig.imposed}"  # on the drives: voltage or motor_speed',
+        f"channels = {json.dumps(list(rig.channels))}  # what its instruments show",
+        f'start = "{rig.start}"  # of histories: rest, measured or free',
+    ]
+    tables: dict[str, list[str]] = {}
+    if rig.columns:
+        tables["columns"] = [
+            f"{mine} = {json.dumps(theirs)}"
+            if factor == 1
+            else f"{mine} = {{column = {json.dumps(theirs)}, factor = {factor!r}}}"
+            for mine, theirs, factor in rig.columns
+        ]
+    for instrument in rig.instruments:
+        channel = next(c for c in channels.known() if c.name == instrument.channel)
+        step = [f"quantum = {instrument.quantum / channel.factor!r}  # [{channel.unit}] step of its readings"]
+        tables[f"instruments.{channel.name}"] = [
+            f"signed = {str(instrument.signed).lower()}",
+            *(step if instrument.quantum else []),
+        ]
+    return head, tables
+
+
+def value_text(name: str, value: float, rig: Rig) -> str:
+    """A parameter's value as a file has it, with ± where its prior is stated and it is unchanged since."""
+    for stated, mean, sd in rig.priors:
+        if stated == name and mean == value:
+            return f'"{value!r} ± {sd!r}"'
+    return repr(value)
+
+
+def same_rig(rig: Rig) -> bool:
+    """Whether a rig is driven and measured as a robot whose file states nothing of it."""
+    usual = Rig()
+    return all(getattr(rig, key) == getattr(usual, key) for key in ("imposed", "channels", "start", "columns")) and (
+        not rig.instruments
+    )

@@ -1,0 +1,54 @@
+"""Numbers with what is known of them: `5.95 ± 5 %`, `0.82 ± 0.02`."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+from calibration.data.errors import BadConfiguration
+
+FORM = 'expected a number, or one with its standard deviation as "0.61 ± 0.03" or "0.61 ± 5 %"'
+_SIGNS = r"(?:±|\+/-|\+-)"
+
+
+def is_stated(value: Any) -> bool:
+    """Whether a value of a file is text with ±."""
+    return isinstance(value, str) and re.search(_SIGNS, value) is not None
+
+
+def stated_number(text: str, where: str) -> tuple[float, float]:
+    """Value and standard deviation of `value ± sd` or `value ± x %`, in the value's unit.
+
+    Args:
+        where: opens the message of an error.
+
+    Raises:
+        BadConfiguration: another form, no number, or an sd that is not positive.
+    """
+    parts = re.split(_SIGNS, text)
+    try:
+        value, sd = parts
+        mean, size = float(value), float(sd.strip().removesuffix("%"))
+    except ValueError:
+        raise BadConfiguration(f"{where}: got {text!r}; {FORM}") from None
+    size *= abs(mean) / 100 if sd.strip().endswith("%") else 1.0
+    if not (math.isfinite(mean) and math.isfinite(size) and size > 0):
+        raise BadConfiguration(f"{where}: got {text!r}; the standard deviation must be more than 0; {FORM}")
+    return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
+
+
+def taken_apart(table: dict[str, Any], where: str, prefix: str = "") -> dict[str, float]:
+    """Put the value in the place of each `value ± sd` of a table and those below it; their sds by dotted name.
+
+    Raises:
+        BadConfiguration: as `stated_number`.
+    """
+    found: dict[str, float] = {}
+    for key, value in table.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            found |= taken_apart(value, where, f"{name}.")
+        elif is_stated(value):
+            table[key], found[name] = stated_number(value, f"{where}, {name}")
+    return found

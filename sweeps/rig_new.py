@@ -1,0 +1,42 @@
+"""The command `rig new`: a rig's file to fill in, with where each number comes from."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+from calibration.data.errors import BadConfiguration, choices
+from sweeps.console import say
+
+#: Kinds of rig, in words.
+KINDS = {
+    "bench": "a motor with its gearbox that turns a shaft: brake, disk, worm, winch",
+    "pendulum": "a servo with an arm that gravity pulls",
+    "linear": "a carriage on a screw, a belt or a rope",
+    "wheeled": "a robot on wheels",
+    "tracked": "a robot on tracks",
+}
+
+
+def template(kind: str) -> str:
+    """The file of a kind, to fill in."""
+    return resources.files("sweeps").joinpath("rigs", f"{kind}.toml").read_text(encoding="utf-8")
+
+
+def new(file: Path, kind: str, force: bool) -> int:
+    """Write a rig's file to fill in; returns 0.
+
+    Raises:
+        BadConfiguration: no such kind, no such folder, or a file that is there without `force`.
+    """
+    if kind not in KINDS:
+        each = "; ".join(f"{name}: {what}" for name, what in KINDS.items())
+        raise BadConfiguration(f"--kind: got {kind}; {choices(kind, KINDS)} ({each})")
+    if file.exists() and (file.is_dir() or not force):
+        what = "a folder; state a file, as my-rig.toml" if file.is_dir() else "there already; --force replaces it"
+        raise BadConfiguration(f"{file}: {what}")
+    if not file.parent.is_dir():
+        raise BadConfiguration(f"{file}: no such folder as {file.parent}; make it first")
+    file.write_text(template(kind), encoding="utf-8")
+    say(f"{file}: {KINDS[kind]}. Fill in what is marked example: yours, then: mmrjax rig check {file} [DATA.csv]")
+    return 0

@@ -1,0 +1,380 @@
+"""Rig files: the templates read, loads are converted, what is written reads back, and one sentence for each mistake."""
+
+from __future__ import annotations
+
+import math
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
+from mmrjax import effects, params, robots
+from mmrjax.rig import Instrument
+from mmrjax.signals import GRAVITY
+from sweeps import rig_new
+
+KINDS = tuple(rig_new.KINDS)
+
+
+def read(tmp_path, text):
+    path = tmp_path / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    return robot_file.read(path)
+
+
+def again(tmp_path, robot):
+    robot_file.write(robot, tmp_path / "again.toml", note="of a test")
+    return robot_file.read(tmp_path / "again.toml")
+
+
+def same(a, b):
+    """Leaves, structure, names, rig: everything."""
+    return bool(eqx.tree_equal(a, b))
+
+
+BENCH = """
+base = "none"
+imposed = "motor_speed"
+channels = ["total_current"]
+[motor]
+torque_constant = "0.05 ± 4 %"
+[gearbox]
+ratio = 16
+efficiency_load = "0.8 +- 0.03"
+[bench]
+load = "shaft"
+inertia = 0.001
+loss_coulomb = "0.1 ± 0.05"
+"""
+
+ROVER = """
+base = "none"
+sides = 2
+[motor]
+torque_constant = 0.05
+resistance = 1.0
+[gearbox]
+ratio = 16
+efficiency_load = 0.8
+[rover]
+load = "vehicle"
+mass = 4.0
+radius = 0.04
+[rover.ground]
+rolling_resistance = 0.02
+[rover.ground.friction]
+static = 0.5
+"""
+
+CARRIAGE = """
+base = "none"
+sides = {sides}
+[motor]
+torque_constant = 0.05
+resistance = 1.0
+[gearbox]
+ratio = 4
+efficiency_load = 0.8
+[carriage]
+load = "linear"
+"""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_template_reads_as_written_and_back(tmp_path, kind):
+    robot = read(tmp_path, rig_new.template(kind))
+    assert robot.rig.blank and robot.rig.priors and robot.on_shaft == (kind not in ("tracked", "wheeled"))
+    assert same(again(tmp_path, robot), robot)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_line_of_a_template_that_is_commented_out_reads(tmp_path, kind):
+    """Each example line, and the table that it stands in, is valid where its comment sign is taken away."""
+    lines = rig_new.template(kind).splitlines()
+    tables = {"# [columns]", "# [rig]"}
+    for k, line in enumerate(lines):
+        if not line.startswith("# ") or " = " not in line or "OURS" in line:
+            continue
+        key = line[2:].split(" = ")[0]
+        if not key.isidentifier() or key in ("drum_radius_mm",):
+            continue
+        open_ = [lines[j] for j in range(k) if lines[j] in tables or lines[j].startswith("# [instruments")]
+        head = max((j for j in range(k) if lines[j] in open_), default=None)
+        last = max((j for j in range(k) if lines[j].startswith("[")), default=-1)
+        chosen = {k, *([head] if head is not None and head > last else [])}
+        text = "\n".join(x[2:] if j in chosen else x for j, x in enumerate(lines))
+        read(tmp_path, text)
+
+
+def test_bench_is_what_its_file_states(tmp_path):
+    robot = read(tmp_path, BENCH)
+    assert (robot.rig.imposed, robot.rig.channels, float(robot.sides)) == ("motor_speed", ("total_current",), 1.0)
+    assert robot.rig.priors == (
+        ("motor.torque_constant", 0.05, 0.002),
+        ("gearbox.efficiency_load", 0.8, 0.03),
+        ("bench.loss_coulomb", 0.1, 0.05),
+    )
+    zero = ("motor.friction_coulomb", "motor.friction_viscous", "gearbox.friction_coulomb", "bench.loss_viscous")
+    known = {p.name: float(p.value) for p in params.walk(robot)}
+    assert [known[name] for name in zero] == [0.0] * 4 and known["bench.radius"] == 1.0
+    assert robot.gearbox.torque_limit is None and robot.motor.speed_limit > 1e8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_written_rig_mentions_no_other_robot(tmp_path, kind):
+    robot_file.write(read(tmp_path, rig_new.template(kind)), tmp_path / "again.toml")
+    text = (tmp_path / "again.toml").read_text(encoding="utf-8").lower()
+    assert not [w for w in ("nominal", "re30", "gp32", "6t2a", "4w2t", "table ", "maxon", "0.611") if w in text]
+
+
+def test_rig_of_everything_is_written_and_read_the_same(tmp_path):
+    robot = read(
+        tmp_path,
+        BENCH.replace(
+            'channels = ["total_current"]',
+            'channels = ["total_current", "output_speed", "motor_voltage"]\nstart = "measured"',
+        ).replace("[motor]", "[motor]\nresistance = 2.0\nspeed_limit = 500.0\nvoltage_limit = 24.0")
+        + """
+[slow]
+load = "shaft"
+inertia = 0.002
+loss_coulomb = 0.3
+torque_constant = -0.2
+[rig]
+delay = "0.01 ± 0.005"
+[battery]
+cells = 3
+resistance = 0.02
+[driver]
+returns_current = false
+[columns]
+total_current_A = {column = "I", factor = 0.001}
+surface = "floor"
+motor_speed_rad_s = "w"
+[instruments.total_current]
+signed = false
+quantum = 0.026
+[instruments.output_speed]
+quantum = 0.5
+[effects.churning]
+amplitude = 1e-4
+""",
+    )  # fmt: skip
+    assert robot.configurations.names == ("bench", "slow")
+    assert robot.rig.columns == (
+        ("total_current_A", "I", 0.001),
+        ("surface", "floor", 1.0),
+        ("motor_speed_rad_s", "w", 1.0),
+    )
+    assert robot.rig.instruments == (
+        Instrument("total_current", False, 0.026),
+        Instrument("output_speed", True, 0.5 * math.pi / 30),
+    )
+    assert same(again(tmp_path, robot), robot)
+
+
+def test_written_rig_keeps_the_prior_of_what_a_fit_left_alone(tmp_path):
+    robot = params.replace(read(tmp_path, BENCH), {"motor.torque_constant": params.as_float(0.052)})
+    back = again(tmp_path, robot)
+    assert float(back.motor.torque_constant) == 0.052
+    assert [name for name, _, _ in back.rig.priors] == ["gearbox.efficiency_load", "bench.loss_coulomb"]
+
+
+def test_nominal_robot_with_a_rig_of_its_own_is_read_back(tmp_path):
+    robot = read(tmp_path, 'imposed = "motor_speed"\n[6T2A]\nmass = "12 ± 1 %"\n')
+    assert robot.rig.channels == ("total_current", "speed") and not robot.rig.blank
+    assert robot.rig.priors == (("6T2A.mass", 12.0, 0.12),)
+    assert same(again(tmp_path, robot), robot)
+
+
+def test_nominal_drive_on_a_bench(tmp_path):
+    robot = read(tmp_path, 'configurations = ["b"]\n[b]\nload = "shaft"\ninertia = 0.01\nloss_coulomb = 0.1\n')
+    assert (
+        robot.on_shaft
+        and float(robot.motor.resistance) == 0.611
+        and robot.rig.channels == ("total_current", "motor_speed")
+    )
+    assert same(again(tmp_path, robot), robot)
+
+
+@pytest.mark.parametrize("sides", [1, 2])
+@pytest.mark.parametrize(
+    ("travel", "radius"), [("lead_mm = 5.0", 5e-3 / (2 * math.pi)), ("drum_radius_mm = 20.0", 0.02)]
+)
+def test_linear_unit_is_a_shaft(tmp_path, travel, radius, sides):
+    text = (
+        CARRIAGE.format(sides=sides)
+        + f"mass_kg = 2.5\n{travel}\nforce_coulomb_N = 12.0\nforce_viscous_N_s_m = 40.0\n"
+    )
+    robot = read(tmp_path, text + "force_constant_N = 3.0\nincline_deg = 30.0\ninertia = 1e-5\n")
+    load = robot.configurations["carriage"]
+    found = [
+        float(x) for x in (load.radius, load.inertia, load.loss_coulomb, load.loss_viscous, load.torque_constant)
+    ]
+    weight = 2.5 * GRAVITY * 0.5
+    forces = [12.0 * radius / sides, 40.0 * radius**2 / sides, (3.0 + weight) * radius / sides]
+    np.testing.assert_allclose(found, [radius, 1e-5 + 2.5 * radius**2 / sides, *forces], rtol=1e-12)
+    assert "speed" in robot.rig.channels
+    assert same(again(tmp_path, robot), robot)
+
+
+def test_sds_of_a_linear_unit_are_those_of_its_shaft(tmp_path):
+    """J = m (p / 2π)²: relative variances add, that of the lead fourfold."""
+    robot = read(tmp_path, CARRIAGE.format(sides=1) + 'mass_kg = "2.5 ± 2 %"\nlead_mm = "5.0 ± 0.01 %"\n')
+    priors = {name: (mean, sd) for name, mean, sd in robot.rig.priors}
+    mean, sd = priors["carriage.inertia"]
+    assert mean == pytest.approx(2.5 * (5e-3 / (2 * math.pi)) ** 2, rel=1e-12)
+    assert sd / mean == pytest.approx(math.hypot(0.02, 0.0002), rel=1e-3)
+    assert priors["carriage.radius"][1] / priors["carriage.radius"][0] == pytest.approx(1e-4, rel=1e-9)
+
+
+def test_like_names_another_load_of_the_file(tmp_path):
+    robot = read(tmp_path, BENCH + '[heavy]\nlike = "bench"\ninertia = 0.01\n')
+    assert robot.configurations.names == ("bench", "heavy")
+    assert float(robot.configurations["heavy"].loss_coulomb) == 0.1
+    assert float(robot.configurations["heavy"].inertia) == 0.01
+    assert ("heavy.loss_coulomb", 0.1, 0.05) in robot.rig.priors
+
+
+def test_changed_parameter_takes_its_prior_along(tmp_path):
+    robot = robot_file.change(read(tmp_path, BENCH), {"motor.torque_constant": 0.06}, where="--set")
+    assert robot.rig.priors[0] == ("motor.torque_constant", 0.06, 0.002)
+
+
+def test_wheels_lose_nothing_that_is_not_stated_and_tracks_have_to_state_it(tmp_path):
+    robot = read(tmp_path, ROVER)
+    track, friction = robot.configurations["rover"].track, robot.configurations["rover"].ground.friction
+    assert [float(x) for x in (track.loss_coulomb, track.loss_viscous, track.guide_share)] == [0.0, 0.0, 0.0]
+    assert float(friction.dynamic) == pytest.approx(0.4)
+    with pytest.raises(BadConfiguration, match=r"rover\.track\.loss_coulomb \[N·m\] is missing"):
+        read(tmp_path, ROVER.replace('load = "vehicle"', 'movers = "tracks"'))
+
+
+def without(text, *keys):
+    return "\n".join(line for line in text.splitlines() if line.partition(" =")[0] not in keys)
+
+
+REFUSED = {
+    "no load": ('base = "none"\n[motor]\nresistance = 1.0\n', r"no load; expected a table such as \[bench\] with load"),
+    "unknown base": ('base = "nothing"', r"base: got nothing; .*none"),
+    "vehicle without mass": (without(ROVER, "mass"), r'rig\.toml: rover\.mass \[kg\] is missing, which a robot with base'),
+    "all that is missing": (
+        'base = "none"\n[bench]\nload = "shaft"\n',
+        r"gearbox\.ratio \[-\], gearbox\.efficiency_load \[-\], motor\.torque_constant \[N·m/A\], motor\.resistance "
+        r"\[ohm\], bench\.inertia \[kg·m\^2\], bench\.loss_coulomb \[N·m\] are missing",
+    ),
+    "no voltage known": (
+        BENCH.replace('["total_current"]', '["total_current", "motor_voltage"]'),
+        r"motor\.resistance \[ohm\] is missing",
+    ),
+    "speed of a shaft": (
+        BENCH.replace('["total_current"]', '["total_current", "speed"]'),
+        r"bench\.radius \[m\] is missing",
+    ),
+    "ratio upside down": (
+        BENCH.replace("ratio = 16", "ratio = 0.0625"),
+        r"gearbox\.ratio: got 0\.0625; expected turns of the motor for one of the output, at least 1; is 16 meant\?",
+    ),
+    "vehicle and shaft": (
+        BENCH + ROVER[ROVER.index("[rover]") :],
+        r"bench is a shaft and rover a vehicle; expected loads of one kind",
+    ),
+    "unknown load": (BENCH.replace('"shaft"', '"shafts"'), r"bench\.load: got shafts; did you mean shaft\?"),
+    "shaft on wheels": (BENCH + 'movers = "wheels"', r"bench: states both load = 'shaft' and movers"),
+    "not said what": (
+        BENCH + "[other]\ninertia = 1.0\n",
+        r"other: what it is is missing; state load = one of shaft, linear, vehicle",
+    ),
+    "not among": ('configurations = ["bench"]' + BENCH + '[slow]\nload = "shaft"', r"slow: not among the configurations"),
+    "vehicle with a parameter of a shaft": (
+        ROVER.replace("mass = 4.0", "mass = 4.0\ntorque_gravity = 1.0"),
+        r"rover\.torque_gravity: no such parameter",
+    ),
+    "unknown imposed": (BENCH.replace('"motor_speed"', '"torque"'), r"imposed: got torque; allowed: voltage, motor_speed"),
+    "imposed and read": (
+        BENCH.replace('["total_current"]', '["motor_speed"]'),
+        r'channels: motor_speed is imposed, so it is no reading; remove it, or state imposed = "voltage"',
+    ),
+    "unknown channel": (
+        BENCH.replace('["total_current"]', '["totalcurrent"]'),
+        r"channels: got totalcurrent; did you mean total_current\?",
+    ),
+    "no channels": (BENCH.replace('["total_current"]', "[]"), r"channels: got \[\]; expected a list of channels"),
+    "unknown start": ('start = "still"' + BENCH, r"start: got still; allowed: rest, measured, free"),
+    "unknown column": (BENCH + '[columns]\ntotal_curent_A = "I"', r"columns\.total_curent_A: no such column .*total_current_A"),
+    "odd column": (BENCH + "[columns]\ntotal_current_A = 3", r"columns\.total_current_A: got 3; expected MINE = \"THEIRS\""),
+    "factor 0": (
+        BENCH + '[columns]\ntotal_current_A = {column = "I", factor = 0}',
+        r"total_current_A\.factor: got 0; expected a number that is not 0",
+    ),
+    "instrument of no channel": (
+        BENCH + "[instruments.speed]\nsigned = false",
+        r"instruments\.speed: the rig has no such channel; allowed: total_current",
+    ),
+    "odd instrument": (BENCH + "[instruments.total_current]\nstep = 1", r"total_current\.step: no such key; allowed: signed, quantum"),
+    "negative step": (
+        BENCH + "[instruments.total_current]\nquantum = -1",
+        r"quantum: got -1; expected the step of its readings, 0 or more A",
+    ),
+    "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, or false"),
+    "± nothing": (BENCH.replace("0.1 ± 0.05", "0.1 ± "), r"bench\.loss_coulomb: got '0\.1 ± '; expected a number, or one with"),
+    "± zero": (BENCH.replace("0.1 ± 0.05", "0.1 ± 0"), r"the standard deviation must be more than 0"),
+    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"the standard deviation must be more than 0"),
+    "± out of bounds": (BENCH.replace("0.8 +- 0.03", "1.8 ± 0.1"), r"efficiency_load: got 1\.8; expected 0\.05 to 1"),
+    "± of a rating": (BENCH + '[motor.x]\ny = 1\n', r"motor\.x\.y: no such parameter"),
+    "two travels": (
+        CARRIAGE.format(sides=1) + "mass_kg = 1.0\nlead_mm = 5.0\ndrum_radius_mm = 3.0\n",
+        r"carriage: got lead_mm and drum_radius_mm; expected one of them",
+    ),
+    "no travel": (CARRIAGE.format(sides=1) + "mass_kg = 1.0\n", r"carriage: got neither lead_mm nor drum_radius_mm"),
+    "no mass": (CARRIAGE.format(sides=1) + "lead_mm = 1.0\n", r"carriage\.mass_kg: missing"),
+    "negative lead": (CARRIAGE.format(sides=1) + "mass_kg = 1.0\nlead_mm = -5.0\n", r"lead_mm: got -5\.0; expected a number more than 0"),
+    "SI in a linear unit": (CARRIAGE.format(sides=1) + "mass = 1.0\nlead_mm = 5.0\n", r"carriage\.mass: no such key of a linear unit"),
+    "like nobody": (BENCH + '[b]\nlike = "bensh"', r"b\.like: got bensh; did you mean bench\?"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_bad_rigs_are_refused_in_one_sentence(tmp_path, case):
+    text, sentence = REFUSED[case]
+    with pytest.raises(BadConfiguration, match=sentence) as refusal:
+        read(tmp_path, text)
+    said = str(refusal.value)
+    assert said.startswith("rig.toml") and "\n" not in said
+
+
+def test_packaged_robot_is_as_it_was(tmp_path):
+    robot = robot_file.with_effects(robots.nominal(), tuple(effects.BY_NAME))
+    assert same(again(tmp_path, robot), robot) and "[rig]" not in (tmp_path / "again.toml").read_text()
+
+
+# --- from the command line ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rig_new_writes_a_file_that_reads(mmrjax, tmp_path, kind):
+    code, out, err = mmrjax("rig", "new", "my-rig.toml", "--kind", kind)
+    assert (code, err) == (0, "") and "mmrjax rig check my-rig.toml" in out
+    assert robot_file.load(str(tmp_path / "my-rig.toml")).rig.blank
+
+
+def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
+    (tmp_path / "my-rig.toml").write_text("mine")
+    code, _, err = mmrjax("rig", "new", "my-rig.toml")
+    assert code == 2 and "my-rig.toml: there already; --force replaces it" in err
+    assert (tmp_path / "my-rig.toml").read_text() == "mine"
+    assert mmrjax("rig", "new", "my-rig.toml", "--force")[0] == 0
+    assert robot_file.load(str(tmp_path / "my-rig.toml")).on_shaft
+
+
+def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
+    code, _, err = mmrjax("rig", "new", "my-rig.toml", "--kind", "bensh")
+    assert (
+        code == 2
+        and "--kind: got bensh; did you mean bench? allowed: bench, pendulum, linear, wheeled, tracked" in err
+    )
+    code, _, err = mmrjax("rig", "new", "nowhere/my-rig.toml")
+    assert code == 2 and "no such folder as nowhere" in err
+    assert not list(tmp_path.iterdir())
