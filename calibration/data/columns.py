@@ -35,7 +35,7 @@ ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
 #: Columns that say when a row was measured; a table without either was measured in the order of its rows.
 WHEN = ("time_s", "order")
 WORDS = ("configuration", "surface", "run_id", "mode")
-#: Columns that every table of a robot that is not blank has to have, and those that one without measurements may lack.
+#: Columns that every table of the packaged robot has to have, and those that one without measurements may lack.
 REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
 #: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
 SUPPLY, SPEED = "supply_voltage_V", "motor_speed_rpm"
@@ -223,9 +223,7 @@ class Layout:
         for k, meaning in enumerate(found):
             twin = next((m for m in found[:k] if m and meaning and m.column == meaning.column), None)
             if meaning and twin and meaning.shown != twin.shown:
-                raise BadData(
-                    f"{source}: columns {twin.shown} and {meaning.shown} state the same; keep one of them"
-                )
+                raise BadData(f"{source}: columns {twin.shown} and {meaning.shown} state the same; keep one of them")
         return found
 
     def _by_name(self) -> Mapping[str, Meaning]:
@@ -251,5 +249,3 @@ class Layout:
 
 def _standard(by_name: Mapping[str, Meaning], name: str) -> str:
     return by_name[name].column if name in by_name else name
-
-

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.columns import RPM, SPEED, SUPPLY
@@ -47,7 +48,7 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
     if not runs.has(column) or not np.nan_to_num(runs[column]).any():
         return
     voltage = runs[column]
-    back = np.asarray(robot.motor.voltage_back(runs[SPEED] * RPM))
+    back = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
     along = voltage * np.sign(back)
     if column == SUPPLY and (voltage > 0).all():
         along = np.abs(voltage)

@@ -69,7 +69,7 @@ class Runs:
     columns: dict[str, np.ndarray]
     unknown: tuple[str, ...] = ()
     digest: str = ""
-    layout: Layout = Layout()
+    layout: Layout = dataclasses.field(default_factory=Layout)
 
     def __len__(self) -> int:
         return len(self.columns["configuration"])
@@ -190,9 +190,7 @@ class Runs:
         )
 
 
-def read(
-    source: str | Path, *, measured: bool = True, battery: bool = False, robot: Robot | None = None
-) -> Runs:
+def read(source: str | Path, *, measured: bool = True, battery: bool = False, robot: Robot | None = None) -> Runs:
     """Read a packaged table by its name, or a CSV file.
 
     Args:
@@ -328,10 +326,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         wrong = np.flatnonzero(backward & (readings > 0))
         if wrong.size:
             at = int(wrong[0])
-            hint = "" if layout.usual else (
-                f"; if the instrument shows magnitude alone, state signed = false for {channel.name} in the robot's "
-                "file"
-            )
+            alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
+            hint = "" if layout.usual else alone
             raise BadData(
                 f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at "
                 f"{number(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
