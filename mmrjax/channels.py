@@ -36,6 +36,7 @@ class Channel:
         resolution: digits after the point that a person wants to see [unit].
         unit_si: of readings inside; empty where `factor` is 1.
         zero_at_rest: whether it shows 0 until the robot moves.
+        directed: whether it has another sign in the other direction.
         settled, over_time: whether settled runs and histories can show it.
         other_units: what is often written in its column by mistake, and the SI value of each.
     """
@@ -54,6 +55,7 @@ class Channel:
     resolution: int = 1
     unit_si: str = ""
     zero_at_rest: bool = False
+    directed: bool = True
     settled: bool = True
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
@@ -203,6 +205,7 @@ EVERY: tuple[Channel, ...] = (
         sd_share=0.02,
         unit_si="°C",
         over_time=False,
+        directed=False,
     ),
 )
 

@@ -94,6 +94,7 @@ class Rig(eqx.Module):
         priors: (parameter, mean, sd) [SI] that the file states, in place of the parameters' own.
         start: of histories: `rest`, `measured` (by the first samples) or `free`, which those are the prior of.
         begins: of histories that do not begin at rest, once their table is known.
+        surfaces: (configuration, another from which it differs by its ground alone).
         blank: whether it starts from nothing, so that nothing in it is another robot's.
     """
 
@@ -112,6 +113,7 @@ class Rig(eqx.Module):
     columns: tuple[tuple[str, str, float], ...] = eqx.field(default=(), static=True)
     priors: tuple[tuple[str, float, float], ...] = eqx.field(default=(), static=True)
     start: str = eqx.field(default="rest", static=True)
+    surfaces: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
     blank: bool = eqx.field(default=False, static=True)
 
     def instrument(self, channel: str) -> Instrument:

@@ -13,12 +13,17 @@ from calibration.data import runs as records
 from calibration.inference import errors as residual
 from calibration.inference.ranges import check_ranges
 from mmrjax import channels
+from mmrjax.robot import Robot
 from sweeps import config as configuration
 from sweeps import run, uncertainty, words
 from sweeps.console import say
 from sweeps.inputs import beside_robot, load_robot, read_runs
 from sweeps.store import open_folder
 
+#: Conditions that are printed, and their headings.
+HEADINGS = {
+    "supply_voltage_V": "U [V]", "motor_speed_rpm": "n [rpm]", "total_mass_kg": "M [kg]", "slope_deg": "slope [deg]",
+}  # fmt: skip
 #: Group → channel → rows, rms_percent, max_percent, r2, missing.
 Summary = dict[str, dict[str, dict[str, Any]]]
 
@@ -33,7 +38,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)
-        comparison, summary = compared(stated, table)
+        comparison, summary = compared(stated, table, robot)
         folder.write_table("comparison.csv", comparison)
         notes = [*missing(comparison), *said]
         print_comparison(comparison, summary, notes)
@@ -57,12 +62,17 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
         return run.leave(folder, config, run.SimulationResult("compare", config.model, robot, runs, table, further))
 
 
-def compared(measured: records.Runs, simulated: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Summary]:
-    """Rows side by side with their errors (35), and the errors' summary for all rows and by configuration.
+def compared(
+    measured: records.Runs, simulated: dict[str, np.ndarray], robot: Robot | None = None
+) -> tuple[dict[str, np.ndarray], Summary]:
+    """Rows side by side with their errors (35), and the errors' summary for all rows and by configuration, of `robot`
+    those of its surfaces.
 
     A reading that is missing is NaN in its row; it weighs nothing and is counted as `missing`.
     """
-    table = {key: simulated[key] for key in ("configuration", *records.CONDITIONS)}
+    table = {key: simulated[key] for key in ("configuration", *measured.layout.axes)}
+    if not measured.layout.usual and measured.has("surface"):
+        table["surface"] = measured["surface"]
     nothing = np.full(len(measured), np.nan)
     for channel in channels.CHANNELS:
         table[channel.column] = measured.columns.get(channel.column, nothing)
@@ -72,7 +82,8 @@ def compared(measured: records.Runs, simulated: dict[str, np.ndarray]) -> tuple[
         )
     table["status"] = simulated["status"]
     groups = {"all": np.ones(len(measured), bool)}
-    groups |= {str(c): measured["configuration"] == c for c in dict.fromkeys(measured["configuration"])}
+    names = measured["configuration"] if robot is None else measured.configurations_named(robot)
+    groups |= {str(c): names == c for c in dict.fromkeys(names)}
     summary = {
         name: {c.name: _summary(c, {k: v[rows] for k, v in table.items()}) for c in channels.CHANNELS}
         for name, rows in groups.items()
@@ -103,11 +114,12 @@ def missing(table: dict[str, np.ndarray]) -> list[str]:
 def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list[str]) -> None:
     """Every row's errors, their summary, and which readings are missing."""
     rows = Table(title="(simulated - measured) / simulated, eq. (35) [%]", title_justify="left")
-    for heading in ("", "U [V]", "M [kg]", "slope [deg]", *(_words(c) for c in channels.CHANNELS), "status"):
+    stated_here = {c: words for c, words in HEADINGS.items() if c in table and f"simulated_{c}" not in table}
+    for heading in ("", *stated_here.values(), *(_words(c) for c in channels.CHANNELS), "status"):
         rows.add_column(heading, justify="left" if heading in ("", "status") else "right")
     for k in range(len(table["status"])):
         errors = (table[f"error_{channel.name}_percent"][k] for channel in channels.CHANNELS)
-        stated = (f"{table[c][k]:g}" for c in ("supply_voltage_V", "total_mass_kg", "slope_deg"))
+        stated = (f"{table[c][k]:g}" for c in stated_here)
         rows.add_row(
             table["configuration"][k], *stated,
             *("-" if e != e else f"{e:+.1f}" for e in errors), table["status"][k],

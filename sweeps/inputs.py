@@ -83,7 +83,7 @@ def read_runs(
         BadData: what `records.read` refuses, time histories where none are taken, or a configuration that the
             robot does not have.
     """
-    runs = records.read(source, measured=measured, battery=battery)
+    runs = records.read(source, measured=measured, battery=battery, robot=robot)
     if not series:
         from calibration.inference import observers
 

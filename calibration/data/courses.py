@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data.columns import SPEED
 from calibration.data.runs import Runs
 
 #: Columns of which every sample of a run may have a value of its own. A stated mass may change as the payload does.
@@ -40,19 +41,29 @@ class Stretch:
         return self.rows[time[self.rows] >= self.begin + share * (self.end - self.begin)]
 
 
+def changing(runs: Runs) -> tuple[str, ...]:
+    """Those of `CHANGING`, and an imposed speed, that a table has."""
+    imposed = (SPEED,) if runs.layout.imposed_column == SPEED else ()
+    return tuple(c for c in (*imposed, *CHANGING) if runs.has(c))
+
+
 def names(runs: Runs) -> np.ndarray:
     """Which run each row belongs to, shape (rows,)."""
     return runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
 
 
 def applied(runs: Runs) -> np.ndarray:
-    """Voltage that the driver gives the motors in every row, 0 where they brake or coast [V], shape (rows,)."""
+    """Voltage that the driver gives the motors in every row, 0 where they brake or coast [V], or the speed imposed on
+    them [rpm]; shape (rows,)."""
+    if runs.layout.imposed_column == SPEED:
+        return runs[SPEED]
     voltage = runs["supply_voltage_V"] * (runs["duty"] if runs.has("duty") else 1.0)
     return np.where(runs["mode"] == "voltage", voltage, 0.0) if runs.has("mode") else voltage
 
 
-def varies(runs: Runs, columns: tuple[str, ...] = CHANGING) -> np.ndarray:
-    """Whether one of these columns changes within the run of a row, shape (rows,)."""
+def varies(runs: Runs, columns: tuple[str, ...] | None = None) -> np.ndarray:
+    """Whether one of these columns, or of those that may, changes within the run of a row, shape (rows,)."""
+    columns = changing(runs) if columns is None else columns
     found = np.zeros(len(runs), bool)
     if not runs.sampled:
         return found
@@ -85,7 +96,7 @@ def stretches(runs: Runs) -> list[list[Stretch]]:
     """The stretches of every run, runs in the order of their names."""
     found = []
     every, time, volts = names(runs), runs["time_s"], applied(runs)
-    columns = [runs[c] for c in CHANGING if runs.has(c)]
+    columns = [runs[c] for c in changing(runs)]
     for name in np.unique(every):
         rows = np.flatnonzero(every == name)
         found.append(divided(rows[np.argsort(time[rows], kind="stable")], time, columns, volts))
@@ -96,7 +107,7 @@ def courses(runs: Runs) -> np.ndarray:
     """For every row the course of its run's conditions, empty where they do not change; shape (rows,)."""
     found = np.full(len(runs), "", dtype=object)
     if varies(runs).any():
-        columns = [c for c in CHANGING if runs.has(c)]
+        columns = changing(runs)
         for run in (r for r in stretches(runs) if len(r) > 1):
             said = [f"{s.begin:g}: {', '.join(str(runs[c][s.rows[0]]) for c in columns)}" for s in run]
             found[np.concatenate([s.rows for s in run])] = "; ".join(said)

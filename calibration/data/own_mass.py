@@ -15,6 +15,7 @@ import numpy as np
 
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
+from calibration.data.surfaces import scaled
 from mmrjax import params
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH
@@ -103,7 +104,10 @@ def remarks(robot: Robot, runs: Runs) -> list[str]:
                 f"{name}: the table states {stated.median:.6g} kg without payload, the robot's file {own:.6g} kg; "
                 f"{stated.median:.6g} kg is fitted with and written"
             )
-    others = [s for s in np.unique(runs["surface"]) if s != BENCH] if runs.has("surface") else []
+    of_table5 = np.zeros(len(runs), bool)
+    if runs.has("surface"):
+        of_table5 = scaled(robot, runs["configuration"], runs["surface"])
+    others = [s for s in np.unique(runs["surface"][of_table5]) if s != BENCH] if of_table5.any() else []
     if others:
         said.append(
             f"the table has runs on {', '.join(others)}: the friction that is written is that of {BENCH}; simulate "

@@ -14,55 +14,39 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.data import surfaces
+from calibration.data.columns import (
+    CONDITIONS,
+    DEFAULTS,
+    DRIVEN,
+    DRIVING,
+    DUTY,
+    IMPOSED,
+    ON_GROUND,
+    SUPPLY,
+    TIME,
+    WHEN,
+    WORDS,
+    Layout,
+    Meaning,
+    deviation_columns,
+    measured_columns,
+)
 from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number
 from mmrjax import channels
 from mmrjax.channels import MM, RPM
-from mmrjax.tables import SURFACES, adhesion_ratio
+from mmrjax.tables import adhesion_ratio
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
     from mmrjax.robot import Robot
 
-#: Condition columns with the least and greatest value allowed.
-CONDITIONS: dict[str, tuple[float, float]] = {
-    "supply_voltage_V": (-100.0, 100.0),  # negative: backward
-    "total_mass_kg": (0.1, 500.0),
-    "payload_kg": (0.0, 300.0),
-    "slope_deg": (-45.0, 45.0),
-}
-TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
-#: What a time history may state of its motors' driver: the share of the supply's voltage that they get, negative
-#: backward; and how they are driven: by that share, or not, their terminals shorted or their circuit open.
-DUTY: dict[str, tuple[float, float]] = {"duty": (-1.0, 1.0)}
-DRIVEN = ("voltage", "brake", "coast")
-DRIVING = ("duty", "mode")
-#: Place of a row in the sequence in which runs were made; without it that of the row in the file.
-ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
-#: Columns that say when a row was measured; a table without either was measured in the order of its rows.
-WHEN = ("time_s", "order")
-WORDS = ("configuration", "surface", "run_id", "mode")
-#: Columns that every table has to have, and those that a table without measurements may lack.
-REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
-
 __all__ = ["CONDITIONS", "MM", "RPM", "Runs", "known_columns", "measured_columns", "read", "single"]
 
 
-def measured_columns() -> tuple[str, ...]:
-    """Columns of the channels, in the order of arrays."""
-    return tuple(c.column for c in channels.CHANNELS)
-
-
 def known_columns() -> tuple[str, ...]:
-    """Every column that means something in a table of runs."""
-    deviations = tuple(c.sd_column for c in channels.CHANNELS)
-    return (*REQUIRED, *measured_columns(), *deviations, "surface", "run_id", "time_s", *DRIVING, *ORDER)
-
-
-def _ranges() -> dict[str, tuple[float, float]]:
-    """Least and greatest value of every number column."""
-    readings = {c.column: c.range for c in channels.CHANNELS}
-    deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.CHANNELS}
-    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **ORDER}
+    """Every column that means something in a table of the packaged robot's runs."""
+    return Layout().known()
 
 
 #: Tables that come with the package.
@@ -81,6 +65,7 @@ class Runs:
         digest: SHA-256 of the file, empty for a table that came from none.
         extras: cells of `unknown` columns, shape (rows,): numbers, NaN where empty, or words; not in `columns`, as
             they have no role, and looked at only for what residuals go with.
+        layout: what its columns mean for the robot that it is of.
     """
 
     source: str
@@ -88,6 +73,7 @@ class Runs:
     unknown: tuple[str, ...] = ()
     digest: str = ""
     extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    layout: Layout = dataclasses.field(default_factory=Layout)
 
     def __len__(self) -> int:
         return len(self.columns["configuration"])
@@ -98,6 +84,11 @@ class Runs:
     def has(self, column: str) -> bool:
         """Whether the table has this column."""
         return column in self.columns
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Columns of the conditions that its runs have, what is imposed first."""
+        return tuple(c for c in self.layout.axes if self.has(c))
 
     @property
     def sampled(self) -> bool:
@@ -135,14 +126,16 @@ class Runs:
         return said
 
     def configurations(self, robot: Robot) -> np.ndarray:
-        """Index of each row's configuration in `robot`, shape (rows,).
+        """Index of each row's configuration in `robot`, shape (rows,): that of its configuration on its surface
+        (`surfaces.named`) where the robot has one, else that of its configuration.
 
         Raises:
             InputError: a configuration that the robot does not have; those that it has are listed.
         """
         which = np.empty(len(self), int)
-        for name in np.unique(self["configuration"]):
-            rows = self["configuration"] == name
+        names = self.configurations_named(robot)
+        for name in np.unique(names):
+            rows = names == name
             if name not in robot.configurations:
                 first = int(np.flatnonzero(rows)[0]) + 1
                 raise BadData(
@@ -151,6 +144,14 @@ class Runs:
                 )
             which[rows] = robot.configurations.index(str(name))
         return which
+
+    def configurations_named(self, robot: Robot) -> np.ndarray:
+        """As `configurations`, by name; of those that the robot does not have as the table does."""
+        stated = self["configuration"]
+        if not self.has("surface"):
+            return stated
+        on = [surfaces.named(c, s) for c, s in zip(stated, self["surface"], strict=True)]
+        return np.array([o if o in robot.configurations else c for o, c in zip(on, stated, strict=True)])
 
     def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
         """The conditions as one batch of shape (rows,).
@@ -172,12 +173,17 @@ class Runs:
         adhesion = np.ones(len(self))
         if self.has("surface"):
             on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
-            adhesion = np.array([adhesion_ratio(s, t) for s, t in zip(self["surface"], on_tracks, strict=True)])
+            scaled = surfaces.scaled(robot, self["configuration"], self["surface"])
+            adhesion[scaled] = [
+                adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
+            ]
+        column, factor = IMPOSED["motor_speed"]
+        imposed = robot.rig.imposed == "motor_speed"
         return Conditions(
             which,
-            np.zeros(len(self)) if battery else self["supply_voltage_V"],
-            self["slope_deg"],
-            self["payload_kg"],
+            np.zeros(len(self)) if battery or imposed else self[SUPPLY],
+            self.columns.get("slope_deg", 0.0),
+            self.columns.get("payload_kg", 0.0),
             battery=battery,
             discharge=discharge,
             adhesion=adhesion,
@@ -185,10 +191,11 @@ class Runs:
             order=self["order"] if self.has("order") else 0.0,
             duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),
             open=self["mode"] == "coast" if self.has("mode") else 0.0,
+            motor_speed=self[column] * factor if imposed else None,
         )
 
 
-def read(source: str | Path, *, measured: bool = True, battery: bool = False) -> Runs:
+def read(source: str | Path, *, measured: bool = True, battery: bool = False, robot: Robot | None = None) -> Runs:
     """Read a packaged table by its name, or a CSV file.
 
     Args:
@@ -196,22 +203,30 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False) ->
         measured: whether at least one channel is required; without any `total_mass_kg` may be missing too.
         battery: whether the runs are on the on-board battery, whose voltage no table states: its column is left out,
             or empty.
+        robot: that the table is of; it says which columns are needed. None: the packaged one.
 
     Raises:
         BadData: no such file, nothing in it, no channel, a missing, misspelt or repeated column, a row of another
             length, or a cell that is no number, not finite or out of range; said with file, row (counted
             from 1 below the header), column, value and what is allowed.
     """
+    layout = Layout.of(robot)
     if str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
-            return _read(path, str(source), measured, battery)
-    path = Path(source)
-    if not path.exists():
-        raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-    return _read(path, path.name or str(source), measured, battery)
+            runs = _read(path, str(source), measured, battery, layout)
+    else:
+        path = Path(source)
+        if not path.exists():
+            raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
+        runs = _read(path, path.name or str(source), measured, battery, layout)
+    if robot is not None and not layout.usual:
+        from calibration.data import contradictions
+
+        contradictions.check(runs, robot)
+    return runs
 
 
-def _read(path: Path, name: str, measured: bool, battery: bool) -> Runs:
+def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) -> Runs:
     try:
         content = path.read_bytes()
         text = content.decode("utf-8-sig")
@@ -219,37 +234,48 @@ def _read(path: Path, name: str, measured: bool, battery: bool) -> Runs:
         raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
     rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     if not rows:
-        expected = ", ".join((*REQUIRED, *measured_columns()))
+        expected = ", ".join((*layout.required(measured=True, battery=False), *measured_columns()))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
     header = [cell.strip() for cell in rows[0]]
     if len(header) == 1 and ";" in header[0]:
         raise BadData(f"{name}: columns are separated by semicolons; expected commas, and points in numbers")
-    _check_header(name, header, measured, battery)
+    repeated = sorted({c for c in header if header.count(c) > 1})
+    if repeated:
+        raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
+    meanings = layout.meanings(name, header)
+    _check_header(name, header, meanings, measured, battery, layout)
     if len(rows) == 1:
         raise BadData(f"{name}: a header and no rows; expected at least one run")
     for k, row in enumerate(rows[1:], 1):
         if len(row) != len(header):
             raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
     columns: dict[str, np.ndarray] = {}
-    for j, column in enumerate(header):
-        if column in known_columns():
+    for j, meaning in enumerate(meanings):
+        if meaning is not None:
             cells = [row[j].strip() for row in rows[1:]]
-            if battery and column == "supply_voltage_V":
+            if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
                 _refuse_stated(name, cells)
                 continue
-            columns[column] = np.array([_cell(f"{name} row {k}", column, cell) for k, cell in enumerate(cells, 1)])
+            if layout.on_shaft and meaning.column in ON_GROUND:
+                _refuse_ground(name, meaning, cells)
+                continue
+            where = (f"{name} row {k}" for k in range(1, len(rows)))
+            columns[meaning.column] = np.array(
+                [_cell(at, meaning, cell, layout) for at, cell in zip(where, cells, strict=True)]
+            )
+    _fill(columns, len(rows) - 1, layout)
     _check_driving(name, columns)
     _check_mass(name, columns)
     _check_deviations(name, columns)
-    if battery:
-        columns["supply_voltage_V"] = np.full(len(rows) - 1, np.nan)
+    if battery and layout.imposed == "voltage":
+        columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
-        _check_signs(name, columns)
+        _check_signs(name, columns, layout)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
-    unknown = tuple(c for c in header if c not in known_columns())
+    unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
     extras = {c: _extra([row[header.index(c)].strip() for row in rows[1:]]) for c in unknown}
-    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras)
+    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout)
 
 
 def _extra(cells: list[str]) -> np.ndarray:
@@ -258,6 +284,25 @@ def _extra(cells: list[str]) -> np.ndarray:
         return np.array([float(cell) if cell else math.nan for cell in cells])
     except ValueError:
         return np.array(cells)
+
+
+def _fill(columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+    """Put in what a table of a rig need not state: its only configuration, and conditions as they mostly are."""
+    if layout.usual:
+        return
+    if "configuration" not in columns and layout.configurations:
+        columns["configuration"] = np.full(rows, layout.configurations[0])
+    for column, value in DEFAULTS.items():
+        columns.setdefault(column, np.full(rows, value))
+
+
+def _refuse_ground(name: str, meaning: Meaning, cells: list[str]) -> None:
+    for row, cell in enumerate(cells, 1):
+        if cell.strip("0.-") != "":
+            raise BadData(
+                f"{name} row {row}, {meaning.shown}: got {cell}; the robot's load is a shaft, on which no slope, "
+                "payload or mass acts; remove the column, or describe the load as a vehicle"
+            )
 
 
 def _refuse_stated(name: str, voltages: list[str]) -> None:
@@ -269,63 +314,81 @@ def _refuse_stated(name: str, voltages: list[str]) -> None:
             )
 
 
-def _check_signs(name: str, columns: dict[str, np.ndarray]) -> None:
-    """Refuse readings without a sign where the supply drives the robot backward, and rows without a voltage."""
-    voltage = columns["supply_voltage_V"]
-    if (voltage == 0).any():
-        row = int(np.flatnonzero(voltage == 0)[0]) + 1
-        raise BadData(f"{name} row {row}, supply_voltage_V: got 0; expected a voltage, in a table of readings")
+def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+    """Refuse readings without a sign where what is imposed drives the robot backward, and rows without it."""
+    column = layout.imposed_column
+    imposed, what, unit = columns[column], column.split("_")[-2], column.split("_")[-1]
+    if (imposed == 0).any():
+        row = int(np.flatnonzero(imposed == 0)[0]) + 1
+        raise BadData(f"{name} row {row}, {column}: got 0; expected a {what}, in a table of readings")
     for channel in channels.CHANNELS:
-        if channel.column not in columns:
+        if channel.column not in columns or not channel.directed:
+            continue
+        readings = columns[channel.column]
+        if layout.magnitude(channel.name):
+            wrong = np.flatnonzero(readings < 0)
+            if wrong.size:
+                raise BadData(
+                    f"{name} row {wrong[0] + 1}, {channel.column}: got {number(readings[wrong[0]])}; expected no "
+                    "negative reading, as the robot's file says that the instrument shows magnitude alone"
+                )
             continue
         # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
-        backward = (voltage < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
-        wrong = np.flatnonzero(backward & (columns[channel.column] > 0))
+        backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
+        if layout.weight and not channel.zero_at_rest:
+            continue
+        wrong = np.flatnonzero(backward & (readings > 0))
         if wrong.size:
             at = int(wrong[0])
+            alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
+            hint = "" if layout.usual else alone
             raise BadData(
-                f"{name} row {at + 1}, {channel.column}: got {number(columns[channel.column][at])} at "
-                f"{number(voltage[at])} V; expected readings with their signs, negative backward"
+                f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at "
+                f"{number(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
             )
 
 
-def _check_header(name: str, header: list[str], measured: bool, battery: bool) -> None:
-    repeated = sorted({c for c in header if header.count(c) > 1})
-    if repeated:
-        raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
-    known = known_columns()
-    strange = [c for c in header if c not in known]
-    own = (() if measured else OWN) + (("supply_voltage_V",) if battery else ())
-    required = tuple(c for c in REQUIRED if c not in own)
-    for column in (c for c in (*required, *measured_columns()) if c not in header):
+def _check_header(
+    name: str, header: list[str], meanings: list[Meaning | None], measured: bool, battery: bool, layout: Layout
+) -> None:
+    stated = {m.column for m in meanings if m is not None}
+    strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
+    if not layout.usual:  # other channels' columns are not misspelt
+        strange = [c for c in strange if c not in {x for k in channels.known() for x in (k.column, k.sd_column)}]
+    required = layout.required(measured=measured, battery=battery)
+    for column in (c for c in (*required, *measured_columns()) if c not in stated):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
-        if column in required or close:
+        if column in required or (close and layout.usual):
             got = f"; is {close[0]} meant?" if close else ""
-            raise BadData(f"{name}: column {column} is missing{got} (required: {', '.join(required)})")
-    if measured and not any(c in header for c in measured_columns()):
+            raise BadData(
+                f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
+            )
+    if measured and not any(c in stated for c in measured_columns()):
         raise BadData(f"{name}: no column of a channel; expected at least one of {', '.join(measured_columns())}")
     for column in strange:
-        close = difflib.get_close_matches(column, [c for c in known if c not in header], 1, 0.85)
+        close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
 
 
-def _cell(where: str, column: str, cell: str, kind: type[InputError] = BadData) -> Any:
+def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[InputError] = BadData) -> Any:
+    column = meaning.column
+
     def refuse(allowed: str) -> InputError:
-        return kind(f"{where}, {column}: got {cell or 'an empty cell'}; expected {allowed}")
+        return kind(f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; expected {allowed}")
 
     if column in WORDS:
-        if column == "surface" and cell not in SURFACES:
-            raise refuse(f"one of these; {choices(cell, SURFACES)}")
+        if column == "surface" and (message := surfaces.refused(cell, layout)):
+            raise refuse(message)
         if column == "mode" and cell not in DRIVEN:
             raise refuse(f"one of these; {choices(cell, DRIVEN)}")
         if column == "configuration" and not cell:
             raise refuse("the name of one of the robot's configurations")
         return cell
-    deviations = [c.sd_column for c in channels.CHANNELS]
-    if not cell and column in (*measured_columns(), *deviations, *DUTY):
+    deviations = deviation_columns()
+    if not cell and column != layout.imposed_column and column in (*measured_columns(), *deviations, *DUTY):
         return math.nan
-    low, high = _ranges()[column]
+    low, high = meaning.limits()
     positive = column in deviations
     allowed = f"{'more than ' if positive else ''}{number(low)} to {number(high)}"
     try:
@@ -334,7 +397,7 @@ def _cell(where: str, column: str, cell: str, kind: type[InputError] = BadData) 
         raise refuse(f"a number, {allowed}") from None
     if not math.isfinite(value) or not low <= value <= high or (positive and value == low):
         raise refuse(allowed)
-    return value
+    return value if meaning.as_named else meaning.value(value)
 
 
 def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
@@ -382,7 +445,10 @@ def single(cells: dict[str, Any]) -> Runs:
         BadConfiguration: an option that is out of range, not finite or an unknown word.
     """
     texts = {column: number(value) if isinstance(value, float) else str(value) for column, value in cells.items()}
-    columns = {column: np.array([_cell("option", column, t, BadConfiguration)]) for column, t in texts.items()}
+    columns = {
+        column: np.array([_cell("option", Meaning(column, column), t, Layout(), BadConfiguration)])
+        for column, t in texts.items()
+    }
     columns.setdefault("supply_voltage_V", np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
         raise BadConfiguration(_too_light("option", cells["total_mass_kg"], cells["payload_kg"]))

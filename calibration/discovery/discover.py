@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import own_mass, robot_file
+from calibration.data import own_mass, robot_file, surfaces
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -95,7 +95,9 @@ def discover(
     """
     menu.check_forbidden(forbidden, robot)
     distinct, numbers, notes = without_copies(runs)
-    stated = robot_file.current_values(stated or {}, robot, "--prior", notes)
+    robot = surfaces.separated(robot, distinct)
+    stated = surfaces.of_surfaces(stated or {}, robot, distinct)
+    stated = robot_file.current_values(stated, robot, "--prior", notes)
     kind = observers.kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
@@ -327,7 +329,7 @@ def pose(
     robot = own_mass.weighed(robot, runs)
     kind = observers.kind(runs)
     index, real = padded(len(runs), kind.sizes_padded)
-    names = priors.free_names(robot, runs["configuration"], *kind.free())
+    names = priors.free_names(robot, runs.configurations_named(robot), *kind.free())
     coordinates = priors.coordinates(robot, names, dict(stated or {}), any_surface=True)
     bare = observers.pose(runs.where(index), robot, coordinates, sd[index])
     shown = visible(library, robot, kind, both_ways(runs))

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
+from calibration.data.columns import SPEED, Layout
 from calibration.inference.linearization import PROBED, Linearization
 from mmrjax import channels
 from mmrjax.effects import UNNAMED
@@ -43,7 +44,14 @@ CONDITIONS = "conditions"
 AXES, WINDOWS, FEWEST = ("time", "order"), (1 / 4, 1 / 8, 1 / 16), 3
 #: Conditions of which a level may differ from the others, the SI value of their column's unit, and the unit; most
 #: levels that each may have.
-LEVELS = {"voltage": (1.0, "V"), "slope": (np.pi / 180, "deg"), "payload": (1.0, "kg")}
+LEVELS = {
+    "voltage": (1.0, "V"),
+    "speed_motor": (channels.RPM, "rpm"),
+    "slope": (np.pi / 180, "deg"),
+    "payload": (1.0, "kg"),
+}
+#: Columns of conditions that a run may have.
+EVERY_AXIS = ("supply_voltage_V", "slope_deg", "payload_kg")
 MOST_LEVELS = 6
 #: Share of the variance of the order that conditions explain from which drift cannot be told from them.
 COLLINEAR = 0.9
@@ -144,6 +152,12 @@ def balances_of(robot: Robot | None) -> tuple[str, ...]:
     return tuple(b for b in BALANCES if b not in lacks)
 
 
+def axes_of(robot: Robot | None) -> tuple[str, ...]:
+    """Columns of the conditions over which curves are, of a robot; None: of the packaged one."""
+    axes = Layout.of(robot).axes
+    return tuple(c for c in (SPEED, *EVERY_AXIS) if c in axes)
+
+
 def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> Bases:
     """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
     of what the readings of a channel are off by, over the reading and over what time or order brings.
@@ -155,9 +169,9 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot
     balances = balances_of(robot)
     over: dict[str, tuple[str, np.ndarray]] = {}
     for variable, column in VARIABLES.items():
-        if column not in columns:
+        if column not in columns or (column in EVERY_AXIS and column not in axes_of(robot)):
             continue
-        if variable == "order" and collinearity(columns, weight) > COLLINEAR:
+        if variable == "order" and collinearity(columns, weight, robot) > COLLINEAR:
             # Another variable again in its place: tables of one size share what is compiled.
             over[variable] = next(iter(over.values()))
             continue
@@ -174,7 +188,7 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot
     new = [n for n in shown if over[n[1]][0] == n[1]]
     # As above: what is left out makes room for another of its channel, or of the first that has one.
     read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
-    axes = [scaled(columns[c], weight) for c in ("supply_voltage_V", "slope_deg", "payload_kg")]
+    axes = [scaled(columns[c], weight) for c in axes_of(robot)]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(axes)) if sum(p) <= DEGREE]
     terms = [
         np.prod([a**k for a, k in zip(axes, p, strict=True)], 0) * (columns["configuration"] == name)
@@ -240,6 +254,8 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot 
                 inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
                 offered.append((axis, x, counts & inside))
     for condition, (factor, _) in LEVELS.items():
+        if VARIABLES[condition] not in axes_of(robot):
+            continue
         x = factor * np.asarray(columns[VARIABLES[condition]], float)
         levels = np.unique(x[counts])
         levels = levels if 2 < len(levels) <= MOST_LEVELS else levels[:0]
@@ -265,18 +281,18 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot 
     )
 
 
-def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray) -> float:
+def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> float:
     """Share of the variance of the order of runs that their conditions explain (R²): at 1 a drift from run to run
     cannot be told from what the conditions do.
 
-    Conditions are a level for each configuration and polynomials of voltage, slope and payload.
+    Conditions are a level for each configuration and polynomials of what is imposed, slope and payload.
     """
     there = weight > 0
     x = np.asarray(columns["order"], float)[there]
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
     terms = [columns["configuration"][there] == name for name in np.unique(columns["configuration"][there])]
-    for column in ("supply_voltage_V", "slope_deg", "payload_kg"):
+    for column in axes_of(robot):
         terms += list(legendre.legvander(scaled(columns[column], weight)[there], DEGREE)[:, 1:].T)
     matrix = np.stack(terms, 1).astype(float)
     left = x - matrix @ np.linalg.lstsq(matrix, x, rcond=None)[0]

@@ -17,6 +17,7 @@ from calibration.inference.problem import Problem
 BLOCKS: dict[str, tuple[str, ...]] = {
     "slope": ("slope_deg",),
     "voltage": ("supply_voltage_V",),
+    "motor_speed": ("motor_speed_rpm",),
     "payload": ("payload_kg",),
     "configuration": ("configuration",),
     "voltage_configuration": ("configuration", "supply_voltage_V"),
@@ -24,15 +25,39 @@ BLOCKS: dict[str, tuple[str, ...]] = {
 }
 
 
+#: Columns of blocks that are labels.
+NO_CONDITIONS = ("configuration", "run_id")
+#: Share of a value by which the next has to be larger to be of another level [-]: a speed that a controller holds is
+#: measured, and not twice the same. Blocks of a quantity that has no levels.
+APART, PARTS = 0.1, 4
+
+
+def levels(x: np.ndarray) -> np.ndarray:
+    """Every number's level, the median of those about as large, to four digits; parts of about as many numbers where
+    they go on without a gap."""
+    order = np.argsort(x, kind="stable")
+    step = np.diff(x[order])
+    group = np.concatenate([[0], np.cumsum(step > APART * np.abs(x[order][:-1]))])
+    if group[-1] == 0 and np.ptp(x) > 2 * APART * PARTS * np.max(np.abs(x)):
+        group = np.arange(len(x)) * PARTS // len(x)
+    level = np.array([float(f"{np.median(x[order][group == g]):.4g}") for g in group])
+    found = np.empty(len(x))
+    found[order] = level
+    return found
+
+
 def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
     """Label → mask of its rows, for each block of `by`; empty where the data do not vary in it.
 
     A run of a history in which it changes is a block of its own; empty where that is all that there is.
     """
-    columns = [c for c in BLOCKS[by] if runs.has(c)]
+    columns = [c for c in BLOCKS[by] if runs.has(c) and (c in NO_CONDITIONS or c in runs.axes)]
     if len(columns) < len(BLOCKS[by]):
         return {}
-    labels = np.array([" ".join(str(runs[c][k]) for c in columns) for k in range(len(runs))])
+    if by == "voltage_configuration" and not runs.layout.usual and len(np.unique(runs["configuration"])) == 1:
+        return {}  # those of `voltage`
+    values = {c: levels(runs[c]) if c == "motor_speed_rpm" else runs[c] for c in columns}
+    labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
     changes = varies(runs, BLOCKS[by])
     if changes.all() and by != "run":
         return {}

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data.columns import SUPPLY
 from calibration.data.courses import applied
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
@@ -84,8 +85,10 @@ def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
 
 
 def _stuck(runs: Runs) -> None:
-    columns = [c for c in observers.kind(runs).axes if runs.has(c)]
-    if len(np.unique(np.stack([runs[c] for c in columns], 1), axis=0)) < 2:
+    labels = () if runs.layout.usual else ("configuration", "surface")
+    columns = [c for c in (*observers.kind(runs).axes_of(runs), *labels) if runs.has(c)]
+    varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
+    if len(np.unique(np.stack(varied, 1), axis=0)) < 2:
         return
     for channel in channels.CHANNELS:
         readings = (
@@ -99,14 +102,17 @@ def _stuck(runs: Runs) -> None:
 
 
 def _constant_conditions(runs: Runs) -> list[str]:
+    imposed = runs.layout.imposed_column
+    losses = "rolling resistance, guide friction" if runs.layout.usual else "rolling resistance"
     says = {
-        "slope_deg": "rolling resistance, guide friction and Coulomb losses act alike without slopes",
-        "supply_voltage_V": "losses that grow with speed and those that do not act alike at one voltage",
+        "slope_deg": f"{losses} and Coulomb losses act alike without slopes",
+        imposed: "losses that grow with speed and those that do not act alike at one "
+        + ("voltage" if imposed == SUPPLY else "speed"),
     }
     return [
         f"{column} is {number(runs[column][0])} in every row: {why}, and only their priors tell them apart"
         for column, why in says.items()
-        if np.ptp(runs[column]) == 0 and (column != "supply_voltage_V" or np.ptp(applied(runs)) == 0)
+        if column in runs.axes and np.ptp(runs[column]) == 0 and (column != SUPPLY or np.ptp(applied(runs)) == 0)
     ]
 
 
@@ -139,7 +145,7 @@ def infeasible(
             f"no start is feasible: the model does not reach {runs.source} rows {rows(lost)} ({words} at the best "
             "point found); check their conditions, or widen the priors"
         )
-    sliding = sorted(set(runs["configuration"][slides]), key=robot.configurations.index)
+    sliding = sorted(set(runs.configurations_named(robot)[slides]), key=robot.configurations.index)
     parameter = {c: f"{c}.ground.friction.static" for c in sliding}
     at = ", ".join(f"{float(robot.configurations[c].ground.friction.static):.3g}" for c in sliding)
     cure = "free it, or raise it in --robot" if set(parameter.values()) - set(names) else "widen its prior"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.runs import CONDITIONS, DRIVING, Runs
+from calibration.data.runs import DRIVING, Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import priors
 from calibration.inference.errors import channel_errors
@@ -174,6 +174,6 @@ def chi_square(
 
 def conditions(observe: type[Observer], runs: Runs) -> dict[str, np.ndarray]:
     """Columns of the runs that say which row is which."""
-    others = (axis for axis in observe.axes if axis not in CONDITIONS)
-    columns = ("run_id", *others, "configuration", *CONDITIONS, *DRIVING, "surface")
+    others = (axis for axis in observe.axes_of(runs) if axis not in runs.axes)
+    columns = ("run_id", *others, "configuration", *runs.axes, *DRIVING, "surface")
     return {column: runs[column] for column in columns if runs.has(column)}

@@ -17,7 +17,7 @@ from numpy.polynomial import legendre
 from scipy import stats
 
 from calibration.data.courses import courses
-from calibration.data.runs import CONDITIONS, DUTY, Runs
+from calibration.data.runs import DUTY, Runs
 from calibration.inference.observers import Observer
 from mmrjax import channels
 
@@ -173,7 +173,7 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
 def _families(fit: Residuals) -> dict[str, np.ndarray]:
     """Columns over the readings by what they mean: for each channel, curves over each variable, by configuration."""
     observe, runs, simulated, there = fit.observe, fit.runs, fit.simulated, fit.there
-    variables = {c: (runs[c], TERMS) for c in (*CONDITIONS, *DUTY) if runs.has(c)}
+    variables = {c: (runs[c], TERMS) for c in (*runs.axes, *DUTY) if runs.has(c)}
     if observe.axis:
         variables[observe.axis] = runs[observe.axis], OVER_TIME
     if runs.has("order"):
@@ -227,7 +227,7 @@ def _replicates(fit: Residuals) -> tuple[float, str] | None:
     """Whether the residuals exceed the scatter of rows under the same conditions."""
     observe, runs, residual, there = fit.observe, fit.runs, fit.whitened, fit.there
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
-    columns = [c for c in ("configuration", *observe.axes, "surface") if runs.has(c)]
+    columns = [c for c in ("configuration", *observe.axes_of(runs), "surface") if runs.has(c)]
     groups: dict[tuple[str, ...], list[int]] = {}
     past = courses(runs).tolist()  # what a run met before counts too
     for row, key in enumerate(zip(past, *(runs[c].astype(str).tolist() for c in columns), strict=True)):

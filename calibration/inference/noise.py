@@ -74,7 +74,8 @@ def parse(text: str) -> dict[int, tuple[float, bool]]:
 
 
 def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
-    """Noise of a table: `stated` channels as stated, else the file's sd columns, else to be estimated.
+    """Noise of a table: `stated` channels as stated, else the file's sd columns, else to be estimated; what is known
+    with the error by the step of an instrument, `Instrument.variance`.
 
     Args:
         sizes: of each reading [SI], that a share of the reading is of, see `Observer.sizes`; shape (rows, channels).
@@ -103,6 +104,10 @@ def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
             )
         sd[:, k] = np.where(there, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")
+    quantum = np.array([runs.layout.variance(name) for name in channels.names()])
+    known = np.array([s in ("columns", "stated") for s in source])  # an estimate has it in it already
+    if (known & (quantum > 0)).any():
+        sd = np.where(known & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
     return Noise(sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 

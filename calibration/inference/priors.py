@@ -39,6 +39,8 @@ TIED = (
     ("ground.friction.dynamic", "ground.friction.static"),
     ("ground.friction.speed_dynamic", "ground.friction.speed_static"),
 )
+#: Beginning of the parameters of a configuration that are its surface's.
+GROUND = "ground."
 #: What a surface may be where nobody states it: relative sds around the robot's friction that hold dry grounds of
 #: every kind (μ_s from 0.2 to 1, V_s from 2 to 60 mm/s) within two sds. The fields' own are those of the surface of
 #: Table 5.
@@ -48,6 +50,9 @@ SURFACE = {
     "ground.friction.speed_static": 3.0,
     "ground.friction.speed_dynamic": 3.0,
 }
+
+#: And of each of several surfaces of one robot, which differ in their resistance to rolling too.
+SURFACE_OF_RIGS = {**SURFACE, "ground.rolling_resistance": 1.0}
 
 #: Friction of which a rig's file states no tolerance, by the end of its name, and its relative sd: rigs are alike
 #: within a factor of two or three. The fields' own are those of Tables 2 to 4.
@@ -150,6 +155,7 @@ def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequ
     """
     present = set(configurations)
     names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
+    names = [n for n in names if _leader(robot, n) is None]
     if GUIDE_SHARE in computed:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]
     return (*names, *(f"effects.{e.name}.amplitude" for e in robot.effects), *begins(robot))
@@ -191,7 +197,15 @@ def free_names(
         if c in present
         for name in (*friction(robot, c), *_radius(robot, c), *(f"{c}.{n}" for n in chassis if _has(robot, c, n)))
     ]
+    own = [n for n in own if _leader(robot, n) is None]
     return (*_not_zero(robot, _drive(robot, (*BENCH, *drive))), *own, *begins(robot))
+
+
+def _leader(robot: Robot, name: str) -> str | None:
+    """The parameter of another configuration that this one follows, as the two differ by their surface alone."""
+    configuration, _, rest = name.partition(".")
+    leader = dict(robot.rig.surfaces).get(configuration)
+    return None if leader is None or rest.startswith(GROUND) else f"{leader}.{rest}"
 
 
 def _has(robot: Robot, configuration: str, name: str) -> bool:
@@ -352,6 +366,9 @@ def coordinates(
         if name not in names:
             raise BadConfiguration(f"--prior {name}: it is not free; add --free {name} (with --free default)")
     wide = {n: SURFACE[n.split(".", 1)[-1]] for n in names if any_surface and n.split(".", 1)[-1] in SURFACE}
+    apart = {c for pair in robot.rig.surfaces for c in pair}
+    of_surfaces = {n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in apart}
+    wide |= {n: share for n, share in of_surfaces.items() if share is not None}
     if robot.rig.blank:
         wide = {n: RELATIVE_OF_RIGS for n in names if n.endswith(FRICTION_OF_RIGS)} | wide
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
@@ -363,6 +380,11 @@ def coordinates(
         for configuration in robot.configurations
         for follower, leader in ((f"{configuration}.{a}", f"{configuration}.{b}") for a, b in TIED)
         if leader in names and follower not in names
+    )
+    tied += tuple(
+        (follower, names.index(leader), float(fields[follower].value / fields[leader].value))
+        for follower, leader in ((n, _leader(robot, n)) for n in fields)
+        if leader is not None and leader in names and follower not in names
     )
     return Coordinates(
         jnp.asarray(location),

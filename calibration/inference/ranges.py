@@ -23,6 +23,8 @@ ALIKE = 1.3
 UNDER_WAY = 0.25
 #: Friction of a robot nobody has calibrated, as factors on what its file states.
 FRICTION = (0.1, 1.0, 4.0)
+#: Channels that show torque: what they show depends on friction, of which nothing is known of a rig from nothing.
+OF_TORQUE = ("total_current", "motor_current", "output_torque", "winding_temperature")
 #: Readings smaller than this share of the channel's largest tell no factor.
 SMALL = 0.05
 #: A slope in other units than degrees: of one of those [deg]; how well the current has to follow it.
@@ -46,7 +48,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
         return []
     _check_masses(runs, robot)
     runs, measured = runs.where(lasts >= UNDER_WAY), measured[lasts >= UNDER_WAY]
-    if not len(runs):
+    if not len(runs) or (robot.on_shaft and any(float(c.torque_gravity) > 0 for c in robot.configurations.members)):
         return []
     conditions = runs.conditions(robot)
     possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
@@ -56,17 +58,20 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
     said = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
-        if off <= SAID:
+        if off <= SAID or (robot.rig.blank and channel.name in OF_TORQUE):
             continue
         units = _units(channel, measured[:, k], possible[:, :, k], robot)
-        if kind.axis and not units:  # a start that slides has speeds of its own
+        if not units and (kind.axis or _slips(robot, channel, factor)):  # what slides has speeds of its own
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
-        sentence = _sentence(channel, typical if units else factor, units, _others(channel, factors))
+        upside_down = _upside_down(robot, channel, typical)
+        sentence = _sentence(channel, typical if units else factor, units, _others(channel, factors), runs)
+        if upside_down and off > REFUSED:
+            sentence = f"{sentence}; is gearbox.ratio upside down? expected motor turns per turn of the output"
         if off > REFUSED:
             raise BadData(f"{runs.source}, {sentence}")
         said.append(sentence)
-    return [*said, *_slopes(runs, measured, possible[1])]
+    return [*said, *_slopes(runs, measured, possible[1], robot)]
 
 
 def _rubbing(robot: Robot, factor: float) -> Robot:
@@ -99,7 +104,7 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
     """Units in which the readings would be possible, the likeliest first; the arguments as of `_factor`."""
     known = {unit: channel.factor / size for unit, size in channel.other_units}
-    if channel.name == "motor_speed":
+    if channel.name == "motor_speed" and not robot.on_shaft:
         known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}
     return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
@@ -111,10 +116,27 @@ def _others(channel: Channel, factors: dict[Channel, float]) -> list[str]:
     return [c.column for c, f in factors.items() if c is not channel and abs(math.log(f / mine)) < math.log(ALIKE)]
 
 
-def _sentence(channel: Channel, factor: float, units: list[str], others: list[str]) -> str:
+def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
+    """Whether a vehicle's speed is low as its movers may slide, where nobody has stated the ground."""
+    return robot.rig.blank and not robot.on_shaft and channel.name == "speed" and factor < 1
+
+
+def _upside_down(robot: Robot, channel: Channel, factor: float) -> bool:
+    """Whether an output's speed is off by the square of the gear ratio."""
+    ratio = float(robot.gearbox.ratio)
+    return (
+        channel.name in ("speed", "output_speed")
+        and abs(math.log(ratio)) > math.log(SAID)
+        and abs(math.log(factor / ratio**2)) < math.log(SAID)
+    )
+
+
+def _sentence(channel: Channel, factor: float, units: list[str], others: list[str], runs: Runs) -> str:
     off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
     what = f"{channel.column}: readings are about {number(float(f'{off:.2g}'))} times too {size} for this robot"
-    alike = f"; {' and '.join(others)} alike: check supply_voltage_V and the robot's file" if others else ""
+    alike = (
+        f"; {' and '.join(others)} alike: check {runs.layout.imposed_column} and the robot's file" if others else ""
+    )
     if units:
         return f"{what}; are they in {' or '.join(units)}? expected {channel.unit}{alike}"
     return f"{what}{alike}" if others else f"{what}; check the unit, {channel.unit}, and the robot's file"
@@ -135,15 +157,19 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
         )
 
 
-def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray) -> Iterator[str]:
+def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[str]:
     """Say so where the current rises with the slope as if that were in another unit.
 
     Within runs that differ in their slope alone the current is about linear in it; the coefficient of what is
     measured on what is possible is 1 where slopes are in degrees.
     """
-    k = channels.index("total_current")
+    k = next((k for k, name in enumerate(channels.names()) if name in ("total_current", "motor_current")), None)
+    if k is None or robot.on_shaft:
+        return
     slope, there = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
-    columns = [c for c in ("configuration", "supply_voltage_V", "payload_kg", "surface", "duty") if runs.has(c)]
+    columns = [
+        c for c in ("configuration", runs.layout.imposed_column, "payload_kg", "surface", "duty") if runs.has(c)
+    ]
     groups: dict[tuple[str, ...], list[int]] = {}
     for row in np.flatnonzero(there):
         groups.setdefault(tuple(str(runs[c][row]) for c in columns), []).append(int(row))

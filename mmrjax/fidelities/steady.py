@@ -323,4 +323,17 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
     return Run(steady_batch(robot, conditions))
 
 
-FIDELITY = Fidelity("steady", settled=_settled, run=_run)
+def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
+    """Refuse an arm that gravity pulls: it turns unevenly, or hangs where its friction lets it."""
+    if not robot.on_shaft:
+        return
+    for k, (name, load) in enumerate(robot.configurations.items()):
+        pulled = bool(jnp.any(jnp.asarray(load.torque_gravity) > 0))
+        if pulled and bool(jnp.any(jnp.asarray(conditions.configuration) == k)):
+            raise ValueError(
+                f"{name} is an arm on which gravity acts with its angle (torque_gravity above 0), so it has no "
+                "steady state; follow it over time: --model drive, and tables with a column time_s"
+            )
+
+
+FIDELITY = Fidelity("steady", settled=_settled, run=_run, check=_check)

@@ -49,8 +49,7 @@ class Observer(eqx.Module):
     Attributes:
         conditions: of each run, shape (runs,); of a history what changes within one at each of its instants.
         word: what a row is; fewest: rows in which a missing effect can be told from noise.
-        axes: columns of a table over which readings vary.
-        axis: of those, the one along which the rows of a run follow one another; empty where a run is one row.
+        axis: column of a table along which the rows of a run follow one another; empty where a run is one row.
         sizes_padded: numbers of rows to which tables are padded, so that those of about one size share what is
             compiled; beyond the last to a multiple of that, and with none not at all.
         blocks: kinds of blocks to hold out, the most telling first.
@@ -65,7 +64,6 @@ class Observer(eqx.Module):
 
     word: ClassVar[str]
     fewest: ClassVar[int]
-    axes: ClassVar[tuple[str, ...]]
     axis: ClassVar[str] = ""
     sizes_padded: ClassVar[tuple[int, ...]] = ()
     blocks: ClassVar[tuple[str, ...]]
@@ -76,6 +74,11 @@ class Observer(eqx.Module):
     searches: ClassVar[int | None] = None
 
     # --- of a table, before anything is simulated
+
+    @classmethod
+    def axes_of(cls, runs: Runs) -> tuple[str, ...]:
+        """Columns of a table over which its readings vary."""
+        return (*runs.axes, *([cls.axis] if cls.axis else []))
 
     @classmethod
     @abc.abstractmethod

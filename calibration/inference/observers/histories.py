@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from calibration.data.courses import Stretch, applied, divided, stretches
 from calibration.data.courses import names as _names
 from calibration.data.errors import BadConfiguration, BadData, number
-from calibration.data.runs import CONDITIONS, Runs
+from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
@@ -134,7 +134,6 @@ class Histories(Observer):
 
     word: ClassVar[str] = "samples"
     fewest: ClassVar[int] = 24
-    axes: ClassVar[tuple[str, ...]] = (*CONDITIONS, "time_s")
     axis: ClassVar[str] = "time_s"
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
     percent_of: ClassVar[str] = "channel's root mean square"

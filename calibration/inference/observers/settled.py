@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.errors import BadData, number
-from calibration.data.runs import CONDITIONS, Runs
+from calibration.data.errors import BadConfiguration, BadData, number
+from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
@@ -60,9 +60,10 @@ class SettledRuns(Observer):
 
     word: ClassVar[str] = "runs"
     fewest: ClassVar[int] = 6
-    axes: ClassVar[tuple[str, ...]] = tuple(CONDITIONS)
     sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
-    blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage_configuration", "voltage", "payload", "configuration")
+    blocks: ClassVar[tuple[str, ...]] = (
+        "slope", "voltage_configuration", "voltage", "motor_speed", "payload", "configuration",
+    )  # fmt: skip
     percent_of: ClassVar[str] = "simulated reading, eq. (35)"
     policy: ClassVar[SearchPolicy] = SearchPolicy()
     rows_tell: ClassVar[bool] = True
@@ -77,7 +78,14 @@ class SettledRuns(Observer):
 
     @classmethod
     def of(cls, runs: Runs, robot: Robot, fidelity: str | None = None) -> SettledRuns:
-        return cls(runs.conditions(robot), fidelities.get(fidelity or "steady").name)
+        chosen = fidelities.get(fidelity or "steady")
+        conditions = runs.conditions(robot)
+        if not chosen.rollout:
+            try:
+                chosen.check(robot, conditions, chosen.resolved())
+            except ValueError as error:
+                raise BadConfiguration(f"{runs.source}, settled runs: {error}") from error
+        return cls(conditions, chosen.name)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -87,7 +95,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[str]:
-        columns = [c for c in ("configuration", *CONDITIONS, "surface") if runs.has(c)]
+        columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
         measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
         for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
             alike.setdefault(key, []).append(row)

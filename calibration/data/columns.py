@@ -1,0 +1,251 @@
+"""Columns of tables of runs: which a robot's table has, which it may lack, and the units that their names state."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from calibration.data import units
+from calibration.data.errors import BadData
+from calibration.data.units import Quantity
+from mmrjax import channels
+from mmrjax.channels import RPM as RPM
+from mmrjax.channels import Channel
+
+if TYPE_CHECKING:
+    from mmrjax.rig import Instrument
+    from mmrjax.robot import Robot
+
+#: Condition columns with the least and greatest value allowed.
+CONDITIONS: dict[str, tuple[float, float]] = {
+    "supply_voltage_V": (-100.0, 100.0),  # negative: backward
+    "total_mass_kg": (0.1, 500.0),
+    "payload_kg": (0.0, 300.0),
+    "slope_deg": (-45.0, 45.0),
+}
+TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
+#: What a time history may state of its motors' driver: the share of the supply's voltage that they get, negative
+#: backward; and how they are driven: by that share, or not, their terminals shorted or their circuit open.
+DUTY: dict[str, tuple[float, float]] = {"duty": (-1.0, 1.0)}
+DRIVEN = ("voltage", "brake", "coast")
+DRIVING = ("duty", "mode")
+#: Place of a row in the sequence in which runs were made; without it that of the row in the file.
+ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
+#: Columns that say when a row was measured; a table without either was measured in the order of its rows.
+WHEN = ("time_s", "order")
+WORDS = ("configuration", "surface", "run_id", "mode")
+#: Columns that every table of the packaged robot has to have, and those that one without measurements may lack.
+REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
+#: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
+SUPPLY, SPEED = "supply_voltage_V", "motor_speed_rpm"
+IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM)}
+#: What a column that a table may lack is then.
+DEFAULTS = {"slope_deg": 0.0, "payload_kg": 0.0, SUPPLY: 0.0}
+#: Conditions that act on a vehicle alone.
+ON_GROUND = ("total_mass_kg", "payload_kg", "slope_deg")
+
+_OF_CONDITIONS = {
+    SUPPLY: Quantity("supply_voltage", units.VOLTAGE, CONDITIONS[SUPPLY]),
+    "total_mass_kg": Quantity("total_mass", units.MASS, CONDITIONS["total_mass_kg"]),
+    "payload_kg": Quantity("payload", units.MASS, CONDITIONS["payload_kg"]),
+    "slope_deg": Quantity("slope", units.ANGLE, CONDITIONS["slope_deg"], slope=True),
+    "time_s": Quantity("time", units.TIME, TIME["time_s"]),
+    "duty": Quantity("duty", units.SHARE, DUTY["duty"]),
+}
+
+
+def measured_columns() -> tuple[str, ...]:
+    """Columns of the channels, in the order of arrays."""
+    return tuple(c.column for c in channels.CHANNELS)
+
+
+def deviation_columns() -> tuple[str, ...]:
+    """Columns of the channels' sds, in the order of arrays."""
+    return tuple(c.sd_column for c in channels.CHANNELS)
+
+
+def ranges() -> dict[str, tuple[float, float]]:
+    """Least and greatest value of every number column."""
+    readings = {c.column: c.range for c in channels.known()}
+    deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.known()}
+    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **ORDER}
+
+
+def _of_channel(channel: Channel) -> dict[str, Quantity]:
+    size = {
+        units.spelled(unit): factor / channel.factor
+        for unit, factor in ((channel.unit, channel.factor), *channel.other_units)
+    }
+    return {
+        channel.column: Quantity(channel.name, size, channel.range),
+        channel.sd_column: Quantity(f"{channel.name}_sd", size, (0.0, channel.sd_largest)),
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class Meaning:
+    """What a column of a file means.
+
+    Attributes:
+        column: as this program calls it; shown: as the file does.
+        quantity: what it holds; None for a word, or a number without a unit.
+        unit: of its name; factor: from its cells to that unit.
+    """
+
+    column: str
+    shown: str
+    quantity: Quantity | None = None
+    unit: str = ""
+    factor: float = 1.0
+
+    @property
+    def as_named(self) -> bool:
+        """Whether its cells are in the unit of `column`."""
+        return self.factor == 1.0 and (self.quantity is None or self.unit == next(iter(self.quantity.units)))
+
+    def value(self, written: float) -> float:
+        """A cell's number in the unit of `column`."""
+        written = written * self.factor
+        return written if self.quantity is None else self.quantity.value(written, self.unit)
+
+    def limits(self) -> tuple[float, float]:
+        """Least and greatest number that a cell may hold."""
+        if self.as_named or self.quantity is None:
+            return ranges()[self.column]
+        low, high = (x / self.factor for x in self.quantity.limits(self.unit))
+        return (low, high) if self.factor > 0 else (high, low)
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What a robot's tables of runs hold.
+
+    Attributes:
+        imposed: on its motors, one of `rig.IMPOSED`.
+        on_shaft: whether its load is a shaft, on which no ground, slope or payload acts.
+        weight: whether a constant torque acts on it, which may drive its motors either way.
+        blank: whether it is a rig that starts from nothing.
+        configurations: its names.
+        instruments: of channels, where more is known than that they are there.
+        mapped: (column as this program calls it, column of the file, factor from its unit).
+    """
+
+    imposed: str = "voltage"
+    on_shaft: bool = False
+    weight: bool = False
+    blank: bool = False
+    configurations: tuple[str, ...] = ()
+    instruments: tuple[Instrument, ...] = ()
+    mapped: tuple[tuple[str, str, float], ...] = ()
+
+    @classmethod
+    def of(cls, robot: Robot | None) -> Layout:
+        """That of a robot's tables; of None the packaged robot's."""
+        if robot is None:
+            return cls()
+        rig = robot.rig
+        weight = robot.on_shaft and any(float(load.torque_constant) != 0 for load in robot.configurations.members)
+        names = robot.configurations.names
+        return cls(rig.imposed, robot.on_shaft, weight, rig.blank, names, rig.instruments, rig.columns)
+
+    @property
+    def usual(self) -> bool:
+        """Whether tables have to state every condition, as the packaged robot's."""
+        return not self.blank and not self.on_shaft and self.imposed == "voltage"
+
+    @property
+    def imposed_column(self) -> str:
+        """Column of what is imposed."""
+        return IMPOSED[self.imposed][0]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Columns of the conditions that a run of it has, what is imposed first."""
+        on_ground = () if self.on_shaft else ON_GROUND
+        return (self.imposed_column, *on_ground)
+
+    def magnitude(self, channel: str) -> bool:
+        """Whether the instrument of a channel shows its magnitude alone."""
+        return any(i.channel == channel and not i.signed for i in self.instruments)
+
+    def variance(self, channel: str) -> float:
+        """Of the error by the step of a channel's instrument [SI²]."""
+        return sum(i.variance for i in self.instruments if i.channel == channel)
+
+    def known(self) -> tuple[str, ...]:
+        """Every column that means something."""
+        driven = DRIVING if self.imposed == "voltage" else ()
+        of_ground = () if self.on_shaft else ("surface",)
+        named = ("configuration", *self.axes, SUPPLY, *measured_columns(), *deviation_columns())
+        return tuple(dict.fromkeys((*named, *of_ground, "run_id", "time_s", *driven, *ORDER)))
+
+    def required(self, *, measured: bool, battery: bool) -> tuple[str, ...]:
+        """Columns that a table has to have, besides channels."""
+        if self.usual:
+            own = (() if measured else OWN) + ((SUPPLY,) if battery else ())
+            return tuple(c for c in REQUIRED if c not in own)
+        imposed = () if battery and self.imposed == "voltage" else (self.imposed_column,)
+        return (("configuration",) if len(self.configurations) != 1 else ()) + imposed
+
+    def quantities(self) -> dict[str, Quantity]:
+        """What each number column holds, by its name."""
+        found: dict[str, Quantity] = {**_OF_CONDITIONS}
+        for channel in channels.known():
+            if channel in channels.CHANNELS or channel.column == self.imposed_column:
+                found |= _of_channel(channel)
+        known = (*self.known(), *ON_GROUND)
+        return {column: quantity for column, quantity in found.items() if column in known}
+
+    def meanings(self, source: str, header: list[str]) -> list[Meaning | None]:
+        """What each column of a file means, None where nothing; names may state another unit.
+
+        Raises:
+            BadData: two columns of one meaning.
+        """
+        by_name = self._by_name()
+        theirs = {column: (mine, factor) for mine, column, factor in self.mapped if column in header}
+        taken = {_standard(by_name, mine) for mine, _ in theirs.values()}
+        found: list[Meaning | None] = []
+        for column in header:
+            if column in theirs:
+                mine, factor = theirs[column]
+                meant = by_name.get(mine)
+                if meant is None:
+                    raise BadData(
+                        f"{source}: the robot's file reads {mine} from column {column}; this program has no column "
+                        f"{mine} for it (known: {', '.join(self.known())})"
+                    )
+                found.append(dataclasses.replace(meant, shown=column, factor=factor))
+            else:
+                meant = by_name.get(column)
+                found.append(None if meant is None or meant.column in taken else meant)
+        for k, meaning in enumerate(found):
+            twin = next((m for m in found[:k] if m and meaning and m.column == meaning.column), None)
+            if meaning and twin and meaning.shown != twin.shown:
+                raise BadData(f"{source}: columns {twin.shown} and {meaning.shown} state the same; keep one of them")
+        return found
+
+    def _by_name(self) -> Mapping[str, Meaning]:
+        """Every name of a column, in any unit, with what it means."""
+        known = (*self.known(), *(ON_GROUND if self.on_shaft else ()))
+        quantities = self.quantities()
+        found = {
+            name: Meaning(column, name, quantity, unit)
+            for column, quantity in quantities.items()
+            for name, unit in quantity.columns().items()
+        }
+        for column in known:  # its own name, whatever the unit
+            quantity = quantities.get(column)
+            own = None if quantity is None else next(iter(quantity.units))
+            found[column] = Meaning(column, column, quantity, own or "")
+        return found
+
+    def expected(self, column: str) -> str:
+        """The column, and where the robot's file says that it is read from."""
+        theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name(), mine) == column), None)
+        return column if theirs is None else f"{column} (in the robot's file: {theirs})"
+
+
+def _standard(by_name: Mapping[str, Meaning], name: str) -> str:
+    return by_name[name].column if name in by_name else name

@@ -1,0 +1,126 @@
+"""Surfaces of runs: labels of Table 5 scale the paper's robots' adhesion, any other has a friction of its own.
+
+A surface whose friction nobody has stated is a configuration of its own, named after configuration and label: its
+`ground.*` is free, and all else of it follows the first one's (`rig.surfaces`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from mmrjax.errors import choices
+from mmrjax.robot import Configurations
+from mmrjax.tables import SURFACES
+
+if TYPE_CHECKING:
+    from calibration.data.columns import Layout
+    from calibration.data.runs import Runs
+    from mmrjax.robot import Robot
+
+#: Beginning of the parameters of a configuration that are its surface's.
+GROUND = "ground."
+#: Likeness of a label to one of Table 5 from which it is taken for misspelt [-].
+MISSPELT = 0.75
+
+V = TypeVar("V")
+
+
+def named(configuration: str, surface: str) -> str:
+    """Name of a configuration on a surface."""
+    return f"{configuration}-{re.sub(r'[^0-9A-Za-z_]+', '_', surface)}"
+
+
+def refused(label: str, layout: Layout) -> str:
+    """What is allowed in place of a label, empty where it is fine."""
+    if layout.blank:
+        return "" if label else "the name of a surface"
+    if label in SURFACES:
+        return ""
+    alike = difflib.get_close_matches(label, SURFACES, 1, MISSPELT)
+    return f"one of these; {choices(label, SURFACES)}" if not label or alike or not layout.configurations else ""
+
+
+def scaled(robot: Robot, configurations: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Whether a row's adhesion is the robot's times the ratio of Table 5, shape (rows,)."""
+    return np.array(
+        [
+            not robot.rig.blank and label in SURFACES and named(name, label) not in robot.configurations
+            for name, label in zip(configurations, labels, strict=True)
+        ],
+        bool,
+    )
+
+
+def separated(robot: Robot, runs: Runs) -> Robot:
+    """`robot` with a configuration for each surface of the table that is not of Table 5 (of a blank robot: each).
+
+    A configuration without rows elsewhere gives way to those of its surfaces, unless it has but one. Priors that the
+    robot's file states become those of the new ones.
+    """
+    if not runs.has("surface") or robot.on_shaft:
+        return robot
+    pairs = list(dict.fromkeys(zip(runs["configuration"].tolist(), runs["surface"].tolist(), strict=True)))
+    members = dict(robot.configurations.items())
+    leaders: dict[str, str] = {}
+    for configuration in dict.fromkeys(c for c, _ in pairs):
+        mine = [label for c, label in pairs if c == configuration]
+        own = [x for x in mine if robot.rig.blank or x not in SURFACES or named(configuration, x) in members]
+        there = [named(configuration, x) for x in own if named(configuration, x) in members]
+        if not own or (len(mine) == 1 and not there) or (configuration not in members and not there):
+            continue
+        stays = configuration in members and len(own) < len(mine)
+        pattern = members[configuration] if configuration in members else members[there[0]]
+        names = list(dict.fromkeys(named(configuration, x) for x in own))
+        if configuration in members and not stays:  # in its place
+            members = {
+                n: m for key, value in members.items()
+                for n, m in (
+                    [(n, members.get(n, pattern)) for n in names] if key == configuration else [(key, value)]
+                )
+            }  # fmt: skip
+        else:
+            members |= {n: members.get(n, pattern) for n in names}
+        first = configuration if stays else names[0]
+        leaders |= {n: first for n in names if n != first}
+    rig = dataclasses.replace(robot.rig, surfaces=tuple(leaders.items()))
+    found = dataclasses.replace(robot, configurations=Configurations(members), rig=rig)
+    priors = of_surfaces({name: (mean, sd) for name, mean, sd in rig.priors}, found, runs)
+    rig = dataclasses.replace(rig, priors=tuple((name, *value) for name, value in priors.items()))
+    return dataclasses.replace(found, rig=rig)
+
+
+def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, V]:
+    """What is stated of configurations by parameter, those that gave way to their surfaces' replaced by them.
+
+    Args:
+        robot: as from `separated`.
+    """
+    found: dict[str, V] = {}
+    for name, value in stated.items():
+        for new in names_of_surfaces([name], robot, runs):
+            found[new] = value
+    return found
+
+
+def names_of_surfaces(names: Iterable[str], robot: Robot, runs: Runs) -> list[str]:
+    """Names of parameters, those of configurations that gave way to their surfaces' replaced by theirs: what is of
+    the ground by each one's, all else by the first's."""
+    found: list[str] = []
+    for name in names:
+        configuration, _, rest = name.partition(".")
+        gone = configuration not in robot.configurations and configuration in (
+            runs["configuration"] if runs.has("surface") else ()
+        )
+        if not gone:
+            found.append(name)
+            continue
+        mine = runs["surface"][runs["configuration"] == configuration]
+        on = [n for n in dict.fromkeys(named(configuration, s) for s in mine) if n in robot.configurations]
+        found += [f"{n}.{rest}" for n in (on if rest.startswith((GROUND, "*")) else on[:1])]
+    return found
