@@ -48,7 +48,11 @@ def parity(table: dict[str, np.ndarray]) -> Figure:
 
 def errors_over(table: dict[str, np.ndarray]) -> Figure:
     """Error (35) of each channel over each condition."""
-    conditions = {"slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "payload_kg": "payload [kg]"}
+    every = {
+        "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
+        "payload_kg": "payload [kg]",
+    }  # fmt: skip
+    conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
     fig, grid = figure(
         len(channels.CHANNELS), len(conditions), 2.3 * len(channels.CHANNELS), sharex="col", sharey="row"
     )

@@ -78,6 +78,27 @@ def changed_parameters(robot: Robot, nominal: Robot) -> list[dict[str, str]]:
     return answer
 
 
+#: Conditions of a run by their columns: heading, and format of a number.
+CONDITIONS = {
+    "supply_voltage_V": ("U [V]", "{:g}"),
+    "motor_speed_rpm": ("n [rpm]", "{:g}"),
+    "total_mass_kg": ("M [kg]", "{:.1f}"),
+    "payload_kg": ("payload [kg]", "{:g}"),
+    "slope_deg": ("slope [°]", "{:g}"),
+}
+
+
+def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:
+    """Heading and format of each condition that a table has, by column; readings of channels are none.
+
+    Args:
+        mass: whether the total mass is among them.
+    """
+    readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
+    shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
+    return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
+
+
 def columns() -> dict[str, str]:
     """Column of each channel, as in the tables of runs."""
     return {c.name: c.column for c in channels.CHANNELS}

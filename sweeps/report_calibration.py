@@ -8,7 +8,7 @@ from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
 from sweeps import figures_calibration, figures_clusters, figures_comparison
-from sweeps.report import Album, columns, first_rows, render, words_shown
+from sweeps.report import Album, columns, conditions, first_rows, render, words_shown
 
 
 def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
@@ -42,6 +42,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         title=f"Calibration of {words_shown(Path(robot_name).name)} to {Path(found.source).name}",
         document=found.to_json(),
         rows=first_rows(table),
+        conditions=conditions(table),
         columns=columns(),
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweeps import figures_comparison
-from sweeps.report import Album, columns, first_rows, named, render, statuses
+from sweeps.report import Album, columns, conditions, first_rows, named, render, statuses
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -50,6 +50,7 @@ def write(
         model=model,
         data_name=Path(data_name).name,
         rows=first_rows(table),
+        conditions=conditions(table, mass=True),
         total=len(table["status"]),
         statuses=statuses(table),
         summary=summary,

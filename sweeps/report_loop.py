@@ -9,7 +9,7 @@ from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
 from sweeps import figures_clusters, figures_loop
-from sweeps.report import Album, columns, first_rows, render, words_shown
+from sweeps.report import Album, columns, conditions, first_rows, render, words_shown
 
 Section = Callable[[Album, DiscoveryResult], None]
 
@@ -73,6 +73,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         alike=alike(found),
         worse=preference.said_worse(found.held_out_worse, found.errors_held_out),
         rows=first_rows(found.rows_table()),
+        conditions=conditions(found.rows_table()),
         columns=columns(),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

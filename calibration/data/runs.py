@@ -278,6 +278,14 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) 
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout)
 
 
+def _extra(cells: list[str]) -> np.ndarray:
+    """A column without a role: numbers where every cell that is not empty is one, else words."""
+    try:
+        return np.array([float(cell) if cell else math.nan for cell in cells])
+    except ValueError:
+        return np.array(cells)
+
+
 def _fill(columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
     """Put in what a table of a rig need not state: its only configuration, and conditions as they mostly are."""
     if layout.usual:
@@ -295,14 +303,6 @@ def _refuse_ground(name: str, meaning: Meaning, cells: list[str]) -> None:
                 f"{name} row {row}, {meaning.shown}: got {cell}; the robot's load is a shaft, on which no slope, "
                 "payload or mass acts; remove the column, or describe the load as a vehicle"
             )
-
-
-def _extra(cells: list[str]) -> np.ndarray:
-    """A column without a role: numbers where every cell that is not empty is one, else words."""
-    try:
-        return np.array([float(cell) if cell else math.nan for cell in cells])
-    except ValueError:
-        return np.array(cells)
 
 
 def _refuse_stated(name: str, voltages: list[str]) -> None:

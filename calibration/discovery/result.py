@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import posterior, robot_file
 from calibration.data.posterior import Posterior
-from calibration.data.runs import CONDITIONS, DRIVING, WHEN, Runs
+from calibration.data.runs import DRIVING, WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.settings import Settings
@@ -555,7 +555,7 @@ class DiscoveryResult:
     def rows_table(self) -> dict[str, np.ndarray]:
         """Conditions, measured, simulated before and after and held out, and defects where rows show them, by row."""
         seen = self.readings_of_rows
-        known = ("run_id", *WHEN, "configuration", *CONDITIONS, *DRIVING)
+        known = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
         table = {"row": self.numbers, **{k: self.runs[k] for k in known if self.runs.has(k)}}
         main = next(iter(seen.held_out.values()), None)
         for k, channel in enumerate(channels.CHANNELS):

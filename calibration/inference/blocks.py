@@ -29,7 +29,7 @@ BLOCKS: dict[str, tuple[str, ...]] = {
 NO_CONDITIONS = ("configuration", "run_id")
 #: Share of a value by which the next has to be larger to be of another level [-]: a speed that a controller holds is
 #: measured, and not twice the same. Blocks of a quantity that has no levels.
-APART, PARTS = 0.05, 4
+APART, PARTS = 0.1, 4
 
 
 def levels(x: np.ndarray) -> np.ndarray:
@@ -54,6 +54,8 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
     columns = [c for c in BLOCKS[by] if runs.has(c) and (c in NO_CONDITIONS or c in runs.axes)]
     if len(columns) < len(BLOCKS[by]):
         return {}
+    if by == "voltage_configuration" and not runs.layout.usual and len(np.unique(runs["configuration"])) == 1:
+        return {}  # those of `voltage`
     values = {c: levels(runs[c]) if c == "motor_speed_rpm" else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
     changes = varies(runs, BLOCKS[by])
