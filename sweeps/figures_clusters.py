@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from calibration.inference.residual_clusters import ResidualCluster, levels_of
+from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax import channels
 from sweeps.figures_style import BLUE, FAINT, INK, figure
 
@@ -27,14 +27,13 @@ def clusters(found: Sequence[ResidualCluster]) -> Figure:
     for axes, one in zip(grid.flat, found, strict=False):
         axes.axhline(0, color=FAINT, lw=0.8)
         if one.correlation is None:
-            of = levels_of(one.at)
-            for place, level in enumerate(dict.fromkeys(m.level for m in one.levels)):
-                y = one.residual[of == level]
+            for place, level in enumerate(one.levels):
+                y = one.residual[one.at == level.name]
                 side = np.linspace(-0.5, 0.5, len(y)) if len(y) > 1 else np.zeros(1)
                 axes.plot(place + WIDE * side, y, "o", ms=3, color=BLUE, alpha=0.7)
                 axes.plot(place + WIDE * np.array([-0.6, 0.6]), [y.mean()] * 2, color=INK, lw=2)
-            names = list(dict.fromkeys(m.level for m in one.levels))
-            axes.set_xticks(range(len(names)), names)
+            turned = 30 if len(one.levels) > ACROSS else 0
+            axes.set_xticks(range(len(one.levels)), [m.name for m in one.levels], rotation=turned, fontsize=8)
         else:
             axes.plot(one.at, one.residual, "o", ms=3, color=BLUE, alpha=0.7)
         axes.set(xlabel=one.column, ylabel=f"{labels[one.channel]} [{one.unit}]")

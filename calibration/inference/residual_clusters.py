@@ -56,6 +56,11 @@ class LevelMean:
     mean: float
     rows: int
 
+    @property
+    def name(self) -> str:
+        """The level, and what it is within."""
+        return f"{self.level} at {self.within}" if self.within else self.level
+
 
 @dataclasses.dataclass(frozen=True)
 class ResidualCluster:
@@ -64,13 +69,14 @@ class ResidualCluster:
     Attributes:
         column: its name; channel: whose residuals; unit: of the channel.
         within: label within whose levels the column matters, "" where it does over all rows.
-        reversing: whether with opposite signs in the two directions of travel; the means are then of the residual
-            times the sign of the reading.
+        reversing: whether with opposite signs in the two directions of travel; means are then of the residual times
+            the sign of the reading.
         levels: means by level; empty for a column of many numbers.
         correlation: of ranks, for such a column; else None.
         p: family-wise.
         alike: other columns that go with these residuals no better once this one is known.
-        at: the column; residual: simulated less measured [unit]; shape (rows,), of histories (runs,).
+        at: the column, or name of the level, of each row; residual: simulated less measured [unit], or that times the
+            sign of the reading; shape (rows,), of histories (runs,).
     """
 
     column: str
@@ -101,7 +107,7 @@ class ResidualCluster:
             )
         ordered = sorted(self.levels, key=lambda m: -abs(m.mean))[:_LISTED]
         kept = [m for m in self.levels if m in ordered]
-        each = ", ".join(f"{m.level}{f' at {m.within}' * bool(m.within)}: {m.mean:+.2g} {self.unit}" for m in kept)
+        each = ", ".join(f"{m.name}: {m.mean:+.2g} {self.unit}" for m in kept)
         more = ", ..." if len(kept) < len(self.levels) else ""
         return (
             f"{what} cluster by {self.column}{within}{signs} (simulated less measured at levels {each}{more}; {p}), "
@@ -486,24 +492,20 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
     return strongest
 
 
-def levels_of(cells: np.ndarray) -> np.ndarray:
-    """Name of the level of each row, as `LevelMean` has it."""
-    words = _words(cells)
-    return np.where(words == "", "not stated", words)
-
-
 def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
     """A finding in the units of its channel."""
     channel, there = channels.CHANNELS[k], whole.there[:, k]
     cells, residual = whole.runs.extras[test.column][there], whole.residual[there, k] / channel.factor
     signed = residual * np.sign(whole.simulated[there, k]) if test.reversing else residual
     within = whole.runs[test.within][there] if test.within else np.zeros(int(there.sum()), str)
-    words, correlation = levels_of(cells), None
+    words, correlation, at = _words(cells), None, cells
+    words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
     if _numbers(cells):
         fine = np.isfinite(cells)
         correlation = float(stats.spearmanr(cells[fine], signed[fine]).statistic)
     else:
+        at = np.array([f"{w} at {c}" if c else w for w, c in zip(words, within, strict=True)])
         keys = sorted(set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _place(x[1])))
         levels = tuple(
             LevelMean(w, c, float(signed[mine].mean()), int(mine.sum()))
@@ -519,8 +521,8 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
         correlation,
         p,
         alike,
-        cells,
-        residual,
+        at,
+        signed,
     )
 
 
