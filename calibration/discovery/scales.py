@@ -19,8 +19,8 @@ import numpy as np
 
 from calibration.data.effect_file import Library
 from calibration.inference.linearization import amplitude_of, shape_of
-from mmrjax import params, robots
-from mmrjax.balances import BALANCES
+from mmrjax import channels, params, robots
+from mmrjax.balances import BALANCES, added
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.steady import operating
@@ -43,12 +43,6 @@ WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
     ),
     "inductance": lambda robot, s: robot.motor.inductance,
 }
-#: Readings that sensor effects are a share of.
-READ: dict[str, Callable[[Signals], object]] = {
-    "total_current": lambda s: s.total_current,
-    "motor_speed": lambda s: s.speed_motor,
-    "speed": lambda s: s.speed,
-}
 #: What a shape parameter is scaled with, by its unit; a speed in rad/s by the shaft of its balance.
 SCALED_WITH: dict[str, Callable[[Signals], object]] = {
     "A": lambda s: s.current,
@@ -57,6 +51,8 @@ SCALED_WITH: dict[str, Callable[[Signals], object]] = {
     "V": lambda s: s.voltage,
 }
 AT_THE_OUTPUT = ("track", "ground", "slip")
+#: Shares of slip are those of tracks and tyres on the paper's grounds; small wheels on soft ones slip by half.
+SLIPPERY = 4.0
 #: Factors are powers of this one: rigs of about one size share what is compiled.
 STEP = 2.0
 
@@ -134,10 +130,8 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
         if with_ is not None:
             stretch = _rounded(_size(with_(mine[1])) / _size(with_(theirs[1])))
     grown = effect if shape is None else params.replace(effect, {shape.name: jnp.asarray(stretch * shape.value)})
-    factor = 1.0
-    if (
-        amplitude.spec.unit == BALANCES[kind.balance][0]
-    ):  # a term of its own size, also where operating points show none
+    factor = SLIPPERY if kind.balance == "slip" and amplitude.spec.unit == "-" else 1.0
+    if amplitude.spec.unit == BALANCES[kind.balance][0]:  # of its own size, also where operating points show none
         whole = WHOLE[kind.balance]
         factor = _rounded(_size(whole(*mine)) / _size(whole(*theirs)))
     elif amplitude.spec.unit != "-":
@@ -150,9 +144,14 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
     """How much of its balance a term of amplitude one is [1/unit of the amplitude]."""
     one = params.replace(effect, {amplitude_of(effect).name: jnp.asarray(1.0)})
-    whole = READ[effect.channel] if effect.channel else (lambda s: WHOLE[effect.balance](robot, s))
-    term = jax.vmap(lambda s: jnp.asarray(one.term(robot, s), float))(signals)
-    total = jax.vmap(lambda s: jnp.asarray(whole(s), float))(signals)
+    alone = dataclasses.replace(robot, effects=(one,))
+
+    def share(s: Signals) -> tuple[jax.Array, jax.Array]:
+        shown = next((c.read(robot, s) for c in channels.known() if c.name == effect.channel), None)
+        whole = WHOLE[effect.balance](robot, s) if shown is None else shown
+        return jnp.asarray(added(alone, s, effect.balance, effect.channel), float), jnp.asarray(whole, float)
+
+    term, total = jax.vmap(share)(signals)
     return _size(term) / _size(total)
 
 

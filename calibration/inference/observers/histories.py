@@ -41,7 +41,7 @@ from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, grid, growth, hi
 from mmrjax.params import Scalar
 from mmrjax.rig import Begin, Begins
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, FAILED, Signals
+from mmrjax.signals import CONVERGED, FAILED, Signals, State
 
 if TYPE_CHECKING:
     from calibration.discovery.adequacy import Diagnosis
@@ -645,27 +645,34 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     if robot.rig.start == "rest" or not runs.sampled:
         return robot
     names, measured = _names(runs), runs.measured()
-    ratio, found, known = float(robot.gearbox.ratio), dict[str, Begin](), []
-    radius = np.array([float(c.radius) for c in robot.configurations.members])[runs.configurations(robot)]
+    found, known = dict[str, Begin](), []
+    rows = runs.configurations(robot)
     for name in np.unique(names):
         mine = np.flatnonzero(names == name)
         mine = mine[np.argsort(runs["time_s"][mine], kind="stable")]
         key = begin_name(str(name))
-        per = {"motor_speed": 1.0, "output_speed": ratio, "speed": ratio / radius[mine[0]]}
         at: dict[str, tuple[float, float]] = {}
-        for field, factors in (("motor_speed", per), ("angle", {"output_angle": 1.0})):
-            for k, channel in enumerate(channels.CHANNELS):
-                there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES] if channel.name in factors else mine[:0]
-                if len(there):
-                    factor = factors[channel.name]
-                    value, sd = _extrapolated(runs["time_s"][there] - runs["time_s"][mine[0]], measured[there, k])
-                    least = float(np.median(noise.sd[there, k]))
-                    at[field] = factor * value, abs(factor) * max(sd, least)
-                    break
+        for k, channel in enumerate(channels.CHANNELS):
+            field = "angle" if channel.unit_si == "rad" else "motor_speed"
+            there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
+            if channel.zero_at_rest and field not in at and len(there):
+                factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
+                value, sd = _extrapolated(runs["time_s"][there] - runs["time_s"][mine[0]], measured[there, k])
+                least = float(np.median(noise.sd[there, k]))
+                at[field] = factor * value, abs(factor) * max(sd, least)
         found[key] = Begin(**{field: value for field, (value, _) in at.items()})
         known += [(f"rig.{key}.{field}", value, sd) for field, (value, sd) in at.items()]
     priors = (*robot.rig.priors, *known) if robot.rig.start == "free" else robot.rig.priors
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(found), priors=priors))
+
+
+def _shown_of_unit(robot: Robot, configuration: int, channel: channels.Channel) -> float:
+    """What a channel shows while the motor shafts turn by 1 rad/s, the load rolls with them and the output's angle is
+    1 rad [SI]."""
+    radius = float(robot.configurations.members[configuration].radius)
+    none, one = jnp.zeros(()), jnp.ones(())
+    rolling = State(none, one, radius / robot.gearbox.ratio, none, distance=radius)
+    return float(channel.read(robot, balances.begin(robot, Conditions(configuration), rolling)))
 
 
 def _extrapolated(time: np.ndarray, shown: np.ndarray) -> tuple[float, float]:
