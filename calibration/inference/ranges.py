@@ -50,6 +50,8 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
     runs, measured = runs.where(lasts >= UNDER_WAY), measured[lasts >= UNDER_WAY]
     if not len(runs) or (robot.on_shaft and any(float(c.torque_gravity) > 0 for c in robot.configurations.members)):
         return []
+    if robot.rig.blank:
+        _check_gear(runs, measured, robot)
     conditions = runs.conditions(robot)
     possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
     if not np.isfinite(possible).any():
@@ -64,10 +66,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
         if not units and (kind.axis or _slips(robot, channel, factor)):  # what slides has speeds of its own
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
-        upside_down = _upside_down(robot, channel, typical)
         sentence = _sentence(channel, typical if units else factor, units, _others(channel, factors), runs)
-        if upside_down and off > REFUSED:
-            sentence = f"{sentence}; is gearbox.ratio upside down? expected motor turns per turn of the output"
         if off > REFUSED:
             raise BadData(f"{runs.source}, {sentence}")
         said.append(sentence)
@@ -121,14 +120,28 @@ def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
     return robot.rig.blank and not robot.on_shaft and channel.name == "speed" and factor < 1
 
 
-def _upside_down(robot: Robot, channel: Channel, factor: float) -> bool:
-    """Whether an output's speed is off by the square of the gear ratio."""
+def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
+    """Refuse a gear ratio that is the inverse of what the speeds of motor and output show."""
+    shown = dict(zip(channels.names(), measured.T, strict=True))
+    conditions = runs.conditions(robot)
+    which = np.asarray(conditions.configuration)
+    radius = np.asarray([float(c.radius) for c in robot.configurations.members])[which]
+    output = shown.get("output_speed", shown["speed"] / radius if "speed" in shown else None)
+    motor = shown.get("motor_speed", conditions.motor_speed)
+    if motor is None:  # about what it turns at without load
+        motor = np.asarray(conditions.voltage) / float(robot.motor.torque_constant)
     ratio = float(robot.gearbox.ratio)
-    return (
-        channel.name in ("speed", "output_speed")
-        and abs(math.log(ratio)) > math.log(SAID)
-        and abs(math.log(factor / ratio**2)) < math.log(SAID)
-    )
+    if output is None or abs(math.log(ratio)) < math.log(REFUSED):
+        return
+    turns = np.abs(np.asarray(motor)) / np.maximum(np.abs(output), 1e-12)
+    turns = turns[np.isfinite(turns) & (turns > 0)]
+    found = float(np.median(turns)) if turns.size else ratio
+    if abs(math.log(found * ratio)) < math.log(SAID):
+        raise BadData(
+            f"{runs.source}: the motor turns about {number(float(f'{found:.2g}'))} times for one turn of the output, "
+            f"but gearbox.ratio is {number(float(f'{ratio:.4g}'))}: is it upside down? expected motor turns per turn "
+            "of the output"
+        )
 
 
 def _sentence(channel: Channel, factor: float, units: list[str], others: list[str], runs: Runs) -> str:

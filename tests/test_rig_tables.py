@@ -1,0 +1,415 @@
+"""Tables of rigs: which columns a robot's file asks for, other units, surfaces, directions, and their refusals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calibration.data import runs as records
+from calibration.data import surfaces
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.inference import blocks, checks, noise, observers, priors
+from calibration.inference.calibrate import calibrate
+from calibration.inference.ranges import check_ranges
+from mmrjax import channels, params, robots
+from mmrjax.chassis import Chassis
+from mmrjax.conditions import Conditions
+from mmrjax.contact import Friction
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.ground import Ground
+from mmrjax.rig import Instrument, Rig
+from mmrjax.robot import Configurations
+from mmrjax.shaft import Shaft
+from mmrjax.track import Track
+
+DRIVE = {
+    "motor.resistance": 2.0,
+    "motor.torque_constant": 0.05,
+    "motor.friction_coulomb": 0.004,
+    "gearbox.ratio": 16.0,
+}
+
+
+@pytest.fixture(autouse=True)
+def _channels():
+    """Channels as they were, whatever a test selects."""
+    with channels.panel(channels.names()):
+        yield
+
+
+def rig(load, *, sides=1.0, **stated):
+    """A rig from nothing with one load, its channels selected."""
+    robot = robots.blank(Configurations({"rig": load}), sides, Rig(**stated))
+    channels.select(robot.rig.channels)
+    return params.replace(robot, DRIVE)
+
+
+def bench(imposed="motor_speed", shown=("total_current",), sides=1.0, load=None, **stated):
+    usual = {"inertia": 1e-3, "loss_coulomb": 0.05, "loss_viscous": 0.004}
+    return rig(Shaft(**{**usual, **(load or {})}), sides=sides, imposed=imposed, channels=shown, **stated)
+
+
+def vehicle(mass=10.0, **stated):
+    stated = {"imposed": "motor_speed", "channels": ("total_current", "speed"), **stated}
+    track = Track(loss_coulomb=0.02, loss_viscous=0.0, guide_share=0.0)
+    ground = Ground(Friction(static=0.5, dynamic=0.4), rolling_resistance=0.05)
+    return rig(Chassis(track=track, ground=ground, on_tracks=0.0, mass=mass, radius=0.05, inertia=1e-3), **stated)
+
+
+def read(tmp_path, text, robot, **options):
+    path = tmp_path / "runs.csv"
+    path.write_text(text, encoding="utf-8")
+    return records.read(path, robot=robot, **options)
+
+
+def measured(tmp_path, robot, conditions, columns, true=None, *, share=0.01, seed=0):
+    """A table of what a robot with other parameters shows."""
+    found = steady_batch(params.replace(robot, true or {}), conditions)
+    rng = np.random.default_rng(seed)
+    columns = dict(columns)
+    for c in channels.CHANNELS:
+        x = np.asarray(found.reading[c.name]) / c.factor
+        columns[c.column] = [f"{v:.6g}" for v in x * (1 + share * rng.standard_normal(x.shape))]
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    return read(tmp_path, "\n".join(lines) + "\n", robot)
+
+
+# --- which columns
+
+
+def test_a_bench_needs_what_is_imposed_and_a_channel_alone(tmp_path):
+    robot = bench()
+    runs = read(tmp_path, "motor_speed_rpm,total_current_A\n1000,0.4\n2000,0.5\n", robot)
+    conditions = runs.conditions(robot)
+    assert runs.axes == ("motor_speed_rpm",) and conditions.motor_speed == pytest.approx(
+        [1000 * np.pi / 30] * 1 + [2000 * np.pi / 30]
+    )
+    assert runs["configuration"].tolist() == ["rig", "rig"] and conditions.total_mass is None
+    assert runs.measured().tolist() == [[0.4], [0.5]]
+
+
+def test_a_vehicle_takes_its_mass_from_its_file_and_the_flat_without_payload(tmp_path):
+    robot = vehicle(imposed="voltage", channels=("total_current",))
+    runs = read(tmp_path, "supply_voltage_V,total_current_A\n12,1.5\n", robot)
+    conditions = runs.conditions(robot)
+    assert conditions.total_mass is None and conditions.slope_deg == 0 == conditions.payload
+    assert runs.axes == ("supply_voltage_V", "payload_kg", "slope_deg")
+
+
+def test_a_packaged_robot_reads_its_tables_as_ever(robot):
+    with_robot, without = records.read("measured", robot=robot), records.read("measured")
+    assert list(with_robot.columns) == list(without.columns) and with_robot.unknown == without.unknown
+    assert all((with_robot[c] == without[c]).all() for c in without.columns)
+
+
+UNITS = {
+    "motor_speed_rad_s,total_current_mA": ("104.71975511965977,400", (1000.0, 0.4)),
+    "motor_speed_turns_s,total_current_A": ("50,0.4", (3000.0, 0.4)),
+}
+
+
+@pytest.mark.parametrize("header", UNITS)
+def test_units_are_read_where_the_name_says_so(tmp_path, header):
+    row, (speed, current) = UNITS[header]
+    runs = read(tmp_path, f"{header}\n{row}\n", bench())
+    assert runs["motor_speed_rpm"] == pytest.approx([speed], rel=1e-14)
+    assert runs["total_current_A"] == pytest.approx([current], rel=1e-14)
+
+
+def test_conditions_and_sds_are_read_in_other_units(tmp_path):
+    robot = vehicle(imposed="voltage")
+    text = "supply_voltage_mV,payload_g,slope_percent,speed_m_s,speed_sd_m_s\n12000,1500,10,0.5,0.01\n"
+    runs = read(tmp_path, text, robot)
+    assert runs["supply_voltage_V"] == pytest.approx([12.0]) and runs["payload_kg"] == pytest.approx([1.5])
+    assert runs["slope_deg"] == pytest.approx([np.degrees(np.arctan(0.1))])
+    assert runs["speed_mm_s"] == pytest.approx([500.0]) and runs["speed_sd_mm_s"] == pytest.approx([10.0])
+
+
+def test_columns_of_other_names_are_those_that_the_robots_file_says(tmp_path):
+    robot = bench(columns=(("total_current_A", "I_mean", 1.0), ("motor_speed_rpm", "ticks_s", 60 / 2048)))
+    runs = read(tmp_path, "ticks_s,I_mean,note\n20480,0.4,x\n", robot)
+    assert runs["motor_speed_rpm"] == pytest.approx([600.0]) and runs["total_current_A"] == [0.4]
+    assert runs.unknown == ("note",)
+    with pytest.raises(BadData, match=r"column motor_speed_rpm \(in the robot's file: ticks_s\) is missing"):
+        read(tmp_path, "I_mean\n0.4\n", robot)
+
+
+BENCH = "motor_speed_rpm,total_current_A\n"
+REFUSED = {
+    "a slope on a bench": (
+        bench,
+        "motor_speed_rpm,slope_deg,total_current_A\n1000,5,0.4\n",
+        r"slope_deg: got 5; the r",
+    ),
+    "a mass on a bench": (
+        bench,
+        "motor_speed_rpm,total_mass_kg,total_current_A\n9,5,0.4\n",
+        r"total_mass_kg: got 5; t",
+    ),
+    "one unit twice": (
+        bench,
+        "motor_speed_rpm,motor_speed_rad_s,total_current_A\n9,1,0.4\n",
+        r"motor_speed_rpm and mot",
+    ),
+    "nothing imposed": (
+        bench,
+        "total_current_A\n0.4\n",
+        r"column motor_speed_rpm is missing \(required: motor_speed_r",
+    ),
+    "no channel": (
+        bench,
+        "motor_speed_rpm,speed_mm_s\n9,0.4\n",
+        r"no column of a channel; expected at least one of to",
+    ),
+    "an empty file": (bench, "", r"the file is empty; expected a header with motor_speed_rpm, total_current_A"),
+    "not a number": (bench, f"{BENCH}1000,nan\n", r"row 1, total_current_A: got nan; expected -200 to 200"),
+    "in its own unit": (
+        bench,
+        "motor_speed_rpm,total_current_mA\n9,3e5\n",
+        r"total_current_mA: got 3e5; expected -200000",
+    ),
+    "an empty speed": (bench, f"{BENCH},0.4\n", r"row 1, motor_speed_rpm: got an empty cell; expected a number"),
+    "no speed": (
+        bench,
+        f"{BENCH}0,0.4\n",
+        r"row 1, motor_speed_rpm: got 0; expected a speed, in a table of readings",
+    ),
+    "no sign": (
+        bench,
+        f"{BENCH}900,0.4\n-900,0.4\n",
+        r"row 2, .*: got 0.4 at -900 rpm; .*or signed = false for total_c",
+    ),
+    "no mass": (
+        lambda: vehicle(0.0),
+        "motor_speed_rpm,speed_mm_s\n900,5\n",
+        r"no column total_mass_kg, and the robot's",
+    ),
+    "too little voltage": (
+        bench,
+        "motor_speed_rpm,supply_voltage_V,total_current_A\n3000,5,0.4\n",
+        r"supply_voltage_V: got 5 at an imposed motor_speed_rpm of 3000, too small for the motors' back-EMF of 15.7 V",
+    ),
+    "voltage against speed": (
+        lambda: bench(shown=("total_current", "motor_voltage")),
+        "motor_speed_rpm,motor_voltage_V,total_current_A\n3000,-17,0.4\n",
+        r"motor_voltage_V: got -17 at an imposed motor_speed_rpm of 3000, of the other sign",
+    ),
+    "an angle that wraps": (
+        lambda: bench("voltage", ("output_angle",)),
+        "time_s,supply_voltage_V,output_angle_deg\n0,9,340\n1,9,350\n2,9,1\n3,9,11\n",
+        r"row 3, output_angle_deg: jumps by -349 deg from the sample before, as an angle that wraps",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+def test_bad_tables_of_rigs_are_refused_in_one_sentence(tmp_path, case):
+    make, text, sentence = REFUSED[case]
+    with pytest.raises(BadData, match=sentence) as refusal:
+        read(tmp_path, text, make())
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_slope_of_nothing_on_a_bench_is_let_pass(tmp_path):
+    assert len(read(tmp_path, "motor_speed_rpm,slope_deg,total_current_A\n1000,0,0.4\n", bench())) == 1
+
+
+def test_a_mapped_column_in_the_place_of_none_is_refused(tmp_path):
+    with pytest.raises(BadData, match=r"reads currrent from column I; this program has no column currrent"):
+        read(tmp_path, "motor_speed_rpm,I\n9,1\n", bench(columns=(("currrent", "I", 1.0),)))
+
+
+# --- directions and instruments
+
+
+def test_an_instrument_that_shows_magnitude_alone_has_no_signs(tmp_path):
+    robot = bench(instruments=(Instrument("total_current", signed=False),))
+    assert len(read(tmp_path, f"{BENCH}900,0.4\n-900,0.4\n", robot)) == 2
+    with pytest.raises(BadData, match=r"row 2, total_current_A: got -0.4; expected no negative reading"):
+        read(tmp_path, f"{BENCH}900,0.4\n-900,-0.4\n", robot)
+
+
+def test_a_weight_may_drive_the_motors_either_way(tmp_path):
+    assert len(read(tmp_path, f"{BENCH}900,0.9\n-900,0.4\n", bench(load={"torque_constant": 0.5}))) == 2
+
+
+def test_the_step_of_an_instrument_is_in_its_noise(tmp_path):
+    runs = read(
+        tmp_path, f"{BENCH}900,0.4\n1900,0.5\n", bench(instruments=(Instrument("total_current", quantum=0.06),))
+    )
+    sizes = observers.kind(runs).sizes(runs)
+    known = noise.of(runs, sizes, "current=0.01A")
+    assert known.sd == pytest.approx(np.sqrt(0.01**2 + 0.06**2 / 12))
+    assert noise.of(runs, sizes).sd == pytest.approx(0.02 * runs.measured())  # an estimate has it in it already
+
+
+# --- surfaces
+
+ON = "motor_speed_rpm,surface,total_current_A,speed_mm_s\n" + "".join(
+    f"{n},{s},{0.5 + n / 4000},{n * 0.2}\n" for s in ("felt", "tiles") for n in (500, 900, 1500)
+)
+
+
+def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_path):
+    robot = vehicle(priors=(("rig.ground.friction.static", 0.6, 0.1), ("rig.radius", 0.05, 0.001)))
+    runs = read(tmp_path, ON, robot)
+    apart = surfaces.separated(robot, runs)
+    assert apart.configurations.names == ("rig-felt", "rig-tiles")
+    assert apart.rig.surfaces == (("rig-tiles", "rig-felt"),)
+    assert runs.configurations(apart).tolist() == [0, 0, 0, 1, 1, 1]
+    assert {n for n, *_ in apart.rig.priors} == {
+        "rig-felt.ground.friction.static", "rig-tiles.ground.friction.static", "rig-felt.radius",
+    }  # fmt: skip
+    assert (
+        surfaces.separated(apart, runs) == apart or surfaces.separated(apart, runs).rig.surfaces == apart.rig.surfaces
+    )
+    assert runs.conditions(apart).adhesion == pytest.approx(1.0)
+
+
+def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
+    robot = vehicle()
+    runs = read(tmp_path, ON, robot)
+    apart = surfaces.separated(robot, runs)
+    names = priors.free_names(apart, runs.configurations_named(apart))
+    assert "rig-felt.radius" in names and "rig-tiles.radius" not in names
+    assert {"rig-felt.ground.rolling_resistance", "rig-tiles.ground.rolling_resistance"} <= set(names)
+    coordinates = priors.coordinates(apart, names)
+    z = np.linspace(-1, 1, len(names))
+    there = coordinates.robot(apart, z)
+    felt, tiles = there.configurations.members
+    assert felt.radius == tiles.radius != apart.configurations["rig-felt"].radius
+    assert felt.track.loss_coulomb == tiles.track.loss_coulomb
+    assert felt.ground.rolling_resistance != tiles.ground.rolling_resistance
+    held = priors.coordinates(apart, ["rig-tiles.ground.rolling_resistance"])
+    assert held.robot(apart, np.ones(1)).configurations["rig-tiles"].radius == 0.05
+
+
+def test_one_surface_alone_and_a_robot_without_the_others_stay_as_they_are(tmp_path):
+    robot = vehicle()
+    runs = read(tmp_path, ON, robot)
+    assert surfaces.separated(robot, runs.where(np.arange(3))).configurations.names == ("rig",)
+    assert runs.configurations(robot).tolist() == [0] * 6  # simulated as it is
+
+
+def test_surfaces_of_table_5_scale_the_papers_robots_and_others_are_their_own(robot):
+    runs = records.read("measured").where(np.arange(4))
+    columns = {**runs.columns, "surface": np.array(["linoleum", "linoleum", "sand", "sand"])}
+    runs = dataclasses.replace(runs, columns=columns)
+    apart = surfaces.separated(robot, runs)
+    assert apart.configurations.names == ("6T2A", "4W2T", "6T2A-sand") and apart.rig.surfaces == (
+        ("6T2A-sand", "6T2A"),
+    )
+    assert runs.conditions(apart).adhesion == pytest.approx([0.42 / 0.32] * 2 + [1.0] * 2)
+
+
+def test_options_name_a_configuration_that_gave_way_to_its_surfaces(tmp_path):
+    robot = vehicle()
+    runs = read(tmp_path, ON, robot)
+    apart = surfaces.separated(robot, runs)
+    said = surfaces.names_of_surfaces(["rig.radius", "rig.ground.friction.static", "motor.resistance"], apart, runs)
+    assert said == [
+        "rig-felt.radius", "rig-felt.ground.friction.static", "rig-tiles.ground.friction.static", "motor.resistance",
+    ]  # fmt: skip
+
+
+# --- what is fitted
+
+
+def test_blocks_of_an_imposed_speed_are_its_levels(tmp_path):
+    rows = "".join(f"{n},0.4\n" for n in (501, 498, 1003, 996, 2000, 2010))
+    runs = read(tmp_path, BENCH + rows, bench())
+    found = blocks.blocks(runs, "motor_speed")
+    assert [m.tolist().count(True) for m in found.values()] == [2, 2, 2]
+    assert blocks.blocks(runs, "voltage") == {} == blocks.blocks(runs, "slope")
+
+
+def test_what_is_said_of_constant_conditions_is_of_the_rig(tmp_path):
+    robot = bench()
+    runs = read(tmp_path, f"{BENCH}900,0.4\n900,0.41\n900,0.4\n900,0.41\n", robot)
+    known = noise.of(runs, observers.kind(runs).sizes(runs), "current=5%")
+    said = checks.check(runs, robot, (), known)
+    assert any(s.startswith("motor_speed_rpm is 900 in every row: losses that grow with speed") for s in said)
+    assert not any("slope" in s or "voltage" in s for s in said)
+
+
+def test_a_gear_ratio_upside_down_is_said(tmp_path):
+    robot = bench("voltage", ("output_speed",))
+    runs = measured(tmp_path, robot, Conditions(np.zeros(4, int), voltage=np.array([6.0, 9, 12, 24])),
+                    {"supply_voltage_V": [6, 9, 12, 24]})  # fmt: skip
+    assert check_ranges(runs, robot) == []
+    with pytest.raises(
+        BadData, match=r"about 17 times for one turn of the output, but gearbox.ratio is 0.0625: is it ups"
+    ):
+        check_ranges(runs, params.replace(robot, {"gearbox.ratio": 1 / 16.0}))
+
+
+def test_readings_in_another_unit_are_refused_with_the_unit(tmp_path):
+    robot = bench("voltage", ("motor_speed",))
+    columns = {"supply_voltage_V": np.array([6.0, 9, 12, 24])}
+    runs = measured(tmp_path, robot, Conditions(np.zeros(4, int), voltage=columns["supply_voltage_V"]), columns)
+    off = dataclasses.replace(runs, columns={**runs.columns, "motor_speed_rpm": runs["motor_speed_rpm"] * np.pi / 30})
+    with pytest.raises(BadData, match=r"motor_speed_rpm: readings are about .* are they in rad/s"):
+        check_ranges(off, robot)
+
+
+def test_an_arm_has_no_steady_state(tmp_path):
+    robot = bench("voltage", ("motor_speed",), load={"torque_gravity": 0.2})
+    runs = read(
+        tmp_path, "supply_voltage_V,motor_speed_rpm\n" + "".join(f"{v},{v * 100}\n" for v in range(4, 14)), robot
+    )
+    with pytest.raises(
+        BadConfiguration, match=r"rig is an arm on which gravity acts .*; follow it over time"
+    ) as refusal:
+        calibrate(runs, robot, noise="motor_speed=1%")
+    assert "\n" not in str(refusal.value)
+
+
+QUICK = {"starts": 2, "profiles": False, "blocks": ["motor_speed", "voltage"]}
+
+
+def inside(found, true):
+    return {n: abs(p.value - true[n]) / p.sd for n, p in found.parameters.items() if n in true}
+
+
+def test_a_bench_with_imposed_speed_and_current_alone_is_calibrated(tmp_path):
+    robot, speed = bench(), np.repeat(np.linspace(500, 4000, 6), 3)
+    true = {"rig.loss_coulomb": 0.07, "rig.loss_viscous": 0.006}
+    conditions = Conditions(np.zeros(len(speed), int), motor_speed=speed * np.pi / 30)
+    runs = measured(tmp_path, robot, conditions, {"motor_speed_rpm": speed}, true)
+    found = calibrate(runs, robot, noise="current=1%", **QUICK)
+    assert found.converged and found.adequacy.adequate
+    assert set(found.parameters) == set(true) and max(inside(found, true).values()) < 3
+    assert list(found.held_out) == ["motor_speed"] and "supply_voltage_V" not in found.rows()
+
+
+def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
+    robot = bench("voltage", ("total_current", "motor_speed"), sides=3.0)
+    volts = np.array([-24.0, -18, -12, -6, 6, 12, 18, 24] * 2)
+    true = {"rig.loss_coulomb": 0.07, "rig.loss_viscous": 0.006}
+    conditions = Conditions(np.zeros(len(volts), int), voltage=volts)
+    runs = measured(tmp_path, robot, conditions, {"supply_voltage_V": volts}, true)
+    assert (np.sign(runs.measured()) == np.sign(volts)[:, None]).all()
+    found = calibrate(runs, robot, noise="current=1%,motor_speed=1%", **QUICK)
+    assert found.converged and max(inside(found, true).values()) < 3
+    assert set(found.status) == {"converged", "reverses"}
+
+
+def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
+    robot = vehicle(sides=2.0)
+    speed = np.tile([1000.0, 2000, 3000, -1000, -2000, -3000], 4)
+    labels = np.repeat(["felt", "tiles"], 12)
+    two = dataclasses.replace(robot, configurations=Configurations({n: robot.configurations["rig"] for n in "ab"}))
+    true = {"a.ground.rolling_resistance": 0.15, "b.ground.rolling_resistance": 0.03}
+    found = steady_batch(params.replace(two, true), Conditions(np.repeat([0, 1], 12), motor_speed=speed * np.pi / 30))
+    rng = np.random.default_rng(1)
+    rows = [
+        f"{n},{s},{i * (1 + 0.01 * e):.6g},{v * 1e3 * (1 + 0.005 * f):.6g}"
+        for n, s, i, v, e, f in zip(
+            speed, labels, np.asarray(found.reading["total_current"]), np.asarray(found.reading["speed"]),
+            *rng.standard_normal((2, 24)), strict=True,
+        )
+    ]  # fmt: skip
+    runs = read(tmp_path, "\n".join(["motor_speed_rpm,surface,total_current_A,speed_mm_s", *rows]) + "\n", robot)
+    found = calibrate(runs, robot, noise="current=1%,speed=0.5%", free=["rig.ground.rolling_resistance"], **QUICK)
+    named = {"rig-felt.ground.rolling_resistance": 0.15, "rig-tiles.ground.rolling_resistance": 0.03}
+    assert set(found.parameters) == set(named) and max(inside(found, named).values()) < 3
