@@ -264,6 +264,10 @@ def test_each_surface_of_a_rig_is_a_configuration_with_a_ground_of_its_own(tmp_p
         surfaces.separated(apart, runs) == apart or surfaces.separated(apart, runs).rig.surfaces == apart.rig.surfaces
     )
     assert runs.conditions(apart).adhesion == pytest.approx(1.0)
+    again = read(tmp_path, ON, apart)  # without a column configuration
+    assert again.configurations(apart).tolist() == [0, 0, 0, 1, 1, 1]
+    with pytest.raises(BadData, match="configuration is missing, and the robot has rig-felt, rig-tiles"):
+        read(tmp_path, ON.replace("felt", "sand"), apart)
 
 
 def test_what_is_not_the_ground_follows_the_first_surface(tmp_path):
@@ -318,7 +322,7 @@ def test_options_name_a_configuration_that_gave_way_to_its_surfaces(tmp_path):
 def test_blocks_of_an_imposed_speed_are_its_levels(tmp_path):
     rows = "".join(f"{n},0.4\n" for n in (501, 498, 1003, 996, 2000, 2010))
     runs = read(tmp_path, BENCH + rows, bench())
-    found = blocks.blocks(runs, "motor_speed")
+    found = blocks.blocks(runs, "speed")
     assert [m.tolist().count(True) for m in found.values()] == [2, 2, 2]
     assert blocks.blocks(runs, "voltage") == {} == blocks.blocks(runs, "slope")
 
@@ -364,7 +368,7 @@ def test_an_arm_has_no_steady_state(tmp_path):
     assert "\n" not in str(refusal.value)
 
 
-QUICK = {"starts": 2, "profiles": False, "blocks": ["motor_speed", "voltage"]}
+QUICK = {"starts": 2, "profiles": False, "blocks": ["speed", "voltage"]}
 
 
 def inside(found, true):
@@ -379,7 +383,7 @@ def test_a_bench_with_imposed_speed_and_current_alone_is_calibrated(tmp_path):
     found = calibrate(runs, robot, noise="current=1%", **QUICK)
     assert found.converged and found.adequacy.adequate
     assert set(found.parameters) == set(true) and max(inside(found, true).values()) < 3
-    assert list(found.held_out) == ["motor_speed"] and "supply_voltage_V" not in found.rows()
+    assert list(found.held_out) == ["speed"] and "supply_voltage_V" not in found.rows()
 
 
 def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):

@@ -263,7 +263,7 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) 
             columns[meaning.column] = np.array(
                 [_cell(at, meaning, cell, layout) for at, cell in zip(where, cells, strict=True)]
             )
-    _fill(columns, len(rows) - 1, layout)
+    _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
     _check_mass(name, columns)
     _check_deviations(name, columns)
@@ -286,12 +286,23 @@ def _extra(cells: list[str]) -> np.ndarray:
         return np.array(cells)
 
 
-def _fill(columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
+def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
+    """The configuration that a table need not state: the robot's only one, or the one whose surfaces it has."""
+    labels = np.unique(columns.get("surface", np.zeros(0, str)))
+    found = surfaces.common(layout.configurations, labels)
+    if found is None:
+        raise BadData(
+            f"{name}: column configuration is missing, and the robot has {', '.join(layout.configurations)}"
+        )
+    return found
+
+
+def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
     """Put in what a table of a rig need not state: its only configuration, and conditions as they mostly are."""
     if layout.usual:
         return
     if "configuration" not in columns and layout.configurations:
-        columns["configuration"] = np.full(rows, layout.configurations[0])
+        columns["configuration"] = np.full(rows, _only(name, columns, layout))
     for column, value in DEFAULTS.items():
         columns.setdefault(column, np.full(rows, value))
 
@@ -356,6 +367,8 @@ def _check_header(
     if not layout.usual:  # other channels' columns are not misspelt
         strange = [c for c in strange if c not in {x for k in channels.known() for x in (k.column, k.sd_column)}]
     required = layout.required(measured=measured, battery=battery)
+    if not layout.usual and "surface" in stated:  # which says the configuration too, where it has those of one
+        required = tuple(c for c in required if c != "configuration")
     for column in (c for c in (*required, *measured_columns()) if c not in stated):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.usual):

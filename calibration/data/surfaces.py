@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -34,6 +34,17 @@ V = TypeVar("V")
 def named(configuration: str, surface: str) -> str:
     """Name of a configuration on a surface."""
     return f"{configuration}-{re.sub(r'[^0-9A-Za-z_]+', '_', surface)}"
+
+
+def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
+    """The only one of configurations, or the one of which they are the surfaces with these labels; None: none such."""
+    if len(configurations) == 1:
+        return configurations[0]
+    stems = [
+        {c[: -len(end)] for c in configurations if c.endswith(end)} for end in (named("", label) for label in labels)
+    ]
+    stem = set.intersection(*stems) if stems else set()
+    return stem.pop() if len(stem) == 1 else None
 
 
 def refused(label: str, layout: Layout) -> str:

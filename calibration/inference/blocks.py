@@ -17,7 +17,7 @@ from calibration.inference.problem import Problem
 BLOCKS: dict[str, tuple[str, ...]] = {
     "slope": ("slope_deg",),
     "voltage": ("supply_voltage_V",),
-    "motor_speed": ("motor_speed_rpm",),
+    "speed": ("motor_speed_rpm",),
     "payload": ("payload_kg",),
     "configuration": ("configuration",),
     "voltage_configuration": ("configuration", "supply_voltage_V"),

@@ -62,7 +62,7 @@ class SettledRuns(Observer):
     fewest: ClassVar[int] = 6
     sizes_padded: ClassVar[tuple[int, ...]] = (16, 24, 32, 48, 64, 96, 128, 192, 256)
     blocks: ClassVar[tuple[str, ...]] = (
-        "slope", "voltage_configuration", "voltage", "motor_speed", "payload", "configuration",
+        "slope", "voltage_configuration", "voltage", "speed", "payload", "configuration",
     )  # fmt: skip
     percent_of: ClassVar[str] = "simulated reading, eq. (35)"
     policy: ClassVar[SearchPolicy] = SearchPolicy()
