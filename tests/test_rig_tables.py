@@ -21,6 +21,8 @@ from mmrjax.rig import Instrument, Rig
 from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
 from mmrjax.track import Track
+from sweeps import config as configuration
+from sweeps import run
 
 DRIVE = {
     "motor.resistance": 2.0,
@@ -366,6 +368,15 @@ def test_an_arm_has_no_steady_state(tmp_path):
     ) as refusal:
         calibrate(runs, robot, noise="motor_speed=1%")
     assert "\n" not in str(refusal.value)
+
+
+def test_an_arm_is_simulated_over_time_alone():
+    robot = bench("voltage", ("motor_speed",), load={"torque_gravity": 0.2})
+    config = configuration.Simulate(model="steady")
+    with pytest.raises(
+        BadConfiguration, match=r"--model steady: rig is an arm .* --model drive, and tables with a col"
+    ):
+        run.refuse(robot, Conditions(np.zeros(1, int), voltage=np.array([9.0])), config)
 
 
 QUICK = {"starts": 2, "profiles": False, "blocks": ["speed", "voltage"]}

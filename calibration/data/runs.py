@@ -150,8 +150,9 @@ class Runs:
         stated = self["configuration"]
         if not self.has("surface"):
             return stated
-        on = [surfaces.named(c, s) for c, s in zip(stated, self["surface"], strict=True)]
-        return np.array([o if o in robot.configurations else c for o, c in zip(on, stated, strict=True)])
+        pairs = list(zip(stated.tolist(), self["surface"].tolist(), strict=True))
+        on = {pair: surfaces.named(*pair) for pair in set(pairs)}
+        return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
 
     def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
         """The conditions as one batch of shape (rows,).
@@ -179,6 +180,8 @@ class Runs:
             ]
         column, factor = IMPOSED["motor_speed"]
         imposed = robot.rig.imposed == "motor_speed"
+        if imposed and not self.has(column):
+            raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
         return Conditions(
             which,
             np.zeros(len(self)) if battery or imposed else self[SUPPLY],

@@ -37,7 +37,7 @@ def named(configuration: str, surface: str) -> str:
 
 
 def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
-    """The only one of configurations, or the one of which they are the surfaces with these labels; None: none such."""
+    """The only one of configurations, or the one of which they are the surfaces with these labels; else None."""
     if len(configurations) == 1:
         return configurations[0]
     stems = [
@@ -59,13 +59,12 @@ def refused(label: str, layout: Layout) -> str:
 
 def scaled(robot: Robot, configurations: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Whether a row's adhesion is the robot's times the ratio of Table 5, shape (rows,)."""
-    return np.array(
-        [
-            not robot.rig.blank and label in SURFACES and named(name, label) not in robot.configurations
-            for name, label in zip(configurations, labels, strict=True)
-        ],
-        bool,
-    )
+    pairs = list(zip(configurations.tolist(), labels.tolist(), strict=True))
+    of_table5 = {
+        (name, label): not robot.rig.blank and label in SURFACES and named(name, label) not in robot.configurations
+        for name, label in set(pairs)
+    }
+    return np.array([of_table5[pair] for pair in pairs], bool)
 
 
 def separated(robot: Robot, runs: Runs) -> Robot:
