@@ -58,7 +58,7 @@ VEHICLE: dict[str, tuple[float, str]] = {
 }
 #: Those of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)
-_DYNAMIC = "ground.friction.dynamic"
+DYNAMIC = "ground.friction.dynamic"
 DYNAMIC_WHY = f"not stated: assumed, {DYNAMIC_SHARE:g} of static"
 
 
@@ -128,7 +128,7 @@ def vehicle_defaults(on_tracks: bool, static: Any) -> dict[str, float]:
         static: friction that its file states; no number where it states none.
     """
     found = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
-    return found | {_DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
+    return found | {DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
 
 
 def rig(content: dict[str, Any], where: str, *, on_shaft: bool, linear: bool, blank: bool) -> Rig:

@@ -123,6 +123,19 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
     return rig_file.with_priors(robot, sds, path.name)
 
 
+def parameters_stated(path: Path) -> tuple[set[str], set[str]]:
+    """Names of the parameters that a robot file states, and of the configurations that it states as linear units.
+
+    Raises:
+        BadConfiguration: as `read`.
+    """
+    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    base = content.get("base", "nominal")
+    linear = {n for n, table in content.items() if isinstance(table, dict) and table.get("load") == "linear"}
+    _without_parameters(None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name)
+    return {name for name, _ in _flatten(content)}, linear
+
+
 def _without_parameters(base: Robot | None, content: dict[str, Any], where: str) -> tuple[Robot, dict[str, float]]:
     """The robot of a file's content before the parameters that it states, and the sds stated of those.
 
@@ -355,6 +368,8 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
     for parameter in params.walk(robot):
         head_, _, key = parameter.name.rpartition(".")
         spec, value = parameter.spec, float(parameter.value)
+        if head_.startswith("rig."):  # where the runs of one table begin is not the robot's
+            continue
         was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
         if same and (blank or head_ == "rig"):
