@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,8 @@ class RigCheck:
     Attributes:
         file: that was read; robot: of it; examples: its lines that still hold an example's number.
         origins: of its numbers; facts: that follow from them.
-        runs: of the table, None without one; foresight: what it can determine.
+        runs: of the table, None without one; shown: its columns by the names of this program; foresight: what it can
+            determine.
     """
 
     file: str
@@ -44,6 +47,7 @@ class RigCheck:
     origins: tuple[Origin, ...]
     facts: tuple[Fact, ...]
     runs: Runs | None = None
+    shown: Mapping[str, str] = dataclasses.field(default_factory=dict)
     foresight: Foresight | None = None
 
     def understood(self) -> list[str]:
@@ -110,7 +114,8 @@ class RigCheck:
             found.append(
                 {
                     "column": name,
-                    "use": _use(name, self.robot),
+                    "theirs": self.shown.get(name, ""),
+                    "use": _use(name, self.robot) if name in self.shown else "not in the table",
                     "values": len(kinds),
                     "least": float(there.min()) if number and len(there) else None,
                     "greatest": float(there.max()) if number and len(there) else None,
@@ -124,12 +129,14 @@ class RigCheck:
         if self.runs is None:
             return []
         every = {c.column: c.name for c in channels.EVERY}
-        return [
+        said = [
             f"{name}: not among the rig's channels; add {every[name]} to channels in its file to use it"
-            if name in every
-            else f"{name}: no column of this program; name it under [columns] in the rig's file if it is one"
             for name in self.runs.unknown
+            if name in every
         ]
+        others = [name for name in self.runs.unknown if name not in every]
+        without = f"{', '.join(others)}: without a role; name one under [columns] in the rig's file if it has one"
+        return [*said, *([without] if others else [])]
 
     def statement(self) -> str:
         """What the table can determine, in a sentence."""
@@ -158,6 +165,7 @@ class RigCheck:
                 "unused": self.unused(),
                 "status": {str(n): int(c) for n, c in zip(names, counts, strict=True)},
                 "parameters": [dataclasses.asdict(p) for p in self.foresight.parameters],
+                "alike": [list(pair) for pair in self.foresight.alike],
             }
         return {
             "schema": "mmrjax.rig_check/1",
@@ -228,7 +236,17 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
     if data is None:
         return found
     runs = read_runs(data, robot, measured=True, series=True)
-    return dataclasses.replace(found, runs=runs, foresight=foresight.foresee(runs, robot))
+    seen = foresight.foresee(runs, robot)
+    return dataclasses.replace(found, runs=runs, shown=_shown(runs, data), foresight=seen)
+
+
+def _shown(runs: Runs, data: str) -> dict[str, str]:
+    """Columns of a table as its file calls them, by the names of this program."""
+    if not Path(data).is_file():
+        return {name: name for name in runs.columns}
+    with Path(data).open(encoding="utf-8-sig", newline="") as stream:
+        header = [cell.strip() for cell in next(csv.reader(stream))]
+    return {m.column: m.shown for m in runs.layout.meanings(runs.source, header) if m is not None}
 
 
 def _table(title: str, *headings: str) -> Table:
@@ -267,8 +285,9 @@ def print_check(found: RigCheck) -> None:
 def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     shown = _table(f"\n{runs.source}: {len(runs)} rows", "column", "used as", "values>r", "from>r", "to>r")
     for c in found.columns():
-        ends = [", ".join(c["words"][:6]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
-        shown.add_row(c["column"], c["use"], str(c["values"]), *ends)
+        ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
+        name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
+        shown.add_row(name, c["use"], str(c["values"]), *ends)
     say(shown)
     for sentence in [*found.unused(), *runs.missing()]:
         say(f"- {sentence}")
@@ -276,8 +295,8 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     others = [f"{count} rows: {name}" for name, count in zip(names, counts, strict=True) if name != "converged"]
     if others:
         say(
-            f"- with the file's numbers not every row settles ({', '.join(others)}); one that the robot does not reach "
-            "counts for nothing"
+            f"- with the file's numbers not every row settles ({', '.join(others)}); one that the "
+            "robot does not reach counts for nothing"
         )
     title = "\nwhat these data can determine (posterior sd over prior sd, at the numbers of the file)"
     shown = _table(title, "parameter", "value>r", "prior ±>r", "unit", "posterior/prior>r", "")
@@ -286,6 +305,12 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
         shown.add_row(p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", said)
     say(shown)
     say(f"held by its prior: above {identifiability.HELD:g}")
+    for one, other, size in seen.alike:
+        say(f"- {one} and {other} act alike in these data (correlation {size:+.2f})")
+
+
+def _words(words: list[str]) -> str:
+    return ", ".join(words) if len(words) < 5 else f"{', '.join(words[:3])}, ..."
 
 
 def _end(value: float | None) -> str:

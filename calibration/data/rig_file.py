@@ -20,7 +20,7 @@ from mmrjax.signals import GRAVITY
 #: Base of a robot that starts from nothing.
 NONE = "none"
 #: Keys and tables of a robot file that state the rig.
-KEYS = ("imposed", "channels", "start", "columns", "instruments")
+KEYS = ("imposed", "channels", "start", "columns", "instruments", "surfaces")
 #: How the histories of a rig start.
 STARTS = ("rest", "measured", "free")
 #: What a configuration may be.
@@ -131,11 +131,14 @@ def vehicle_defaults(on_tracks: bool, static: Any) -> dict[str, float]:
     return found | {DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
 
 
-def rig(content: dict[str, Any], where: str, *, on_shaft: bool, linear: bool, blank: bool) -> Rig:
+def rig(
+    content: dict[str, Any], where: str, loads: Sequence[str], *, on_shaft: bool, linear: bool, blank: bool
+) -> Rig:
     """The rig that a file's content states; takes the `KEYS` out of it.
 
     Args:
-        on_shaft: whether the loads are shafts; linear: whether one is a linear unit, whose travel can be measured;
+        loads: names of the configurations; on_shaft: whether they are shafts.
+        linear: whether one is a linear unit, whose travel can be measured.
         blank: whether the robot starts from nothing.
 
     Raises:
@@ -157,6 +160,7 @@ def rig(content: dict[str, Any], where: str, *, on_shaft: bool, linear: bool, bl
         instruments=_instruments(content.pop("instruments", {}), names, where),
         columns=_columns(content.pop("columns", {}), where),
         start=start,
+        surfaces=_surfaces(content.pop("surfaces", {}), loads, where),
         blank=blank,
     )
 
@@ -177,6 +181,17 @@ def _channels(stated: Any, where: str) -> tuple[str, ...]:
         if name not in every:
             raise BadConfiguration(f"{where}: got {name}; {choices(name, every)}")
     return tuple(name for name in every if name in stated)
+
+
+def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
+    here = f"{where}, surfaces"
+    if not isinstance(stated, dict):
+        raise BadConfiguration(f"{here}: got {stated!r}; expected a table [surfaces]")
+    for name, other in stated.items():
+        for word in (name, other):
+            if word not in loads:
+                raise BadConfiguration(f"{here}.{name}: got {word}; {choices(str(word), loads)}")
+    return tuple(stated.items())
 
 
 def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
@@ -308,6 +323,9 @@ def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
             else f"{mine} = {{column = {json.dumps(theirs)}, factor = {factor!r}}}"
             for mine, theirs, factor in rig.columns
         ]
+    if rig.surfaces:
+        tables["surfaces"] = ["# each differs from the other by its ground alone"]
+        tables["surfaces"] += [f'{name} = "{other}"' for name, other in rig.surfaces]
     for instrument in rig.instruments:
         channel = next(c for c in channels.known() if c.name == instrument.channel)
         step = [f"quantum = {instrument.quantum / channel.factor!r}  # [{channel.unit}] step of its readings"]
@@ -329,6 +347,4 @@ def value_text(name: str, value: float, rig: Rig) -> str:
 def same_rig(rig: Rig) -> bool:
     """Whether a rig is driven and measured as a robot whose file states nothing of it."""
     usual = Rig()
-    return all(getattr(rig, key) == getattr(usual, key) for key in ("imposed", "channels", "start", "columns")) and (
-        not rig.instruments
-    )
+    return all(getattr(rig, key) == getattr(usual, key) for key in KEYS)

@@ -151,9 +151,9 @@ def _without_parameters(base: Robot | None, content: dict[str, Any], where: str)
     if base is not None:
         robot = dataclasses.replace(base, configurations=Configurations(found.by_name))
         changed = found.on_shaft or any(key in content for key in rig_file.KEYS)
-        rig = rig_file.rig(content, where, **shared, blank=False) if changed else robot.rig
+        rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=False) if changed else robot.rig
         return dataclasses.replace(robot, rig=rig), sds
-    rig = rig_file.rig(content, where, **shared, blank=True)
+    rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=True)
     robot = robots.blank(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))

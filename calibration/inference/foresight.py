@@ -7,7 +7,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import own_mass
+from calibration.data import own_mass, surfaces
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import identifiability, observers, priors
@@ -43,11 +43,13 @@ class Foresight:
         parameters: that `loop` would free.
         status: of each row with the numbers of the file.
         noise: of each channel: where its sd comes from.
+        alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
     """
 
     parameters: tuple[Determined, ...]
     status: tuple[str, ...]
     noise: tuple[str, ...]
+    alike: tuple[tuple[str, str, float], ...]
 
 
 def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
@@ -63,6 +65,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
         BadConfiguration: no parameter of the robot can be freed.
     """
     observe = observers.kind(runs)
+    robot = surfaces.separated(robot, runs)
     robot = own_mass.weighed(robot, runs)
     known = noise_room.assumed(runs, observe.sizes(runs), noise)
     robot = observe.begun(robot, runs, known)
@@ -85,4 +88,6 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
         Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
         for k, n in enumerate(names)
     )
-    return Foresight(found, tuple(STATUSES[int(s)] for s in np.asarray(seen.status)), known.source)
+    return Foresight(
+        found, tuple(STATUSES[int(s)] for s in np.asarray(seen.status)), known.source, tuple(about.correlated())
+    )
