@@ -135,7 +135,10 @@ class RigCheck:
             if name in every
         ]
         others = [name for name in self.runs.unknown if name not in every]
-        without = f"{', '.join(others)}: without a role; name one under [columns] in the rig's file if it has one"
+        without = (
+            f"{', '.join(others)}: without a role, so residuals are tested for clusters by each; name one under "
+        )
+        without += "[columns] in the rig's file if it has one"
         return [*said, *([without] if others else [])]
 
     def statement(self) -> str:

@@ -201,7 +201,10 @@ def origins(robot: Robot, stated: set[str], linear: set[str]) -> list[Origin]:
         head, _, rest = p.name.partition(".")
         mine = head in robot.configurations
         shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
-        if not shown and not (robot.rig.blank and p.name == "motor.inertia"):
+        assumed = robot.rig.blank and (
+            p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
+        )
+        if not shown and not assumed:
             continue
         if p.name in stated:
             why = "the file, by mass and travel of the linear unit" if head in linear else "the file"
@@ -214,6 +217,8 @@ def origins(robot: Robot, stated: set[str], linear: set[str]) -> list[Origin]:
 
 
 def _default(name: str, rest: str, on_shaft: bool) -> str:
+    if name == "motor.inductance":
+        return rig_file.WINDING_WHY
     if name in rig_file.DEFAULTS:
         return rig_file.DEFAULTS[name][1]
     if rest == rig_file.DYNAMIC:

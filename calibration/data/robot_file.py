@@ -157,6 +157,9 @@ def _without_parameters(base: Robot | None, content: dict[str, Any], where: str)
     robot = robots.blank(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
+    resistance = given.get("motor.resistance")
+    if isinstance(resistance, int | float):
+        robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
     missing = [name for name in rig_file.needed(rig) if name not in given]
     if found.on_shaft and not found.linear and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
