@@ -768,6 +768,28 @@ def new(
     return rig_new.new(file, kind, force)
 
 
+@rig.command("check", epilog="Example: mmrjax rig check my-rig.toml my-runs.csv")
+def rig_check(
+    file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The rig's file.")],
+    data: Annotated[
+        str | None, typer.Argument(metavar="[DATA.csv]", help="A table of runs, settled or over time (time_s, s).")
+    ] = None,
+    effects: _Effects = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON (mmrjax.rig_check/1) instead of words.")] = False,
+    no_cache: _NoCache = False,
+) -> int:
+    """Say what was understood of a rig's file, where each number comes from, and whether it makes sense.
+
+    With data: which columns are used for what, over what range, and which parameters these data can determine;
+    one whose posterior sd is above 0.9 of its prior's is held by its prior. Nothing is fitted or written.
+    Exit codes: 0 it can be used; 2 the file cannot; 4 the data cannot.
+    """
+    _start_jax(no_cache)
+    from sweeps import rig_check as room
+
+    return room.check(file, data, tuple(effects or ()), json)
+
+
 @app.command()
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""

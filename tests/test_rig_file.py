@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 import pytest
 
-from calibration.data import robot_file
+from calibration.data import rig_facts, robot_file
 from calibration.data.errors import BadConfiguration
 from mmrjax import effects, params, robots
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.steady import steady_batch
 from mmrjax.rig import Instrument
 from mmrjax.signals import GRAVITY
 from sweeps import rig_new
@@ -243,6 +247,16 @@ def test_changed_parameter_takes_its_prior_along(tmp_path):
     assert robot.rig.priors[0] == ("motor.torque_constant", 0.06, 0.002)
 
 
+def test_inductance_that_is_not_stated_follows_the_resistance(tmp_path):
+    robot = read(tmp_path, ROVER.replace("resistance = 1.0", "resistance = 3.0"))
+    assert float(robot.motor.inductance) == pytest.approx(6e-4, rel=1e-12)
+    assert same(again(tmp_path, robot), robot)
+    found = {o.name: o for o in rig_facts.origins(robot, *robot_file.parameters_stated(tmp_path / "rig.toml"))}
+    assert found["motor.inductance"].why == "not stated: assumed, 0.2 ms of the resistance"
+    stated = read(tmp_path, ROVER.replace("[gearbox]", "inductance = 1e-3\n[gearbox]"))
+    assert float(stated.motor.inductance) == 1e-3
+
+
 def test_wheels_lose_nothing_that_is_not_stated_and_tracks_have_to_state_it(tmp_path):
     robot = read(tmp_path, ROVER)
     track, friction = robot.configurations["rover"].track, robot.configurations["rover"].ground.friction
@@ -378,3 +392,139 @@ def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
     code, _, err = mmrjax("rig", "new", "nowhere/my-rig.toml")
     assert code == 2 and "no such folder as nowhere" in err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def bench(mmrjax, tmp_path):
+    """A bench as its template has it, and a table of it with sds, in mA."""
+    mmrjax("rig", "new", "my-rig.toml")
+    robot = robot_file.load(str(tmp_path / "my-rig.toml"))
+    voltage = np.linspace(3.0, 24.0, 12)
+    seen = steady_batch(robot, Conditions(voltage=voltage))
+    rows = zip(voltage, np.asarray(seen.total_current) * 1e3, np.asarray(seen.motor_speed) * 30 / np.pi, strict=True)
+    lines = ["supply_voltage_V,total_current_mA,motor_speed_rpm,output_torque_Nm,room"]
+    lines += [f"{u:.6g},{i:.6g},{n:.6g},0,{k % 2}" for k, (u, i, n) in enumerate(rows)]
+    (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
+    return robot
+
+
+def test_rig_check_says_what_a_file_is(mmrjax, bench):
+    code, out, err = mmrjax("rig", "check", "my-rig.toml")
+    assert (code, err) == (0, "")
+    assert "One motor drives, through its gearbox 20 : 1, bench: a shaft of 0.002 kg·m²." in out
+    assert "10 lines still hold the number of an example" in out
+    assert "382 rpm/V" in out and "LOOK" not in out and "Without data" in out
+
+
+def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
+    """Friction of motor and load act alike on current and speed, as does the gear's loss: the wider prior gives way."""
+    code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv", "--json")
+    assert code == 0
+    found = json.loads(out)
+    assert found["schema"] == "mmrjax.rig_check/1" and found["data"]["rows"] == 12
+    columns = {c["column"]: c for c in found["data"]["columns"]}
+    assert columns["total_current_A"]["theirs"] == "total_current_mA"
+    assert columns["supply_voltage_V"]["use"] == "imposed" and columns["slope_deg"]["use"] == "not in the table"
+    assert columns["supply_voltage_V"]["least"] == 3.0 and columns["supply_voltage_V"]["greatest"] == 24.0
+    assert [s.split(":")[0] for s in found["data"]["unused"]] == ["output_torque_Nm", "room"]
+    shares = {p["name"]: p["share"] for p in found["data"]["parameters"]}
+    held = {p["name"] for p in found["data"]["parameters"] if p["held"]}
+    assert held == {name for name, share in shares.items() if share > 0.9} == {
+        "motor.friction_coulomb", "motor.friction_viscous", "gearbox.efficiency_load",
+    }  # fmt: skip
+    assert shares["motor.torque_constant"] < 0.2 and shares["bench.loss_viscous"] < 0.3
+    assert "would be held by their priors" in found["statement"]
+
+
+def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
+    code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv")
+    assert code == 0 and "total_current_A, yours total_current_mA" in out
+    assert "gearbox.efficiency_load" in out and "held by its prior" in out
+    assert "room: without a role" in out and "add output_torque to channels" in out
+
+
+def test_rig_check_ends_with_2_for_the_file_and_4_for_the_data(mmrjax, bench, tmp_path):
+    code, _, err = mmrjax("rig", "check", "mine.toml")
+    assert code == 2 and "mine.toml: no such file; mmrjax rig new mine.toml writes one to fill in" in err
+    text = (tmp_path / "my-rig.toml").read_text().replace("\nratio = 20.0", "")
+    (tmp_path / "lacking.toml").write_text(text)
+    code, _, err = mmrjax("rig", "check", "lacking.toml")
+    assert code == 2 and "gearbox.ratio [-] is missing" in err
+    (tmp_path / "odd.csv").write_text("supply_voltage_V,total_current_A,motor_speed_rpm\n12,x,3000\n")
+    code, _, err = mmrjax("rig", "check", "my-rig.toml", "odd.csv")
+    assert code == 4 and "odd.csv row 1, total_current_A: got x" in err
+
+
+ODD = {
+    "constant in mN·m/A": ("torque_constant = 0.05", "torque_constant = 5.0", "is torque_constant in N·m/A?"),
+    "efficient stages": ("ratio = 16", "ratio = 300", "an efficiency of 0.9 is more than three stages"),
+    "nothing geared": (
+        "ratio = 16\nefficiency_load = 0.9",
+        "ratio = 1\nefficiency_load = 0.5",
+        "is the ratio missing?",
+    ),
+    "stuck": ("loss_coulomb = 0.1", "loss_coulomb = 40.0", "above the stall current 12 A at 12 V, so it stands"),
+    "rotor in g·cm²": ("[gearbox]", "inertia = 0.02\n[gearbox]", "look at motor.inertia (1 g·cm² is 1e-7 kg·m²)"),
+    "voltage beyond the speed": (
+        "voltage_limit = 12.0",
+        "voltage_limit = 120.0",
+        "more than twice motor.speed_limit",
+    ),
+}
+SOUND = """
+base = "none"
+[motor]
+torque_constant = 0.05
+resistance = 1.0
+friction_coulomb = 0.002
+voltage_limit = 12.0
+speed_limit = 500.0
+[gearbox]
+ratio = 16
+efficiency_load = 0.9
+[bench]
+load = "shaft"
+inertia = 0.001
+loss_coulomb = 0.1
+"""
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_facts_say_which_number_to_look_at(tmp_path, case):
+    stated, instead, sentence = ODD[case]
+    assert not [f for f in rig_facts.facts(read(tmp_path, SOUND)) if f.odd] and stated in SOUND
+    odd = [f.odd for f in rig_facts.facts(read(tmp_path, SOUND.replace(stated, instead))) if f.odd]
+    assert any(sentence in text for text in odd)
+
+
+def test_facts_of_an_arm_and_a_vehicle_by_hand(tmp_path):
+    arm = read(tmp_path, SOUND + "torque_gravity = 0.5\n")
+    found = {f.what: f for f in rig_facts.facts(arm)}
+    assert found["bench: swings as a pendulum of"].value == f"{1e3 * 0.001 * GRAVITY / 0.5:.3g} mm"
+    current = (0.6 / (16 * 0.9) + 0.002) / 0.05
+    assert found["bench: current to hold and lift the arm"].value == f"{current:.3g} A each motor"
+    rover = read(tmp_path, ROVER.replace("[gearbox]", "voltage_limit = 12.0\n[gearbox]"))
+    found = {f.what: f for f in rig_facts.facts(rover)}
+    assert found["rover: steepest slope that the ground holds"].value == "27°"
+    assert found["rover: speed without load at 12 V"].value == f"{12 / 0.05 / 16 * 0.04:.3g} m/s"
+    assert found["rover: steepest slope that the stall torque holds at 12 V"].value == "any"
+
+
+def test_surfaces_of_a_calibrated_rig_are_written_and_read(tmp_path):
+    robot = read(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngrass = "rover"\n')
+    assert robot.rig.surfaces == (("grass", "rover"),)
+    assert same(again(tmp_path, robot), robot)
+    with pytest.raises(BadConfiguration, match=r"surfaces\.gras: got gras; did you mean grass\?"):
+        read(tmp_path, ROVER + '[grass]\nlike = "rover"\n[surfaces]\ngras = "rover"\n')
+
+
+EXAMPLES = (
+    (Path(__file__).parents[1] / "docs" / "rigs" / "README.md").read_text(encoding="utf-8").split("```toml\n")[1:]
+)
+
+
+@pytest.mark.parametrize("text", [e.split("```")[0] for e in EXAMPLES], ids=lambda text: text[2:].split(":")[0])
+def test_example_of_the_page_reads(tmp_path, text):
+    robot = read(tmp_path, text)
+    assert robot.rig.blank and not [f for f in rig_facts.facts(robot) if f.odd]
+    assert same(again(tmp_path, robot), robot)

@@ -20,7 +20,7 @@ from mmrjax.signals import GRAVITY
 #: Base of a robot that starts from nothing.
 NONE = "none"
 #: Keys and tables of a robot file that state the rig.
-KEYS = ("imposed", "channels", "start", "columns", "instruments")
+KEYS = ("imposed", "channels", "start", "columns", "instruments", "surfaces")
 #: How the histories of a rig start.
 STARTS = ("rest", "measured", "free")
 #: What a configuration may be.
@@ -46,6 +46,9 @@ DEFAULTS: dict[str, tuple[float, str]] = {
     "motor.inertia": (0.0, "not stated: the load's inertia alone; histories from rest need it"),
     "battery.current_other": (0.0, "not stated: nothing else is on the battery"),
 }
+#: Time constant L / R of a winding whose inductance is not stated [s]: of small motors 0.05 to 1 ms.
+WINDING = 2e-4
+WINDING_WHY = f"not stated: assumed, {1e3 * WINDING:g} ms of the resistance"
 #: The same of a vehicle, below its configuration.
 VEHICLE: dict[str, tuple[float, str]] = {
     "inertia": (0.0, "not stated: what turns with a wheel is small beside the mass"),
@@ -58,7 +61,7 @@ VEHICLE: dict[str, tuple[float, str]] = {
 }
 #: Those of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)
-_DYNAMIC = "ground.friction.dynamic"
+DYNAMIC = "ground.friction.dynamic"
 DYNAMIC_WHY = f"not stated: assumed, {DYNAMIC_SHARE:g} of static"
 
 
@@ -128,14 +131,17 @@ def vehicle_defaults(on_tracks: bool, static: Any) -> dict[str, float]:
         static: friction that its file states; no number where it states none.
     """
     found = {name: value for name, (value, _) in VEHICLE.items() if not (on_tracks and name in _OF_TRACKS)}
-    return found | {_DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
+    return found | {DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
 
 
-def rig(content: dict[str, Any], where: str, *, on_shaft: bool, linear: bool, blank: bool) -> Rig:
+def rig(
+    content: dict[str, Any], where: str, loads: Sequence[str], *, on_shaft: bool, linear: bool, blank: bool
+) -> Rig:
     """The rig that a file's content states; takes the `KEYS` out of it.
 
     Args:
-        on_shaft: whether the loads are shafts; linear: whether one is a linear unit, whose travel can be measured;
+        loads: names of the configurations; on_shaft: whether they are shafts.
+        linear: whether one is a linear unit, whose travel can be measured.
         blank: whether the robot starts from nothing.
 
     Raises:
@@ -157,6 +163,7 @@ def rig(content: dict[str, Any], where: str, *, on_shaft: bool, linear: bool, bl
         instruments=_instruments(content.pop("instruments", {}), names, where),
         columns=_columns(content.pop("columns", {}), where),
         start=start,
+        surfaces=_surfaces(content.pop("surfaces", {}), loads, where),
         blank=blank,
     )
 
@@ -177,6 +184,17 @@ def _channels(stated: Any, where: str) -> tuple[str, ...]:
         if name not in every:
             raise BadConfiguration(f"{where}: got {name}; {choices(name, every)}")
     return tuple(name for name in every if name in stated)
+
+
+def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str, str], ...]:
+    here = f"{where}, surfaces"
+    if not isinstance(stated, dict):
+        raise BadConfiguration(f"{here}: got {stated!r}; expected a table [surfaces]")
+    for name, other in stated.items():
+        for word in (name, other):
+            if word not in loads:
+                raise BadConfiguration(f"{here}.{name}: got {word}; {choices(str(word), loads)}")
+    return tuple(stated.items())
 
 
 def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
@@ -308,6 +326,9 @@ def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
             else f"{mine} = {{column = {json.dumps(theirs)}, factor = {factor!r}}}"
             for mine, theirs, factor in rig.columns
         ]
+    if rig.surfaces:
+        tables["surfaces"] = ["# each differs from the other by its ground alone"]
+        tables["surfaces"] += [f'{name} = "{other}"' for name, other in rig.surfaces]
     for instrument in rig.instruments:
         channel = next(c for c in channels.known() if c.name == instrument.channel)
         step = [f"quantum = {instrument.quantum / channel.factor!r}  # [{channel.unit}] step of its readings"]
@@ -329,6 +350,4 @@ def value_text(name: str, value: float, rig: Rig) -> str:
 def same_rig(rig: Rig) -> bool:
     """Whether a rig is driven and measured as a robot whose file states nothing of it."""
     usual = Rig()
-    return all(getattr(rig, key) == getattr(usual, key) for key in ("imposed", "channels", "start", "columns")) and (
-        not rig.instruments
-    )
+    return all(getattr(rig, key) == getattr(usual, key) for key in KEYS)

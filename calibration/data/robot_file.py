@@ -123,6 +123,19 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
     return rig_file.with_priors(robot, sds, path.name)
 
 
+def parameters_stated(path: Path) -> tuple[set[str], set[str]]:
+    """Names of the parameters that a robot file states, and of the configurations that it states as linear units.
+
+    Raises:
+        BadConfiguration: as `read`.
+    """
+    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    base = content.get("base", "nominal")
+    linear = {n for n, table in content.items() if isinstance(table, dict) and table.get("load") == "linear"}
+    _without_parameters(None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name)
+    return {name for name, _ in _flatten(content)}, linear
+
+
 def _without_parameters(base: Robot | None, content: dict[str, Any], where: str) -> tuple[Robot, dict[str, float]]:
     """The robot of a file's content before the parameters that it states, and the sds stated of those.
 
@@ -138,12 +151,15 @@ def _without_parameters(base: Robot | None, content: dict[str, Any], where: str)
     if base is not None:
         robot = dataclasses.replace(base, configurations=Configurations(found.by_name))
         changed = found.on_shaft or any(key in content for key in rig_file.KEYS)
-        rig = rig_file.rig(content, where, **shared, blank=False) if changed else robot.rig
+        rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=False) if changed else robot.rig
         return dataclasses.replace(robot, rig=rig), sds
-    rig = rig_file.rig(content, where, **shared, blank=True)
+    rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=True)
     robot = robots.blank(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
+    resistance = given.get("motor.resistance")
+    if isinstance(resistance, int | float):
+        robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
     missing = [name for name in rig_file.needed(rig) if name not in given]
     if found.on_shaft and not found.linear and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
@@ -355,6 +371,8 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
     for parameter in params.walk(robot):
         head_, _, key = parameter.name.rpartition(".")
         spec, value = parameter.spec, float(parameter.value)
+        if head_.startswith("rig."):  # where the runs of one table begin is not the robot's
+            continue
         was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
         if same and (blank or head_ == "rig"):

@@ -1,0 +1,228 @@
+"""What follows from a rig's numbers, and whether it is what such a thing mostly has."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+from calibration.data import rig_file
+from mmrjax import params
+from mmrjax.channels import RPM
+from mmrjax.robot import Robot
+from mmrjax.shaft import Shaft
+from mmrjax.signals import GRAVITY
+
+#: From this ratio a gearbox has three stages or more; and the efficiency that makers state for those at most.
+STAGES, EFFICIENCY = 100.0, 0.85
+
+
+@dataclasses.dataclass(frozen=True)
+class Fact:
+    """What follows from a rig's numbers.
+
+    Attributes:
+        what: in words; value: with its unit; odd: why its numbers should be looked at again, else empty.
+    """
+
+    what: str
+    value: str
+    odd: str = ""
+
+
+def facts(robot: Robot) -> list[Fact]:
+    """What follows from the numbers of a robot: of its motor, gearbox and each load."""
+    found = [*_motor(robot), *_gearbox(robot)]
+    for name, load in robot.configurations.items():
+        found += _shaft(robot, name, load) if isinstance(load, Shaft) else _vehicle(robot, name)
+    return found
+
+
+def _has(robot: Robot, name: str) -> bool:
+    """Whether a robot's file has to state a parameter; of one with a base, all are."""
+    return not robot.rig.blank or name in rig_file.needed(robot.rig)
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def _within(value: float, low: float, high: float, why: str) -> str:
+    """`why` where a value is out of what is usual."""
+    return "" if low <= value <= high else f"{why} (usual: {_number(low)} to {_number(high)})"
+
+
+def _motor(robot: Robot) -> Iterator[Fact]:
+    motor = robot.motor
+    constant, resistance, inertia = (float(x) for x in (motor.torque_constant, motor.resistance, motor.inertia))
+    voltage = motor.voltage_limit
+    with_constant, with_resistance = _has(robot, "motor.torque_constant"), _has(robot, "motor.resistance")
+    if with_constant:
+        per_volt = 1 / constant / RPM
+        odd = _within(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
+        yield Fact("speed without load, of each volt", f"{_number(per_volt)} rpm/V", odd)
+        idle = float(motor.friction_coulomb) / constant
+        odd = _within(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
+        yield Fact("current that the motor's dry friction takes", f"{_number(idle)} A", odd)
+    if with_constant and voltage is not None:
+        fastest = voltage / constant
+        odd = "" if fastest < 2 * motor.speed_limit else "more than twice motor.speed_limit; look at torque_constant"
+        yield Fact(f"speed without load at {_number(voltage)} V", f"{_number(fastest / RPM)} rpm", odd)
+    if with_resistance and voltage is not None:
+        odd = _within(voltage / resistance, 0.02, 1000, "look at motor.resistance")
+        yield Fact(f"stall current at {_number(voltage)} V", f"{_number(voltage / resistance)} A", odd)
+    if with_constant and with_resistance:
+        size = constant**2 / resistance
+        odd = _within(
+            size, 1e-7, 1.0, "torque_constant and resistance hardly belong to one motor; look at their units"
+        )
+        yield Fact("torque over speed k²/R", f"{_number(size * 1e3)} mN·m·s", odd)
+        if inertia > 0:
+            constant_time = inertia / size
+            why = "look at motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
+            odd = _within(constant_time, 5e-4, 0.5, why)
+            yield Fact(
+                "mechanical time constant of the motor alone J R/k²", f"{_number(constant_time * 1e3)} ms", odd
+            )
+
+
+def _gearbox(robot: Robot) -> Iterator[Fact]:
+    ratio, efficiency = float(robot.gearbox.ratio), float(robot.gearbox.efficiency_load)
+    odd = _within(ratio, 1, 3000, "is it motor turns for one of the output?")
+    if ratio >= STAGES and efficiency > EFFICIENCY:
+        odd = f"an efficiency of {efficiency:g} is more than three stages or more have (mostly 0.5 to {EFFICIENCY:g})"
+    if ratio == 1 and efficiency < 0.9:
+        odd = f"an efficiency of {efficiency:g} without a gearbox; is the ratio missing?"
+    yield Fact("gearbox", f"{ratio:g} : 1 with efficiency {efficiency:g}", odd)
+
+
+def _torque(robot: Robot, current: float) -> float:
+    """Torque at the output of one drive at a motor current, with its losses [N·m]."""
+    motor, gear = robot.motor, robot.gearbox
+    lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
+    return (float(motor.torque_constant) * current - lost) * float(gear.ratio) * float(gear.efficiency_load)
+
+
+def _current(robot: Robot, torque: float) -> float:
+    """Current of one motor that a torque at its output takes, slowly [A]."""
+    motor, gear = robot.motor, robot.gearbox
+    lost = float(motor.friction_coulomb) + float(gear.friction_coulomb)
+    return (torque / (float(gear.ratio) * float(gear.efficiency_load)) + lost) / float(motor.torque_constant)
+
+
+def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact]:
+    """The current that a torque takes, held against the stall current where the voltage's limit is stated."""
+    if not _has(robot, "motor.torque_constant"):
+        return
+    current, limit = _current(robot, torque), robot.motor.voltage_limit
+    odd = _within(current, 0, 200, f"look at {places}, and the gearbox")
+    if limit is not None and _has(robot, "motor.resistance"):
+        stall = limit / float(robot.motor.resistance)
+        if current > stall:
+            odd = f"above the stall current {_number(stall)} A at {_number(limit)} V, so it stands; look at {places}"
+    yield Fact(what, f"{_number(current)} A each motor", odd)
+
+
+def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
+    friction, constant, gravity = (float(x) for x in (load.loss_coulomb, load.torque_constant, load.torque_gravity))
+    places = f"{name}.loss_coulomb [N·m, at the output]"
+    yield from _drawn(robot, f"{name}: current to turn it slowly", friction + max(constant, 0.0), places)
+    if gravity > 0:
+        yield from _drawn(
+            robot, f"{name}: current to hold and lift the arm", friction + gravity, f"{name}.torque_gravity"
+        )
+        length = float(load.inertia) * GRAVITY / gravity
+        why = f"{name}.inertia and {name}.torque_gravity hardly belong to one arm: m l² and m g l"
+        yield Fact(f"{name}: swings as a pendulum of", f"{_number(length * 1e3)} mm", _within(length, 0.01, 3.0, why))
+    if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
+        share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
+        why = f"look at {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7"
+        yield Fact(f"{name}: inertia over the motor's at the output", _number(share), _within(share, 1e-4, 1e4, why))
+    if float(load.radius) != 1.0:
+        travel = 2 * math.pi * float(load.radius)
+        yield Fact(
+            f"{name}: travel of a turn", f"{_number(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
+        )
+
+
+def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
+    load = robot.configurations[name]
+    sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
+    rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
+    odd = _within(mass, 0.05, 2000, f"is {name}.mass in kg?")
+    yield Fact(f"{name}: weight", f"{_number(mass)} kg, {_number(mass * GRAVITY)} N", odd)
+    guide = float(load.track.guide_friction) * float(load.track.guide_share)
+    torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
+    places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
+    yield from _drawn(robot, f"{name}: current to roll slowly on the flat", torque, places)
+    grip = math.degrees(math.atan(static))
+    odd = "" if static > rolling + guide else "it cannot move on the flat: friction.static is below the resistance"
+    yield Fact(
+        f"{name}: steepest slope that the ground holds", f"{grip:.0f}°", odd or _within(grip, 5, 60, "look at static")
+    )
+    limit = robot.motor.voltage_limit
+    if limit is None or not _has(robot, "motor.resistance"):
+        return
+    pull = _torque(robot, limit / float(robot.motor.resistance)) - float(load.track.loss_coulomb)
+    climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
+    odd = "" if climb > 0 else "its motors cannot move it; look at mass, ratio, torque_constant and resistance"
+    angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
+    yield Fact(f"{name}: steepest slope that the stall torque holds at {_number(limit)} V", angle, odd)
+    speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
+    odd = _within(speed, 0.005, 15, f"look at {name}.radius, gearbox.ratio and motor.torque_constant")
+    yield Fact(f"{name}: speed without load at {_number(limit)} V", f"{_number(speed)} m/s", odd)
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Where a number of a robot comes from.
+
+    Attributes:
+        name: of the parameter; value [unit]; sd: stated, None where the file states none.
+        why: in words.
+    """
+
+    name: str
+    value: float
+    unit: str
+    sd: float | None
+    why: str
+
+
+def origins(robot: Robot, stated: set[str], linear: set[str]) -> list[Origin]:
+    """Where the numbers of a robot come from, those that its file leaves open last of each part.
+
+    Args:
+        stated: parameters that its file states; linear: configurations that it states as linear units.
+    """
+    priors = {name: sd for name, _, sd in robot.rig.priors}
+    found = []
+    for p in params.walk(robot):
+        head, _, rest = p.name.partition(".")
+        mine = head in robot.configurations
+        shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
+        assumed = robot.rig.blank and (
+            p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
+        )
+        if not shown and not assumed:
+            continue
+        if p.name in stated:
+            why = "the file, by mass and travel of the linear unit" if head in linear else "the file"
+        elif not robot.rig.blank:
+            why = "its base"
+        else:
+            why = _default(p.name, rest if mine else "", robot.on_shaft)
+        found.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
+    return found
+
+
+def _default(name: str, rest: str, on_shaft: bool) -> str:
+    if name == "motor.inductance":
+        return rig_file.WINDING_WHY
+    if name in rig_file.DEFAULTS:
+        return rig_file.DEFAULTS[name][1]
+    if rest == rig_file.DYNAMIC:
+        return rig_file.DYNAMIC_WHY
+    if rest and not on_shaft:
+        return rig_file.VEHICLE[rest][1]
+    return "not stated: travel is the angle" if rest == "radius" else "not stated: none"

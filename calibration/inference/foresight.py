@@ -1,0 +1,93 @@
+"""What a table can determine of a rig before anything is fitted: posterior over prior sd, at the prior mean."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data import own_mass, surfaces
+from calibration.data.errors import BadConfiguration
+from calibration.data.runs import Runs
+from calibration.inference import identifiability, observers, priors
+from calibration.inference import noise as noise_room
+from calibration.inference import optimizers as fit
+from mmrjax import fidelities
+from mmrjax.robot import Robot
+from mmrjax.signals import STATUSES
+
+
+@dataclasses.dataclass(frozen=True)
+class Determined:
+    """What a table says of a free parameter.
+
+    Attributes:
+        name: of the parameter; value: prior mean [unit]; prior_sd: of it [unit].
+        share: posterior over prior sd [-]; held: whether its prior holds it.
+    """
+
+    name: str
+    unit: str
+    value: float
+    prior_sd: float
+    share: float
+    held: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Foresight:
+    """What a table can determine.
+
+    Attributes:
+        parameters: that `loop` would free.
+        status: of each row with the numbers of the file.
+        noise: of each channel: where its sd comes from.
+        alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
+    """
+
+    parameters: tuple[Determined, ...]
+    status: tuple[str, ...]
+    noise: tuple[str, ...]
+    alike: tuple[tuple[str, str, float], ...]
+
+
+def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
+    """What `runs` can determine of `robot`, by the linear analysis at its own values.
+
+    Rows that the robot does not reach with these values count for nothing.
+
+    Args:
+        noise: as `noise.parse`; None takes the file's sd columns, or shares of the readings.
+
+    Raises:
+        BadData: data that cannot be used.
+        BadConfiguration: no parameter of the robot can be freed.
+    """
+    observe = observers.kind(runs)
+    robot = surfaces.separated(robot, runs)
+    robot = own_mass.weighed(robot, runs)
+    known = noise_room.assumed(runs, observe.sizes(runs), noise)
+    robot = observe.begun(robot, runs, known)
+    present = {robot.configurations.names[k] for k in runs.configurations(robot)}
+    names = priors.free_names(robot, present, *observe.free())
+    names = tuple(n for n in names if n not in fidelities.unread("steady", names)) if not observe.axis else names
+    if not names:
+        raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
+    coordinates = priors.coordinates(robot, names, any_surface=not robot.rig.blank)
+    posed = observers.pose(runs, robot, coordinates, known.sd)
+    z = jnp.zeros(len(names))
+    seen = fit.observation(posed, z)
+    reached = np.isfinite(np.asarray(seen.reading)).all(1) & ~posed.observe.unreachable(np.asarray(seen.status))
+    data = dataclasses.replace(posed.data, weight=posed.data.weight * jnp.asarray(reached, float)[:, None])
+    about = identifiability.analyse(posed, z, data)
+    held = identifiability.held_by_prior(about.sd)
+    fields = priors.known(robot)
+    width = np.abs(np.asarray(coordinates.slope(z)))
+    found = tuple(
+        Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
+        for k, n in enumerate(names)
+    )
+    return Foresight(
+        found, tuple(STATUSES[int(s)] for s in np.asarray(seen.status)), known.source, tuple(about.correlated())
+    )
