@@ -143,7 +143,7 @@ def test_parse_prior_refuses(text):
     [
         (["motor.resistance"], {"motor.resistanse": (1, 1)}, "no such parameter; did you mean motor.resistance"),
         (["motor.resistance"], {"motor.inertia": (1, 1)}, "is not free; add --free motor.inertia"),
-        (["motor.resistance"], {"motor.resistance": (50.0, 1)}, "got 50; expected 0.01 to 20 ohm"),
+        (["motor.resistance"], {"motor.resistance": (5000.0, 1)}, "got 5000; expected 0.001 to 1000 ohm"),
     ],
 )
 def test_coordinates_refuse_stated_priors(robot, names, stated, says):

@@ -286,13 +286,13 @@ WRONG = {
     "configuration[1]: got -1; expected one of 0 (6T2A), 1 (4W2T)": dict(configuration=[0, -1]),
 }
 WRONG_ROBOT = {
-    "motor.resistance: got -1; expected 0.01 to 20 ohm (terminal resistance R_rot, eq. (15))": with_value(
+    "motor.resistance: got -1; expected 0.001 to 1000 ohm (terminal resistance R_rot, eq. (15))": with_value(
         "motor.resistance", -1.0
     ),
-    "motor.resistance: got nan; expected 0.01 to 20 ohm (terminal resistance R_rot, eq. (15))": with_value(
+    "motor.resistance: got nan; expected 0.001 to 1000 ohm (terminal resistance R_rot, eq. (15))": with_value(
         "motor.resistance", jnp.nan
     ),
-    "4W2T.mass: got 0; expected 0.5 to 200 kg (mass of the robot without payload)": with_value("4W2T.mass", 0.0),
+    "4W2T.mass: got 0; expected 0.01 to 10000 kg (mass of the robot without payload)": with_value("4W2T.mass", 0.0),
     "robot: got function; expected a Robot such as mmrjax.nominal()": lambda robot: mm.nominal,
 }
 WRONG_CALL = {

@@ -52,7 +52,7 @@ SCALED_WITH: dict[str, Callable[[Signals], object]] = {
 }
 AT_THE_OUTPUT = ("track", "ground", "slip")
 #: Shares of slip are those of tracks and tyres on the paper's grounds; small wheels on soft ones slip by half.
-SLIPPERY = 4.0
+SLIPPERY = 8.0
 #: Factors are powers of this one: rigs of about one size share what is compiled.
 STEP = 2.0
 
