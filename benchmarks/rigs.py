@@ -39,7 +39,7 @@ TRIES = (15, 30)
 #: figure is linear at the truth and of the file's tolerances alone, so more of it is asked for.
 HELD, SURE = 0.9, 0.97
 #: Resident memory of a worker beyond which its compiled programs are dropped [bytes].
-MEMORY = 2e9
+MEMORY = 1.5e9
 
 
 # --- cases ------------------------------------------------------------------------------------------
@@ -100,22 +100,26 @@ def work(task: Task) -> dict:
     if isinstance(case, str):
         return {"skipped": case}
     _ready()
-    from calibration.data import robot_file
+    from calibration.data import robot_file, surfaces
     from calibration.data import runs as records
-    from calibration.discovery.discover import trace
+    from calibration.discovery import scales
+    from calibration.discovery.discover import trace, without_copies
     from calibration.discovery.settings import settings_for
     from calibration.inference import noise, observers
-    from mmrjax import channels
+    from mmrjax import channels, effects
 
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         case.write(Path(folder))
         robot = robot_file.read(Path(folder) / "rig.toml")
         with channels.panel(robot.rig.channels):
-            runs = records.read(Path(folder) / "table.csv", robot=robot)
+            # as `discover` does, without what only a report needs
+            runs = without_copies(records.read(Path(folder) / "table.csv", robot=robot))[0]
+            robot = surfaces.separated(robot, runs)
             observer = observers.kind(runs)
+            library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
             settings = settings_for(observer, task.replicates, task.seed)
-            found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings)
+            found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings, library=library)
             said = verdict(found)
             parameters = identified(found, case)
     line = {
