@@ -32,8 +32,10 @@ POWER, NO_LOAD, RATIO = (5.0, 200.0), (3000.0, 10_000.0), (5.0, 200.0)  # [W], [
 MOST_MOTORS = 6
 ROWS = (16, 60)
 STEEPEST, DEMAND = 20.0, 0.8  # [deg]; largest share of the adhesion that a run demands
-#: Largest share of the drive's nominal torque that an effect may take in any row, and of a reading.
-LARGEST = 0.5
+
+#: Coarsest displays [sd of the noise], where every row has conditions of its own and where rows are repeats: from two
+#: on, repeats round alike and no longer as noise of Δ²/12, which is what an analyst can state.
+COARSE = (4.0, 2.0)
 
 #: Channel: column, its unit in SI, sd as a share of the largest reading (least, most).
 CHANNELS: dict[str, tuple[str, float, tuple[float, float]]] = {
@@ -530,11 +532,14 @@ def world(rng: np.random.Generator, kind: str | None = None, imposed: str | None
         largest = np.abs(s.shown).max(1)
         sd, quantum = {}, {}
         coarse = rng.random() < 0.25
+        repeated = int(
+            np.unique(np.stack([getattr(c, f.name) for f in dataclasses.fields(c)]), axis=1).shape[1] < len(c)
+        )
         for name, most in zip(r.channels, largest, strict=True):
             column_unit, share = CHANNELS[name][1], rng.uniform(*CHANNELS[name][2])
             sd[name] = _typed(share * most / column_unit, 2)
             if coarse and rng.random() < 0.7:
-                quantum[name] = _typed(sd[name] * rng.uniform(1.0, 4.0), 1)
+                quantum[name] = _typed(sd[name] * rng.uniform(1.0, COARSE[repeated]), 2)
         return World(dataclasses.replace(r, quantum=quantum), p, z, c, sd)
     raise ValueError("no such rig whose rows are all sound")
 
