@@ -204,10 +204,7 @@ def _clean(f: scores.Figures) -> None:
     f.say("  with a name", clean, lambda x: x["classes"])
     for name, key in STRATA.items():
         for value in sorted({key(x["made"]) for x in clean}):
-            some = [x for x in clean if key(x["made"]) == value]
-            hits = sum(map(scores.false_finding, some))
-            mark = "  ABOVE 5 %" if scores.wilson(hits, len(some))[0] > scores.FALSE else ""
-            f.note(f"  {f'{name} {value}':74s} {scores.interval(hits, len(some))}{mark}")
+            scores.stratum(f, f"{name} {value}", [x for x in clean if key(x["made"]) == value])
 
 
 def _library(f: scores.Figures) -> None:
