@@ -189,8 +189,8 @@ def clean(f: Figures, kinds: Sequence[str]) -> None:
     for kind in kinds:
         f.say(f"{kind}: a false finding (goal <= 5 %)", f.of(kind), false_finding)
     wide = f.of("clean_wide")
-    for stratum in dict.fromkeys(sorted(x.get("stratum", "") for x in wide)):
-        stratum(f, f"stratum {stratum}", [x for x in wide if x.get("stratum") == stratum])
+    for name in dict.fromkeys(sorted(x.get("stratum", "") for x in wide)):
+        stratum(f, f"stratum {name}", [x for x in wide if x.get("stratum") == name])
     for name, edges in BINS:
         for low, high in itertools.pairwise(edges):
             inside = [x for x in wide if any(low <= v < high or v == high == edges[-1] for v in values(x, name))]
