@@ -31,6 +31,7 @@ lint: $(READY)
 campaign: $(READY)
 	$(BIN)/python benchmarks/loop.py --clean-wide 1000 --noise 100 --library 500 --variants 300 --outside 300 --pairs 200 --triples 150 --drift 100 --cluster 120 --coverage 600
 	$(BIN)/python benchmarks/loop_series.py --clean-wide 300 --noise 20 --library 120 --outside 60 --pairs 60 --event 60
+	$(BIN)/python benchmarks/rigs.py --clean 500 --library 400 --outside 250
 
 bench: $(READY)
 	$(BIN)/python benchmarks/steady.py

@@ -219,7 +219,7 @@ def campaign(
         parser.add_argument(f"--{kind.replace('_', '-')}", type=int, default=0, help="cases")
     parser.add_argument("--replicates", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--first", "--seed", type=int, default=0, help="first seed")
     parser.add_argument("--robot", default="nominal", help="of the paper's robot's cases")
     parser.add_argument("--stratum", default="", help="one stratum of the wide kinds alone, e.g. plain")
     parser.add_argument("--narrow", action="store_true", help="one surface, its adhesion stated, as before")

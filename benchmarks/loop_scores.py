@@ -189,12 +189,12 @@ def clean(f: Figures, kinds: Sequence[str]) -> None:
     for kind in kinds:
         f.say(f"{kind}: a false finding (goal <= 5 %)", f.of(kind), false_finding)
     wide = f.of("clean_wide")
-    for stratum in dict.fromkeys(sorted(x.get("stratum", "") for x in wide)):
-        _stratum(f, f"stratum {stratum}", [x for x in wide if x.get("stratum") == stratum])
+    for name in dict.fromkeys(sorted(x.get("stratum", "") for x in wide)):
+        stratum(f, f"stratum {name}", [x for x in wide if x.get("stratum") == name])
     for name, edges in BINS:
         for low, high in itertools.pairwise(edges):
             inside = [x for x in wide if any(low <= v < high or v == high == edges[-1] for v in values(x, name))]
-            _stratum(f, f"{name} {low:g} to {high:g}", inside)
+            stratum(f, f"{name} {low:g} to {high:g}", inside)
 
 
 def values(x: dict, name: str) -> list[float]:
@@ -207,7 +207,8 @@ def values(x: dict, name: str) -> list[float]:
     return [made["robot"][name]] if name in made.get("robot", {}) else []
 
 
-def _stratum(f: Figures, what: str, those: list[dict]) -> None:
+def stratum(f: Figures, what: str, those: list[dict]) -> None:
+    """False findings of a part of the clean cases, marked where they are surely too many."""
     if not those:
         return
     hits = sum(map(false_finding, those))
