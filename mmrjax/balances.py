@@ -182,7 +182,8 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
     gear, inertia_motor = robot.gearbox, robot.motor.inertia
     idle = gear.torque_idle(signals.speed_motor, signals.direction)
     mover = chassis.radius * signals.traction if mover is None else mover
-    load = signals.torque_track_loss + mover + added(robot, signals, "gearbox")
+    own = added(robot, signals, "gearbox")
+    load = signals.torque_track_loss + mover + own
     drive = signals.torque_motor - idle
     inertia_added = added(robot, signals, "inertia")
     inertia_wheel = chassis.inertia + inertia_added
@@ -202,6 +203,7 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
         acceleration_wheel=acceleration,
         torque_input=torque_input,
         torque_gear=gear.ratio * efficiency * (torque_input - idle),
+        torque_output=gear.ratio * efficiency * (torque_input - idle) - own,
     )
 
 

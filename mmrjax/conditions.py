@@ -82,7 +82,7 @@ class Conditions(eqx.Module):
         try:
             shape = jnp.broadcast_shapes(*shapes)
         except ValueError:
-            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in others]
+            names = [f.name for f in dataclasses.fields(type(self)) if f.name not in (*others, "begin")]
             of = dict(zip([*names, *optional], shapes, strict=True))
             said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None

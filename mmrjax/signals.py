@@ -116,6 +116,9 @@ class Signals(eqx.Module):
     torque_idle: Scalar = UNSET  # M_rf_idle at the gearbox input, eq. (20) [N·m]
     torque_input: Scalar = UNSET  # into the gearbox, the armature's share taken off [N·m]
     torque_gear: Scalar = UNSET  # M_r, eq. (23) [N·m]
+    torque_output: Scalar = (
+        UNSET  # that, less what effects of the gearbox take: what a meter at the output reads [N·m]
+    )
     torque_net: Scalar = UNSET  # drives the rotating masses, at the pulley [N·m]
     # motion
     acceleration_wheel: Scalar = UNSET  # [rad/s²]

@@ -172,6 +172,7 @@ REPRODUCTION = ("sweeps", "paper")
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
     ("calibration/inference/bases.py", "VARIABLES"),
+    ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
     ("sweeps/figures_loop.py", "VARIABLE_WORDS"),  # words of the same variables
 }

@@ -13,6 +13,8 @@ from mmrjax.robot import Robot
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].
 TOO_SMALL, LEAST = 0.5, 0.2
+#: Channel of a column whose instrument may show magnitude alone.
+MAGNITUDES = {"motor_voltage_V": "motor_voltage"}
 #: Jump of an angle between samples that is a turn lost [deg], and least multiple of the step that is usual.
 TURN, UNUSUAL = 180.0, 4.0
 
@@ -49,7 +51,7 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
         return
     voltage = runs[column]
     back = np.asarray(robot.motor.voltage_back(jnp.asarray(runs[SPEED] * RPM)))
-    along = voltage * np.sign(back)
+    along = np.abs(voltage) if runs.layout.magnitude(MAGNITUDES.get(column, "")) else voltage * np.sign(back)
     if column == SUPPLY and (voltage > 0).all():
         along = np.abs(voltage)
     wrong = np.flatnonzero((np.abs(back) > LEAST) & (along < TOO_SMALL * np.abs(back)))

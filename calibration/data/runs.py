@@ -19,7 +19,6 @@ from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
     DRIVEN,
-    DRIVING,
     DUTY,
     IMPOSED,
     ON_GROUND,
@@ -88,7 +87,8 @@ class Runs:
     @property
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
-        return tuple(c for c in self.layout.axes if self.has(c))
+        duty = () if self.sampled else DUTY
+        return tuple(c for c in (*self.layout.axes, *duty) if self.has(c))
 
     @property
     def sampled(self) -> bool:
@@ -332,6 +332,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
     """Refuse readings without a sign where what is imposed drives the robot backward, and rows without it."""
     column = layout.imposed_column
     imposed, what, unit = columns[column], column.split("_")[-2], column.split("_")[-1]
+    if layout.imposed == "voltage":
+        imposed = imposed * columns.get("duty", 1.0)
     if (imposed == 0).any():
         row = int(np.flatnonzero(imposed == 0)[0]) + 1
         raise BadData(f"{name} row {row}, {column}: got 0; expected a {what}, in a table of readings")
@@ -417,8 +419,8 @@ def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[In
 
 
 def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
-    for column in (c for c in DRIVING if c in columns and not set(TIME) <= set(columns)):
-        raise BadData(f"{name}: column {column} is for time histories; add {', '.join(TIME)}, or remove it")
+    if "mode" in columns and not set(TIME) <= set(columns):  # settled runs are driven
+        raise BadData(f"{name}: column mode is for time histories; add {', '.join(TIME)}, or remove it")
     if "duty" not in columns:
         return
     modes = columns.get("mode", np.full(len(columns["duty"]), DRIVEN[0]))

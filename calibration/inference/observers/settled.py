@@ -235,6 +235,8 @@ class SettledRuns(Observer):
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         weight = included.astype(float)
+        if "duty" in columns:  # what the motors get
+            columns = {**columns, "supply_voltage_V": columns["supply_voltage_V"] * columns["duty"]}
         return (*bases_room.families(columns, weight, robot), *bases_room.windows(columns, weight, robot))
 
     def detail(self, bases: Bases, included: np.ndarray, before: Diagnosis, after: Diagnosis) -> EquationDefects:
