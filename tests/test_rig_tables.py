@@ -132,6 +132,8 @@ def test_columns_of_other_names_are_those_that_the_robots_file_says(tmp_path):
     runs = read(tmp_path, "ticks_s,I_mean,note\n20480,0.4,x\n", robot)
     assert runs["motor_speed_rpm"] == pytest.approx([600.0]) and runs["total_current_A"] == [0.4]
     assert runs.unknown == ("note",)
+    unread = bench(columns=(("speed_m_s", "v", 1.0),))
+    assert read(tmp_path, "motor_speed_rpm,total_current_A,v\n900,0.4,1\n", unread).unknown == ("v",)
     with pytest.raises(BadData, match=r"column motor_speed_rpm \(in the robot's file: ticks_s\) is missing"):
         read(tmp_path, "I_mean\n0.4\n", robot)
 
@@ -428,3 +430,37 @@ def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
     found = calibrate(runs, robot, noise="current=1%,speed=0.5%", free=["rig.ground.rolling_resistance"], **QUICK)
     named = {"rig-felt.ground.rolling_resistance": 0.15, "rig-tiles.ground.rolling_resistance": 0.03}
     assert set(found.parameters) == set(named) and max(inside(found, named).values()) < 3
+
+
+RIG = """
+schema = "mmrjax.robot/2"
+base = "none"
+sides = 1
+imposed = "motor_speed"
+channels = ["total_current"]
+[motor]
+torque_constant = 0.05
+friction_coulomb = 0.004
+[gearbox]
+ratio = 16
+efficiency_load = 0.8
+[bench]
+load = "shaft"
+inertia = 1e-3
+loss_coulomb = "0.05 ± 50 %"
+loss_viscous = 0.004
+"""
+
+
+def test_a_bench_is_compared_and_calibrated_from_two_files(mmrjax, tmp_path):
+    (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
+    rows = "".join(f"{n},{0.16 + n * 2.4e-5 + 1e-3 * (k % 3)}\n" for k, n in enumerate(range(500, 4500, 500)))
+    (tmp_path / "runs.csv").write_text(BENCH + rows, encoding="utf-8")
+    both = ("runs.csv", "--robot", "rig.toml", "--out")
+    code, _, said = mmrjax("compare", *both, "a")
+    assert code == 0, said
+    code, _, said = mmrjax("calibrate", *both, "b", "--starts", "2", "--no-profiles", "--noise", "current=2%")
+    assert code == 0, said
+    for page in (tmp_path / "a" / "report.html", tmp_path / "b" / "report.html"):
+        text = page.read_text(encoding="utf-8")
+        assert "n [rpm]" in text and "slope [°]" not in text and "6T2A" not in text

@@ -211,6 +211,9 @@ class Layout:
             if column in theirs:
                 mine, factor = theirs[column]
                 meant = by_name.get(mine)
+                if meant is None and mine in _of_every_channel():  # one that is not read
+                    found.append(None)
+                    continue
                 if meant is None:
                     raise BadData(
                         f"{source}: the robot's file reads {mine} from column {column}; this program has no column "
@@ -245,6 +248,12 @@ class Layout:
         """The column, and where the robot's file says that it is read from."""
         theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name(), mine) == column), None)
         return column if theirs is None else f"{column} (in the robot's file: {theirs})"
+
+
+def _of_every_channel() -> set[str]:
+    """Names of columns of every channel, in any unit."""
+    every = (quantity for channel in channels.known() for quantity in _of_channel(channel).values())
+    return {name for quantity in every for name in quantity.columns()}
 
 
 def _standard(by_name: Mapping[str, Meaning], name: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calibration.data.columns import SPEED
 from calibration.data.courses import names as runs_of
 from calibration.data.courses import varies
 from calibration.data.runs import Runs
@@ -17,7 +18,7 @@ from calibration.inference.problem import Problem
 BLOCKS: dict[str, tuple[str, ...]] = {
     "slope": ("slope_deg",),
     "voltage": ("supply_voltage_V",),
-    "speed": ("motor_speed_rpm",),
+    "speed": (SPEED,),
     "payload": ("payload_kg",),
     "configuration": ("configuration",),
     "voltage_configuration": ("configuration", "supply_voltage_V"),
@@ -56,7 +57,7 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
         return {}
     if by == "voltage_configuration" and not runs.layout.usual and len(np.unique(runs["configuration"])) == 1:
         return {}  # those of `voltage`
-    values = {c: levels(runs[c]) if c == "motor_speed_rpm" else runs[c] for c in columns}
+    values = {c: levels(runs[c]) if c == SPEED else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
     changes = varies(runs, BLOCKS[by])
     if changes.all() and by != "run":
