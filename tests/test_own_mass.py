@@ -220,10 +220,8 @@ def test_a_surface_other_than_the_robots_is_said(robot):
 
 
 def test_a_mass_that_no_robot_has_is_refused(robot):
-    runs = table({"6T2A": 0.3, "4W2T": 13.1})
-    says = (
-        r"runs\.csv row 1, total_mass_kg: got 0\.3 with a payload of 0 kg; expected a robot of 0\.5 to 200 kg without"
-    )
+    runs = table({"6T2A": 0.003, "4W2T": 13.1})
+    says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected a robot of 0\.01 to 10000 kg without"
     with pytest.raises(BadData, match=says):
         own_mass.weighed(robot, runs)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.runs import DRIVING, Runs
+from calibration.data.columns import DRIVING
+from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
 from calibration.inference import priors
 from calibration.inference.errors import channel_errors
