@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from calibration.data import posterior, robot_file
+from calibration.data.columns import DRIVING
 from calibration.data.posterior import Posterior
-from calibration.data.runs import DRIVING, WHEN, Runs
+from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.settings import Settings
