@@ -351,8 +351,8 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             continue
         # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
-        if layout.weight and not channel.zero_at_rest:
-            continue
+        if not channel.zero_at_rest and (layout.weight or "duty" in columns):
+            continue  # gravity may drive a motor, and a bridge that turns the voltage round turns the supply's current
         wrong = np.flatnonzero(backward & (readings > 0))
         if wrong.size:
             at = int(wrong[0])
