@@ -72,12 +72,15 @@ def _reading(channel: str) -> Callable[[Result], Any]:
     return lambda result: result.reading[channel]
 
 
-def table() -> tuple[Output, ...]:
-    """Every output, the channels first, in the order of columns."""
-    shown = tuple(
-        Output(c.name, c.column, c.unit, c.factor, c.label, _reading(c.name), c.resolution) for c in channels.CHANNELS
-    )
-    return shown + FURTHER
+def table(shown: tuple[channels.Channel, ...] | None = None) -> tuple[Output, ...]:
+    """Every output, the channels first, in the order of columns.
+
+    Args:
+        shown: the channels; None: those of the robot at hand.
+    """
+    rows = channels.CHANNELS if shown is None else shown
+    read = tuple(Output(c.name, c.column, c.unit, c.factor, c.label, _reading(c.name), c.resolution) for c in rows)
+    return read + FURTHER
 
 
 def names() -> tuple[str, ...]:

@@ -141,7 +141,8 @@ def _response(primals: tuple, tangents: tuple) -> tuple[tuple[Array, Array], tup
         begin = eqx.filter_jvp(lambda r: _at_start(r, conditions), (robot,), (moved,))[1]
 
     def source(_: Array, y: Array, held: Conditions) -> Array:
-        return eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
+        change = eqx.filter_jvp(lambda r: rates(r, held, y), (robot,), (moved,))[1]
+        return jnp.zeros_like(y) if change is None else change
 
     return stages, respond(robot, conditions, times, stages, source, lambda y, dy, _: dy, begin)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -13,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, ground, outputs, params
+from mmrjax import balances, channels, ground, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
@@ -240,10 +239,9 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     return _over_points(steady, robot, conditions)
 
 
-@functools.cache
 def _getters() -> dict[str, Callable[[Result], Array]]:
     codes = {name: operator.attrgetter(name) for name in CODES}
-    return {**{output.name: output.get for output in outputs.table()}, **codes}
+    return {**{output.name: output.get for output in outputs.table(channels.known())}, **codes}
 
 
 def _check_outputs(names: Iterable[str]) -> None:
@@ -300,7 +298,9 @@ def steady_derivatives(
     """
     _check_outputs(names)
     for name in set(names) & set(CODES):
-        raise KeyError(f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table())}")
+        raise KeyError(
+            f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table(channels.known()))}"
+        )
     values = {p.name: p.value for p in params.walk(robot)}
     params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have
 
