@@ -97,6 +97,7 @@ def simulate(
     """
     assert config.profile is not None
     robot = load_robot(config)
+    _check_robot(robot)
     source = profiles.read(config.profile)
     source.check_source(config.battery)
     for column in source.stated:
@@ -125,6 +126,20 @@ def simulate(
             report_mission.write(folder.partial, robot=robot, robot_name=config.robot, found=found)
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
         return run.leave(folder, config, result)
+
+
+def _check_robot(robot: Robot) -> None:
+    if robot.rig.imposed == "motor_speed":
+        raise BadConfiguration(
+            "--profile: the motors' speed is imposed on this robot, and a profile drives motors by their voltage; "
+            'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
+        )
+    for name, load in robot.configurations.items():
+        if robot.on_shaft and float(load.torque_gravity) > 0:
+            raise BadConfiguration(
+                f"--profile: {name} is an arm on which gravity acts with its angle, which a profile does not follow; "
+                "simulate it over time with --model drive"
+            )
 
 
 def _check_charge(robot: Robot, config: configuration.Simulate) -> None:

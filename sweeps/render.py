@@ -12,7 +12,7 @@ from mmrjax import render as pictures
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
-from sweeps import run, words
+from sweeps import imposed, run, words
 from sweeps.console import progress, say
 from sweeps.inputs import load_robot, one_run
 from sweeps.store import DONE, SOME_NOT_CONVERGED
@@ -36,6 +36,7 @@ def render(
     if not file.parent.is_dir():
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
     robot = load_robot(config)
+    imposed.check_on_ground(robot, "render")
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
     with progress(1, quiet=False) as advance:

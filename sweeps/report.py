@@ -13,7 +13,7 @@ import jinja2
 import numpy as np
 
 from mmrjax import __version__, channels, params
-from sweeps import words
+from sweeps import own, words
 from sweeps.figures_style import style, svg
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ class Album:
 def named(robot: Robot, robot_name: str) -> dict[str, Any]:
     """What a page says of the robot: the `robot`'s name, and the parameters `changed` from the nominal one's.
 
+    Of a rig that starts from nothing its `own`, with where each comes from.
+
     Args:
         robot: the one that was simulated.
         robot_name: its name or file; of a file only the last part is shown, and a changed packaged robot is said to
@@ -53,9 +55,11 @@ def named(robot: Robot, robot_name: str) -> dict[str, Any]:
     from mmrjax.robots import ROBOTS
 
     name = Path(robot_name).name
+    if robot.rig.blank:
+        return {"robot": name, "changed": [], "own": own.parameters(robot, robot_name)}
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
         name = f"{name}, changed"
-    return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]())}
+    return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]()), "own": []}
 
 
 def words_shown(name: str) -> str:
@@ -97,6 +101,18 @@ def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str,
     readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
     shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
     return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
+
+
+def label(table: dict[str, np.ndarray], row: int) -> str:
+    """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
+    parts = [str(table["configuration"][row])]
+    if "supply_voltage_V" in table:
+        parts.append(supply(table["supply_voltage_V"][row]))
+    elif "motor_speed_rpm" in table:
+        parts.append(f"{table['motor_speed_rpm'][row]:g} rpm")
+    if "payload_kg" in table:
+        parts += [f"{table['payload_kg'][row]:g} kg", f"{table['slope_deg'][row]:g}°"]
+    return ", ".join(parts)
 
 
 def columns() -> dict[str, str]:
