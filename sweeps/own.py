@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calibration.data import rig_file
+from calibration.data.columns import Layout
 from mmrjax import channels, params
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
@@ -24,6 +25,11 @@ OF_TRAVEL = ("theoretical_speed_mm_s", "distance_m")
 #: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
 OF_HEAT = ("temperature_winding_C", "permissible_time_s")
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
+
+
+def is_rig(robot: Robot) -> bool:
+    """Whether it is a rig, in whose tables a reading may cross zero, and not the packaged robot or one like it."""
+    return not Layout.of(robot).usual
 
 
 def thermal(robot: Robot) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -120,6 +120,18 @@ def columns() -> dict[str, str]:
     return {c.name: c.column for c in channels.CHANNELS}
 
 
+def rms(table: dict[str, np.ndarray], whens: Iterable[str]) -> dict[str, dict[str, float]]:
+    """rms of simulated less measured in each channel's unit, by when (of columns `WHEN_COLUMN`) and channel."""
+    found: dict[str, dict[str, float]] = {}
+    for when in whens:
+        for c in channels.CHANNELS:
+            if f"{when}_{c.column}" in table:
+                error = np.square(table[f"{when}_{c.column}"] - table[c.column])
+                there = error[np.isfinite(error)]
+                found.setdefault(when, {})[c.name] = float(np.sqrt(there.mean())) if there.size else math.nan
+    return found
+
+
 def first_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """The rows of a table that a page has room for."""
     return [{k: v[i] for k, v in table.items()} for i in range(min(len(next(iter(table.values()))), ROWS))]
@@ -159,6 +171,12 @@ def reading(value: Any, channel: str) -> str:
     return number(value, f"{{:.{digits}f}}")
 
 
+def error(value: Any, channel: str) -> str:
+    """A difference of readings, with its sign, with a digit more than they."""
+    digits = {c.name: c.resolution for c in channels.CHANNELS}[channel]
+    return number(value, f"{{:+.{digits}f}}")
+
+
 def _grade(value: Any) -> str:
     """Class of a cell by the size of its error [%]: the paper claims 7 %."""
     size = abs(float(value))
@@ -174,7 +192,7 @@ def render(folder: Path, template: str, album: Album, **known: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "reading": reading, "grade": _grade, "winding": winding}
+    environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
     environment.globals |= {
         "channels": {c.name: (c.label, c.unit) for c in channels.CHANNELS},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
