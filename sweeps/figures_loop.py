@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax import channels
 from mmrjax.channels import MM, RPM
-from sweeps import words as wording
 from sweeps.figures_style import (
     BLUE,
     FAINT,
@@ -192,7 +192,7 @@ def null(before: Evidence) -> Figure:
 def errors(found: DiscoveryResult) -> Figure:
     """rms error (35) before and after, fitted and held out by every kind of block."""
     lines = {"fitted": found.errors}
-    lines |= {f"held out by\n{wording.kind(k, ', ')}": v for k, v in found.errors_held_out.items()}
+    lines |= {f"held out by\n{blocks.in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
     fig, grid = figure(1, len(channels.CHANNELS), 2.9, sharey=False)
     for place, channel in enumerate(channels.CHANNELS):
         axes = grid[0, place]

@@ -13,7 +13,7 @@ from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
 from calibration.discovery.result import DiscoveryResult
-from calibration.inference import priors
+from calibration.inference import blocks, priors
 from mmrjax import channels
 from sweeps import config as configuration
 from sweeps import words
@@ -105,7 +105,7 @@ def print_discovery(found: DiscoveryResult) -> None:
     lines = {"as stated, nothing fitted": found.errors_as_stated}
     lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
     for kind, both in found.errors_held_out.items():
-        lines |= {f"{when[k]}, held out by {words.kind(kind)}": both[k] for k in whens}
+        lines |= {f"{when[k]}, held out by {blocks.in_words(kind)}": both[k] for k in whens}
     for text, by in lines.items():
         cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)

@@ -18,12 +18,16 @@ from mmrjax.robots import blank
 
 #: Columns of runs and histories that are of the ground.
 OF_GROUND = (
-    "slip", "adhesion_used", "traction_N", "power_ground_W", "power_lift_W", "efficiency_chassis",
+    "slip", "adhesion_used", "traction_N", "slope_deg", "power_ground_W", "power_lift_W", "efficiency_chassis",
 )  # fmt: skip
 #: Those of travel, which a shaft has where a channel shows it.
-OF_TRAVEL = ("theoretical_speed_mm_s", "distance_m")
+OF_TRAVEL = (
+    "theoretical_speed_mm_s", "distance_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
+)  # fmt: skip
 #: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
-OF_HEAT = ("temperature_winding_C", "permissible_time_s")
+OF_HEAT = (
+    "temperature_winding_C", "permissible_time_s", "winding_C", "housing_C", "winding_peak_C", "housing_end_C",
+)  # fmt: skip
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
 
 

@@ -102,11 +102,6 @@ def meaning(status: str) -> str:
     return STATUSES[status].meaning if status in STATUSES else ""
 
 
-def kind(blocks: str, joint: str = " and ") -> str:
-    """A kind of blocks that are held out, in words; `joint` joins two conditions."""
-    return blocks.replace("motor_speed", "motor speed").replace("_", joint)
-
-
 #: Names of fits that rms errors are of.
 _FITS = {
     "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -240,7 +239,6 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     return _over_points(steady, robot, conditions)
 
 
-@functools.cache
 def _getters() -> dict[str, Callable[[Result], Array]]:
     codes = {name: operator.attrgetter(name) for name in CODES}
     return {**{output.name: output.get for output in outputs.table()}, **codes}
