@@ -77,7 +77,7 @@ class Parameter:
 
 
 #: Numbers of equations and tables of the paper, in what is said of a parameter.
-_OF_PAPER = re.compile(r",? (?:of )?(?:eqs?\. \(\d+\)(?:-\(\d+\))?|Tables? \w+(?:-\w+)?)")
+_OF_PAPER = re.compile(r",? (?:of )?(?:(?:eqs?\. )?\(\d+\)(?:-\(\d+\))?|Tables? \w+(?:-\w+)?)")
 #: Words by which a source is of the paper's robot.
 _PAPERS = re.compile(r"Table|eq\.|paper|Section|Fig\.|lacquered|sheet|M_t0|GP32|RE30")
 #: Sources of a rig's parameters.

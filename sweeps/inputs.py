@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +103,13 @@ def read_runs(
     return runs
 
 
-def one_run(robot: Robot, cells: dict[str, Any], battery: bool = False) -> records.Runs:
+def one_run(
+    robot: Robot, cells: dict[str, Any], battery: bool = False, elsewhere: Collection[str] = ()
+) -> records.Runs:
     """One run from options by column name; without a configuration it is the robot's first.
+
+    Args:
+        elsewhere: columns that a profile states.
 
     Raises:
         BadConfiguration: a value out of range, a configuration that the robot does not have, a voltage beside the
@@ -127,7 +133,8 @@ def one_run(robot: Robot, cells: dict[str, Any], battery: bool = False) -> recor
     if battery:
         imposed.check_battery(robot)
     elif column not in given:
-        given[column] = VOLTAGE if layout.usual else imposed.default(robot, OPTIONS[column])
+        rest = 0.0 if column in elsewhere else None
+        given[column] = VOLTAGE if layout.usual else imposed.default(robot, OPTIONS[column]) if rest is None else rest
     if not layout.on_shaft:
         bench = {} if layout.blank else {"surface": BENCH}
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}

@@ -110,7 +110,7 @@ def simulate(
     if isinstance(given, str):
         runs = read_runs(given, robot, measured=False, battery=config.battery)
     else:
-        runs = one_run(robot, given, config.battery)
+        runs = one_run(robot, given, config.battery, source.stated)
     for column in source.stated:
         if isinstance(given, str) and runs.has(column):
             tell(f"{runs.source}, {column}: not used, {source.source} states it")

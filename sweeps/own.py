@@ -36,6 +36,12 @@ def is_rig(robot: Robot) -> bool:
     return not Layout.of(robot).usual
 
 
+def stated(robot: Robot, prefix: str) -> bool:
+    """Whether any parameter whose name begins so is another than that of a rig of which nothing is known."""
+    usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
+    return any(float(p.value) != usual[p.name] for p in params.walk(robot) if p.name.startswith(prefix))
+
+
 def thermal(robot: Robot) -> bool:
     """Whether it is known how heat leaves the windings."""
     sheet = Motor()
@@ -95,7 +101,9 @@ def parameters(robot: Robot, robot_name: str) -> list[dict[str, str]]:
         stated = _keys(tomllib.loads(path.read_text(encoding="utf-8"))) if path.suffix == ".toml" else set()
     except OSError:
         stated = set()
-    linear = {key.partition(".")[0] for key in stated if key.rpartition(".")[2] in rig_file.LINEAR}
+    of_unit = set(rig_file.LINEAR) - {"inertia"}
+    linear = {key.partition(".")[0] for key in stated if key.rpartition(".")[2] in of_unit}
+    travels = not robot.on_shaft or "speed" in robot.rig.channels
     usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
     found = []
     for p in params.walk(robot):
@@ -104,7 +112,7 @@ def parameters(robot: Robot, robot_name: str) -> list[dict[str, str]]:
         moved = p.name not in usual or float(p.value) != usual[p.name]
         if not own and not moved and not (load and float(p.value) != 0):
             continue
-        if p.name in rig_file.DEFAULTS and not own:
+        if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not travels)):
             continue
         of_file = own or p.name.partition(".")[0] in linear
         source = f"stated in {path.name}" if of_file else "default" if not moved or load else "changed"

@@ -12,8 +12,8 @@ from mmrjax import render as pictures
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import STATUSES
 from sweeps import config as configuration
-from sweeps import imposed, run, words
-from sweeps.console import progress, say
+from sweeps import imposed, own, run, words
+from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run
 from sweeps.store import DONE, SOME_NOT_CONVERGED
 
@@ -37,6 +37,8 @@ def render(
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
     robot = load_robot(config)
     imposed.check_on_ground(robot, "render")
+    if robot.rig.blank and not own.stated(robot, "running_gear."):
+        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
     with progress(1, quiet=False) as advance:
