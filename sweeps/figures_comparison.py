@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -52,10 +54,13 @@ def parity(table: dict[str, np.ndarray], band: bool = True) -> Figure:
     return fig
 
 
-def errors_over(table: dict[str, np.ndarray], in_units: bool = False) -> Figure:
+def errors_over(
+    table: dict[str, np.ndarray], in_units: bool = False, beside: Mapping[str, str] | None = None
+) -> Figure:
     """Error (35) of each channel over each condition.
 
     Args:
+        beside: further columns than conditions, with their words, where errors are in units.
         in_units: errors in the unit of the channel instead, with a band of two sds where they are known; over those
             conditions that vary.
     """
@@ -65,7 +70,7 @@ def errors_over(table: dict[str, np.ndarray], in_units: bool = False) -> Figure:
     }  # fmt: skip
     conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
     if in_units:
-        conditions |= {"time_s": "time [s]"} if "time_s" in table else {}
+        conditions |= beside or {}
         varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
         conditions = varied or dict(list(conditions.items())[:1])
     fig, grid = figure(

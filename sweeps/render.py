@@ -37,10 +37,10 @@ def render(
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
     robot = load_robot(config)
     imposed.check_on_ground(robot, "render")
-    if robot.rig.blank and not own.stated(robot, "running_gear."):
-        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
+    if robot.rig.blank and not own.stated(robot, "running_gear."):
+        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     with progress(1, quiet=False) as advance:
         told = run.shares(advance, 1)
         trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)

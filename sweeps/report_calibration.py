@@ -28,9 +28,10 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
     album.add("before_after", lambda: figures_calibration.before_after(found))
     if found.axis:
         album.add("histories", lambda: figures_calibration.histories(table))
+    along = {found.axis: "time [s]"} if found.axis else {}
     sized = own.is_rig(found.robot)
     album.add("parity", lambda: figures_comparison.parity(table, band=not sized))
-    album.add("residuals", lambda: figures_comparison.errors_over(table, in_units=sized))
+    album.add("residuals", lambda: figures_comparison.errors_over(table, sized, along))
     if found.residual_clusters:
         album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
     if found.profiled:

@@ -219,7 +219,9 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
     if robot.on_shaft:
         raise ValueError("the robot's load is a shaft, which has no running gear; steady and drive take it")
     if robot.rig.imposed == "motor_speed":
-        raise ValueError("the motors' speed is imposed, and this model drives them by their voltage; use steady or drive")
+        raise ValueError(
+            "the motors' speed is imposed, and this model drives them by their voltage; use steady or drive"
+        )
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
