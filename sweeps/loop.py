@@ -66,6 +66,8 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person."""
     say(f"{found.verdict}: {found.statement}")
+    if found.robot.on_shaft and found.verdict != "none":
+        say("The balance track of a shaft is what its load loses.")
     for said in (findings.said_standing(found), findings.said_ruled_out(found)):
         if said:
             say(said)

@@ -47,6 +47,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         conditions=conditions(table),
         columns=columns(),
         sized=sized,
+        on_shaft=found.robot.on_shaft,
         rms=rms(table, ("before", "after", "held_out")),
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",

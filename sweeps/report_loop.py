@@ -77,6 +77,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         conditions=conditions(found.rows_table()),
         columns=columns(),
         sized=sized,
+        on_shaft=found.robot.on_shaft,
         closed=figures_loop.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
         rms=rms(table, ("before", "after", "held_out_before", "held_out_after")),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
