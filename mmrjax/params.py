@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import re
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
@@ -74,12 +76,43 @@ class Parameter:
     spec: Spec
 
 
+#: Numbers of equations and tables of the paper, in what is said of a parameter.
+_OF_PAPER = re.compile(r",? (?:of )?(?:(?:eqs?\. )?\(\d+\)(?:-\(\d+\))?|Tables? \w+(?:-\w+)?)")
+#: Words by which a source is of the paper's robot.
+_PAPERS = re.compile(r"Table|eq\.|paper|Section|Fig\.|lacquered|sheet|M_t0|GP32|RE30")
+#: Sources of a rig's parameters.
+STATED, DEFAULT = "stated in the robot's file", "default"
+
+
+@functools.cache
+def own_spec(spec: Spec, stated: bool) -> Spec:
+    """What a field says of a rig's parameter: its meaning without the paper's numbers, its own source.
+
+    Args:
+        stated: whether the rig's file states its prior.
+    """
+    source = STATED if stated else DEFAULT if not spec.amplitude or _PAPERS.search(spec.source) else spec.source
+    return dataclasses.replace(spec, meaning=_OF_PAPER.sub("", spec.meaning), source=source)
+
+
 def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
-    """Yield every parameter below `component`, depth first, by dotted name.
+    """Yield every parameter below `component`, depth first, by dotted name; those of a rig that starts from nothing
+    say nothing of the paper's robot (`own_spec`).
 
     A tuple of modules (the effects) is walked by each member's `name`; a collection of modules by name (the
     configurations) by those names alone: `6T2A.mass`.
     """
+    rig = getattr(component, "rig", None)
+    if rig is None or not rig.blank:
+        yield from _walk(component, prefix)
+        return
+    stated = {name for name, _, _ in rig.priors}
+    for parameter in _walk(component, prefix):
+        spec = own_spec(parameter.spec, parameter.name in stated)
+        yield dataclasses.replace(parameter, spec=spec)
+
+
+def _walk(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
     for field in dataclasses.fields(component):
         value = getattr(component, field.name)
         name = f"{prefix}{field.name}"
@@ -87,13 +120,13 @@ def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
             yield Parameter(name, value, field.metadata["spec"])
         elif hasattr(value, "items"):
             for key, member in value.items():
-                yield from walk(member, f"{prefix}{key}.")
+                yield from _walk(member, f"{prefix}{key}.")
         elif isinstance(value, eqx.Module):
-            yield from walk(value, f"{name}.")
+            yield from _walk(value, f"{name}.")
         elif isinstance(value, tuple):
             members: list[Any] = [m for m in value if isinstance(m, eqx.Module)]
             for member in members:
-                yield from walk(member, f"{name}.{member.name}.")
+                yield from _walk(member, f"{name}.{member.name}.")
 
 
 M = TypeVar("M", bound=eqx.Module)

@@ -13,10 +13,13 @@ from jaxtyping import Float
 
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax import variation
+from mmrjax.channels import RPM
+from mmrjax.rig import IMPOSED
 from mmrjax.robot import Robot
 from mmrjax.tables import SURFACES, adhesion_ratio
 from mmrjax.variation import Axis
 from sweeps import config as configuration
+from sweeps import imposed
 from sweeps.config_campaign import Campaign
 from sweeps.design import DESIGNS, Design, Joint, Samples, in_blocks
 
@@ -24,6 +27,9 @@ if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
 
 CONFIGURATION, SURFACE = "configuration", "surface"
+#: Condition that is imposed, by `rig.IMPOSED`; those that act on a vehicle alone.
+AXIS = {name: name for name in IMPOSED}
+ON_GROUND = ("slope_deg", "payload", "total_mass", "adhesion")
 #: Most values of one axis: they are kept in memory, samples are not.
 LONGEST = 10_000_000
 #: Most points: beyond it their numbers leave 64 bits.
@@ -81,12 +87,35 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
         raise BadConfiguration(
             f"{where}, voltage: acts without battery only, whose voltage is that of its charge; remove one of them"
         )
+    _acting({*fixed, *design.names}, robot, where, surface)
+    own = AXIS[robot.rig.imposed]
+    if robot.rig.blank and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
+        level = imposed.default(robot, f"{where}, conditions.{own}")
+        fixed[own] = level if own == "voltage" else level * RPM
     if surface is not None and "adhesion" in {*fixed, *design.names}:
         raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
     if design.points > MOST:
         raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
     known = variation.Variation(robot, design.names).axes
     return Plan(design, known, fixed, surface, tuple(data))
+
+
+def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
+    """Refuse conditions that do not act on a robot."""
+    idle = ("motor_speed", "motor_acceleration") if robot.rig.imposed == "voltage" else ("voltage", "duty", "open")
+    for name in sorted(names & set(idle)):
+        raise BadConfiguration(
+            f"{where}, {name}: the robot's file imposes the {robot.rig.imposed.replace('_', ' ')}; vary "
+            f"{AXIS[robot.rig.imposed]} instead"
+        )
+    ground = {*names, *([SURFACE] if surface is not None else [])} & {*ON_GROUND, SURFACE}
+    if robot.on_shaft and ground:
+        raise BadConfiguration(imposed.on_shaft(f"{where}, {min(ground)}"))
+    if robot.rig.blank and surface is not None:
+        raise BadConfiguration(
+            f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations of its own "
+            f"({', '.join(robot.configurations)}); vary or state configuration"
+        )
 
 
 def adhesions(robot: Robot, surface: str) -> tuple[float, ...]:
@@ -203,7 +232,7 @@ def _fixed(stated: Mapping[str, Any], robot: Robot, where: str) -> tuple[dict[st
         if name not in allowed:
             raise BadConfiguration(f"{place}: no such condition; {choices(name, allowed)}")
         if name == SURFACE:
-            if not isinstance(value, str) or value not in SURFACES:
+            if not isinstance(value, str) or (value not in SURFACES and not robot.rig.blank):
                 raise BadConfiguration(f"{place}: got {value!r}; {choices(str(value), SURFACES)}")
             surface = str(value)
         elif name == CONFIGURATION:

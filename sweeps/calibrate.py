@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from calibration.inference import priors
+from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
@@ -14,6 +14,8 @@ from sweeps import config as configuration
 from sweeps import words
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
+from sweeps.own import is_rig
+from sweeps.report import rms
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
 
 
@@ -64,11 +66,13 @@ def print_calibration(found: CalibrationResult) -> None:
     for heading in ("", "rows", *(c.label for c in channels.CHANNELS)):
         errors.add_column(heading, justify="right" if heading else "left")
     lines = {"before": found.errors_before, "after": found.errors_after}
-    lines |= {f"after, held out by {k.replace('_', ' and ')}": h.errors for k, h in found.held_out.items()}
+    lines |= {f"after, held out by {blocks.in_words(k)}": h.errors for k, h in found.held_out.items()}
     for which, by in lines.items():
         cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
+    if is_rig(found.robot):
+        say(words.said_rms(rms(found.rows(), ("before", "after", "held_out"))))
     say(found.starts.statement())
     for note in found.notes:
         say(f"- {note}")

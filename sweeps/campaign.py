@@ -25,8 +25,9 @@ from mmrjax.profile import Profile
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.variation import STATUS, Variation, check_outputs
-from sweeps import axes, scale, words
+from sweeps import axes, config_campaign, grid, scale, words
 from sweeps import config as configuration
+from sweeps.config import Sweep
 from sweeps.config_campaign import Campaign, How
 from sweeps.console import progress, say, tell
 from sweeps.design import Blocks
@@ -44,13 +45,22 @@ PROBED = 64
 NOTHING_SPECIAL = How()
 
 
-def campaign(config: Campaign, where: str, out: Path | None, force: bool, options: How = NOTHING_SPECIAL) -> int:
+def campaign(
+    config: Campaign | Sweep, where: str, out: Path | None, force: bool, options: How = NOTHING_SPECIAL
+) -> int:
     """Simulate a design and leave a run folder with its store; returns the exit code.
 
     Args:
         config: the configuration; where: its file, for messages; out: the run folder; force: replace one.
     """
     robot = load_robot(config)
+    if isinstance(config, Sweep):
+        notes: list[str] = []
+        stated = config.configurations
+        config = grid.resolved(config, robot, config.battery, notes).model_copy(update={"configurations": stated})
+        config = config_campaign.of_grid(config)
+        for note in notes:
+            tell(note)
     plan = axes.plan(config, robot, where)
     pool = None
     if options.scheduler is not None and not options.dry_run:

@@ -56,15 +56,31 @@ _Configuration = Annotated[
 ]
 _Voltage = Annotated[
     float | None,
-    typer.Option(help="Supply voltage (V), negative backward.  \\[default: 33; none with --battery]"),
+    typer.Option(
+        help="Supply voltage (V), negative backward.  \\[default: 33; of a rig its limit; none with --battery]"
+    ),
 ]
-_Slope = Annotated[float, typer.Option(help="Slope, positive uphill (deg).")]
-_Payload = Annotated[float, typer.Option(help="Additional load mass (kg).")]
+_MotorSpeed = Annotated[
+    float | None,
+    typer.Option(help="Motor speed (rpm), negative backward, of a rig on whose motors it is imposed."),
+]
+_MotorSpeeds = Annotated[
+    str | None,
+    typer.Option(
+        help="Motor speeds (rpm) of a rig on whose motors they are imposed.  \\[default: thirds of speed_limit]"
+    ),
+]
+_Slope = Annotated[float | None, typer.Option(help="Slope, positive uphill (deg).  \\[default: 0]")]
+_Payload = Annotated[float | None, typer.Option(help="Additional load mass (kg).  \\[default: 0]")]
 _Mass = Annotated[
     float | None, typer.Option(help="Total mass (kg).  \\[default: the robot's own mass and the payload]")
 ]
 _Surface = Annotated[
-    str, typer.Option(help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood.")
+    str | None,
+    typer.Option(
+        help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood. Of a rig a label of "
+        "its own.  \\[default: lacquered_wood; of a rig none]"
+    ),
 ]
 _Step = Annotated[float | None, typer.Option("--step", help=f"Integration step (s).  {_defaults('step')}")]
 _Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
@@ -119,10 +135,11 @@ def simulate(
     context: typer.Context,
     configuration: _Configuration = None,
     voltage: _Voltage = None,
-    slope: _Slope = 0.0,
-    payload: _Payload = 0.0,
+    motor_speed: _MotorSpeed = None,
+    slope: _Slope = None,
+    payload: _Payload = None,
     mass: _Mass = None,
-    surface: _Surface = "lacquered_wood",
+    surface: _Surface = None,
     runs: Annotated[
         Path | None, typer.Option(help="CSV of runs to simulate instead; the condition columns are enough.")
     ] = None,
@@ -154,7 +171,7 @@ def simulate(
         discharge_mAh=discharge, posterior=posterior, report=report, profile=profile,
     )  # fmt: skip
     resolved = _prepared(config.resolve(config.Simulate, None, options), no_cache)
-    cells = _cells(configuration, voltage, slope, payload, mass, surface)
+    cells = _cells(configuration, voltage, motor_speed, slope, payload, mass, surface)
     given = cells if runs is None else str(runs)
     if resolved.profile is not None:
         from sweeps import missions
@@ -180,14 +197,18 @@ def sweep(
     configurations: Annotated[
         str | None, typer.Option(help="Comma-separated, of the robot's.  \\[default: all that it has]")
     ] = None,
-    voltages: Annotated[str | None, typer.Option(help="Supply voltages (V).  \\[default: 15,24,33]")] = None,
+    voltages: Annotated[
+        str | None,
+        typer.Option(help="Supply voltages (V).  \\[default: 15,24,33; of a rig thirds of its voltage_limit]"),
+    ] = None,
+    motor_speeds: _MotorSpeeds = None,
     payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8]")
+        str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8; of a rig 0]")
     ] = None,
     slopes: Annotated[
-        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: 0,5,10,15,20]")
+        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: 0,5,10,15,20; of a rig 0]")
     ] = None,
-    surface: Annotated[str | None, typer.Option(help="Surface of Table 5.  \\[default: lacquered_wood]")] = None,
+    surface: _Surface = None,
     config_file: Annotated[
         Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
     ] = None,
@@ -244,6 +265,7 @@ def sweep(
     ) | {
         "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
         "voltages_V": config.axis("--voltages", voltages),
+        "motor_speeds_rpm": config.axis("--motor-speeds", motor_speeds),
         "payloads_kg": config.axis("--payloads", payloads),
         "slopes_deg": config.axis("--slopes", slopes),
         "surface": surface,
@@ -338,10 +360,11 @@ def render(
     slow: Annotated[float, typer.Option(help="How many times slower than life a film runs.", min=0.01)] = 20.0,
     configuration: _Configuration = None,
     voltage: _Voltage = None,
-    slope: _Slope = 0.0,
-    payload: _Payload = 0.0,
+    motor_speed: _MotorSpeed = None,
+    slope: _Slope = None,
+    payload: _Payload = None,
     mass: _Mass = None,
-    surface: _Surface = "lacquered_wood",
+    surface: _Surface = None,
     duration: _Duration = None,
     step: _Step = None,
     robot: _Robot = None,
@@ -370,7 +393,7 @@ def render(
     resolved = _prepared(config.resolve(config.Render, None, options), no_cache)
     from sweeps import render as room
 
-    cells = _cells(configuration, voltage, slope, payload, mass, surface)
+    cells = _cells(configuration, voltage, motor_speed, slope, payload, mass, surface)
     begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
     end = begin + 0.1 if end is None else end
     return room.render(resolved, cells, file, begin, end, slow, force)
@@ -559,16 +582,23 @@ def sensitivity(
     configurations: Annotated[
         str | None, typer.Option(help="Comma-separated, of the robot's.  \\[default: all that it has]")
     ] = None,
-    voltages: Annotated[str | None, typer.Option(help="Supply voltages (V).  \\[default: of Table 8]")] = None,
+    voltages: Annotated[
+        str | None,
+        typer.Option(help="Supply voltages (V).  \\[default: of Table 8; of a rig thirds of its voltage_limit]"),
+    ] = None,
+    motor_speeds: _MotorSpeeds = None,
     payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses (kg).  \\[default: of Table 8]")
+        str | None, typer.Option(help="Additional load masses (kg).  \\[default: of Table 8; of a rig 0]")
     ] = None,
     slopes: Annotated[
-        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: of Table 8]")
+        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: of Table 8; of a rig 0]")
     ] = None,
-    surface: Annotated[str | None, typer.Option(help="Surface of Table 5.  \\[default: lacquered_wood]")] = None,
+    surface: _Surface = None,
     candidates: Annotated[
-        Path | None, typer.Option(help="CSV of runs that could be made next.  \\[default: Table 8]")
+        Path | None,
+        typer.Option(
+            help="CSV of runs that could be made next.  \\[default: Table 8; of a rig the operating points]"
+        ),
     ] = None,
     runs: Annotated[int | None, typer.Option(help="How many of them to propose.  \\[default: 5]")] = None,
     noise: Annotated[
@@ -606,6 +636,7 @@ def sensitivity(
         "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
         "voltages_V": config.axis("--voltages", voltages), "payloads_kg": config.axis("--payloads", payloads),
         "slopes_deg": config.axis("--slopes", slopes), "surface": surface,
+        "motor_speeds_rpm": config.axis("--motor-speeds", motor_speeds),
         "candidates": None if candidates is None else str(candidates), "runs": runs, "noise": noise, "seed": seed,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Sensitivity, None, options), no_cache)
@@ -629,8 +660,8 @@ def resonance(
     payloads: Annotated[
         str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8, of Table 8]")
     ] = None,
-    slope: _Slope = 0.0,
-    surface: _Surface = "lacquered_wood",
+    slope: _Slope = None,
+    surface: _Surface = None,
     duration: Annotated[
         float | None,
         typer.Option(
@@ -833,12 +864,13 @@ def _start_jax(no_cache: bool) -> None:
 
 
 def _cells(
-    configuration: str | None, voltage: float | None, slope: float, payload: float, mass: float | None, surface: str
-) -> dict[str, Any]:
+    configuration: str | None, voltage: float | None, motor_speed: float | None, slope: float | None,
+    payload: float | None, mass: float | None, surface: str | None,
+) -> dict[str, Any]:  # fmt: skip
     """One run by the columns of a table of runs; None is left to the robot."""
     return {
-        "configuration": configuration, "supply_voltage_V": voltage, "payload_kg": payload, "slope_deg": slope,
-        "surface": surface, "total_mass_kg": mass,
+        "configuration": configuration, "supply_voltage_V": voltage, "motor_speed_rpm": motor_speed,
+        "payload_kg": payload, "slope_deg": slope, "surface": surface, "total_mass_kg": mass,
     }  # fmt: skip
 
 

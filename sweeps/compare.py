@@ -24,7 +24,7 @@ from sweeps.store import open_folder
 HEADINGS = {
     "supply_voltage_V": "U [V]", "motor_speed_rpm": "n [rpm]", "total_mass_kg": "M [kg]", "slope_deg": "slope [deg]",
 }  # fmt: skip
-#: Group → channel → rows, rms_percent, max_percent, r2, missing.
+#: Group → channel → rows, rms_percent, max_percent, rms, unit (of the rms), r2, missing.
 Summary = dict[str, dict[str, dict[str, Any]]]
 
 
@@ -41,7 +41,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
         comparison, summary = compared(stated, table, robot)
         folder.write_table("comparison.csv", comparison)
         notes = [*missing(comparison), *said]
-        print_comparison(comparison, summary, notes)
+        print_comparison(comparison, summary, notes, sized=not runs.layout.usual)
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             uncertainty.say_intervals(table, found)
@@ -77,9 +77,8 @@ def compared(
     for channel in channels.CHANNELS:
         table[channel.column] = measured.columns.get(channel.column, nothing)
         table[f"simulated_{channel.column}"] = simulated[channel.column]
-        table[f"error_{channel.name}_percent"] = residual.relative_error(
-            simulated[channel.column], table[channel.column]
-        )
+        error = residual.relative_error if measured.layout.usual else residual.sized_error
+        table[f"error_{channel.name}_percent"] = error(simulated[channel.column], table[channel.column])
     table["status"] = simulated["status"]
     groups = {"all": np.ones(len(measured), bool)}
     names = measured["configuration"] if robot is None else measured.configurations_named(robot)
@@ -93,8 +92,12 @@ def compared(
 
 def _summary(channel: channels.Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
     measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
+    difference = simulated - measured
+    there = difference[np.isfinite(difference)]
     return {
         **residual.summary(table[f"error_{channel.name}_percent"]),
+        "rms": float(np.sqrt(np.mean(there**2))) if there.size else float("nan"),
+        "unit": channel.unit,
         "r2": residual.certainty(measured, simulated),
         "missing": int(np.isnan(measured).sum()),
     }
@@ -111,30 +114,43 @@ def missing(table: dict[str, np.ndarray]) -> list[str]:
     ]
 
 
-def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list[str]) -> None:
-    """Every row's errors, their summary, and which readings are missing."""
-    rows = Table(title="(simulated - measured) / simulated, eq. (35) [%]", title_justify="left")
+def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list[str], sized: bool = False) -> None:
+    """Every row's errors, their summary, and which readings are missing.
+
+    Args:
+        sized: whether percent are of a channel's size; rows then show errors in the channel's unit.
+    """
+    title = "simulated - measured" if sized else "(simulated - measured) / simulated, eq. (35) [%]"
+    rows = Table(title=title, title_justify="left")
     stated_here = {c: words for c, words in HEADINGS.items() if c in table and f"simulated_{c}" not in table}
-    for heading in ("", *stated_here.values(), *(_words(c) for c in channels.CHANNELS), "status"):
+    for heading in ("", *stated_here.values(), *(_words(c, sized) for c in channels.CHANNELS), "status"):
         rows.add_column(heading, justify="left" if heading in ("", "status") else "right")
     for k in range(len(table["status"])):
-        errors = (table[f"error_{channel.name}_percent"][k] for channel in channels.CHANNELS)
+        errors = [
+            (table[f"simulated_{c.column}"][k] - table[c.column][k], f"+.{c.resolution}f")
+            if sized else (table[f"error_{c.name}_percent"][k], "+.1f")
+            for c in channels.CHANNELS
+        ]  # fmt: skip
         stated = (f"{table[c][k]:g}" for c in stated_here)
         rows.add_row(
             table["configuration"][k], *stated,
-            *("-" if e != e else f"{e:+.1f}" for e in errors), table["status"][k],
+            *("-" if e != e else format(e, form) for e, form in errors), table["status"][k],
         )  # fmt: skip
     if len(table["status"]) <= 60:
         say(rows)
     shown = Table(title="Summary", title_justify="left")
-    for heading in ("rows of", "channel", "rows", "rms [%]", "worst [%]", "R²"):
+    of = " of its size" if sized else ""
+    units = ("rms",) if sized else ()
+    for heading in ("rows of", "channel", "rows", *units, f"rms [%{of}]", f"worst [%{of}]", "R²"):
         shown.add_column(heading, justify="left" if heading in ("rows of", "channel") else "right")
     for group, by_channel in summary.items():
         for channel in channels.CHANNELS:
             numbers = by_channel[channel.name]
             figures = (numbers["rms_percent"], numbers["max_percent"], numbers["r2"])
             cells = ("-" if v != v else format(v, f) for v, f in zip(figures, (".1f", ".1f", ".3f"), strict=True))
-            shown.add_row(group, channel.label, str(numbers["rows"]), *cells)
+            rms = numbers["rms"]
+            in_unit = "-" if rms != rms else f"{rms:.{channel.resolution}f} {channel.unit}"
+            shown.add_row(group, channel.label, str(numbers["rows"]), *((in_unit,) if sized else ()), *cells)
     say(shown)
     lost = int(np.sum(~np.isin(table["status"], words.SETTLED)))
     if lost:
@@ -143,5 +159,5 @@ def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list
         say(note)
 
 
-def _words(channel: channels.Channel) -> str:
-    return channel.word.replace("_", " ")
+def _words(channel: channels.Channel, with_unit: bool) -> str:
+    return channel.word.replace("_", " ") + (f" [{channel.unit}]" if with_unit else "")

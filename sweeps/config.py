@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,12 +13,14 @@ from pydantic_core import PydanticCustomError
 
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import CONDITIONS
-from mmrjax import fidelities
-from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+from mmrjax import channels, fidelities
+from mmrjax.tables import BENCH, PAYLOADS_KG, SURFACES
 
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
+_SPEED = next(c for c in channels.EVERY if c.name == "motor_speed").range
+MotorSpeed = Annotated[float, Field(ge=_SPEED[0], le=_SPEED[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
 #: The fidelity that follows profiles.
 PROFILED = "drive"
@@ -150,24 +151,20 @@ class SupplyPart(Part):
 
 
 class GridPart(Part):
-    """The axes of a grid, Table 8 by default.
+    """The axes of a grid; None leaves them to `sweeps.grid.resolved`: Table 8 for the packaged robot.
 
     Attributes:
         configurations: of the robot, by name; None takes all that it has.
-        voltages_V: None takes those of Table 8, on the battery none.
+        voltages_V: of the supply, motor_speeds_rpm: imposed; a robot has one of the two, on the battery none.
+        payloads_kg, slopes_deg, surface: of a vehicle.
     """
 
     configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] | None = None
-    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
-    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] = SLOPES_DEG
-    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
-
-    def volts(self, battery: bool = False) -> tuple[float, ...]:
-        """The voltages, those of Table 8 where none are stated; on the battery one that is NaN."""
-        if battery:
-            return (math.nan,)
-        return VOLTAGES_V if self.voltages_V is None else self.voltages_V
+    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = None
+    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] | None = None
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = None
+    surface: str | None = None
 
 
 class InferencePart(Part):
@@ -364,23 +361,25 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
 
     Attributes:
         method: `local`, `sobol`, `morris`, `derivative` or `shapley`.
-        configurations, voltages_V, payloads_kg, slopes_deg, surface: operating points, as of a grid; None leaves them
-            to the method: Table 8 where gradients do, its corners and middle where a sample is drawn.
+        configurations, voltages_V, motor_speeds_rpm, payloads_kg, slopes_deg, surface: operating points, as of a
+            grid; None leaves them to the method: Table 8 where gradients do, its corners and middle where a sample is
+            drawn; of a rig see `sweeps.grid.resolved`.
         parameters: uncertain, by dotted name, with their priors; empty takes all that have one.
         vary: conditions that are uncertain, `name=low:high`.
         outputs: by name; empty takes the usual ones.
         evaluations: of the model at least, in all; None takes the default.
         posterior: whether the inputs are the posterior of a calibrated robot.
-        candidates: CSV of runs that could be made next; empty takes Table 8.
+        candidates: CSV of runs that could be made next; empty takes Table 8, of a rig the operating points.
         runs: how many of them to propose; noise: of their readings, as of `calibrate`.
     """
 
     method: str = "sobol"
     configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] | None = None
+    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = None
     payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] | None = None
     slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = None
-    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
+    surface: str | None = None
     parameters: tuple[str, ...] = ()
     vary: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
@@ -438,7 +437,13 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         name: first["ctx"][name] for name in ("gt", "ge", "lt", "le", "expected") if name in first.get("ctx", {})
     }
     wanted = first["msg"][0].lower() + first["msg"][1:]
-    ranges = {"slopes_deg": _SLOPE, "slope_deg": _SLOPE, "payloads_kg": _PAYLOAD, "voltages_V": _VOLTAGE}
+    ranges = {
+        "slopes_deg": _SLOPE,
+        "slope_deg": _SLOPE,
+        "payloads_kg": _PAYLOAD,
+        "voltages_V": _VOLTAGE,
+        "motor_speeds_rpm": _SPEED,
+    }
     allowed = ranges.get(key)
     if allowed is not None and limits:
         wanted = f"expected {allowed[0]:g} to {allowed[1]:g}"

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from calibration.data.errors import BadConfiguration, choices
+from mmrjax.channels import RPM
 from mmrjax.tables import COULOMB_PER_MAH
 from sweeps.config import BatchPart, OutputPart, ProfilePart, RobotPart, Sweep, read_toml, resolve
 
@@ -18,7 +19,8 @@ from sweeps.config import BatchPart, OutputPart, ProfilePart, RobotPart, Sweep, 
 KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile")
 #: Options of a grid, which a file with axes of its own has no use for.
 GRID = (
-    "configurations", "voltages_V", "payloads_kg", "slopes_deg", "surface", "battery", "discharge_mAh",
+    "configurations", "voltages_V", "motor_speeds_rpm", "payloads_kg", "slopes_deg", "surface", "battery",
+    "discharge_mAh",
 )  # fmt: skip
 EXPORTS = ("csv", "parquet")
 
@@ -88,8 +90,10 @@ def is_campaign(file: Path | None) -> bool:
     return file is not None and not set(KEYS).isdisjoint(read_toml(file))
 
 
-def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign:
+def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign | Sweep:
     """The configuration of a sweep into a store: of its file, or the grid of the options (or of such a file).
+
+    A grid is one of a store's once the robot is known (`of_grid`).
 
     Raises:
         BadConfiguration: as `resolve`; an option of the grid beside a file with axes of its own.
@@ -103,18 +107,27 @@ def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign:
                     "conditions"
                 )
         return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID})
-    grid = resolve(Sweep, file, options)
-    volts = {} if grid.battery else {"voltage": grid.volts()}
-    axes = {**volts, "payload": grid.payloads_kg, "slope_deg": grid.slopes_deg}
+    return resolve(Sweep, file, options)
+
+
+def of_grid(grid: Sweep) -> Campaign:
+    """The configuration of a store with the axes of a grid that are stated, in `variation`'s units."""
+    speeds = grid.motor_speeds_rpm
+    axes: dict[str, tuple[float, ...] | None] = {
+        "voltage": None if grid.battery else grid.voltages_V,
+        "motor_speed": None if speeds is None else tuple(n * RPM for n in speeds),
+        "payload": grid.payloads_kg,
+        "slope_deg": grid.slopes_deg,
+    }
     # every run of the grid with every robot drawn, which the store keeps along its last dimension
     drawn = {"design": "random", "number": grid.posterior, "posterior": str(Path(grid.robot).parent)}
     names = "all" if grid.configurations is None else list(grid.configurations)
     return Campaign(
         **{key: getattr(grid, key) for key in Sweep.model_fields if key in Campaign.model_fields},
         samples=drawn if grid.posterior is not None else {},
-        axes={"configuration": names, **{name: list(values) for name, values in axes.items()}},
+        axes={"configuration": names, **{name: list(values) for name, values in axes.items() if values is not None}},
         conditions={
-            "surface": grid.surface,
+            **({} if grid.surface is None else {"surface": grid.surface}),
             "battery": grid.battery,
             "discharge": grid.discharge_mAh * COULOMB_PER_MAH,
         },

@@ -6,6 +6,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
@@ -93,7 +94,7 @@ def correlations(found: CalibrationResult) -> Figure:
 def before_after(found: CalibrationResult) -> Figure:
     """rms errors by channel: before, fitted, and with each kind of block held out."""
     lines = {"before": found.errors_before, "fitted": found.errors_after}
-    lines |= {f"held out: {kind.replace('_', ' + ')}": held.errors for kind, held in found.held_out.items()}
+    lines |= {f"held out: {blocks.in_words(kind, ' + ')}": held.errors for kind, held in found.held_out.items()}
     fig, grid = figure(1, len(channels.CHANNELS), 1.1 + 0.36 * len(lines), sharey=True)
     for axes, channel in zip(grid[0], channels.CHANNELS, strict=True):
         most = int(np.isfinite(found.readings[channel.name].measured).sum())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -9,8 +11,12 @@ from mmrjax import channels
 from sweeps.figures_style import axis_label, figure, looks, note
 
 
-def parity(table: dict[str, np.ndarray]) -> Figure:
-    """Simulated over measured, one panel a channel; a reading that is missing is not drawn."""
+def parity(table: dict[str, np.ndarray], band: bool = True) -> Figure:
+    """Simulated over measured, one panel a channel; a reading that is missing is not drawn.
+
+    Args:
+        band: whether ±5 % are shaded.
+    """
     fig, grid = figure(1, len(channels.CHANNELS), 3.6)
     look = looks(table["configuration"])
     for axes, channel in zip(grid[0], channels.CHANNELS, strict=True):
@@ -19,7 +25,8 @@ def parity(table: dict[str, np.ndarray]) -> Figure:
         ends = np.concatenate([measured[both], simulated[both]]) if both.any() else np.array([0.0, 1.0])
         low, high = min(0.0, float(ends.min())), max(0.0, float(ends.max()))
         span = np.array([low - 0.05 * (high - low) * (low < 0), high + 0.05 * (high - low)])
-        axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
+        if band:
+            axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
         axes.plot(span, span, color="#666666", lw=0.9)
         for kind, (colour, marker) in look.items():
             pick = both & (table["configuration"] == kind)
@@ -42,25 +49,43 @@ def parity(table: dict[str, np.ndarray]) -> Figure:
             note(axes, "no row has both numbers")
     if grid[0, 0].get_legend_handles_labels()[0]:
         grid[0, 0].legend(loc="lower right")
-    note(grid[0, 0], "band: ±5 %")
+    if band:
+        note(grid[0, 0], "band: ±5 %")
     return fig
 
 
-def errors_over(table: dict[str, np.ndarray]) -> Figure:
-    """Error (35) of each channel over each condition."""
+def errors_over(
+    table: dict[str, np.ndarray], in_units: bool = False, beside: Mapping[str, str] | None = None
+) -> Figure:
+    """Error (35) of each channel over each condition.
+
+    Args:
+        beside: further columns than conditions, with their words, where errors are in units.
+        in_units: errors in the unit of the channel instead, with a band of two sds where they are known; over those
+            conditions that vary.
+    """
     every = {
         "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
         "payload_kg": "payload [kg]",
     }  # fmt: skip
     conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
+    if in_units:
+        conditions |= beside or {}
+        varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
+        conditions = varied or dict(list(conditions.items())[:1])
     fig, grid = figure(
         len(channels.CHANNELS), len(conditions), 2.3 * len(channels.CHANNELS), sharex="col", sharey="row"
     )
     look = looks(table["configuration"])
     for row, channel in zip(grid, channels.CHANNELS, strict=True):
         error = table[f"error_{channel.name}_percent"]
+        half = 5.0
+        if in_units:
+            error = table[f"simulated_{channel.column}"] - table[channel.column]
+            sd = table.get(f"sd_{channel.column}", np.array([np.nan]))
+            half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
         for axes, (condition, words) in zip(row, conditions.items(), strict=True):
-            axes.axhspan(-5, 5, color="#eef3ee", zorder=0)
+            axes.axhspan(-half, half, color="#eef3ee", zorder=0)
             axes.axhline(0, color="#666666", lw=0.9)
             levels = np.unique(table[condition])
             shift = 0.012 * max(1e-9, float(np.ptp(levels))) if levels.size > 1 else 0.02
@@ -83,7 +108,7 @@ def errors_over(table: dict[str, np.ndarray]) -> Figure:
                 axes.set_xlabel(words)
                 if levels.size <= 8:
                     axes.set_xticks(levels)
-        row[0].set_ylabel(f"{channel.label}\nerror [%]")
+        row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit if in_units else '%'}]")
     for axes in grid[0]:
         if axes.get_legend_handles_labels()[0]:
             axes.legend(loc="best")

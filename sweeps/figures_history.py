@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mmrjax import channels
 from mmrjax.channels import MM
 from sweeps import words
-from sweeps.figures_style import FAINT, INK, VERMILION, figure, looks, note
+from sweeps.figures_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -202,3 +203,58 @@ def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
                 (left + right) / 2, 0.985, f"{stage}\n{name}", transform=axes.get_xaxis_transform(), ha="center",
                 va="top", fontsize=8.5, fontweight="bold", color=INK,
             )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Course:
+    """A run of a shaft over time, up to its last finite sample.
+
+    Attributes:
+        name: heading; status; time: [s]; readings: of each channel by name, in the unit of its column.
+    """
+
+    name: str
+    status: str
+    time: np.ndarray
+    readings: dict[str, np.ndarray]
+
+    def largest(self, channel: str) -> float:
+        """Reading that is largest in size."""
+        values = self.readings[channel]
+        return float(values[int(np.argmax(np.abs(values)))]) if values.size else np.nan
+
+    def last(self, channel: str) -> float:
+        """Reading at the end."""
+        values = self.readings[channel]
+        return float(values[-1]) if values.size else np.nan
+
+
+def courses(history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
+    """Members of a batch of runs as their instruments show them.
+
+    Args:
+        history: of the batch; status: codes of how its members ended; names: headings of the members.
+    """
+    from mmrjax.signals import STATUSES
+
+    answer = []
+    for k, name in enumerate(names):
+        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in channels.CHANNELS}
+        finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
+        upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
+        of = {channel: values[upto] for channel, values in readings.items()}
+        answer.append(Course(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], of))
+    return answer
+
+
+def over_time(shown: list[Course]) -> Figure:
+    """A row for each run, a panel for each channel."""
+    fig, grid = figure(len(shown), len(channels.CHANNELS), 2.6 * len(shown))
+    for row, course in zip(grid, shown, strict=True):
+        row[0].set_title(course.name)
+        for axes, channel in zip(row, channels.CHANNELS, strict=True):
+            axes.plot(course.time, course.readings[channel.name], color=BLUE)
+            axes.set(xlabel="time [s]", ylabel=axis_label(channel))
+        if course.status not in words.SETTLED:
+            note(row[0], f"ends: {words.short(course.status)}", color=VERMILION)
+    return fig

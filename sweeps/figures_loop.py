@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax import channels
@@ -22,6 +23,7 @@ from sweeps.figures_style import (
     note,
     short,
 )
+from sweeps.figures_sweep import UNITS, imposed
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
@@ -32,11 +34,20 @@ DEFECT_WORDS = {
 }
 
 
+#: The same of a rig, whose output need be no pulley.
+RIG_WORDS = {"track": "torque missing at the output"}
+IMPOSED_WORDS = {"supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]"}
+
+
 def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
-    order = np.lexsort((table["payload_kg"], table["slope_deg"], table["supply_voltage_V"], table["configuration"]))
+    own = imposed(table)
+    beside = [c for c in ("payload_kg", "slope_deg") if c in table]
+    order = np.lexsort((*(table[c] for c in beside), table[own], table["configuration"]))
     fig, grid = figure(len(channels.CHANNELS), 1, 1.8 * len(channels.CHANNELS), sharex=True)
-    groups = [f"{table['configuration'][k]}, {table['supply_voltage_V'][k]:g} V" for k in order]
+    levels = np.unique(table[own]).size
+    few = levels <= 8 or own == "supply_voltage_V"  # else a group by configuration alone
+    groups = [f"{table['configuration'][k]}" + (f", {table[own][k]:g} {UNITS[own]}" if few else "") for k in order]
     edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
     x = np.arange(len(order))
     for axes, channel in zip(grid[:, 0], channels.CHANNELS, strict=True):
@@ -57,7 +68,8 @@ def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
     grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)],
                            [groups[a] for a in starts])  # fmt: skip
     grid[-1, 0].grid(axis="x", visible=False)
-    grid[-1, 0].set_xlabel("runs, in each group by slope, then payload; band: ±2σ of the instruments")
+    within = "by slope, then payload" if beside else "by motor speed" if own == "motor_speed_rpm" else "by voltage"
+    grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
     return fig
 
 
@@ -95,8 +107,8 @@ def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
                 axes.set_ylabel(f"{channel.label} [σ]")
         first = mine[0]
         grid[0, column].set_title(
-            f"{name}\n{table['configuration'][first]} {_range(table['supply_voltage_V'][mine])} V "
-            f"{_range(table['slope_deg'][mine])}°", fontsize=8,
+            f"{name}\n{table['configuration'][first]} {_range(table[imposed(table)][mine])} {UNITS[imposed(table)]}"
+            + (f" {_range(table['slope_deg'][mine])}°" if "slope_deg" in table else ""), fontsize=8,
         )  # fmt: skip
         grid[-1, column].set_xlabel("time [s]")
     words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
@@ -180,7 +192,7 @@ def null(before: Evidence) -> Figure:
 def errors(found: DiscoveryResult) -> Figure:
     """rms error (35) before and after, fitted and held out by every kind of block."""
     lines = {"fitted": found.errors}
-    lines |= {f"held out by\n{k.replace('_', ', ')}": v for k, v in found.errors_held_out.items()}
+    lines |= {f"held out by\n{blocks.in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
     fig, grid = figure(1, len(channels.CHANNELS), 2.9, sharey=False)
     for place, channel in enumerate(channels.CHANNELS):
         axes = grid[0, place]
@@ -199,20 +211,44 @@ def errors(found: DiscoveryResult) -> Figure:
     return fig
 
 
-def defects(table: dict[str, np.ndarray], verdict: str) -> Figure:
-    """What each equation lacks, run by run, over the variable that shows it, before and after."""
+def closed(table: dict[str, np.ndarray]) -> list[str]:
+    """Equations that the readings close: those with a defect somewhere, at least one."""
+    found = [b for b in DEFECT_WORDS if np.nan_to_num(table[f"defect_before_{b}"]).any()]
+    return found or ["track"]
+
+
+def _over(table: dict[str, np.ndarray], column: str, label: str) -> tuple[np.ndarray, str]:
+    """The variable over which a defect is drawn, or what is imposed where a table lacks it or it does not vary."""
+    column = "total_" + column if column == "current_A" else column
+    own = imposed(table)
+    if column not in table or (column not in ("total_current_A", own) and np.unique(table[column]).size == 1):
+        return table[own], IMPOSED_WORDS[own]
+    return table[column], label
+
+
+def defects(table: dict[str, np.ndarray], verdict: str, blank: bool = False) -> Figure:
+    """What each equation lacks, run by run, over the variable that shows it, before and after.
+
+    Args:
+        blank: whether the robot is a rig, of which the equations are drawn that its readings close.
+    """
     whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
-    fig, grid = figure(len(whens), 3, 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
+    drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if blank else DEFECT_WORDS)}
+    fig, grid = figure(len(whens), len(drawn), 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
     for row, when in enumerate(whens):
-        for axes, (balance, (words, unit, column, label)) in zip(grid[row], DEFECT_WORDS.items(), strict=True):
-            x = table["total_" + column if column == "current_A" else column]
+        for axes, (balance, (words, unit, column, label)) in zip(grid[row], drawn.items(), strict=True):
+            if blank:
+                x, label = _over(table, column, label)
+                balance_words = RIG_WORDS.get(balance, words)
+            else:
+                x, balance_words = table["total_" + column if column == "current_A" else column], words
             y = table[f"defect_{when}_{balance}"] * (1e3 if balance == "slip" else 1.0)
             axes.axhline(0, color=FAINT, lw=0.8)
             for name, colour in colours_of(table["configuration"]).items():
                 mine = table["configuration"] == name
                 axes.plot(x[mine], y[mine], "o", ms=4.5, color=colour, label=name)
-            axes.set_title(f"{balance}, {when}")
-            axes.set_ylabel(f"{words} [{unit}]")
+            axes.set_title(f"{'torque' if blank and balance == 'track' else balance}, {when}")
+            axes.set_ylabel(f"{balance_words} [{unit}]")
             if row == len(whens) - 1:
                 axes.set_xlabel(label)
     grid[0, 0].legend(loc="best")
@@ -257,14 +293,21 @@ def base_shift(found: DiscoveryResult) -> Figure:
     return fig
 
 
-def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy) -> Figure:
-    """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band."""
+def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy, sides: float = 2.0) -> Figure:
+    """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band.
+
+    Args:
+        sides: motors that the total current is of.
+    """
     variable = found.variable if found.window is None else str(found.window["axis"])
     column, factor, words = VARIABLE_WORDS.get(variable, ("", 1.0, f"phase of the wave, {variable} [rad]"))
+    if variable == "current":
+        one = "motor_current_A" in table and "total_current_A" not in table
+        column, factor = ("motor_current_A", 1.0) if one else (column, 1 / sides)
     fig, grid = figure(1, 1, 3.4)
     axes = grid[0, 0]
     axes.axhline(0, color=FAINT, lw=0.8)
-    if found.defect is not None and found.defect_sd is not None:
+    if found.defect is not None and found.defect_sd is not None and column in table:
         there = np.isfinite(found.defect)
         axes.errorbar(np.asarray(table[column])[there] * factor, found.defect[there], 2 * found.defect_sd[there],
                       fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from mmrjax.energy import SINKS
 from sweeps.figures_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
+from sweeps.imposed import UNLIMITED
 
 #: Units of a time axis: how long a mission is for it [s], its size [s], its name.
 _TIMES = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
@@ -40,11 +41,14 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, li
         shown = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
         time = shown["time_s"] / size
         first = column == 0
-        axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows["slope_deg"]) else ""))
+        axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
         _speed(axes[0], time, shown, linear, legend=first)
         axes[1].set_title("current of all motors, and duty of the driver")
         _current(axes[1], time, shown, legend=first)
-        beyond = "" if _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
+        unlimited = limit >= UNLIMITED or "winding_C" not in rows
+        beyond = (
+            "" if unlimited or _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
+        )
         axes[2].set_title("temperatures" + (beyond if first else ""))
         _temperatures(axes[2], time, shown, limit, legend=first)
         _source(axes[3], time, shown)
@@ -70,13 +74,15 @@ def _legend(axes: Axes, *others: Axes) -> None:
 
 
 def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear: bool, legend: bool) -> None:
-    axes.plot(time, rows["speed_mm_s"], color=BLUE, lw=1.4, label="speed")
-    demanded = rows["demanded_speed_mm_s"]
+    turning = "demanded_motor_speed_rpm" in rows  # a shaft's
+    speed = rows["motor_speed_rpm"] if turning else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
+    axes.plot(time, speed, color=BLUE, lw=1.4, label="speed")
+    demanded = rows["demanded_motor_speed_rpm" if turning else "demanded_speed_mm_s"]
     if np.isfinite(demanded).any():
         axes.plot(time, demanded, color=INK, lw=0.9, ls=(0, (4, 2)), label="demanded")
-    axes.set_ylabel("speed [mm/s]")
-    if not np.any(rows["slope_deg"]):
-        note(axes, "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
+    axes.set_ylabel("motor speed [rpm]" if turning else "speed [mm/s]")
+    if turning or not np.any(rows["slope_deg"]):
+        note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
         if legend:
             _legend(axes)
         return
@@ -106,10 +112,14 @@ def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], legen
 
 def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
     """Whether the limit is near enough to be drawn; far above it would flatten what is to be seen."""
-    return bool(np.max(rows["winding_C"]) > 0.6 * limit)
+    return "winding_C" in rows and bool(np.max(rows["winding_C"]) > 0.6 * limit)
 
 
 def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], limit: float, legend: bool) -> None:
+    if "winding_C" not in rows:
+        note(axes, "the robot's file does not state how heat leaves the windings (motor.resistance_thermal_...)")
+        axes.set_yticks([])
+        return
     axes.plot(time, rows["winding_C"], color=VERMILION, lw=1.4, label="winding")
     axes.plot(time, rows["housing_C"], color=ORANGE, lw=1.4, label="housing")
     top, bottom = float(np.max(rows["winding_C"])), float(np.min(rows["housing_C"]))

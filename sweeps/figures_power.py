@@ -43,10 +43,15 @@ def drawable(runs: dict[str, np.ndarray]) -> np.ndarray:
     return np.isfinite(parts).all(0) & (parts >= -1e-6 * np.maximum(given, 1.0)).all(0) & (given > 0)
 
 
-def chain(runs: dict[str, np.ndarray], names: list[str]) -> Figure:
-    """A bar a run [W], from the motor's losses to the power that lifts the robot."""
+#: Words of an item where the load is a shaft, which takes all that the gearboxes pass on.
+ON_SHAFT = {"track and slip": "load"}
+
+
+def chain(runs: dict[str, np.ndarray], names: list[str], on_shaft: bool = False) -> Figure:
+    """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
     fig, grid = figure(1, 1, 1.15 + 0.42 * len(names))
     axes, parts = grid[0, 0], split(runs)
+    said = ON_SHAFT if on_shaft else {}
     supply, slope = sources(runs)
     total = supply + slope
     left = np.zeros(len(names))
@@ -54,7 +59,9 @@ def chain(runs: dict[str, np.ndarray], names: list[str]) -> Figure:
     for item, colour in ITEMS.items():
         value = np.maximum(parts[item], 0.0)
         if value.max() > 1e-6:
-            axes.barh(place, value, left=left, height=0.7, color=colour, label=item, ec="white", lw=0.6)
+            axes.barh(
+                place, value, left=left, height=0.7, color=colour, label=said.get(item, item), ec="white", lw=0.6
+            )
         for y, x, width in zip(place, left, value, strict=True):
             if width >= 0.04 * total.max():
                 ink = "white" if colour in _DARK else "black"

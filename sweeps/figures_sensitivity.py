@@ -60,7 +60,7 @@ def panels(study: OutputStudy, found: SensitivityResult) -> list[int]:
     chosen: list[int] = []
     for kind in kinds:
         mine = np.flatnonzero((points.configuration == kind) & np.isfinite(study.value) & study.studied)
-        order = mine[np.lexsort((points.payload[mine], points.slope_deg[mine], points.voltage[mine]))]
+        order = mine[np.lexsort((points.payload[mine], points.slope_deg[mine], points.imposed[1][mine]))]
         if order.size:
             chosen += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, each).astype(int))]
     return chosen[:PANELS]
@@ -145,7 +145,7 @@ def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np
     points = found.points
     names = np.array(list(map(str, points.configuration)))
     kinds = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    order = np.lexsort((points.payload, points.voltage, points.slope_deg, np.array([kinds[n] for n in names])))
+    order = np.lexsort((points.payload, points.imposed[1], points.slope_deg, np.array([kinds[n] for n in names])))
     _cells(ax, study.share[order][:, top].T, 24)
     ax.set_yticks([])
     ticks, labels = [], []
@@ -153,15 +153,20 @@ def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np
         mine = np.flatnonzero(names[order] == kind)
         if mine[0]:
             ax.axvline(mine[0] - 0.5, color="white", linewidth=4)
-        for slope in np.unique(points.slope_deg[order][mine]):
-            at = mine[points.slope_deg[order][mine] == slope]
+        levels = points.imposed[1] if points.on_shaft else points.slope_deg
+        for level in np.unique(levels[order][mine]):
+            at = mine[levels[order][mine] == level]
             ticks.append(at.mean())
-            labels.append(f"{slope:g}°")
+            labels.append(f"{level:g}" + ("" if points.on_shaft else "°"))
             if at[0] != mine[0]:
                 ax.axvline(at[0] - 0.5, color="white", linewidth=1.5)
         ax.text(mine.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
     ax.set_xticks(ticks, labels, fontsize=8.5)
-    other = (("voltage", points.voltage, "V"), ("payload", points.payload, "kg"))
+    word, own, unit = points.imposed
+    if points.on_shaft:
+        ax.set_xlabel(f"{word} [{unit}]; grey: no index there", fontsize=8.5)
+        return
+    other = ((word, own, unit), ("payload", points.payload, "kg"))
     inner = [f"{word} {_range(x)} {unit}" for word, x, unit in other if np.unique(x).size > 1]
     within = f"; within each {' and '.join(inner)}" if inner else ""
     ax.set_xlabel(f"slope{within}; grey: no index there", fontsize=8.5)

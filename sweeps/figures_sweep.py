@@ -19,27 +19,42 @@ _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled
 
 
-def panels(voltages: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """How a figure splits runs by supply voltage: a title and a mask for each of at most three panels.
+#: Axis of what is imposed: its unit, and words of several.
+UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm"}
+PLURAL = {"supply_voltage_V": "voltages", "motor_speed_rpm": "motor speeds"}
+
+
+def imposed(runs: dict[str, np.ndarray]) -> str:
+    """Column of what is imposed in runs."""
+    return next(column for column in UNITS if column in runs)
+
+
+def on_ground(runs: dict[str, np.ndarray]) -> bool:
+    """Whether runs are of a vehicle, with slope and payload."""
+    return "slope_deg" in runs and "payload_kg" in runs
+
+
+def panels(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple[str, np.ndarray]]:
+    """How a figure splits runs by what is imposed: a title and a mask for each of at most three panels.
 
     Every voltage up to three; of a grid of more, the least, a middle and the greatest; where nearly every
     run has a voltage of its own, thirds of the range.
     """
     if np.isnan(voltages).all():
         return [("battery", np.ones(len(voltages), bool))]
-    levels = np.unique(voltages)
+    levels, unit = np.unique(voltages), UNITS[column]
     if levels.size > _PANELS and 4 * levels.size > voltages.size:
         bounds = np.linspace(levels[0], levels[-1], _PANELS + 1)
         third = np.clip(np.searchsorted(bounds, voltages, side="right") - 1, 0, _PANELS - 1)
-        return [(f"{bounds[k]:.3g} to {bounds[k + 1]:.3g} V", third == k) for k in range(_PANELS)]
+        return [(f"{bounds[k]:.3g} to {bounds[k + 1]:.3g} {unit}", third == k) for k in range(_PANELS)]
     if levels.size > _PANELS:
         levels = levels[[0, levels.size // 2, -1]]
-    return [(f"{v:.4g} V", voltages == v) for v in levels]
+    return [(f"{v:.4g} {unit}", voltages == v) for v in levels]
 
 
 def is_map(runs: dict[str, np.ndarray]) -> bool:
     """Whether the runs have at least two slopes and two payloads, and so fill a map."""
-    return np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1
+    return on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1
 
 
 def settled(runs: dict[str, np.ndarray], channel: Channel) -> np.ndarray:
@@ -54,7 +69,7 @@ def sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
     and says why. Where several runs share a cell their median is shown.
     """
     kinds = list(dict.fromkeys(map(str, runs["configuration"])))
-    volts = panels(runs["supply_voltage_V"])
+    volts = panels(runs[imposed(runs)], imposed(runs))
     if not is_map(runs):
         return _lines(runs, channel, kinds)
     there = runs[channel.column][settled(runs, channel)]
@@ -163,14 +178,19 @@ def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel
 
 def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> Figure:
     column, there = channel.column, settled(runs, channel)
-    over = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
-    if np.unique(runs[over]).size == 1 and np.unique(runs["supply_voltage_V"]).size > 1:
-        over = "supply_voltage_V"
-    label = {"payload_kg": "payload [kg]", "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]"}[over]
+    over = own = imposed(runs)
+    if on_ground(runs):
+        over = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
+        if np.unique(runs[over]).size == 1 and np.unique(runs[own]).size > 1:
+            over = own
+    label = {
+        "payload_kg": "payload [kg]", "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]",
+        "motor_speed_rpm": "motor speed [rpm]",
+    }[over]  # fmt: skip
     fig, grid = figure(1, len(kinds), 3.2, sharey=True)
     for axes, kind in zip(grid[0], kinds, strict=True):
         mine = runs["configuration"] == kind
-        volts = [("", mine)] if over == "supply_voltage_V" else panels(runs["supply_voltage_V"])
+        volts = [("", mine)] if over == own else panels(runs[own], own)
         for k, (volt, mask) in enumerate(volts):
             pick = np.nonzero(mine & mask)[0]
             pick = pick[np.argsort(runs[over][pick], kind="stable")]

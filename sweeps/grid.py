@@ -3,37 +3,106 @@
 from __future__ import annotations
 
 import itertools
+import math
+from typing import TypeVar
 
 import numpy as np
 
+from calibration.data.columns import Layout
+from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import Runs
 from mmrjax.robot import Robot
+from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+from sweeps import imposed
 from sweeps.config import GridPart
 from sweeps.inputs import check_configurations
+
+G = TypeVar("G", bound=GridPart)
+
+#: Option that states an axis.
+OPTIONS = {
+    "voltages_V": "--voltages", "motor_speeds_rpm": "--motor-speeds", "payloads_kg": "--payloads",
+    "slopes_deg": "--slopes", "surface": "--surface",
+}  # fmt: skip
+#: Those that act on a vehicle alone.
+ON_GROUND = ("payloads_kg", "slopes_deg", "surface")
+#: Axis of what is imposed (`rig.IMPOSED`).
+AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm"}
+
+
+def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:
+    """The grid with every axis stated that the robot has.
+
+    What is imposed is that of Table 8 for the packaged robot; of a rig thirds of its limit (`sweeps.imposed`).
+    Payloads and slopes are those of Table 8 too, of a rig none and 0.
+
+    Args:
+        battery: whether the runs are on the battery, where the axis of voltages drops out.
+        notes: is given a sentence for what is taken of a rig's limits.
+
+    Raises:
+        BadConfiguration: an axis that the robot does not have, one that is neither stated nor follows from a limit,
+            or a surface or a configuration that there is not.
+    """
+    layout = Layout.of(robot)
+    check(config, robot)
+    own = AXIS[layout.imposed]
+    update: dict[str, object] = {"configurations": configurations(config, robot)}
+    if battery:
+        imposed.check_battery(robot)
+    elif getattr(config, own) is None:
+        update[own] = VOLTAGES_V if layout.usual else imposed.levels(robot, OPTIONS[own], notes)
+    if not layout.on_shaft:
+        table8 = not layout.blank
+        update |= {
+            "payloads_kg": config.payloads_kg or (PAYLOADS_KG if table8 else (0.0,)),
+            "slopes_deg": config.slopes_deg or (SLOPES_DEG if table8 else (0.0,)),
+            "surface": config.surface or (BENCH if table8 else None),
+        }
+    return config.model_copy(update=update)
+
+
+def check(config: GridPart, robot: Robot) -> None:
+    """Refuse axes that a robot does not have.
+
+    Raises:
+        BadConfiguration: one of them, or a surface that is none of Table 5 where those are meant.
+    """
+    layout = Layout.of(robot)
+    for key in AXIS.values():
+        if key != AXIS[layout.imposed] and getattr(config, key) is not None:
+            raise BadConfiguration(imposed.refused(robot, OPTIONS[key], OPTIONS[AXIS[layout.imposed]]))
+    for key in ON_GROUND:
+        if layout.on_shaft and getattr(config, key) is not None:
+            raise BadConfiguration(imposed.on_shaft(OPTIONS[key]))
+    surface = config.surface
+    if surface is not None and not layout.blank and surface not in SURFACES:
+        raise BadConfiguration(f"option surface: got {surface!r}; {choices(surface, SURFACES)}")
 
 
 def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
     """Every combination of the axes as a table of conditions, slope varying fastest.
 
     Args:
-        battery: whether the runs are on the battery, where the axis of voltages drops out.
+        config: as `resolved` makes it, or not yet; battery: whether the runs are on the battery.
 
     Raises:
-        BadConfiguration: a configuration that the robot does not have.
+        BadConfiguration: as `resolved`.
     """
-    names = configurations(config, robot)
-    points = list(itertools.product(names, config.volts(battery), config.payloads_kg, config.slopes_deg))
-    configuration, voltage, payload, slope = (np.array(column) for column in zip(*points, strict=True))
-    return Runs(
-        source="the grid",
-        columns={
-            "configuration": configuration,
-            "supply_voltage_V": voltage,
-            "payload_kg": payload,
-            "slope_deg": slope,
-            "surface": np.full(len(points), config.surface),
-        },
-    )
+    config = resolved(config, robot, battery)
+    layout = Layout.of(robot)
+    values = getattr(config, AXIS[layout.imposed])
+    axes: dict[str, tuple[object, ...]] = {
+        "configuration": configurations(config, robot),
+        layout.imposed_column: (math.nan,) if battery else values,
+    }
+    if not layout.on_shaft:
+        axes |= {"payload_kg": config.payloads_kg or (), "slope_deg": config.slopes_deg or ()}
+    points = list(itertools.product(*axes.values()))
+    columns = {name: np.array(column) for name, column in zip(axes, zip(*points, strict=True), strict=True)}
+    if config.surface is not None:
+        columns["surface"] = np.full(len(points), config.surface)
+    return Runs(source="the grid", columns=columns, layout=layout)
 
 
 def configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:

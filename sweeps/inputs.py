@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 from calibration.data import effect_file, posterior, robot_file
 from calibration.data import runs as records
+from calibration.data.columns import IMPOSED, ON_GROUND, Layout
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from mmrjax import channels
 from mmrjax.robot import Robot
+from mmrjax.tables import BENCH
+from sweeps import imposed
 from sweeps.config import RobotPart
 from sweeps.console import tell
 
+#: Option that states a condition of one run.
+OPTIONS = {
+    "supply_voltage_V": "--voltage", "motor_speed_rpm": "--motor-speed", "payload_kg": "--payload",
+    "slope_deg": "--slope", "total_mass_kg": "--mass", "surface": "--surface",
+}  # fmt: skip
 #: Supply voltage of one run where none is stated [V], the highest of Table 8.
 VOLTAGE = 33.0
 
@@ -94,12 +103,17 @@ def read_runs(
     return runs
 
 
-def one_run(robot: Robot, cells: dict[str, Any], battery: bool = False) -> records.Runs:
+def one_run(
+    robot: Robot, cells: dict[str, Any], battery: bool = False, elsewhere: Collection[str] = ()
+) -> records.Runs:
     """One run from options by column name; without a configuration it is the robot's first.
 
+    Args:
+        elsewhere: columns that a profile states.
+
     Raises:
-        BadConfiguration: a value out of range, a configuration that the robot does not have, or a voltage beside the
-            battery.
+        BadConfiguration: a value out of range, a configuration that the robot does not have, a voltage beside the
+            battery, a condition that does not act on the robot, or nothing imposed where its file states no limit.
     """
     if battery and cells.get("supply_voltage_V") is not None:
         raise BadConfiguration(
@@ -110,5 +124,18 @@ def one_run(robot: Robot, cells: dict[str, Any], battery: bool = False) -> recor
     name = robot.configurations.names[0] if stated is None else stated
     check_configurations(robot, (name,), "--configuration")
     given = {key: value for key, value in cells.items() if value is not None}
-    usual = {} if battery else {"supply_voltage_V": VOLTAGE}
-    return records.single({**usual, **given, "configuration": name})
+    layout = Layout.of(robot)
+    column = layout.imposed_column
+    for other in (c for c, _ in IMPOSED.values() if c != column and c in given):
+        raise BadConfiguration(imposed.refused(robot, OPTIONS[other], OPTIONS[column]))
+    for key in (key for key in given if layout.on_shaft and key in (*ON_GROUND, "surface")):
+        raise BadConfiguration(imposed.on_shaft(OPTIONS[key]))
+    if battery:
+        imposed.check_battery(robot)
+    elif column not in given:
+        rest = 0.0 if column in elsewhere else None
+        given[column] = VOLTAGE if layout.usual else imposed.default(robot, OPTIONS[column]) if rest is None else rest
+    if not layout.on_shaft:
+        bench = {} if layout.blank else {"surface": BENCH}
+        given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
+    return records.single({**given, "configuration": name}, layout)

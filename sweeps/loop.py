@@ -13,11 +13,14 @@ from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
 from calibration.discovery.result import DiscoveryResult
-from calibration.inference import priors
+from calibration.inference import blocks, priors
 from mmrjax import channels
 from sweeps import config as configuration
+from sweeps import words
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
+from sweeps.own import is_rig
+from sweeps.report import rms
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
 
 
@@ -63,6 +66,8 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person."""
     say(f"{found.verdict}: {found.statement}")
+    if found.robot.on_shaft and found.verdict != "none":
+        say("The balance track of a shaft is what its load loses.")
     for said in (findings.said_standing(found), findings.said_ruled_out(found)):
         if said:
             say(said)
@@ -98,15 +103,17 @@ def print_discovery(found: DiscoveryResult) -> None:
     for heading in ("", "rows", *(c.label for c in channels.CHANNELS)):
         errors.add_column(heading, justify="right" if heading else "left")
     whens = (0,) if found.verdict == "none" else (0, 1)
-    words = ("before", "after")
+    when = ("before", "after")
     lines = {"as stated, nothing fitted": found.errors_as_stated}
-    lines |= {f"{words[k]}, fitted": found.errors[k] for k in whens}
+    lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
     for kind, both in found.errors_held_out.items():
-        lines |= {f"{words[k]}, held out by {kind.replace('_', ' and ')}": both[k] for k in whens}
+        lines |= {f"{when[k]}, held out by {blocks.in_words(kind)}": both[k] for k in whens}
     for text, by in lines.items():
         cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
+    if is_rig(found.robot):
+        say(words.said_rms(rms(found.rows_table(), ("before", "after", "held_out_before", "held_out_after"))))
     for other in found.sensitivity:
         say(f"with {other.factor:g} times the assumed noise: {other.verdict}: {other.statement}")
     for note in found.notes:

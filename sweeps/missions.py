@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from sweeps import config as configuration
-from sweeps import run, words
+from sweeps import imposed, own, run, words
 from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run, read_runs
 from sweeps.store import open_folder
@@ -97,7 +97,9 @@ def simulate(
     """
     assert config.profile is not None
     robot = load_robot(config)
+    _check_robot(robot)
     source = profiles.read(config.profile)
+    _check_acting(robot, source)
     source.check_source(config.battery)
     for column in source.stated:
         if column in stated and not isinstance(given, str):
@@ -108,7 +110,7 @@ def simulate(
     if isinstance(given, str):
         runs = read_runs(given, robot, measured=False, battery=config.battery)
     else:
-        runs = one_run(robot, given, config.battery)
+        runs = one_run(robot, given, config.battery, source.stated)
     for column in source.stated:
         if isinstance(given, str) and runs.has(column):
             tell(f"{runs.source}, {column}: not used, {source.source} states it")
@@ -116,15 +118,43 @@ def simulate(
         tell(f"{source.source}, current_other_A: not used, other consumers are on the battery")
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         found = simulated(robot, runs, source, config)
-        folder.write_table("segments.csv", found.segments)
-        folder.write_table("history.csv", found.course)
-        print_missions(found)
+        folder.write_table("segments.csv", own.of(robot, found.segments))
+        folder.write_table("history.csv", own.of(robot, found.course))
+        print_missions(found, own.idle_columns(robot))
         if config.report:
             from sweeps import report_mission
 
             report_mission.write(folder.partial, robot=robot, robot_name=config.robot, found=found)
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
         return run.leave(folder, config, result)
+
+
+def _check_robot(robot: Robot) -> None:
+    if robot.rig.imposed == "motor_speed":
+        raise BadConfiguration(
+            "--profile: the motors' speed is imposed on this robot, and a profile drives motors by their voltage; "
+            'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
+        )
+    for name, load in robot.configurations.items():
+        if robot.on_shaft and float(load.torque_gravity) > 0:
+            raise BadConfiguration(
+                f"--profile: {name} is an arm on which gravity acts with its angle, which a profile does not follow; "
+                "simulate it over time with --model drive"
+            )
+
+
+def _check_acting(robot: Robot, source: ProfileTable) -> None:
+    """Refuse a profile that states what does not act on a shaft."""
+    if not robot.on_shaft:
+        return
+    for column in ("slope_deg", "payload_kg", "surface"):
+        if column in source.stated:
+            raise BadConfiguration(imposed.on_shaft(f"{source.source}, {column}"))
+    if "speed" in source.modes and "speed" not in robot.rig.channels:
+        raise BadConfiguration(
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, of which no channel shows a travel; demand "
+            "motor_speed_rpm or duty"
+        )
 
 
 def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
@@ -253,6 +283,13 @@ def _course(
     per_speed = float(robot.gearbox.ratio) / float(robot.configurations.members[which].radius)
     battery = float(np.asarray(conditions.battery)[k]) > 0.5
     left = 1 - signals.discharge / float(robot.battery.capacity)
+    demanded = source.demanded(segment, elapsed, per_speed)
+    turning = {}
+    if robot.on_shaft:
+        turning = {
+            "motor_speed_rpm": np.asarray(reading["motor_speed"]) / channels.RPM,
+            "demanded_motor_speed_rpm": demanded * per_speed / channels.RPM,
+        }
     return {
         "run_id": np.full(len(picked), name),
         "time_s": course.time,
@@ -261,7 +298,8 @@ def _course(
         "distance_m": course.distance,
         "voltage_V": signals.voltage,
         "traction_N": float(robot.sides) * signals.traction,
-        "demanded_speed_mm_s": source.demanded(segment, elapsed, per_speed) / channels.MM,
+        "demanded_speed_mm_s": demanded / channels.MM,
+        **turning,
         "duty": signals.duty,
         "source_voltage_V": signals.voltage_source,
         "motor_current_A": float(robot.sides) * signals.current,
@@ -275,8 +313,8 @@ def _course(
     }
 
 
-def print_missions(found: Missions) -> None:
-    """What missions come to, one a column; statuses and flags in words."""
+def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
+    """What missions come to, one a column, without `idle` columns; statuses and flags in words."""
     about = {output.column: output for output in missions.OUTPUTS}
     table, source = found.table, found.source
     count = len(table["status"])
@@ -286,7 +324,7 @@ def print_missions(found: Missions) -> None:
     shown.add_row("configuration", *table["configuration"][:_SHOWN])
     for key in _PRINTED:
         heading, form = f"{about[key].label} [{about[key].unit}]", f".{about[key].resolution}f"
-        if np.isfinite(table[key]).any():
+        if np.isfinite(table[key]).any() and key not in idle:
             shown.add_row(heading, *("-" if v != v else format(v, form) for v in table[key][:_SHOWN]))
     shown.add_row("status", *table["status"][:_SHOWN])
     say(shown)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ import jinja2
 import numpy as np
 
 from mmrjax import __version__, channels, params
-from sweeps import words
+from sweeps import own, words
 from sweeps.figures_style import style, svg
 
 if TYPE_CHECKING:
@@ -45,6 +45,8 @@ class Album:
 def named(robot: Robot, robot_name: str) -> dict[str, Any]:
     """What a page says of the robot: the `robot`'s name, and the parameters `changed` from the nominal one's.
 
+    Of a rig that starts from nothing its `own`, with where each comes from.
+
     Args:
         robot: the one that was simulated.
         robot_name: its name or file; of a file only the last part is shown, and a changed packaged robot is said to
@@ -53,9 +55,11 @@ def named(robot: Robot, robot_name: str) -> dict[str, Any]:
     from mmrjax.robots import ROBOTS
 
     name = Path(robot_name).name
+    if robot.rig.blank:
+        return {"robot": name, "changed": [], "own": own.parameters(robot, robot_name)}
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
         name = f"{name}, changed"
-    return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]())}
+    return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]()), "own": []}
 
 
 def words_shown(name: str) -> str:
@@ -99,9 +103,33 @@ def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str,
     return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
 
 
+def label(table: dict[str, np.ndarray], row: int) -> str:
+    """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
+    parts = [str(table["configuration"][row])]
+    if "supply_voltage_V" in table:
+        parts.append(supply(table["supply_voltage_V"][row]))
+    elif "motor_speed_rpm" in table:
+        parts.append(f"{table['motor_speed_rpm'][row]:g} rpm")
+    if "payload_kg" in table:
+        parts += [f"{table['payload_kg'][row]:g} kg", f"{table['slope_deg'][row]:g}°"]
+    return ", ".join(parts)
+
+
 def columns() -> dict[str, str]:
     """Column of each channel, as in the tables of runs."""
     return {c.name: c.column for c in channels.CHANNELS}
+
+
+def rms(table: dict[str, np.ndarray], whens: Iterable[str]) -> dict[str, dict[str, float]]:
+    """rms of simulated less measured in each channel's unit, by when (of columns `WHEN_COLUMN`) and channel."""
+    found: dict[str, dict[str, float]] = {}
+    for when in whens:
+        for c in channels.CHANNELS:
+            if f"{when}_{c.column}" in table:
+                error = np.square(table[f"{when}_{c.column}"] - table[c.column])
+                there = error[np.isfinite(error)]
+                found.setdefault(when, {})[c.name] = float(np.sqrt(there.mean())) if there.size else math.nan
+    return found
 
 
 def first_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -143,6 +171,12 @@ def reading(value: Any, channel: str) -> str:
     return number(value, f"{{:.{digits}f}}")
 
 
+def error(value: Any, channel: str) -> str:
+    """A difference of readings, with its sign, with a digit more than they."""
+    digits = {c.name: c.resolution for c in channels.CHANNELS}[channel]
+    return number(value, f"{{:+.{digits}f}}")
+
+
 def _grade(value: Any) -> str:
     """Class of a cell by the size of its error [%]: the paper claims 7 %."""
     size = abs(float(value))
@@ -158,7 +192,7 @@ def render(folder: Path, template: str, album: Album, **known: Any) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "reading": reading, "grade": _grade, "winding": winding}
+    environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
     environment.globals |= {
         "channels": {c.name: (c.label, c.unit) for c in channels.CHANNELS},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},

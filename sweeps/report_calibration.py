@@ -7,8 +7,8 @@ from pathlib import Path
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels
-from sweeps import figures_calibration, figures_clusters, figures_comparison
-from sweeps.report import Album, columns, conditions, first_rows, render, words_shown
+from sweeps import figures_calibration, figures_clusters, figures_comparison, own
+from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
 
 def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
@@ -28,8 +28,10 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
     album.add("before_after", lambda: figures_calibration.before_after(found))
     if found.axis:
         album.add("histories", lambda: figures_calibration.histories(table))
-    album.add("parity", lambda: figures_comparison.parity(table))
-    album.add("residuals", lambda: figures_comparison.errors_over(table))
+    along = {found.axis: "time [s]"} if found.axis else {}
+    sized = own.is_rig(found.robot)
+    album.add("parity", lambda: figures_comparison.parity(table, band=not sized))
+    album.add("residuals", lambda: figures_comparison.errors_over(table, sized, along))
     if found.residual_clusters:
         album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
     if found.profiled:
@@ -44,6 +46,9 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         rows=first_rows(table),
         conditions=conditions(table),
         columns=columns(),
+        sized=sized,
+        on_shaft=found.robot.on_shaft,
+        rms=rms(table, ("before", "after", "held_out")),
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

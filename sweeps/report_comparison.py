@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calibration.data.columns import Layout
 from sweeps import figures_comparison
 from sweeps.report import Album, columns, conditions, first_rows, named, render, statuses
 
@@ -39,8 +40,9 @@ def write(
         The path of the page.
     """
     album = Album(folder)
-    album.add("parity", lambda: figures_comparison.parity(table))
-    album.add("errors", lambda: figures_comparison.errors_over(table))
+    sized = not Layout.of(robot).usual
+    album.add("parity", lambda: figures_comparison.parity(table, band=not sized))
+    album.add("errors", lambda: figures_comparison.errors_over(table, in_units=sized))
     known = named(robot, robot_name)
     return render(
         folder,
@@ -56,5 +58,6 @@ def write(
         summary=summary,
         notes=notes,
         columns=columns(),
+        sized=sized,
         **known,
     )

@@ -8,8 +8,8 @@ from pathlib import Path
 from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from sweeps import figures_clusters, figures_loop
-from sweeps.report import Album, columns, conditions, first_rows, render, words_shown
+from sweeps import figures_clusters, figures_loop, own
+from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
 Section = Callable[[Album, DiscoveryResult], None]
 
@@ -17,7 +17,7 @@ Section = Callable[[Album, DiscoveryResult], None]
 def _run_by_run(album: Album, found: DiscoveryResult) -> None:
     table = found.rows_table()
     album.add("before_after", lambda: figures_loop.before_after(table, found.verdict))
-    album.add("defects", lambda: figures_loop.defects(table, found.verdict))
+    album.add("defects", lambda: figures_loop.defects(table, found.verdict, own.is_rig(found.robot)))
 
 
 def _over_time(album: Album, found: DiscoveryResult) -> None:
@@ -49,13 +49,14 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         The path of the page.
     """
     album = Album(Path(folder))
+    table, sized = found.rows_table(), own.is_rig(found.robot)
     SECTIONS[type(found.detail)](album, found)
     if found.residual_clusters:
         album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
     album.add("errors", lambda: figures_loop.errors(found))
     if found.unnamed is not None:
         curve = found.unnamed
-        album.add("curve", lambda: figures_loop.curve(found.rows_table(), curve))
+        album.add("curve", lambda: figures_loop.curve(found.rows_table(), curve, float(found.robot.sides)))
     album.add("ladder", lambda: figures_loop.ladder(found))
     album.add("null", lambda: figures_loop.null(found.before))
     album.add("look_alikes", lambda: figures_loop.look_alikes(found))
@@ -75,5 +76,9 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         rows=first_rows(found.rows_table()),
         conditions=conditions(found.rows_table()),
         columns=columns(),
+        sized=sized,
+        on_shaft=found.robot.on_shaft,
+        closed=figures_loop.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
+        rms=rms(table, ("before", "after", "held_out_before", "held_out_after")),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

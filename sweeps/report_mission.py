@@ -9,7 +9,8 @@ import numpy as np
 
 from mmrjax import missions
 from mmrjax.signals import FLAGS
-from sweeps import figures_mission, words
+from sweeps import figures_mission, own, words
+from sweeps.imposed import UNLIMITED
 from sweeps.report import ROWS, Album, named, render, statuses
 from sweeps.report_runs import labels
 
@@ -34,7 +35,8 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
     runs, source = found.table, found.source
     first = {key: value[0] for key, value in runs.items()}
     name = found.segments["run_id"][0]
-    rows = {key: value[found.course["run_id"] == name] for key, value in found.course.items()}
+    rows = {key: value[found.course["run_id"] == name] for key, value in own.of(robot, found.course).items()}
+    idle = own.idle_columns(robot)
     limit = float(robot.motor.temperature_limit)
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
     on_battery = bool(np.isfinite(first["state_of_charge"]))
@@ -51,7 +53,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
         first=names[0],
         run=first,
         on_battery=on_battery,
-        cards=_cards(first),
+        cards=_cards({key: value for key, value in first.items() if key not in idle}),
         limits=_limits(robot, first),
         flagged=_flags(first, found, name),
         rows=[
@@ -62,6 +64,8 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
         returned=max(float(first["energy_returned_Wh"]), 0.0),
         kept=len(rows["time_s"]),
         whole=found.whole,
+        heat=own.thermal(robot),
+        travels="distance_m" not in idle,
         **named(robot, robot_name),
     )  # fmt: skip
 
@@ -81,13 +85,13 @@ def _cards(run: dict[str, Any]) -> list[dict[str, str]]:
     shown = ("energy_Wh", "energy_per_metre_Wh", "distance_m", "peak_current_A", "winding_peak_C", "state_of_charge")
     cards = []
     for column in shown:
-        output, value = about[column], float(run[column])
+        output, value = about[column], float(run.get(column, np.nan))
         if not np.isfinite(value):
             continue
         text = f"{100 * value:.1f} %" if output.unit == "-" else f"{value:.4g} {output.unit}"
         cards.append({"value": text, "label": output.label})
     if np.isfinite(run["endurance_s"]):
-        label = f"endurance at this duty, {run['range_m']:.0f} m"
+        label = "endurance at this duty" + (f", {run['range_m']:.0f} m" if "range_m" in run else "")
         cards.append({"value": f"{run['endurance_s'] / 60:.0f} min", "label": label})
     return cards
 
@@ -108,7 +112,7 @@ def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         {"words": words, "value": f"{value:.{digits}f} {unit}", "limit": f"{limit:.{digits}f} {unit}",
          "percent": 100 * value / limit}
         for words, value, limit, unit, digits in asked
-        if np.isfinite(value)
+        if np.isfinite(value) and limit < UNLIMITED and not (words == "hottest winding" and not own.thermal(robot))
     ]  # fmt: skip
     low, cutoff = float(run["cell_low_V"]), float(battery.voltage_cutoff)
     if np.isfinite(low):
@@ -121,10 +125,10 @@ def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _flags(run: dict[str, Any], found: Missions, name: str) -> list[dict[str, Any]]:
     """Limits that were exceeded, in words, and in how many segments."""
-    own = [str(f).split(";") for f in found.segments["flags"][found.segments["run_id"] == name]]
+    raising = [str(f).split(";") for f in found.segments["flags"][found.segments["run_id"] == name]]
     raised = str(run["flags"]).split(";")
     return [
-        {"name": flag, "words": words.FLAGS[flag], "segments": sum(flag in f for f in own), "of": len(own)}
+        {"name": flag, "words": words.FLAGS[flag], "segments": sum(flag in f for f in raising), "of": len(raising)}
         for flag in FLAGS
         if flag in raised
     ]
@@ -137,12 +141,12 @@ def _segments(found: Missions, name: str) -> list[dict[str, Any]]:
     whole = float(np.sum(rows["energy_Wh"]))
     answer = []
     for k in range(min(source.segments, SEGMENTS)):
-        own = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
-        if not len(own["status"]):
+        mine = {key: value[rows["segment"] == k + 1] for key, value in rows.items()}
+        if not len(mine["status"]):
             continue
-        energy = float(np.sum(own["energy_Wh"]))
-        ends = {s: int((own["status"] == s).sum()) for s in dict.fromkeys(map(str, own["status"]))}
-        flags = dict.fromkeys(flag for f in own["flags"] for flag in str(f).split(";") if flag)
+        energy = float(np.sum(mine["energy_Wh"]))
+        ends = {s: int((mine["status"] == s).sum()) for s in dict.fromkeys(map(str, mine["status"]))}
+        flags = dict.fromkeys(flag for f in mine["flags"] for flag in str(f).split(";") if flag)
         answer.append(
             {
                 "number": k + 1,
@@ -150,13 +154,13 @@ def _segments(found: Missions, name: str) -> list[dict[str, Any]]:
                 "end": float(source.time[k + 1] - source.time[0]),
                 "mode": source.modes[k],
                 "demand": _demand(found, k),
-                "first": {key: value[0] for key, value in own.items()},
-                "count": len(own["status"]),
+                "first": {key: value[0] for key, value in mine.items()},
+                "count": len(mine["status"]),
                 "energy": energy,
                 "percent": 100 * energy / whole if whole > 0 else float("nan"),
-                "distance": float(np.sum(own["distance_m"])),
-                "peak": float(np.max(own["peak_current_A"])),
-                "hottest": float(np.max(own["winding_peak_C"])),
+                "distance": float(np.sum(mine["distance_m"])),
+                "peak": float(np.max(mine["peak_current_A"])),
+                "hottest": float(np.max(mine["winding_peak_C"])),
                 "ends": ", ".join(words.short(s) + (f" ({n})" if source.cycles > 1 else "") for s, n in ends.items()),
                 "flags": ", ".join(words.FLAGS[f] for f in flags),
             }
@@ -180,7 +184,7 @@ def _demand(found: Missions, k: int) -> str:
     mode = source.modes[k]
     said = []
     if mode in CONTROLLED:
-        channel = channels.CHANNELS[channels.index(mode)]
+        channel = next(c for c in channels.known() if c.name == mode)
         said.append(span(source.demand, channel.factor, channel.unit))
     elif mode == "voltage":
         said.append(span(source.values["duty"], 0.01, "% duty") if "duty" in source.values else "100 % duty")

@@ -9,13 +9,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax import channels
-from sweeps import figures_power, words
-from sweeps.report import Album, columns, first_rows, named, render, statuses, supply
+from sweeps import figures_power, own, words
+from sweeps.imposed import UNLIMITED
+from sweeps.report import Album, columns, conditions, first_rows, label, named, render, statuses
 
 if TYPE_CHECKING:
     from mmrjax.fidelities.base import Run
     from mmrjax.robot import Robot
 
+#: What the table of runs shows beside conditions and channels: heading, factor, format.
+FURTHER = {
+    "slip": ("slip [%]", 100.0, "{:.1f}"), "adhesion_used": ("adhesion used", 1.0, "{:.2f}"),
+    "power_supply_W": ("supply P_e [W]", 1.0, "{:.1f}"), "power_motor_W": ("motors N_d [W]", 1.0, "{:.1f}"),
+    "power_gear_W": ("gearboxes N_r [W]", 1.0, "{:.1f}"), "power_ground_W": ("ground N_t [W]", 1.0, "{:.1f}"),
+    "power_lift_W": ("lift [W]", 1.0, "{:.1f}"),
+}  # fmt: skip
 HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
 
 
@@ -42,14 +50,15 @@ def write(
     """
     album = Album(folder)
     names = labels(runs)
-    known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0}
+    known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": []}
     if histories is not None:
         known |= _histories(album, robot, runs, names, histories)
     chain = np.flatnonzero(figures_power.drawable(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
     if chain.size:
         picked = {key: value[chain] for key, value in runs.items()}
-        album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain]))
+        album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain], robot.on_shaft))
     single = len(names) == 1
+    shown = own.of(robot, runs)
     return render(
         folder,
         "runs.html.j2",
@@ -63,6 +72,10 @@ def write(
         chained=len(chain),
         most=CHAINS,
         columns=columns(),
+        about=conditions(runs, mass=True),
+        further={c: about for c, about in FURTHER.items() if c in shown},
+        heat=own.thermal(robot),
+        on_shaft=robot.on_shaft,
         **known,
         **named(robot, robot_name),
     )
@@ -70,14 +83,8 @@ def write(
 
 def labels(runs: dict[str, np.ndarray]) -> list[str]:
     """A heading for each run: its name where it has one, and its conditions."""
-    answer = []
-    for k in range(len(runs["status"])):
-        at = (
-            f"{runs['configuration'][k]}, {supply(runs['supply_voltage_V'][k])}, {runs['payload_kg'][k]:g} kg, "
-            f"{runs['slope_deg'][k]:g}°"
-        )
-        answer.append(f"{runs['run_id'][k]}: {at}" if "run_id" in runs else at)
-    return answer
+    found = [label(runs, k) for k in range(len(runs["status"]))]
+    return [f"{runs['run_id'][k]}: {at}" for k, at in enumerate(found)] if "run_id" in runs else found
 
 
 def _histories(
@@ -88,6 +95,10 @@ def _histories(
     which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
     history, status = histories.history, np.asarray(histories.result.status)
     assert history is not None  # the fidelity was asked for it
+    if robot.on_shaft:
+        shown = figures_history.courses(history, status, names[:HISTORIES])
+        album.add("courses", lambda: figures_history.over_time(shown))
+        return {"shown": len(shown), "courses": shown, "starts": []}
     starts = figures_history.starts(robot, history, status, which, names[:HISTORIES])
     album.add("history", lambda: figures_history.from_standstill(starts))
     known: dict[str, Any] = {"shown": len(starts), "starts": starts}
@@ -112,6 +123,7 @@ def _histories(
 
 def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
     """How much of each limit a run uses: words, its value, the limit, and the share of it [%]."""
+    idle = own.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
     rpm = channels.RPM
     shaft = float(run["theoretical_speed_mm_s"]) * channels.MM / radius * float(robot.gearbox.ratio) / rpm
@@ -121,19 +133,20 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         if turning
         else math.nan
     )
-    cell = float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
+    cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
+    gear = "gearbox torque at its output" if robot.on_shaft else "gearbox torque at the driving wheel"
     asked = [
-        ("adhesion", float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
+        ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
         ("motor speed", shaft, float(robot.motor.speed_limit) / rpm, "{:.0f}", " rpm"),
         ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / rpm, "{:.0f}", " rpm"),
         ("winding, long running", float(run["temperature_winding_C"]), float(robot.motor.temperature_limit), "{:.0f}",
          " °C"),
-        ("gearbox torque at the driving wheel", torque, robot.gearbox.torque_limit or math.nan, "{:.2f}", " N·m"),
+        (gear, torque, robot.gearbox.torque_limit or math.nan, "{:.2f}", " N·m"),
         ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f}", " V"),
     ]  # fmt: skip
     return [
         {"words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(value) + unit,
          "limit": form.format(limit) + unit, "percent": 100 * abs(value) / limit}
         for name, value, limit, form, unit in asked
-        if not (math.isnan(value) or math.isnan(limit))
+        if not (math.isnan(value) or math.isnan(limit) or limit >= UNLIMITED)
     ]  # fmt: skip

@@ -138,11 +138,12 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
     return {
         "rows": [
             {
-                "configuration": str(points.configuration[k]), "voltage": number(points.voltage[k], "{:g}"),
+                "configuration": str(points.configuration[k]), "imposed": number(points.imposed[1][k], "{:g}"),
                 "payload": f"{points.payload[k]:g}", "slope": f"{points.slope_deg[k]:g}", "gain": f"{n.gain[k]:.1f}",
             }
             for k in range(len(points))
         ],
+        "heading": "supply [V]" if points.motor_speed is None else "motor speed [rpm]", "on_shaft": points.on_shaft,
         "candidates": n.candidates, "source": n.source, "noise": n.noise, "outputs": outputs,
     }  # fmt: skip
 
@@ -155,7 +156,9 @@ def _two(sd: float) -> str:
 def _ranges(found: SensitivityResult) -> str:
     p = found.points
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
-    for x, unit in ((p.voltage, " V"), (p.payload, " kg"), (p.slope_deg, "°")):
+    _, own, symbol = p.imposed
+    ground = () if p.on_shaft else ((p.payload, " kg"), (p.slope_deg, "°"))
+    for x, unit in ((own, f" {symbol}"), *ground):
         on_battery = unit == " V" and np.isnan(x).all()
         parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
     return "; ".join(parts)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax import channels
-from sweeps import figures_sweep, words
+from sweeps import figures_sweep, own, words
 from sweeps.report import Album, named, render, statuses
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ Table = dict[str, np.ndarray]
 _AXES = {
     "configuration": ("configuration", ""),
     "supply_voltage_V": ("supply voltage", " V"),
+    "motor_speed_rpm": ("motor speed", " rpm"),
     "payload_kg": ("payload", " kg"),
     "slope_deg": ("slope", "°"),
 }
@@ -45,7 +46,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Tabl
         album,
         title=f"Sweep of {len(runs['status'])} runs",
         model=model,
-        counts=counts(runs),
+        counts=counts(own.of(robot, runs)),
         volts_drawn=_drawn(runs),
         **named(robot, robot_name),
     )
@@ -72,7 +73,13 @@ def counts(runs: Table) -> dict[str, Any]:
 
 def _axes(runs: Table) -> dict[str, tuple[str, str]]:
     """The axes that runs have: on the battery no voltage."""
-    return {c: known for c, known in _AXES.items() if runs[c].dtype.kind not in "fiu" or not np.isnan(runs[c]).all()}
+    return {
+        c: known
+        for c, known in _AXES.items()
+        if c in runs
+        and not (c == "motor_speed_rpm" and "supply_voltage_V" in runs)  # a reading then
+        and (runs[c].dtype.kind not in "fiu" or not np.isnan(runs[c]).all())
+    }
 
 
 def _levels(values: np.ndarray, unit: str) -> str:
@@ -91,7 +98,8 @@ def _where(runs: Table, pick: np.ndarray) -> str:
         mine = pick & (runs["configuration"] == kind)
         if mine.any():
             ranges = []
-            for column, unit in (("slope_deg", "°"), ("supply_voltage_V", " V")):
+            axes = [c for c in ("slope_deg", figures_sweep.imposed(runs)) if c in runs]
+            for column, unit in ((c, _AXES[c][1]) for c in axes):
                 levels = np.unique(runs[column][mine])
                 if np.isnan(levels).all():
                     continue
@@ -126,7 +134,10 @@ def _extremes(runs: Table) -> list[dict[str, str]]:
 
 
 def _drawn(runs: Table) -> str:
-    shown = figures_sweep.panels(runs["supply_voltage_V"])
+    if not figures_sweep.on_ground(runs):
+        return ""
+    of = figures_sweep.imposed(runs)
+    shown = figures_sweep.panels(runs[of], of)
     if sum(int(mask.sum()) for _, mask in shown) == len(runs["status"]):
         return ""
-    return f"{', '.join(name for name, _ in shown)} of {np.unique(runs['supply_voltage_V']).size} voltages"
+    return f"{', '.join(name for name, _ in shown)} of {np.unique(runs[of]).size} {figures_sweep.PLURAL[of]}"

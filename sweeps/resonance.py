@@ -37,7 +37,7 @@ from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 from mmrjax.tables import PAYLOADS_KG, VOLTAGES_V
 from sweeps import config as configuration
-from sweeps import run
+from sweeps import imposed, run
 from sweeps.config import GridPart
 from sweeps.console import progress, say
 from sweeps.grid import grid
@@ -292,6 +292,7 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
     0 done; 3 done, but some runs did not settle, or slid, tipped or failed.
     """
     robot = load_robot(config)
+    imposed.check_on_ground(robot, "resonance")
     name = config.configuration or robot.configurations.names[0]
     check_configurations(robot, (name,), "--configuration")
     config = config.model_copy(

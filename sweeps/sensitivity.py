@@ -8,6 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data import robot_file
+from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import noise
@@ -18,10 +19,14 @@ from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
 from calibration.sensitivity.study import Study, Supply
+from mmrjax.channels import RPM
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
+from sweeps import axes as axes_room
 from sweeps import config as configuration
+from sweeps import grid as grid_room
+from sweeps import imposed
 from sweeps.config import GridPart
 from sweeps.console import say, tell
 from sweeps.figures_style import short
@@ -37,7 +42,12 @@ CORNERS = {
 }
 WHOLE = {"voltages_V": VOLTAGES_V, "payloads_kg": PAYLOADS_KG, "slopes_deg": SLOPES_DEG}
 #: Condition that may vary → the axis of operating points that it takes the place of.
-AXES = {"voltage": "voltages_V", "payload": "payloads_kg", "slope_deg": "slopes_deg"}
+AXES = {
+    "voltage": "voltages_V",
+    "motor_speed": "motor_speeds_rpm",
+    "payload": "payloads_kg",
+    "slope_deg": "slopes_deg",
+}
 
 
 def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
@@ -48,14 +58,14 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
     robot = load_robot(config)
     if config.method not in METHODS:
         raise BadConfiguration(f"option method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
-    outputs = chosen_outputs(config.outputs)
+    outputs = chosen_outputs(config.outputs, robot)
     ranges = _ranges(config.vary)
     runs = _operating_points(config, robot, ranges)
     inputs = _inputs(config, robot, runs, ranges)
-    candidates = _candidates(config, robot)
+    candidates = _candidates(config, robot, runs)
     conditions = runs.conditions(robot)
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
-    study = Study(robot, inputs, _points(runs), outputs, config.model, config.options, supply, tell)
+    study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, tell)
     with open_folder("sensitivity", config, robot, out, force, runs) as folder:
         found = analyse(study, config.method, config.evaluations, config.seed, candidates)
         folder.write_json("result.json", found.to_json())
@@ -94,8 +104,18 @@ def _operating_points(
     config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
 ) -> Runs:
     """The grid of operating points; an axis that varies has one value, the middle of its range."""
-    usual = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
-    axes = {key: getattr(config, key) or values for key, values in usual.items()}
+    layout = Layout.of(robot)
+    usual: dict[str, tuple[float, ...]] = {}
+    if layout.usual:
+        usual = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+    axes = {key: getattr(config, key) or usual.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
+    for name in ranges:
+        if layout.on_shaft and name in axes_room.ON_GROUND:
+            raise BadConfiguration(imposed.on_shaft(f"--vary {name}"))
+        if name in grid_room.AXIS and name != layout.imposed:
+            raise BadConfiguration(
+                f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
+            )
     if config.battery and "voltage" in ranges:
         raise BadConfiguration("--vary voltage: acts without --battery only, whose voltage is that of its charge")
     for name, (low, high) in ranges.items():
@@ -103,17 +123,22 @@ def _operating_points(
             if getattr(config, AXES[name]) is not None:
                 option = AXES[name].partition("_")[0]
                 raise BadConfiguration(f"--vary {name}: --{option} states it too; give one of them")
-            axes[AXES[name]] = ((low + high) / 2,)
+            axes[AXES[name]] = ((low + high) / 2 / (RPM if name == "motor_speed" else 1.0),)
     try:
         stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
     except ValueError:
         raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range leaves what a run may have") from None
+    notes: list[str] = []
+    stated = grid_room.resolved(stated, robot, config.battery, notes)
+    for note in notes:
+        tell(note)
     names = configurations(stated, robot)
     return grid(stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery)
 
 
-def _points(runs: Runs) -> Points:
-    return Points(*(runs[c] for c in ("configuration", "supply_voltage_V", "payload_kg", "slope_deg")))
+def words_of(name: str) -> str:
+    """What is imposed, in words."""
+    return name.replace("_", " ")
 
 
 def _inputs(
@@ -128,17 +153,19 @@ def _inputs(
     return room.of_priors(robot, names, ranges)
 
 
-def _candidates(config: configuration.Sensitivity, robot: Robot) -> Candidates:
-    """Runs of a table, or of Table 8 in every configuration."""
+def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs) -> Candidates:
+    """Runs of a table, or of Table 8 in every configuration; of a rig its operating points."""
     if config.candidates:
         runs = read_runs(config.candidates, robot, measured=False)
         source = runs.source
+    elif not Layout.of(robot).usual:
+        runs, source = points, "the operating points"
     else:
         runs = grid(GridPart(surface=config.surface), robot)
         source = "Table 8"
     words = config.noise or noise.default()
     stated = {**noise.parse(noise.default()), **(noise.parse(config.noise) if config.noise else {})}
-    return Candidates(_points(runs), runs.conditions(robot), source, stated, words, runs.deviations(), config.runs)
+    return Candidates(Points.of(runs), runs.conditions(robot), source, stated, words, runs.deviations(), config.runs)
 
 
 def print_sensitivity(found: SensitivityResult) -> None:

@@ -18,13 +18,15 @@ from mmrjax.fidelities.result import result
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, STATUSES
 from sweeps import config as configuration
-from sweeps import run, uncertainty, words
+from sweeps import own, run, uncertainty, words
 from sweeps.console import progress, say
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
+#: Channels that histories of a shaft have in any case.
+OF_SHAFT = ("motor_speed", "output_angle")
 #: Column of the largest current of all motors in a run over time.
 PEAK = "peak_current_A"
 #: Column of the time that a run's current may flow before its windings are at their limit.
@@ -55,7 +57,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             table |= found.columns
-        print_runs({key: value[:_SHOWN] for key, value in table.items()})
+        print_runs({key: value[:_SHOWN] for key, value in own.of(robot, table).items()})
         for note in notes:
             say(note)
         if found is not None:
@@ -90,7 +92,7 @@ def _simulated(
         batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
         told(1.0)
     assert batch.history is not None  # the fidelity was asked for it
-    folder.write_table("history.csv", history_table(robot, batch.history, runs))
+    folder.write_table("history.csv", own.of(robot, history_table(robot, batch.history, runs)))
     if batch.history.reactions is not None:
         folder.write_table("reactions.csv", reactions_table(batch.history, runs))
     return {**run.conditions(robot, runs), **over_time(robot, batch)}, batch
@@ -128,10 +130,18 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
 
 def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
     """How long the current of each run may flow from ambient temperature [s]; inf for ever, NaN without a current."""
-    current = np.abs(np.asarray(table["total_current_A"])) / float(robot.sides)
+    current = amperes(robot, table)
     known = np.isfinite(current)
     time = jax.vmap(robot.motor.time_permissible)(jnp.asarray(np.where(known, current, 0.0)))
     return np.where(known, np.asarray(time), np.nan)
+
+
+def amperes(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+    """Size of the current of one motor [A], NaN where no column tells it."""
+    for column, motors in (("total_current_A", float(robot.sides)), ("motor_current_A", 1.0)):
+        if column in table:
+            return np.asarray(np.abs(np.asarray(table[column])) / motors)
+    return np.full(len(table["status"]), np.nan)
 
 
 def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
@@ -159,10 +169,10 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
                 f"{name}winding_hot: {limit:g} °C are reached after {float(times[k]):.3g} s at this "
                 f"current, from {ambient:g} °C"
             )
-        if np.isinf(table["temperature_winding_C"][k]):
-            amperes = abs(float(table["total_current_A"][k])) / float(robot.sides)
+        if np.isinf(table["temperature_winding_C"][k]) and own.thermal(robot):
+            current = float(amperes(robot, table)[k])
             said.append(
-                f"{name}winding, long running: {words.NONE_SETTLES} at {amperes:.2f} A a motor, as resistance "
+                f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "
                 "rises faster than its heat leaves; it stays permissible up to "
                 f"{float(robot.motor.current_continuous):.2f} A"
             )
@@ -183,10 +193,11 @@ def _names(runs: records.Runs) -> np.ndarray:
 def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
+    shown = [c for c in channels.known() if c in channels.CHANNELS or (robot.on_shaft and c.name in OF_SHAFT)]
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),
-        **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in channels.CHANNELS},
+        **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
         "distance_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
@@ -216,6 +227,7 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
     """Operating points, one a column."""
     rows = {
         "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
+        **({} if "supply_voltage_V" in table else {"motor_speed_rpm": ("motor speed [rpm]", ".1f")}),
         "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
         **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in channels.CHANNELS},
         PEAK: ("peak of the total current [A]", ".1f"), "distance_m": ("distance [m]", ".2f"),

@@ -9,8 +9,8 @@ from rich.table import Table
 
 from sweeps import config as configuration
 from sweeps import run, uncertainty, words
-from sweeps.console import say
-from sweeps.grid import configurations, grid
+from sweeps.console import say, tell
+from sweeps.grid import grid, resolved
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.store import open_folder
 
@@ -18,8 +18,10 @@ from sweeps.store import open_folder
 def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
     """Simulate a grid and leave a run folder; returns the exit code."""
     robot = load_robot(config)
-    stated = {"voltages_V": None if config.battery else config.volts()}
-    config = config.model_copy(update={"configurations": configurations(config, robot), **stated})
+    notes: list[str] = []
+    config = resolved(config, robot, config.battery, notes)
+    for note in notes:
+        tell(note)
     runs = grid(config, robot, config.battery)
     drawn = None if config.posterior is None else beside_robot(config, robot)
     with open_folder("sweep", config, robot, out, force) as folder:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from mmrjax import channels
+
 
 class Status(NamedTuple):
     """How a run ended: `short` in figures, `why` in one line, `meaning` for the reader of a report."""
@@ -98,3 +100,20 @@ def short(status: str) -> str:
 def meaning(status: str) -> str:
     """A status for the reader of a report."""
     return STATUSES[status].meaning if status in STATUSES else ""
+
+
+#: Names of fits that rms errors are of.
+_FITS = {
+    "before": "before", "after": "after", "held_out": "held out", "held_out_before": "before, held out",
+    "held_out_after": "after, held out",
+}  # fmt: skip
+
+
+def said_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
+    """rms errors in the units of their channels, in a line; by fit and channel."""
+    units = {c.name: (c.label, c.unit) for c in channels.CHANNELS}
+    parts = [
+        f"{_FITS[when]} " + ", ".join(f"{units[name][0]} {value:.3g} {units[name][1]}" for name, value in by.items())
+        for when, by in rms.items()
+    ]
+    return "rms error: " + "; ".join(parts)

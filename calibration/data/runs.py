@@ -456,19 +456,24 @@ def _too_light(where: str, total: float, payload: float) -> str:
     return f"{where}, total_mass_kg: got {number(total)}; expected {included}"
 
 
-def single(cells: dict[str, Any]) -> Runs:
+def single(cells: dict[str, Any], layout: Layout | None = None) -> Runs:
     """One run from options by column name, each checked as a cell of a file would be; without a voltage on a battery.
+
+    Args:
+        layout: of the robot's tables; None: of the packaged one's.
 
     Raises:
         BadConfiguration: an option that is out of range, not finite or an unknown word.
     """
+    layout = Layout() if layout is None else layout
     texts = {column: number(value) if isinstance(value, float) else str(value) for column, value in cells.items()}
     columns = {
-        column: np.array([_cell("option", Meaning(column, column), t, Layout(), BadConfiguration)])
+        column: np.array([_cell("option", Meaning(column, column), t, layout, BadConfiguration)])
         for column, t in texts.items()
     }
-    columns.setdefault("supply_voltage_V", np.array([math.nan]))
+    if layout.imposed == "voltage":
+        columns.setdefault(SUPPLY, np.array([math.nan]))
     if "total_mass_kg" in cells and cells["total_mass_kg"] <= cells["payload_kg"]:
         raise BadConfiguration(_too_light("option", cells["total_mass_kg"], cells["payload_kg"]))
     columns = {c: np.array([cells[c]]) if isinstance(cells.get(c), float) else v for c, v in columns.items()}
-    return Runs("the options", columns)
+    return Runs("the options", columns, layout=layout)

@@ -65,7 +65,7 @@ def said_worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Erro
         if lost > 0:
             changes.append(f"{lost} row{'s' * (lost > 1)} fewer predicted")
         if changes:
-            parts.append(f"by {kind.replace('_', ' and ')} {', '.join(changes)}")
+            parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
     return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
 
 

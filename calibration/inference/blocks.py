@@ -26,6 +26,11 @@ BLOCKS: dict[str, tuple[str, ...]] = {
 }
 
 
+def in_words(by: str, joint: str = " and ") -> str:
+    """What a block is named after, in words; `joint` joins two conditions."""
+    return by.replace("motor_speed", "motor speed").replace("_", joint)
+
+
 #: Columns of blocks that are labels.
 NO_CONDITIONS = ("configuration", "run_id")
 #: Share of a value by which the next has to be larger to be of another level [-]: a speed that a controller holds is

@@ -12,6 +12,21 @@ def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     return 100.0 * (simulated - measured) / simulated
 
 
+#: What `sized_error` is of.
+OF_SIZE = "channel's root mean square"
+
+
+def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """(CV - EV) / rms(CV) · 100 [%], of the channel's size, which readings that cross zero have too.
+
+    Args:
+        simulated, measured: shape (rows, ...).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = np.sqrt(np.nanmean(np.square(simulated), 0))
+        return np.asarray(100.0 * (simulated - measured) / size)
+
+
 def summary(errors: np.ndarray) -> dict[str, float | int]:
     """Root mean square and worst of the errors (35) [%] over the rows that have one, and their count."""
     there = errors[np.isfinite(errors)]

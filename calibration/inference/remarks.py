@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibration.inference import priors
+from calibration.inference import blocks, priors
 from calibration.inference.identifiability import Z95, said_held
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
@@ -108,7 +108,7 @@ def _limits(found: CalibrationResult) -> list[str]:
 
 def _blocks(found: CalibrationResult) -> list[str]:
     said = [
-        f"held out by {kind.replace('_', ' and ')}: {len(held.unreachable_rows)} of {len(found)} rows have no "
+        f"held out by {blocks.in_words(kind)}: {len(held.unreachable_rows)} of {len(found)} rows have no "
         "prediction, because the robot fitted without them slides there; the errors leave them out"
         for kind, held in found.held_out.items()
         if held.unreachable_rows

@@ -96,6 +96,10 @@ class Inputs:
         return np.array([k for k, name in enumerate(self.names) if not name.startswith(foreign)], int)
 
 
+#: Parameters that a rig has where its file states a prior of them, else they are another robot's.
+_OTHERS = ("driver.", "rig.", "motor.resistance_thermal_", "motor.time_constant_", "motor.temperature_ambient")
+
+
 def default_names(
     robot: Robot, configurations: Sequence[str], battery: bool, model: str = "steady"
 ) -> tuple[str, ...]:
@@ -110,6 +114,9 @@ def default_names(
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
     known = priors.known(robot)
     left_out = {*guides, *fidelities.unread(model, known)}
+    if robot.rig.blank:  # what another robot has is none of its own
+        stated = {name for name, _, _ in robot.rig.priors}
+        left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated}
     return tuple(
         name
         for name, p in known.items()

@@ -60,7 +60,17 @@ def known_outputs() -> dict[str, OutputRow]:
     return {o.name: o for o in rows}
 
 
-def chosen_outputs(words: tuple[str, ...]) -> tuple[OutputRow, ...]:
+def default_outputs(robot: Robot | None = None) -> tuple[str, ...]:
+    """Names of the outputs that are studied where none are named: every channel, and what the robot's load has."""
+    beside: tuple[str, ...] = DEFAULT
+    if robot is not None and robot.on_shaft:
+        beside = ("power_supply",)
+    elif robot is not None and robot.rig.imposed == "motor_speed":  # that stalls on no slope
+        beside = tuple(name for name in DEFAULT if name != "steepest_slope")
+    return (*channels.names(), *beside)
+
+
+def chosen_outputs(words: tuple[str, ...], robot: Robot | None = None) -> tuple[OutputRow, ...]:
     """The outputs of these names, the usual ones for none; `start` stands for all of the start.
 
     Raises:
@@ -68,7 +78,7 @@ def chosen_outputs(words: tuple[str, ...]) -> tuple[OutputRow, ...]:
     """
     known, found = known_outputs(), []
     start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
-    for word in words or (*channels.names(), *DEFAULT):
+    for word in words or default_outputs(robot):
         for name in start if word == "start" else (word,):
             if name not in known:
                 raise BadConfiguration(f"--outputs {name}: no such output; {choices(name, [*known, 'start'])}")

@@ -91,7 +91,7 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
         variance = np.einsum("pi,kij,pj->kp", g, choice.covariance, g)
         outputs[name] = np.sqrt(variance.mean(1)) if len(g) else np.full(len(choice.covariance), np.nan)
     whole = np.where(after[0] > 0, after[0], 1.0)
-    chosen = Points(*(column[picked] for column in points.columns().values()))
+    chosen = points.at(picked)
     return NextRuns(
         int(there.sum()), candidates.source, chosen, choice.gain, candidates.words, after / whole, outputs
     )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from calibration.data.runs import Runs
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
 
@@ -26,29 +27,65 @@ NEGLIGIBLE = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Operating points; arrays of shape (points,). Their voltage is NaN on the battery."""
+    """Operating points; arrays of shape (points,). Their voltage is NaN on the battery.
+
+    Attributes:
+        motor_speed: imposed [rpm], in the place of the voltage, which is 0 then; None where the voltage is imposed.
+        on_shaft: whether their load is a shaft, which has neither payload nor slope (0).
+    """
 
     configuration: np.ndarray
     voltage: np.ndarray
     payload: np.ndarray
     slope_deg: np.ndarray
+    motor_speed: np.ndarray | None = None
+    on_shaft: bool = False
 
     def __len__(self) -> int:
         return len(self.voltage)
 
+    @classmethod
+    def of(cls, runs: Runs) -> Points:
+        """Those of a table of runs."""
+        layout, nothing = runs.layout, np.zeros(len(runs))
+        imposed = runs[layout.imposed_column]
+        turned = layout.imposed == "motor_speed"
+        return cls(
+            runs["configuration"],
+            nothing if turned else imposed,
+            nothing if layout.on_shaft else runs["payload_kg"],
+            nothing if layout.on_shaft else runs["slope_deg"],
+            imposed if turned else None,
+            layout.on_shaft,
+        )
+
+    def at(self, rows: np.ndarray) -> Points:
+        """Some of them, by a mask or an index."""
+        speed = None if self.motor_speed is None else self.motor_speed[rows]
+        voltage, payload, slope = (x[rows] for x in (self.voltage, self.payload, self.slope_deg))
+        return Points(self.configuration[rows], voltage, payload, slope, speed, self.on_shaft)
+
+    @property
+    def imposed(self) -> tuple[str, np.ndarray, str]:
+        """What is imposed on the motors: words, values, unit."""
+        if self.motor_speed is None:
+            return "voltage", self.voltage, "V"
+        return "motor speed", self.motor_speed, "rpm"
+
     def label(self, k: int) -> str:
         """A point in words."""
-        supply = "battery" if np.isnan(self.voltage[k]) else f"{self.voltage[k]:g} V"
-        return f"{self.configuration[k]}, {supply}, {self.payload[k]:g} kg, {self.slope_deg[k]:g}°"
+        _, imposed, unit = self.imposed
+        supply = "battery" if np.isnan(imposed[k]) else f"{imposed[k]:g} {unit}"
+        ground = "" if self.on_shaft else f", {self.payload[k]:g} kg, {self.slope_deg[k]:g}°"
+        return f"{self.configuration[k]}, {supply}{ground}"
 
     def columns(self) -> dict[str, np.ndarray]:
         """As in tables of runs."""
-        return {
-            "configuration": self.configuration,
-            "supply_voltage_V": self.voltage,
-            "payload_kg": self.payload,
-            "slope_deg": self.slope_deg,
-        }
+        own = (
+            {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
+        )
+        ground = {} if self.on_shaft else {"payload_kg": self.payload, "slope_deg": self.slope_deg}
+        return {"configuration": self.configuration, **own, **ground}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.model import Answer, Model, OutputRow, counted
 from calibration.sensitivity.result import Points
 from mmrjax import fidelities
+from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
@@ -59,6 +60,7 @@ class Study:
             battery=supply.battery,
             discharge=supply.discharge,
             adhesion=supply.adhesion,
+            motor_speed=None if points.motor_speed is None else points.motor_speed * RPM,
         )
         self.evaluations, self.seconds = 0, 0.0
         self.told = time.perf_counter()

@@ -213,14 +213,27 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
 
     Raises:
         ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
-            ground; the step is above the largest stable one, which the message states.
+            ground; the step is above the largest stable one, which the message states; a load without ground, an
+            imposed motor speed, movers without inertia.
     """
+    if robot.on_shaft:
+        raise ValueError("the robot's load is a shaft, which has no running gear; steady and drive take it")
+    if robot.rig.imposed == "motor_speed":
+        raise ValueError(
+            "the motors' speed is imposed, and this model drives them by their voltage; use steady or drive"
+        )
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
         raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, conditions))):
         return  # inside a transformation no number is known
+    for name, chassis in robot.configurations.items():
+        if not np.all(np.asarray(chassis.inertia) > 0):
+            raise ValueError(
+                f"{name}.inertia: got 0; expected the inertia of what turns with the movers of one side, which this "
+                "model needs [kg·m^2]"
+            )
     refuse(robot, conditions, step, sample)
 
 

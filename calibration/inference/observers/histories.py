@@ -25,6 +25,7 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
+from calibration.inference.errors import OF_SIZE, sized_error
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import backward, cholesky, forward
@@ -136,7 +137,7 @@ class Histories(Observer):
     fewest: ClassVar[int] = 24
     axis: ClassVar[str] = "time_s"
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
-    percent_of: ClassVar[str] = "channel's root mean square"
+    percent_of: ClassVar[str] = OF_SIZE
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
     rows_tell: ClassVar[bool] = False
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
@@ -294,8 +295,7 @@ class Histories(Observer):
     @classmethod
     def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """Of the channel's size: eq. (35) divides by readings, which begin at rest."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return 100.0 * (simulated - measured) / np.sqrt(np.nanmean(simulated**2, 0))
+        return sized_error(simulated, measured)
 
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]

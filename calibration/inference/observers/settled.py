@@ -17,6 +17,7 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
+from calibration.inference.errors import OF_SIZE, relative_error, sized_error
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -145,7 +146,7 @@ class SettledRuns(Observer):
     @classmethod
     def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return 100.0 * (simulated - measured) / simulated
+            return relative_error(simulated, measured)
 
     def __call__(self, robot: Robot) -> Observation:
         result = fidelities.get(self.fidelity).settled(robot, self.conditions)
@@ -267,3 +268,17 @@ def _fits(
         return levenberg_marquardt(here, z, data, max_steps=steps)
 
     return jax.vmap(one)(starts, weights, active)
+
+
+class SettledRigRuns(SettledRuns):
+    """Of a rig, whose readings may cross zero: percent are of a channel's size."""
+
+    percent_of: ClassVar[str] = OF_SIZE
+
+    @classmethod
+    def observes(cls, runs: Runs) -> bool:
+        return super().observes(runs) and not runs.layout.usual
+
+    @classmethod
+    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        return sized_error(simulated, measured)

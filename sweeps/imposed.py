@@ -1,0 +1,113 @@
+"""What is imposed on a rig's motors where no option states it: shares of what its file says they may take."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calibration.data.errors import BadConfiguration
+from mmrjax.channels import RPM
+from mmrjax.robot import Robot
+from sweeps import own
+
+#: A limit from which on there is none (`robots.blank`).
+UNLIMITED = 1e8
+#: Levels of a grid, as shares of the limit.
+SHARES = (1 / 3, 2 / 3, 1.0)
+
+
+def limit(robot: Robot) -> float | None:
+    """What may be imposed at most: supply voltage [V] or motor speed [rpm]; None where the file says nothing."""
+    if robot.rig.imposed == "voltage":
+        return robot.motor.voltage_limit
+    most = min(float(robot.motor.speed_limit), float(robot.gearbox.speed_limit))
+    return most / RPM if most < UNLIMITED else None
+
+
+def _digits(value: float) -> float:
+    """Two significant digits, downward."""
+    size = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(np.round(math.floor(value / size + 1e-9) * size, 9))
+
+
+def default(robot: Robot, option: str) -> float:
+    """What a single run has imposed where nothing is stated: the limit.
+
+    Raises:
+        BadConfiguration: the file states none.
+    """
+    most = limit(robot)
+    if most is None:
+        raise BadConfiguration(_missing(robot, option, "12" if robot.rig.imposed == "voltage" else "3000"))
+    return most if robot.rig.imposed == "voltage" else _digits(most)
+
+
+def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
+    """What a grid has imposed where nothing is stated: a third, two thirds and all of the limit.
+
+    Args:
+        notes: is given a sentence that says so.
+
+    Raises:
+        BadConfiguration: the file states none.
+    """
+    most = limit(robot)
+    if most is None:
+        raise BadConfiguration(_missing(robot, option, "6,12,24" if robot.rig.imposed == "voltage" else "1000,2000"))
+    found = tuple(_digits(share * most) for share in SHARES)
+    if notes is not None:
+        shown = ",".join(f"{v:g}" for v in found)
+        notes.append(f"{option}: not stated; thirds of the {_of(robot)} of the robot's file are taken: {shown}")
+    return found
+
+
+def _of(robot: Robot) -> str:
+    return "voltage_limit" if robot.rig.imposed == "voltage" else "speed_limit"
+
+
+def _missing(robot: Robot, option: str, example: str) -> str:
+    unit = "V" if robot.rig.imposed == "voltage" else "rpm"
+    return (
+        f"{option}: not stated, and the robot's file has no motor.{_of(robot)} to take it from; state it "
+        f"[{unit}], as {option} {example}"
+    )
+
+
+def refused(robot: Robot, option: str, instead: str) -> str:
+    """Why an option of what is not imposed is refused."""
+    if robot.rig.imposed == "motor_speed":
+        return f"{option}: the motors' speed is imposed on this robot; state {instead} [rpm]"
+    return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
+
+
+def on_shaft(option: str) -> str:
+    """Why an option of the ground is refused."""
+    return f"{option}: the robot's load is a shaft, on which no slope, payload, mass or surface acts; leave it out"
+
+
+def check_battery(robot: Robot) -> None:
+    """Refuse to run a rig on a battery that its file does not state.
+
+    Raises:
+        BadConfiguration: its speed is imposed, or its battery is none of its own.
+    """
+    if robot.rig.imposed == "motor_speed":
+        raise BadConfiguration(
+            "--battery: the motors' speed is imposed on this robot, whatever feeds them; leave it out"
+        )
+    if not own.battery(robot):
+        raise BadConfiguration("--battery: the robot's file states no battery; add [battery], or state --voltage")
+
+
+def check_on_ground(robot: Robot, command: str) -> None:
+    """Refuse a command of the running gear for a load that has none.
+
+    Raises:
+        BadConfiguration: the load is a shaft.
+    """
+    if robot.on_shaft:
+        raise BadConfiguration(
+            f"{command}: the robot's load is a shaft, which has no wheels or tracks on a ground; simulate, sweep, "
+            "compare, calibrate, loop and sensitivity take it"
+        )

@@ -1,0 +1,123 @@
+"""What of the numbers of a run a robot has: a shaft has no ground, and a rig only what its file states."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibration.data import rig_file
+from calibration.data.columns import Layout
+from mmrjax import channels, params
+from mmrjax.motor import Motor
+from mmrjax.power import Battery
+from mmrjax.robot import Robot
+from mmrjax.robots import blank
+
+#: Columns of runs and histories that are of the ground.
+OF_GROUND = (
+    "slip", "adhesion_used", "traction_N", "slope_deg", "power_ground_W", "power_lift_W", "efficiency_chassis",
+)  # fmt: skip
+#: Those of travel, which a shaft has where a channel shows it.
+OF_TRAVEL = (
+    "theoretical_speed_mm_s", "distance_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
+)  # fmt: skip
+#: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
+OF_HEAT = (
+    "temperature_winding_C", "permissible_time_s", "winding_C", "housing_C", "winding_peak_C", "housing_end_C",
+)  # fmt: skip
+_THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
+
+
+def is_rig(robot: Robot) -> bool:
+    """Whether it is a rig, in whose tables a reading may cross zero, and not the packaged robot or one like it."""
+    return not Layout.of(robot).usual
+
+
+def stated(robot: Robot, prefix: str) -> bool:
+    """Whether any parameter whose name begins so is another than that of a rig of which nothing is known."""
+    usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
+    return any(float(p.value) != usual[p.name] for p in params.walk(robot) if p.name.startswith(prefix))
+
+
+def thermal(robot: Robot) -> bool:
+    """Whether it is known how heat leaves the windings."""
+    sheet = Motor()
+    return not robot.rig.blank or any(
+        float(getattr(robot.motor, name)) != float(getattr(sheet, name)) for name in _THERMAL
+    )
+
+
+def battery(robot: Robot) -> bool:
+    """Whether it has a battery of its own."""
+    if not robot.rig.blank:
+        return True
+    usual, other = Battery(), "current_other"  # `rig_file.DEFAULTS` states that one
+    same = [
+        float(getattr(robot.battery, name)) == float(value)
+        for name, value in vars(usual).items()
+        if name != other and isinstance(value, int | float)
+    ]
+    return not all(same)
+
+
+def idle_columns(robot: Robot) -> set[str]:
+    """Columns of runs and histories that mean nothing for a robot."""
+    found: set[str] = set()
+    if robot.on_shaft:
+        found |= {*OF_GROUND, *(() if "speed" in robot.rig.channels else OF_TRAVEL)}
+    if not thermal(robot):
+        found |= {*OF_HEAT}
+    if not battery(robot):
+        found |= {"voltage_cell_V"}
+    return found
+
+
+def of(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A table without what means nothing for the robot, the columns of its channels aside."""
+    idle = idle_columns(robot) - {c.column for c in channels.CHANNELS}
+    ends = ("", "_sd", "_lower", "_upper")
+    gone = {column + end for column in idle for end in ends}
+    return {column: values for column, values in table.items() if column not in gone}
+
+
+def _keys(table: dict[str, Any], before: str = "") -> set[str]:
+    found: set[str] = set()
+    for key, value in table.items():
+        found |= _keys(value, f"{before}{key}.") if isinstance(value, dict) else {before + key}
+    return found
+
+
+def parameters(robot: Robot, robot_name: str) -> list[dict[str, str]]:
+    """Parameters of a rig: those that its file states, and all else that is not the same as nothing; with the source.
+
+    Args:
+        robot_name: its file.
+    """
+    path = Path(robot_name)
+    try:
+        stated = _keys(tomllib.loads(path.read_text(encoding="utf-8"))) if path.suffix == ".toml" else set()
+    except OSError:
+        stated = set()
+    of_unit = set(rig_file.LINEAR) - {"inertia"}
+    linear = {key.partition(".")[0] for key in stated if key.rpartition(".")[2] in of_unit}
+    travels = not robot.on_shaft or "speed" in robot.rig.channels
+    usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
+    found = []
+    for p in params.walk(robot):
+        load = p.name.partition(".")[0] in robot.configurations
+        own = p.name in stated
+        moved = p.name not in usual or float(p.value) != usual[p.name]
+        if not own and not moved and not (load and float(p.value) != 0):
+            continue
+        if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not travels)):
+            continue
+        of_file = own or p.name.partition(".")[0] in linear
+        source = f"stated in {path.name}" if of_file else "default" if not moved or load else "changed"
+        found.append(
+            {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{float(p.value):.6g}"}
+            | {"source": source}
+        )
+    return found

@@ -1,0 +1,387 @@
+"""The front door of rigs: every command from a rig's file alone, and not a word of another robot in what it leaves."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data.columns import Layout
+from calibration.data.runs import Runs
+from calibration.inference.errors import relative_error, sized_error
+from mmrjax import channels, fidelities, params
+from mmrjax.robots import nominal
+from sweeps import imposed, own, rig_new
+
+#: Words of the paper's robot, its parts, its tables and its surfaces; none is a rig's.
+FORBIDDEN = (
+    "paper", "nominal", "Table 1", "Table 2", "Table 3", "Table 4", "Table 5", "Table 6", "Table 7", "Table 8",
+    "Tables A", "eq. (", "6T2A", "4W2T", "48:1", "RE30", "GP32", "310007", "SM-1", "linoleum", "lacquered", "±5 %",
+    "foreign robot",
+)  # fmt: skip
+TEXTS = (".html", ".toml", ".json", ".csv", ".svg", ".txt")
+
+
+def words_of_others(*texts):
+    """Forbidden words in texts, each with what stands around it; pictures within a page lie beside it too."""
+    found = []
+    for text in texts:
+        bare = re.sub(r"data:image/[^\"]*", "", text)
+        bare = re.sub(r'"sweeps/paper/[^"]*"', "", bare)  # a file of the code, in a store's digests
+        bare = re.sub(r"<style>.*?</style>", "", bare, flags=re.DOTALL)
+        for word in FORBIDDEN:
+            at = bare.find(word)
+            if at >= 0:
+                found.append(f"{word}: {bare[max(0, at - 60) : at + 60]!r}")
+    return found
+
+
+def left_in(folder):
+    """The texts of a run folder."""
+    return [path.read_text(encoding="utf-8") for path in sorted(folder.rglob("*")) if path.suffix in TEXTS]
+
+
+def rows_of(path):
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def of_kind(tmp_path, kind, speed=False):
+    """A rig's file as `rig new` writes it, with the motors' speed imposed where asked."""
+    text = rig_new.template(kind)
+    if speed:
+        text = text.replace('imposed = "voltage"', 'imposed = "motor_speed"').replace(' "motor_speed"]', "]", 1)
+        text = text.replace('"motor_speed", ', "").replace('"total_current",]', '"total_current"]')
+    path = tmp_path / f"{kind}{'_speed' if speed else ''}.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def table_of(rig, changed, levels, slopes=None, sd=0.01, seed=5):
+    """A table of settled runs of a rig with changed parameters, beside its file; every reading with its sd."""
+    robot = robot_file.read(rig)
+    layout = Layout.of(robot)
+    levels = np.asarray(levels, float)
+    columns = {"configuration": np.full(len(levels), robot.configurations.names[0]), layout.imposed_column: levels}
+    if slopes is not None:
+        columns |= {"slope_deg": np.asarray(slopes, float), "payload_kg": np.zeros(len(levels))}
+    robot = params.replace(robot, {name: np.asarray(value, float) for name, value in changed.items()})
+    with channels.panel(robot.rig.channels):
+        conditions = Runs("a table", columns, layout=layout).conditions(robot)
+        result = jax.device_get(fidelities.get("steady").run(robot, conditions, {}, lambda share: None).result)
+        drawn = np.random.default_rng(seed)
+        written = {key: value for key, value in columns.items() if key != "configuration"}
+        for c in channels.CHANNELS:
+            reading = np.asarray(result.reading[c.name]) / c.factor
+            size = sd * np.abs(reading).mean()
+            written |= {
+                c.column: reading + size * drawn.normal(size=len(levels)),
+                c.sd_column: np.full(len(levels), size),
+            }
+    path = rig.with_suffix(".csv")
+    lines = [",".join(written), *(",".join(f"{v[k]:.8g}" for v in written.values()) for k in range(len(levels)))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+BOTH_WAYS = [800, 1600, 2400, 3200, 4000, 4800, -800, -1600, -2400, -3200, -4000, -4800]
+
+
+@pytest.fixture
+def bench(tmp_path):
+    """A motor on a bench, its speed imposed, its current alone read, both ways; and its table."""
+    rig = of_kind(tmp_path, "bench", speed=True)
+    return rig, table_of(rig, {"bench.loss_coulomb": 0.07}, BOTH_WAYS)
+
+
+@pytest.fixture
+def rover(tmp_path):
+    """A wheeled robot whose motors' speed is imposed, on slopes; and its table."""
+    rig = of_kind(tmp_path, "wheeled", speed=True)
+    speeds, slopes = np.repeat([1000.0, 2000.0, 3000.0], 3), np.tile([0.0, 5.0, 10.0], 3)
+    return rig, table_of(rig, {"rover.ground.rolling_resistance": 0.03}, speeds, slopes)
+
+
+# --- simulate -----------------------------------------------------------------------------------------------------
+
+SIMULATED = {
+    "bench": ("bench", False, ["--voltage", "12"], {"total_current_A", "motor_speed_rpm"}),
+    "bench, speed": ("bench", True, ["--motor-speed", "-2000"], {"total_current_A"}),
+    "linear": ("linear", False, ["--voltage", "12"], {"total_current_A", "speed_mm_s"}),
+    "wheeled": ("wheeled", False, ["--voltage", "12", "--slope", "5"], {"total_current_A", "speed_mm_s"}),
+    "tracked, speed": ("tracked", True, ["--motor-speed", "2000", "--payload", "1"], {"total_current_A"}),
+}
+
+
+@pytest.mark.parametrize("case", SIMULATED)
+def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_path, case):
+    kind, speed, options, columns = SIMULATED[case]
+    code, out, err = mmrjax("simulate", "--robot", of_kind(tmp_path, kind, speed), *options, "--out", "run")
+    assert code == 0, err
+    (row,) = rows_of(tmp_path / "run" / "runs.csv")
+    assert columns <= set(row) and row["status"] in ("converged", "reverses")
+    on_ground = {"slip", "adhesion_used", "slope_deg", "total_mass_kg", "power_ground_W"}
+    assert on_ground <= set(row) if kind in ("wheeled", "tracked") else on_ground.isdisjoint(row)
+    assert "temperature_winding_C" not in row  # nobody has stated how heat leaves the windings
+    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+
+
+@pytest.mark.parametrize("kind", ["bench", "pendulum", "wheeled"])
+def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind):
+    rig = of_kind(tmp_path, kind)
+    code, out, err = mmrjax(
+        "simulate", "--robot", rig, "--voltage", "3", "--model", "drive", "--duration", "0.5", "--out", "run"
+    )  # fmt: skip
+    assert code in (0, 3), err  # an arm still moves
+    history = rows_of(tmp_path / "run" / "history.csv")
+    shafts = {"motor_speed_rpm", "output_angle_deg"}
+    assert (shafts <= set(history[0])) == (kind != "wheeled") and len(history) > 100
+    assert (tmp_path / "run" / "figures" / ("history.svg" if kind == "wheeled" else "courses.svg")).is_file()
+    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+
+
+def test_a_profile_turns_a_bench(mmrjax, tmp_path):
+    (tmp_path / "turn.csv").write_text("time_s,motor_speed_rpm,supply_voltage_V\n0,0,24\n1,2000,24\n2,2000,24\n")
+    code, out, err = mmrjax(
+        "simulate", "--robot", of_kind(tmp_path, "bench"), "--profile", "turn.csv", "--out", "run"
+    )  # fmt: skip
+    assert code in (0, 3), err
+    course = rows_of(tmp_path / "run" / "history.csv")
+    assert "demanded_motor_speed_rpm" in course[0] and "slope_deg" not in course[0] and "winding_C" not in course[0]
+    assert "distance" not in out and "winding" not in out
+    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+
+
+REFUSED = {
+    "no voltage": ("bench", False, ["simulate"], r"--voltage: not stated, and the robot's file has no motor\.voltage_l"),
+    "no speed": ("bench", True, ["simulate"], r"--motor-speed: not stated, .* as --motor-speed 3000"),
+    "voltage of an imposed speed": (
+        "bench", True, ["simulate", "--voltage", "12"], r"--voltage: the motors' speed is imposed .* state --motor-speed",
+    ),
+    "speed of an imposed voltage": (
+        "bench", False, ["simulate", "--motor-speed", "900"], r"--motor-speed: the voltage is imposed .* state --voltage",
+    ),
+    "slope": ("bench", False, ["simulate", "--voltage", "9", "--slope", "5"], r"--slope: the robot's load is a shaft"),
+    "payload": ("linear", False, ["simulate", "--voltage", "9", "--payload", "1"], r"--payload: the robot's load is a"),
+    "mass": ("bench", False, ["simulate", "--voltage", "9", "--mass", "5"], r"--mass: the robot's load is a shaft"),
+    "surface": ("bench", False, ["simulate", "--voltage", "9", "--surface", "x"], r"--surface: the robot's load is a"),
+    "battery": ("bench", False, ["simulate", "--battery"], r"--battery: the robot's file states no battery"),
+    "battery of an imposed speed": ("bench", True, ["simulate", "--battery"], r"--battery: the motors' speed is imposed"),
+    "a pendulum's steady state": ("pendulum", False, ["simulate", "--voltage", "3"], r"arm .* has no steady state"),
+    "a pendulum's profile": (
+        "pendulum", False, ["simulate", "--profile", "shuttle"], r"--profile: arm is an arm on which gravity acts",
+    ),
+    "an imposed speed's profile": (
+        "bench", True, ["simulate", "--profile", "shuttle"], r"--profile: the motors' speed is imposed on this robot",
+    ),
+    "a shaft's travel": (
+        "bench", False, ["simulate", "--voltage", "9", "--profile", "shuttle"], r"shuttle.*load is a shaft",
+    ),
+    "no axis": ("bench", False, ["sweep"], r"--voltages: not stated, .* state it \[V\], as --voltages 6,12,24"),
+    "no axis of speed": ("wheeled", True, ["sweep"], r"--motor-speeds: not stated, .* --motor-speeds 1000,2000"),
+    "axis of slopes": ("bench", False, ["sweep", "--voltages", "9", "--slopes", "0,5"], r"--slopes: the robot's load"),
+    "axis of voltages": ("wheeled", True, ["sweep", "--voltages", "9"], r"--voltages: the motors' speed is imposed"),
+    "picture": ("bench", False, ["render", "x.png", "--voltage", "9"], r"render: the robot's load is a shaft"),
+    "picture of an imposed speed": (
+        "wheeled", True, ["render", "x.png", "--motor-speed", "900"], r"--model track: the motors' speed is imposed",
+    ),
+    "picture without inertia": (
+        "wheeled", False, ["render", "x.png", "--voltage", "9"], r"--model track: rover\.inertia: got 0; expected",
+    ),
+    "running gear of a bench": (
+        "bench", False, ["simulate", "--voltage", "9", "--model", "track"], r"--model track: the robot's load is a shaft",
+    ),
+    "resonance": ("bench", False, ["resonance"], r"resonance: the robot's load is a shaft"),
+    "sensitivity": ("bench", False, ["sensitivity"], r"--voltages: not stated"),
+    "varied slope": (
+        "bench", False, ["sensitivity", "--voltages", "9", "--vary", "slope_deg=0:5"], r"--vary slope_deg: the robot's lo",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_a_rig_does_not_have_is_refused_in_one_sentence(mmrjax, tmp_path, case):
+    kind, speed, arguments, message = REFUSED[case]
+    code, out, err = mmrjax(*arguments, "--robot", of_kind(tmp_path, kind, speed))
+    assert code == 2 and re.search(message, err) and err.count("\n") == 1, err
+    assert words_of_others(out, err) == [] and "Traceback" not in err
+
+
+# --- what is imposed where nothing is stated -----------------------------------------------------------------------
+
+
+def test_a_single_run_takes_the_limit_of_the_file(mmrjax, tmp_path):
+    rig = of_kind(tmp_path, "bench")
+    code, _, err = mmrjax(
+        "simulate", "--robot", rig, "--set", "motor.voltage_limit=18", "--out", "run", "--no-report"
+    )  # fmt: skip
+    assert code == 0, err
+    assert float(rows_of(tmp_path / "run" / "runs.csv")[0]["supply_voltage_V"]) == 18.0
+
+
+def test_levels_are_thirds_of_the_limit_to_two_digits(tmp_path):
+    robot = robot_file.change(
+        robot_file.read(of_kind(tmp_path, "bench", speed=True)), {"motor.speed_limit": 500.0}, "x"
+    )
+    notes: list[str] = []
+    top = 500.0 / channels.RPM
+    found = imposed.levels(robot, "--motor-speeds", notes)
+    assert all(0.9 * share * top < level <= share * top for level, share in zip(found, imposed.SHARES, strict=True))
+    assert notes == [
+        "--motor-speeds: not stated; thirds of the speed_limit of the robot's file are taken: 1500,3100,4700"
+    ]
+
+
+# --- sweep --------------------------------------------------------------------------------------------------------
+
+
+def test_a_sweep_of_a_bench_has_one_axis(mmrjax, tmp_path):
+    rig = of_kind(tmp_path, "bench")
+    code, out, err = mmrjax("sweep", "--robot", rig, "--set", "motor.voltage_limit=24", "--out", "run")
+    assert code == 0 and "thirds of the voltage_limit of the robot's file are taken: 8,16,24" in err
+    table = rows_of(tmp_path / "run" / "runs.csv")
+    assert [float(row["supply_voltage_V"]) for row in table] == [8.0, 16.0, 24.0]
+    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+
+
+def test_a_sweep_of_a_vehicle_with_imposed_speed_varies_its_slopes(mmrjax, tmp_path):
+    rig = of_kind(tmp_path, "wheeled", speed=True)
+    code, out, err = mmrjax(
+        "sweep", "--robot", rig, "--motor-speeds", "1000,-1000", "--slopes", "0,5", "--out", "run"
+    )  # fmt: skip
+    assert code == 0, err
+    table = rows_of(tmp_path / "run" / "runs.csv")
+    assert len(table) == 4 and {row["payload_kg"] for row in table} == {"0"}
+    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+
+
+def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
+    rig = of_kind(tmp_path, "bench", speed=True)
+    code, out, err = mmrjax(
+        "sweep", "--robot", rig, "--motor-speeds", "600,1200", "--zarr", "--export", "csv", "--out", "run"
+    )  # fmt: skip
+    assert code == 0, err
+    assert words_of_others(out, *left_in(tmp_path / "run")) == []
+    plan = tmp_path / "plan.toml"
+    plan.write_text(f'robot = "{rig.name}"\n[axes]\n"bench.loss_coulomb" = [0.05, 0.07]\n')
+    code, _, err = mmrjax("sweep", plan)
+    assert code == 2 and "plan.toml, conditions.motor_speed: not stated" in err
+    plan.write_text(f'robot = "{rig.name}"\n[axes]\nslope_deg = [0, 5]\n[conditions]\nmotor_speed = 100.0\n')
+    code, _, err = mmrjax("sweep", plan)
+    assert code == 2 and "plan.toml, slope_deg: the robot's load is a shaft" in err
+    plan.write_text(f'robot = "{rig.name}"\n[axes]\nvoltage = [9, 12]\n')
+    code, _, err = mmrjax("sweep", plan)
+    assert code == 2 and "the robot's file imposes the motor speed" in err
+
+
+def test_a_vehicle_is_drawn(mmrjax, tmp_path):
+    rig = of_kind(tmp_path, "wheeled")
+    code, out, err = mmrjax(
+        "render", "x.png", "--robot", rig, "--set", "rover.inertia=5e-4", "--voltage", "12", "--duration", "0.2",
+        "--begin", "0.1",
+    )  # fmt: skip
+    assert code in (0, 3) and (tmp_path / "x.png").stat().st_size > 1000, err
+    assert "states no running_gear" in err and words_of_others(out, err) == []
+
+
+# --- measured tables ----------------------------------------------------------------------------------------------
+
+
+def test_compare_calibrate_and_loop_take_one_channel_both_ways(mmrjax, tmp_path, bench):
+    rig, data = bench
+    code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
+    assert code == 0, err
+    errors = json.loads((tmp_path / "compared" / "result.json").read_text())["errors"]["all"]["total_current"]
+    assert errors["unit"] == "A" and 0.01 < errors["rms"] < 0.1 and " A " in out
+    code, said, err = mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted")
+    assert code == 0 and "rms error: before total current" in said and "motor and speed" not in said, err
+    fitted = robot_file.read(tmp_path / "fitted" / "robot.toml")
+    assert float(fitted.configurations["bench"].loss_coulomb) == pytest.approx(0.07, rel=0.05)
+    code, told, err = mmrjax("loop", data, "--robot", rig, "--replicates", "250", "--out", "found")
+    assert code == 0 and "rms error: before total current" in told, err
+    defects = (tmp_path / "found" / "figures" / "defects.svg").read_text()
+    assert "torque missing at the output" in defects and "voltage missing" not in defects and "slip" not in defects
+    page = (tmp_path / "found" / "report.html").read_text()
+    assert "The channels close one equation: torque." in page
+    for folder in ("compared", "fitted", "found"):
+        assert words_of_others(*left_in(tmp_path / folder)) == [], folder
+    assert words_of_others(out, said, told, err) == []
+
+
+def test_compare_and_calibrate_show_a_vehicles_conditions(mmrjax, tmp_path, rover):
+    rig, data = rover
+    code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
+    assert code == 0, err
+    shown = (tmp_path / "compared" / "figures" / "errors.svg").read_text()
+    assert "motor speed [rpm]" in shown and "slope" in shown and "supply voltage" not in shown
+    code, said, err = mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted")
+    assert code == 0, err
+    priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
+    assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
+    assert words_of_others(out, said, err, *left_in(tmp_path / "compared"), *left_in(tmp_path / "fitted")) == []
+
+
+@pytest.mark.parametrize("kind", ["linear", "tracked"])
+def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
+    rig = of_kind(tmp_path, kind)
+    levels = [8, 12, 18, 24, 8, 12, 18, 24]
+    data = table_of(rig, {}, levels, np.tile([0.0, 5.0], 4) if kind == "tracked" else None)
+    code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
+    assert code == 0, err
+    assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
+
+
+# --- sensitivity --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["bench", "wheeled"])
+def test_sensitivity_takes_what_a_rig_has(mmrjax, tmp_path, kind):
+    rig = of_kind(tmp_path, kind, speed=kind == "bench")
+    where = ["--motor-speeds", "1000,3000"] if kind == "bench" else ["--voltages", "12,24", "--slopes", "0,5"]
+    code, out, err = mmrjax("sensitivity", "--method", "local", "--robot", rig, *where, "--out", "run")
+    assert code == 0, err
+    assert "next runs, of" in out and "the operating points" in out
+    assert ("steepest slope" in out) == (kind == "wheeled")
+    assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
+
+
+# --- the pieces ---------------------------------------------------------------------------------------------------
+
+
+def test_errors_of_a_channels_size_are_finite_where_readings_cross_zero():
+    simulated, measured = np.array([[-1.0], [0.0], [1.0]]), np.array([[-1.1], [0.1], [1.0]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        assert not np.isfinite(relative_error(simulated, measured)).all()
+    assert sized_error(simulated, measured) == pytest.approx(100 * np.array([[0.1], [-0.1], [0.0]]) / np.sqrt(2 / 3))
+
+
+def test_parameters_of_a_rig_say_where_they_come_from(tmp_path):
+    rig = of_kind(tmp_path, "wheeled")
+    found = {p["name"]: p["source"] for p in own.parameters(robot_file.read(rig), str(rig))}
+    assert found["motor.resistance"] == "stated in wheeled.toml"
+    assert found["rover.ground.friction.speed_static"] == "default" and "battery.voltage_full" not in found
+    linear = of_kind(tmp_path, "linear")
+    found = {p["name"]: p["source"] for p in own.parameters(robot_file.read(linear), str(linear))}
+    assert found["carriage.inertia"] == "stated in linear.toml"  # by its mass and lead
+    bench = of_kind(tmp_path, "bench")
+    assert "bench.radius" not in {p["name"] for p in own.parameters(robot_file.read(bench), str(bench))}
+
+
+def test_the_packaged_robots_parameters_keep_their_sources(tmp_path):
+    specs = {p.name: p.spec for p in params.walk(nominal())}
+    assert "eq. (15)" in specs["motor.resistance"].meaning
+    own_specs = {p.name: p.spec for p in params.walk(robot_file.read(of_kind(tmp_path, "bench")))}
+    assert "eq." not in own_specs["motor.resistance"].meaning
+    assert (
+        own_specs["motor.resistance"].source == params.STATED and own_specs["motor.inertia"].source == params.DEFAULT
+    )
+
+
+def test_forbidden_words_are_seen():
+    assert len(words_of_others("<p>the nominal robot of Table 8</p>")) == 2
+    assert words_of_others('<img src="data:image/svg+xml;base64,paper">') == []
