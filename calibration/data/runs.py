@@ -352,7 +352,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         # Gravity may drive a motor: only up the slope, or on the flat, its current has the sign of its voltage.
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
         if not channel.zero_at_rest and (layout.weight or "duty" in columns):
-            continue  # gravity may drive a motor, and a bridge that reverses the voltage reverses the supply's current
+            continue  # gravity may drive a motor; a bridge that reverses the voltage reverses the supply's current
         wrong = np.flatnonzero(backward & (readings > 0))
         if wrong.size:
             at = int(wrong[0])
