@@ -53,6 +53,8 @@ SCALED_WITH: dict[str, Callable[[Signals], object]] = {
 AT_THE_OUTPUT = ("track", "ground", "slip")
 #: Shares of slip are those of tracks and tyres on the paper's grounds; small wheels on soft ones slip by half.
 SLIPPERY = 8.0
+#: A track's losses are of one kind; what turns on a shaft may be a fan, a brake or a worm.
+ANY_LOAD = 4.0
 #: Factors are powers of this one: rigs of about one size share what is compiled.
 STEP = 2.0
 
@@ -136,6 +138,8 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
         factor = _rounded(_size(whole(*mine)) / _size(whole(*theirs)))
     elif amplitude.spec.unit != "-":
         factor = _rounded(_unit_share(effect, *theirs) / _unit_share(grown, *mine))
+    if mine[0].on_shaft and kind.balance == "track":
+        factor *= ANY_LOAD
     if factor == stretch == 1.0:
         return kind
     return _scaled(kind, factor, stretch)
