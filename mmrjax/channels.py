@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
     from mmrjax.signals import Signals
+
+T = TypeVar("T")
 
 RPM = math.pi / 30  # rad/s
 MM = 1e-3  # m
@@ -218,13 +221,13 @@ CHANNELS: tuple[Channel, ...] = tuple(c for c in EVERY if c.name in USUAL)
 
 
 def select(names: Iterable[str]) -> None:
-    """Make channels those of the robot at hand, in the order of `EVERY`.
+    """Make channels those of the robot at hand, in the order of `EVERY`; rows that a program has added stay.
 
     Raises:
         KeyError: no such channel.
     """
     global CHANNELS
-    wanted = set(names)
+    wanted = {*names, *({c.name for c in CHANNELS} - {c.name for c in EVERY})}
     if unknown := wanted - {c.name for c in (*EVERY, *CHANNELS)}:
         raise KeyError(f"no channel {min(unknown)}; there are {', '.join(c.name for c in EVERY)}")
     table = {c.name: c for c in (*EVERY, *CHANNELS)}
@@ -241,6 +244,17 @@ def panel(names: Iterable[str]) -> Iterator[None]:
         yield
     finally:
         CHANNELS = before
+
+
+def of_the_robot(function: Callable[..., T]) -> Callable[..., T]:
+    """`function` of (runs, robot, ...) with the channels of that robot's rig."""
+
+    @functools.wraps(function)
+    def with_panel(runs: Any, robot: Robot, *others: Any, **named: Any) -> T:
+        with panel(robot.rig.channels):
+            return function(runs, robot, *others, **named)
+
+    return with_panel
 
 
 def known() -> tuple[Channel, ...]:

@@ -39,8 +39,7 @@ def load_robot(config: RobotPart) -> Robot:
     notes: list[str] = []
     robot = robot_file.load(config.robot, effect_file.library(config.effects), notes)
     robot = robot_file.change(robot, config.set, where="--set", notes=notes)
-    added = {c.name for c in channels.CHANNELS} - {c.name for c in channels.EVERY}
-    channels.select({*robot.rig.channels, *added})
+    channels.select(robot.rig.channels)
     for note in notes:
         tell(note)
     return robot

@@ -63,6 +63,7 @@ EITHER_WAY = 0.05
 MANY = 0.03
 
 
+@channels.of_the_robot
 def discover(
     runs: Runs,
     robot: Robot,

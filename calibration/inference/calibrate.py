@@ -36,7 +36,7 @@ from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
-from mmrjax import fidelities
+from mmrjax import channels, fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 
@@ -48,6 +48,7 @@ FRICTION = "ground.friction."
 _OF_PRODUCT = "its product with the share of the guides, as in the other fidelities"
 
 
+@channels.of_the_robot
 def calibrate(
     runs: Runs,
     robot: Robot,
