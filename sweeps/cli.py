@@ -199,14 +199,14 @@ def sweep(
     ] = None,
     voltages: Annotated[
         str | None,
-        typer.Option(help="Supply voltages (V).  \\[default: 15,24,33; of a rig thirds of its voltage_limit]"),
+        typer.Option(help="Supply voltages (V), of a rig thirds of its voltage_limit.  \\[default: 15,24,33]"),
     ] = None,
     motor_speeds: _MotorSpeeds = None,
     payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8; of a rig 0]")
+        str | None, typer.Option(help="Additional load masses (kg), of a rig 0.  \\[default: 0,1.5,3,5,6.5,8]")
     ] = None,
     slopes: Annotated[
-        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: 0,5,10,15,20; of a rig 0]")
+        str | None, typer.Option(help="Slopes, positive uphill (deg), of a rig 0.  \\[default: 0,5,10,15,20]")
     ] = None,
     surface: _Surface = None,
     config_file: Annotated[

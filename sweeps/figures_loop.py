@@ -68,7 +68,14 @@ def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
     grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)],
                            [groups[a] for a in starts])  # fmt: skip
     grid[-1, 0].grid(axis="x", visible=False)
-    within = "by slope, then payload" if beside else "by motor speed" if own == "motor_speed_rpm" else "by voltage"
+    varied = own == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
+    within = (
+        "by slope, then payload"
+        if beside and varied
+        else "by motor speed"
+        if own == "motor_speed_rpm"
+        else "by voltage"
+    )
     grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
     return fig
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
@@ -14,8 +16,16 @@ from sweeps.report import Album, columns, conditions, first_rows, render, rms, w
 Section = Callable[[Album, DiscoveryResult], None]
 
 
-def _run_by_run(album: Album, found: DiscoveryResult) -> None:
+def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
+    """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
     table = found.rows_table()
+    if own.is_rig(found.robot):
+        table["configuration"] = found.runs.configurations_named(found.robot)
+    return table
+
+
+def _run_by_run(album: Album, found: DiscoveryResult) -> None:
+    table = rows_of(found)
     album.add("before_after", lambda: figures_loop.before_after(table, found.verdict))
     album.add("defects", lambda: figures_loop.defects(table, found.verdict, own.is_rig(found.robot)))
 
@@ -23,7 +33,7 @@ def _run_by_run(album: Album, found: DiscoveryResult) -> None:
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
-    album.add("before_after", lambda: figures_loop.over_time(found.rows_table(), found.verdict))
+    album.add("before_after", lambda: figures_loop.over_time(rows_of(found), found.verdict))
     album.add("series", lambda: figures_loop.time_statistics(detail, found.verdict))
 
 
@@ -49,14 +59,14 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         The path of the page.
     """
     album = Album(Path(folder))
-    table, sized = found.rows_table(), own.is_rig(found.robot)
+    table, sized = rows_of(found), own.is_rig(found.robot)
     SECTIONS[type(found.detail)](album, found)
     if found.residual_clusters:
         album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
     album.add("errors", lambda: figures_loop.errors(found))
     if found.unnamed is not None:
         curve = found.unnamed
-        album.add("curve", lambda: figures_loop.curve(found.rows_table(), curve, float(found.robot.sides)))
+        album.add("curve", lambda: figures_loop.curve(rows_of(found), curve, float(found.robot.sides)))
     album.add("ladder", lambda: figures_loop.ladder(found))
     album.add("null", lambda: figures_loop.null(found.before))
     album.add("look_alikes", lambda: figures_loop.look_alikes(found))
@@ -73,8 +83,8 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         ruled_out=findings.said_ruled_out(found),
         alike=alike(found),
         worse=preference.said_worse(found.held_out_worse, found.errors_held_out),
-        rows=first_rows(found.rows_table()),
-        conditions=conditions(found.rows_table()),
+        rows=first_rows(rows_of(found)),
+        conditions=conditions(rows_of(found)),
         columns=columns(),
         sized=sized,
         on_shaft=found.robot.on_shaft,

@@ -35,6 +35,7 @@ from calibration.inference import bases, priors
 from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
+from mmrjax.channels import RPM
 
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
 PAD = 4
@@ -349,6 +350,9 @@ def _steps(variable: str, within: Reach) -> str | None:
             f"Make two of the runs again, sampled as finely as the instruments allow from {happens.low:.3g} to "
             f"{happens.high:.3g} s, one of them with all that is switched in that time left as it is"
         )
+    own = _of_rig(variable, within, slope, payload)
+    if own is not None:
+        return own
     return {
         "voltage": f"Repeat at one slope and payload with the supply voltage from {low:g} to {high:g} V in steps of "
         f"{step:g} V",
@@ -367,6 +371,33 @@ def _steps(variable: str, within: Reach) -> str | None:
         "order": "Repeat the table in another order, rows that were first last, and one condition again after every "
         "fifth run",
     }.get(variable, f"Repeat with {variable.replace('_', ' ')} in even small steps from its least to its largest")
+
+
+def _of_rig(variable: str, within: Reach, slope: float, payload: float) -> str | None:
+    """`_steps` where the motors' speed is imposed, or the load is a shaft; None where they say nothing else."""
+    level = "Repeat" if within.on_shaft else "Repeat on the level, unladen,"
+    if within.imposed == "motor_speed":
+        fastest = max(within.speeds, default=within.motor_speed) / RPM
+        turning = f"with the motor speed in {SERIES} even steps up to {fastest:.0f} rpm"
+        words = {
+            "speed_motor": f"{level} {turning}",
+            "speed": f"{level} {turning}, and so the travelling speed",
+            "slope": f"Repeat at one motor speed and payload with the slope from 0 to {slope:g} deg, and downhill",
+            "payload": f"Repeat at one motor speed and slope with the payload from 0 to {payload:g} kg",
+            "time": "Record one motor speed from a cold start for ten minutes, and again at once while all is warm",
+        }
+        if within.on_shaft:
+            words["current"] = f"{level} at one motor speed with a brake that is raised in {SERIES} even steps"
+        return words.get(variable)
+    if not within.on_shaft:
+        return None
+    high = within.voltages[-1]
+    return {
+        "voltage": f"Repeat with the supply voltage in {SERIES} even steps up to {high:g} V",
+        "speed_motor": f"Repeat with the supply voltage in {SERIES} even steps from crawl to {high:g} V",
+        "speed": f"Repeat with the supply voltage in {SERIES} even steps from crawl to {high:g} V",
+        "current": f"Repeat at {high:g} V with a brake that is raised in {SERIES} even steps",
+    }.get(variable)
 
 
 def _steady_speeds(variable: str, within: Reach) -> str:
