@@ -52,7 +52,7 @@ SCALED_WITH: dict[str, Callable[[Signals], object]] = {
 }
 AT_THE_OUTPUT = ("track", "ground", "slip")
 #: Shares of slip are those of tracks and tyres on the paper's grounds; small wheels on soft ones slip by half.
-SLIPPERY = 8.0
+SLIPPERY = 16.0
 #: A track's losses are of one kind; what turns on a shaft may be a fan, a brake or a worm.
 ANY_LOAD = 4.0
 #: Factors are powers of this one: rigs of about one size share what is compiled.

@@ -38,6 +38,8 @@ DEGREE, SHARE = 2, 1 / 3
 OWN = 0.3
 #: Names of columns that say when a row was measured.
 _TIMES = re.compile(r"(^|_)(time|date|datetime|timestamp|stamp|epoch|clock)(_|$)", re.IGNORECASE)
+#: Share of the differences between levels from which a coarser column is said to make most of them [-].
+MOSTLY = 0.5
 #: Levels that a sentence lists.
 _LISTED = 6
 
@@ -75,6 +77,8 @@ class ResidualCluster:
         correlation: of ranks, for such a column; else None.
         p: family-wise.
         alike: other columns that go with these residuals no better once this one is known.
+        coarser: columns whose levels this one divides further, and what share of the differences between its levels
+            theirs make by themselves, from `MOSTLY` on.
         at: the column, or name of the level, of each row; residual: simulated less measured [unit], or that times the
             sign of the reading; shape (rows,), of histories (runs,).
     """
@@ -88,6 +92,7 @@ class ResidualCluster:
     correlation: float | None
     p: float
     alike: tuple[str, ...]
+    coarser: tuple[tuple[str, float], ...]
     at: np.ndarray
     residual: np.ndarray
 
@@ -105,6 +110,9 @@ class ResidualCluster:
                 f"{what} go with {self.column}{within}{signs} (rank correlation {self.correlation:+.2f}; {p}), "
                 f"{role}: find what differs with it"
             )
+        if self.coarser:
+            shares = ", ".join(f"{name} alone {share:.0%} of it" for name, share in self.coarser)
+            role += f" ({shares})"
         ordered = sorted(self.levels, key=lambda m: -abs(m.mean))[:_LISTED]
         kept = [m for m in self.levels if m in ordered]
         each = ", ".join(f"{m.name}: {m.mean:+.2g} {self.unit}" for m in kept)
@@ -120,6 +128,7 @@ class ResidualCluster:
             f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in ("at", "residual")
         }
         document |= {"levels": [dataclasses.asdict(m) for m in self.levels], "alike": list(self.alike)}
+        document |= {"coarser": [{"column": name, "share": share} for name, share in self.coarser]}
         return {**document, "statement": self.statement}
 
 
@@ -521,9 +530,36 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
         correlation,
         p,
         alike,
+        () if _numbers(cells) else _coarser(whole, k, test.column, words, within, signed),
         at,
         signed,
     )
+
+
+def _coarser(
+    whole: _Units, k: int, column: str, words: np.ndarray, within: np.ndarray, residual: np.ndarray
+) -> tuple[tuple[str, float], ...]:
+    """Columns that a finding divides further and that make most of its differences by themselves."""
+
+    def between(labels: np.ndarray) -> float:
+        """Sum of squares between levels within those of the label."""
+        total = 0.0
+        for c in np.unique(within):
+            mine = within == c
+            for w in np.unique(labels[mine]):
+                here = mine & (labels == w)
+                total += here.sum() * (residual[here].mean() - residual[mine].mean()) ** 2
+        return total
+
+    found, all_of_it, there = [], between(words), whole.there[:, k]
+    for name, cells in whole.runs.extras.items():
+        if name == column or _numbers(cells[there]):
+            continue
+        coarse = _words(cells[there])
+        if len(np.unique(coarse)) > 1 and _divides(words, coarse) and all_of_it > 0:
+            share = between(coarse) / all_of_it
+            found += [(name, float(share))] if share >= MOSTLY else []
+    return tuple(sorted(found, key=lambda one: -one[1]))
 
 
 def _place(word: str) -> tuple[float, str]:
