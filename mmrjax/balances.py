@@ -76,6 +76,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
         direction_travel=contact.direction(state.speed, rest) if direction is None else direction,
         speed_wheel=speed_wheel,
         speed_theoretical=speed_theoretical,
+        speed_output=state.speed / chassis.radius if robot.loose else speed_wheel,
         angle=state.distance / chassis.radius,
         temperature=state.temperature,
         duty=duty,
@@ -252,11 +253,44 @@ def _moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
     signals = _to_slip(robot, conditions, chassis, begin(robot, conditions, state))
     if isinstance(chassis, Shaft):
         signals = _fill(signals, traction=signals.demand)
+        if state.gap is not None:
+            return _within_backlash(robot, chassis, signals, state.gap)
         signals = gearbox(robot, chassis, track(robot, chassis, signals))
         return _fill(signals, acceleration=chassis.radius * signals.acceleration_wheel)
     traction = chassis.ground.traction(signals.speed_sliding, signals.normal, signals.adhesion)
     signals = _pulled(robot, signals, traction)
     return gearbox(robot, chassis, track(robot, chassis, signals))
+
+
+def _within_backlash(robot: Robot, chassis: Shaft, signals: Signals, gap: Scalar) -> Signals:
+    """Motor and load as two bodies, between which the flanks of the gear carry what they are pressed with [N·m]."""
+    gear = robot.gearbox
+    idle = gear.torque_idle(signals.speed_motor, signals.direction)
+    own = added(robot, signals, "gearbox")
+    inertia_added = added(robot, signals, "inertia")
+    inertia_motor = robot.motor.inertia * gear.ratio**2
+    mesh = chassis.torque_mesh(gap, signals.speed_wheel - signals.speed_output, inertia_motor)
+    loss = chassis.torque_loss(signals.speed_output, signals.direction_travel) + added(robot, signals, "track")
+    efficiency = gear.efficiency_flow(mesh, signals.direction)
+    drive = signals.torque_motor - idle
+    net = gear.ratio * drive - mesh / efficiency - own
+    acceleration = net / inertia_motor
+    return _fill(
+        signals,
+        torque_idle=idle,
+        torque_track_loss=loss,
+        torque_load=mesh + own,
+        inertia_added=inertia_added,
+        efficiency_load=efficiency,
+        torque_net=net,
+        acceleration_wheel=acceleration,
+        torque_input=signals.torque_motor - robot.motor.inertia * gear.ratio * acceleration,
+        torque_gear=mesh + own,
+        torque_output=mesh,
+        acceleration=chassis.radius
+        * (mesh - loss - chassis.torque_load(signals.angle))
+        / (chassis.inertia + inertia_added),
+    )
 
 
 class Mover(Protocol):

@@ -39,7 +39,7 @@ class Channel:
         resolution: digits after the point that a person wants to see [unit].
         unit_si: of readings inside; empty where `factor` is 1.
         zero_at_rest: whether it shows 0 until the robot moves.
-        directed: whether it has another sign in the other direction.
+        directed: whether its sign is that of the motion; an angle counts on from where it was.
         settled, over_time: whether settled runs and histories can show it.
         other_units: what is often written in its column by mistake, and the SI value of each.
     """
@@ -138,7 +138,7 @@ EVERY: tuple[Channel, ...] = (
         word="output_speed",
         range=(-30_000.0, 30_000.0),
         sd_largest=10_000.0,
-        read=lambda robot, signals: signals.speed_wheel,
+        read=lambda robot, signals: signals.speed_output,
         sd_share=0.005,
         resolution=2,
         unit_si="rad/s",
@@ -160,6 +160,7 @@ EVERY: tuple[Channel, ...] = (
         resolution=2,
         unit_si="rad",
         zero_at_rest=True,
+        directed=False,
         settled=False,
         other_units=(("rad", 1.0), ("turns", 2 * math.pi)),
     ),

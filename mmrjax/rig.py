@@ -96,6 +96,7 @@ class Rig(eqx.Module):
         begins: of histories that do not begin at rest, once their table is known.
         surfaces: (configuration, another from which it differs by its ground alone).
         blank: whether it starts from nothing, so that nothing in it is another robot's.
+        loose: whether the load on the shaft has backlash, which histories then follow as a state.
     """
 
     delay: Scalar = parameter(
@@ -115,6 +116,7 @@ class Rig(eqx.Module):
     start: str = eqx.field(default="rest", static=True)
     surfaces: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
     blank: bool = eqx.field(default=False, static=True)
+    loose: bool = eqx.field(default=False, static=True)
 
     def instrument(self, channel: str) -> Instrument:
         """That of a channel."""

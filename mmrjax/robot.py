@@ -99,6 +99,11 @@ class Robot(eqx.Module):
         """Whether its load is a shaft, else a vehicle."""
         return isinstance(self.configurations.members[0], Shaft)
 
+    @property
+    def loose(self) -> bool:
+        """Whether its load can turn within a backlash, as a body of its own."""
+        return self.on_shaft and self.rig.loose
+
     def chassis(self, configuration: Index) -> Any:
         """The load of the configuration with this index; traceable and batchable."""
         first, *others = self.configurations.members

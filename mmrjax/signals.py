@@ -47,6 +47,7 @@ class State(eqx.Module):
         memory: of each effect that has one, by the effect's name, in its own unit; empty where none is kept.
         temperature: of the winding [°C], whose resistance follows it; None: not followed, resistance as stated.
         distance: travelled since the start of the run [m]; read where a load depends on its angle.
+        gap: of the output's motor side ahead of the load within the backlash, from its middle [rad]; None: rigid.
     """
 
     current: Scalar
@@ -56,6 +57,7 @@ class State(eqx.Module):
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
     temperature: Scalar | None = None
     distance: Scalar = 0.0
+    gap: Scalar | None = None
 
 
 class Signals(eqx.Module):
@@ -83,6 +85,7 @@ class Signals(eqx.Module):
     direction_travel: Scalar = UNSET  # of the robot, -1..1 [-]
     speed_wheel: Scalar = UNSET  # of driving wheel or pulley [rad/s]
     speed_theoretical: Scalar = UNSET  # r_k ω_k, eq. (32) [m/s]
+    speed_output: Scalar = UNSET  # of the load's side of the output, within a backlash not the wheel's [rad/s]
     angle: Scalar = UNSET  # of the output since the start of the run, of a load on a shaft [rad]
     # mass
     mass: Scalar = UNSET  # total M [kg]; to effects of balance `mass`, the stated one

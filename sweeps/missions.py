@@ -135,6 +135,10 @@ def _check_robot(robot: Robot) -> None:
             "--profile: the motors' speed is imposed on this robot, and a profile drives motors by their voltage; "
             'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
         )
+    if robot.loose:
+        raise BadConfiguration(
+            "--profile: a profile does not follow a backlash; set it to 0, or simulate over time with --model drive"
+        )
     for name, load in robot.configurations.items():
         if robot.on_shaft and float(load.torque_gravity) > 0:
             raise BadConfiguration(

@@ -278,7 +278,21 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         part, _, key = name.partition(".")
         robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})
     _check_pairs(robot, where)
-    return robot
+    return _with_backlash(robot, where)
+
+
+def _with_backlash(robot: Robot, where: str) -> Robot:
+    """`robot` that keeps the two sides of a backlash apart, where a load states one."""
+    if not robot.on_shaft:
+        return robot
+    loose = {name: load for name, load in robot.configurations.items() if float(load.backlash) > 0}
+    for name, load in loose.items():
+        if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
+            raise BadConfiguration(
+                f"{where}, {name}.backlash: got {float(load.backlash):g} rad; motor and load then turn apart, so "
+                f"motor.inertia and {name}.inertia have to be more than 0"
+            )
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, loose=bool(loose)))
 
 
 def _switch(where: str, name: str, value: Any) -> bool:

@@ -95,6 +95,8 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
     size = np.abs(possible[:, there])
     low, high = np.nanmin(size, 0), np.nanmax(size, 0)
     tells = high > SMALL * np.nanmax(high)
+    if not tells.any():  # a channel that steady travel does not show
+        return 1.0
     low, high, x = low[tells], high[tells], np.abs(measured[there][tells])
     x = np.maximum(x, 1e-9 * high)
     return float(np.median(np.where(x > high, x / high, np.where(x < low, x / low, 1.0))))

@@ -36,6 +36,7 @@ from mmrjax.signals import (
 # Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
 # The memories of those effects that have one follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
+_GAP = 0.01  # of the gap within a backlash, the last unknown where there is one [rad]
 
 #: Time after which a run is read as settled [s].
 TIME_SETTLED = 4.0
@@ -64,14 +65,14 @@ class Trajectory(eqx.Module):
 
 
 def _units(robot: Robot) -> tuple[float, ...]:
-    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering)
+    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering) + (_GAP,) * robot.loose
 
 
 def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     """The state that a vector of unknowns stands for."""
     y = y * jnp.asarray(_units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
-    return State(y[0], y[1], y[2], y[4], memory, distance=y[3])
+    return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None)
 
 
 #: The signals of an instant, traced once for each kind of robot however often a program asks for them.
@@ -95,6 +96,7 @@ def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
         signals.speed,
         current_battery,
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
+        *[signals.speed_wheel - signals.speed_output] * robot.loose,
     ]
     return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
 
@@ -126,6 +128,7 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
     settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
+    state += [jnp.zeros(())] * robot.loose
     y = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 

@@ -703,7 +703,7 @@ def _check_signs(runs: Runs) -> None:
             for k, channel in enumerate(channels.CHANNELS):
                 shown = measured[rows, k][np.isfinite(measured[rows, k])]
                 size = np.nanmax(np.abs(measured[:, k]), initial=0.0)
-                if channel.zero_at_rest and shown.size and np.median(shown) > RESTING * size:
+                if channel.zero_at_rest and channel.directed and shown.size and np.median(shown) > RESTING * size:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
                         f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} V; "

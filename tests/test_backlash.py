@@ -1,0 +1,137 @@
+"""Backlash as a state of the load: a rigid gear in the limit, free play at reversals, and found in a history."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from calibration.inference.calibrate import calibrate
+from mmrjax import channels, params, robots
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.drive import drive_batch
+from mmrjax.fidelities.histories import grid, histories
+from mmrjax.fidelities.steady import steady_batch
+from mmrjax.rig import Rig
+from mmrjax.robot import Configurations
+from mmrjax.shaft import Shaft
+
+DRIVE = {
+    "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
+    "motor.friction_coulomb": 2e-3, "motor.friction_viscous": 1e-6, "motor.inertia": 2e-6, "motor.inductance": 1e-3,
+}  # fmt: skip
+SAMPLES = np.linspace(0, 2, 201)
+TIMES = grid(SAMPLES, np.arange(0, 2, 0.5))
+VOLTAGE = np.where(TIMES % 1.0 < 0.5, 6.0, -6.0)
+
+
+def bench(backlash):
+    shaft = Shaft(inertia=0.01, loss_coulomb=0.1, loss_viscous=0.01, backlash=backlash)
+    rig = Rig(loose=backlash > 0)
+    return params.replace(robots.blank(Configurations({"bench": shaft}), rig=rig), DRIVE)
+
+
+def driven(robot):
+    conditions = dataclasses.replace(Conditions(voltage=0.0), voltage=jnp.asarray(VOLTAGE))
+    return histories(robot, conditions, jnp.asarray(TIMES))
+
+
+def test_a_little_backlash_is_a_rigid_gear_once_things_have_settled():
+    rigid, tight = driven(bench(0.0)), driven(bench(1e-4))
+    ends = np.searchsorted(TIMES, [0.49, 0.99, 1.49, 1.99])
+    np.testing.assert_allclose(np.asarray(tight.speed_motor)[ends], np.asarray(rigid.speed_motor)[ends], rtol=2e-4)
+    np.testing.assert_allclose(np.asarray(tight.current)[ends], np.asarray(rigid.current)[ends], rtol=2e-3)
+
+
+def test_steady_travel_knows_no_backlash():
+    conditions = Conditions(voltage=np.array([6.0, -6.0]))
+    run = drive_batch(bench(0.05), conditions, jnp.asarray([0.0, 3.0])).result
+    steady = steady_batch(bench(0.05), conditions)
+    for name in ("motor_speed", "output_speed", "total_current", "output_torque"):
+        np.testing.assert_allclose(run.reading[name], steady.reading[name], rtol=1e-4)
+
+
+def test_at_a_reversal_the_motor_turns_through_the_backlash_before_the_load():
+    """Motor side and load differ by the backlash from forward to backward, beside what the flanks give way."""
+    apart = []
+    for backlash in (0.05, 0.1):
+        s = driven(bench(backlash))
+        rate = np.asarray(s.speed_wheel - s.speed_output)
+        gap = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(TIMES))])
+        forward, backward = gap[np.searchsorted(TIMES, 0.49)], gap[np.searchsorted(TIMES, 0.99)]
+        apart.append(forward - backward)
+    np.testing.assert_allclose(np.diff(apart), [0.05], rtol=1e-3)
+    assert 0.05 < apart[0] < 0.052
+
+
+def test_the_derivative_by_the_backlash_is_the_difference():
+    def speed(x):
+        return driven(params.replace(bench(0.05), {"bench.backlash": x})).speed_motor
+
+    slope = np.asarray(jax.jvp(speed, (jnp.asarray(0.05),), (jnp.asarray(1.0),))[1])
+    difference = np.asarray(speed(0.05 + 1e-6) - speed(0.05 - 1e-6)) / 2e-6
+    assert np.abs(slope).max() > 10
+    assert np.abs(slope - difference).max() < 0.01 * np.abs(difference).max()
+
+
+FILE = """
+schema = "mmrjax.robot/2"
+base = "none"
+imposed = "voltage"
+channels = ["motor_speed", "output_angle"]
+[motor]
+resistance = 3.0
+torque_constant = 0.05
+inertia = 2e-6
+friction_coulomb = 2e-3
+[gearbox]
+ratio = 16
+efficiency_load = 0.8
+[bench]
+load = "shaft"
+inertia = 0.01
+loss_coulomb = 0.1
+backlash = "0.08 ± 30 %"
+"""
+
+
+def test_a_file_with_backlash_is_followed_with_it_and_needs_inertia(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(FILE)
+    assert robot_file.load(str(path)).loose
+    path.write_text(FILE.replace("inertia = 2e-6\n", ""))
+    with pytest.raises(
+        BadConfiguration, match=r"bench\.backlash: got 0\.08 rad; .* motor\.inertia and bench\.inertia"
+    ):
+        robot_file.load(str(path))
+
+
+@pytest.mark.slow
+def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(FILE)
+    robot = robot_file.load(str(path))
+    truth = params.replace(robot, {"bench.backlash": 0.06})
+    with channels.panel(robot.rig.channels):
+        seen = driven(truth)
+        at = np.searchsorted(TIMES, SAMPLES)
+        random = np.random.default_rng(3)
+        lines = ["time_s,supply_voltage_V,motor_speed_rpm,motor_speed_sd_rpm,output_angle_deg,output_angle_sd_deg"]
+        for k, t in zip(at, SAMPLES, strict=True):
+            speed = float(seen.speed_motor[k]) / channels.RPM + 5 * random.standard_normal()
+            angle = np.degrees(float(seen.angle[k])) + 0.2 * random.standard_normal()
+            lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
+        table = tmp_path / "table.csv"
+        table.write_text("\n".join(lines))
+        runs = records.read(table, robot=robot)
+        found = calibrate(
+            runs, robot, free=["bench.backlash", "bench.loss_coulomb"], model="drive", starts=2, blocks=False,
+            profiles=False,
+        )  # fmt: skip
+    backlash = found.parameters["bench.backlash"]
+    # Flanks that meet and part make kinks in the misfit: its curvature says less than what it finds is off by.
+    assert abs(backlash.value - 0.06) < 0.003 and not backlash.held_by_prior
