@@ -59,7 +59,7 @@ SIGNAL_UNITS = {
     "N": "normal resistance gravity demand traction adhesion_limit",
     "m/s": "speed speed_theoretical speed_slip_terms speed_sliding",
     "m/s^2": "acceleration",
-    "1/s": "speed_motor speed_wheel",
+    "1/s": "speed_motor speed_wheel speed_output",
     "1/s^2": "acceleration_wheel",
     "N·m": "torque_electromagnetic torque_motor_loss torque_motor torque_track_loss torque_load torque_idle "
     "torque_input torque_gear torque_output torque_net",
