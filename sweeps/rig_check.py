@@ -13,6 +13,7 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data import rig_facts, robot_file
+from calibration.data.columns import ON_GROUND, SUPPLY
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.runs import Runs
@@ -22,6 +23,7 @@ from calibration.inference.foresight import Foresight
 from mmrjax import channels
 from mmrjax.robot import Robot
 from mmrjax.shaft import Shaft
+from sweeps import words
 from sweeps.config import RobotPart
 from sweeps.console import say
 from sweeps.inputs import load_robot, read_runs
@@ -72,6 +74,10 @@ class RigCheck:
     def remarks(self) -> list[str]:
         """What should be looked at, a sentence each."""
         said = []
+        if not self.robot.rig.blank:
+            said.append(
+                'what the file does not state is its base\'s, a packaged robot (base = "none" starts from nothing)'
+            )
         if self.examples:
             lines = ", ".join(map(str, self.examples))
             said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
@@ -108,6 +114,8 @@ class RigCheck:
             return []
         found = []
         for name, values in self.runs.columns.items():
+            if name not in self.shown and self._means_nothing(name):
+                continue
             number = np.issubdtype(values.dtype, np.number)
             there = values[np.isfinite(values)] if number else values
             kinds = np.unique(there)
@@ -123,6 +131,12 @@ class RigCheck:
                 }
             )
         return found
+
+    def _means_nothing(self, column: str) -> bool:
+        """Whether a column that the table lacks says nothing of this rig: of a ground, or what is not imposed."""
+        if self.robot.on_shaft and column in ON_GROUND:
+            return True
+        return column == SUPPLY and self.robot.rig.imposed != "voltage"
 
     def unused(self) -> list[str]:
         """Of each column that is not used, why."""
@@ -218,6 +232,8 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool)
         BadConfiguration: a file that cannot be read, or lacks something, with all that it lacks.
         BadData: a table that cannot be used with this rig.
     """
+    if file.is_dir():
+        raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
     if not file.is_file():
         raise BadConfiguration(f"{file}: no such file; mmrjax rig new {file} writes one to fill in")
     found = examined(file, data, effects)
@@ -295,7 +311,7 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     for sentence in [*found.unused(), *runs.missing()]:
         say(f"- {sentence}")
     names, counts = np.unique(np.array(seen.status), return_counts=True)
-    others = [f"{count} rows: {name}" for name, count in zip(names, counts, strict=True) if name != "converged"]
+    others = [f"{count} rows: {name}" for name, count in zip(names, counts, strict=True) if name not in words.SETTLED]
     if others:
         say(
             f"- with the file's numbers not every row settles ({', '.join(others)}); one that the "

@@ -32,6 +32,7 @@ from sweeps.console import say, tell
 from sweeps.figures_style import short
 from sweeps.grid import configurations, grid
 from sweeps.inputs import beside_robot, load_robot, read_runs
+from sweeps.run import refuse
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
 
 #: Operating points where a sample is drawn at each: corners and middle of Table 8.
@@ -64,6 +65,7 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
     inputs = _inputs(config, robot, runs, ranges)
     candidates = _candidates(config, robot, runs)
     conditions = runs.conditions(robot)
+    refuse(robot, conditions, config)
     supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
     study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, tell)
     with open_folder("sensitivity", config, robot, out, force, runs) as folder:

@@ -191,12 +191,16 @@ REFUSED = {
         "wheeled", True, ["render", "x.png", "--motor-speed", "900"], r"--model track: the motors' speed is imposed",
     ),
     "picture without inertia": (
-        "wheeled", False, ["render", "x.png", "--voltage", "9"], r"--model track: rover\.inertia: got 0; expected",
+        "wheeled", False, ["render", "x.png", "--voltage", "9", "--set", "rover.inertia=0"],
+        r"--model track: rover\.inertia: got 0; expected",
     ),
     "running gear of a bench": (
         "bench", False, ["simulate", "--voltage", "9", "--model", "track"], r"--model track: the robot's load is a shaft",
     ),
     "resonance": ("bench", False, ["resonance"], r"resonance: the robot's load is a shaft"),
+    "a pendulum's sensitivity": (
+        "pendulum", False, ["sensitivity", "--voltages", "3"], r"--model steady: arm .* has no steady state",
+    ),
     "sensitivity": ("bench", False, ["sensitivity"], r"--voltages: not stated"),
     "varied slope": (
         "bench", False, ["sensitivity", "--voltages", "9", "--vary", "slope_deg=0:5"], r"--vary slope_deg: the robot's lo",
@@ -282,7 +286,7 @@ def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
 def test_a_vehicle_is_drawn(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "wheeled")
     code, out, err = mmrjax(
-        "render", "x.png", "--robot", rig, "--set", "rover.inertia=5e-4", "--voltage", "12", "--duration", "0.2",
+        "render", "x.png", "--robot", rig, "--voltage", "12", "--duration", "0.2",
         "--begin", "0.1",
     )  # fmt: skip
     assert code in (0, 3) and (tmp_path / "x.png").stat().st_size > 1000, err

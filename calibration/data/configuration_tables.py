@@ -69,10 +69,12 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
             f"{where}: no load; expected a table such as [bench] with load = one of {', '.join(rig_file.LOADS)}"
         )
     names = _names(content.pop("configurations", usual), where)
+    nothing = f', or state base = "{rig_file.NONE}" for a rig that starts from nothing'
     for name in found:
         if name not in names and set(_KINDS) & set(content[name]):
             raise BadConfiguration(
                 f"{where}, {name}: not among the configurations, {', '.join(names)}; add it to configurations = [...]"
+                f"{'' if base is None else nothing}"
             )
     by_name: dict[str, Load] = {}
     missing: list[str] = []

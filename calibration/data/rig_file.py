@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from calibration.data import runs as records
@@ -268,11 +269,14 @@ def needed(rig: Rig) -> tuple[str, ...]:
     return tuple(name for name, wanted in conditions if wanted)
 
 
-def refuse_missing(missing: Sequence[str], known: Mapping[str, params.Parameter], where: str) -> None:
+def refuse_missing(
+    missing: Sequence[str], known: Mapping[str, params.Parameter], where: str, given: Iterable[str] = ()
+) -> None:
     """Refuse a robot that starts from nothing and does not state what it must.
 
     Args:
         missing: names of parameters; known: every parameter of the robot.
+        given: names that the file states, of which one may be misspelt.
 
     Raises:
         BadConfiguration: one sentence that lists all of them.
@@ -280,9 +284,12 @@ def refuse_missing(missing: Sequence[str], known: Mapping[str, params.Parameter]
     if missing:
         each = ", ".join(f"{name} [{known[name].spec.unit}]" for name in missing)
         verb = "is" if len(missing) == 1 else "are"
+        strange = [name for name in given if name not in known]
+        near = [(x, name) for name in missing for x in difflib.get_close_matches(name, strange, 1, 0.85)]
+        misspelt = "".join(f"; is {x} meant to be {name}?" for x, name in near)
         raise BadConfiguration(
             f'{where}: {each} {verb} missing, which a robot with base = "none" has to state (mmrjax rig new writes a '
-            "file with every one)"
+            f"file with every one){misspelt}"
         )
 
 

@@ -7,7 +7,7 @@ import difflib
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -130,7 +130,8 @@ def parameters_stated(path: Path) -> tuple[set[str], set[str]]:
         BadConfiguration: as `read`.
     """
     content = tomllib.loads(path.read_text(encoding="utf-8"))
-    base = content.get("base", "nominal")
+    content.pop("schema", None)
+    base = content.pop("base", "nominal")
     linear = {n for n, table in content.items() if isinstance(table, dict) and table.get("load") == "linear"}
     _without_parameters(None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name)
     return {name for name, _ in _flatten(content)}, linear
@@ -157,13 +158,17 @@ def _without_parameters(base: Robot | None, content: dict[str, Any], where: str)
     robot = robots.blank(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
+    known = {p.name: p for p in params.walk(robot)}
     resistance = given.get("motor.resistance")
     if isinstance(resistance, int | float):
         robot = params.replace(robot, {"motor.inductance": params.as_float(rig_file.WINDING * resistance)})
+    for name in given:
+        if "." not in name and name not in COUNTS:
+            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
     missing = [name for name in rig_file.needed(rig) if name not in given]
     if found.on_shaft and not found.linear and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
-    rig_file.refuse_missing([*missing, *found.missing], {p.name: p for p in params.walk(robot)}, where)
+    rig_file.refuse_missing([*missing, *found.missing], known, where, given)
     return robot, sds
 
 
@@ -254,12 +259,13 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     known = {p.name: p for p in params.walk(robot)}
     for name, value in stated.items():
         if name not in known:
-            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, list(known))}")
+            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
         spec = known[name].spec
         low, high = spec.bounds
         allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed}")
+            form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
+            raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed}{form}")
         if name == "gearbox.ratio" and 0 < value < 1:
             raise BadConfiguration(
                 f"{where}, {name}: got {number(value)}; expected turns of the motor for one of the output, at least "
@@ -323,7 +329,7 @@ def _count(where: str, name: str, value: Any) -> int:
     return int(value)
 
 
-def _parameters(name: str, known: list[str]) -> str:
+def _parameters(name: str, known: Collection[str]) -> str:
     """What to choose from in place of an unknown parameter."""
     head = name.partition(".")[0]
     heads = list(dict.fromkeys(n.partition(".")[0] for n in known))
@@ -331,7 +337,10 @@ def _parameters(name: str, known: list[str]) -> str:
     if head in heads:
         return choices(name, near or [n for n in known if n.startswith(f"{head}.")])
     hint = f"did you mean {near[0]}? " if near and difflib.get_close_matches(head, heads, 1, 0.6) else ""
-    return f"{hint}the robot has {', '.join(heads)}"
+    single = ("base", "sides", "configurations", *rig_file.KEYS)
+    if not name.count(".") and (close := difflib.get_close_matches(name, single, 1, 0.75)):
+        hint = f"did you mean {close[0]}? "
+    return f"{hint}the robot has {', '.join(heads)}; a file may state {', '.join(single)} too"
 
 
 def _check_pairs(robot: Robot, where: str) -> None:

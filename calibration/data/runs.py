@@ -50,6 +50,8 @@ def known_columns() -> tuple[str, ...]:
 
 #: Tables that come with the package.
 PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_paper.csv"}
+#: How far beyond zero a reading's noise may carry it: in sds that are stated, and as a share of the channel's rms.
+SIGN_SDS, SIGN_SHARE = 4.0, 0.05
 
 
 @dataclasses.dataclass(frozen=True)
@@ -353,7 +355,18 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         backward = (imposed < 0) & ((columns["slope_deg"] <= 0) | channel.zero_at_rest)
         if not channel.zero_at_rest and (layout.weight or "duty" in columns):
             continue  # gravity may drive a motor; a bridge that reverses the voltage reverses the supply's current
-        wrong = np.flatnonzero(backward & (readings > 0))
+        doubt = _doubt(columns, channel)
+        wrong = np.flatnonzero(backward & (readings > (0.0 if layout.usual else doubt)))
+        forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
+        forward &= channel.name != "motor_voltage"  # which is held against the back-EMF
+        against = np.flatnonzero(forward & (readings < -doubt))
+        if against.size:
+            at = int(against[0])
+            raise BadData(
+                f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at {number(imposed[at])} {unit}; "
+                "nothing drives the motors there, so expected a reading with the sign of what is imposed, the "
+                "same in every row"
+            )
         if wrong.size:
             at = int(wrong[0])
             alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
@@ -362,6 +375,13 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
                 f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at "
                 f"{number(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
             )
+
+
+def _doubt(columns: dict[str, np.ndarray], channel: channels.Channel) -> np.ndarray | float:
+    """What a reading may lie beyond zero by its noise: SIGN_SDS of its stated sd, or a share of the channel's rms."""
+    readings = columns[channel.column]
+    share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
+    return np.fmax(share, SIGN_SDS * np.nan_to_num(columns.get(channel.sd_column, np.zeros(len(readings)))))
 
 
 def _check_header(

@@ -33,7 +33,9 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
     except ValueError:
         raise BadConfiguration(f"{where}: got {text!r}; {FORM}") from None
     size *= abs(mean) / 100 if sd.strip().endswith("%") else 1.0
-    if not (math.isfinite(mean) and math.isfinite(size) and size > 0):
+    if not math.isfinite(mean):
+        raise BadConfiguration(f"{where}: got {text!r}; {FORM}")
+    if not (math.isfinite(size) and size > 0):
         raise BadConfiguration(f"{where}: got {text!r}; the standard deviation must be more than 0; {FORM}")
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
 

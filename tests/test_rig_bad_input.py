@@ -1,0 +1,128 @@
+"""What a new user gets wrong of a rig: one sentence each, with where, what came, what is allowed."""
+
+import pytest
+
+from calibration.data import robot_file, stated
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from mmrjax import channels
+from sweeps import rig_check
+
+BRAKE = """
+base = "none"
+imposed = "motor_speed"
+channels = ["total_current"]
+[motor]
+torque_constant = "0.041 ± 3 %"
+friction_coulomb = 0.002
+[gearbox]
+ratio = 29
+efficiency_load = "0.72 ± 6 %"
+[brake]
+load = "shaft"
+inertia = 0.004
+loss_coulomb = "0.3 ± 40 %"
+"""
+WINCH = BRAKE + "torque_constant = 0.2\n"
+
+
+@pytest.fixture(autouse=True)
+def _channels():
+    with channels.panel(channels.names()):
+        yield
+
+
+def rig_of(tmp_path, text):
+    path = tmp_path / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    robot = robot_file.read(path)
+    channels.select(robot.rig.channels)
+    return robot
+
+
+def table(tmp_path, *rows, header="motor_speed_rpm,total_current_A"):
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join((header, *rows)) + "\n", encoding="utf-8")
+    return path
+
+
+FILES = {
+    "a key misspelt": (
+        BRAKE.replace("inertia = ", "inertai = "),
+        r"rig\.toml: brake\.inertia \[kg·m\^2\] is missing, .*; is brake\.inertai meant to be brake\.inertia\?$",
+    ),
+    "no base": (
+        BRAKE.replace('base = "none"', ""),
+        r'brake: not among the configurations, .*, or state base = "none" for a rig that starts from nothing$',
+    ),
+    "a plus for a ±": (
+        BRAKE.replace("0.041 ± 3 %", "0.041 + 3 %"),
+        r"motor\.torque_constant: got '0\.041 \+ 3 %'; expected a number, .* as \"0\.61 ± 0\.03\"$",
+    ),
+    "no number before the ±": (
+        BRAKE.replace("0.041 ± 3 %", "nan ± 1"),
+        r"motor\.torque_constant: got 'nan ± 1'; expected a number, or one with",
+    ),
+    "another key": (
+        'colour = "red"\n' + BRAKE,
+        r"colour: no such parameter; the robot has .*; a file may state base, ",
+    ),
+    "a key of the rig misspelt": (
+        BRAKE.replace("imposed", "impose"),
+        r"impose: no such parameter; did you mean imposed\? the robot has",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_a_mistake_in_a_rigs_file_is_one_sentence(tmp_path, case):
+    text, message = FILES[case]
+    with pytest.raises(BadConfiguration, match=message) as refused:
+        rig_of(tmp_path, text)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_number_that_is_none_is_not_blamed_on_its_sd():
+    with pytest.raises(BadConfiguration, match=r"^x: got 'inf ± 1'; expected a number, or one"):
+        stated.stated_number("inf ± 1", "x")
+
+
+def test_a_folder_is_no_rigs_file(tmp_path):
+    with pytest.raises(BadConfiguration, match=r"is a folder; expected a rig's TOML file$"):
+        rig_check.check(tmp_path, None, (), False)
+
+
+@pytest.mark.parametrize("rows", [("900,-0.6", "1800,-0.7"), ("900,-0.6", "1800,0.7", "-900,-0.6")])
+def test_a_current_against_the_imposed_speed_is_refused_forward_too(tmp_path, rows):
+    robot = rig_of(tmp_path, BRAKE)
+    message = (
+        r"t\.csv row 1, total_current_A: got -0\.6 at 900 rpm; nothing drives the motors there, so expected a reading"
+    )
+    with pytest.raises(BadData, match=message):
+        records.read(table(tmp_path, *rows), robot=robot)
+
+
+def test_noise_about_zero_and_a_weight_are_no_wrong_signs(tmp_path):
+    robot = rig_of(tmp_path, BRAKE)
+    rows = ("900,-0.01,0.004", "1800,0.6,0.004", "-900,0.01,0.004")
+    header = "motor_speed_rpm,total_current_A,total_current_sd_A"
+    assert len(records.read(table(tmp_path, *rows, header=header), robot=robot)) == 3
+    robot = rig_of(tmp_path, WINCH)
+    assert len(records.read(table(tmp_path, "900,-0.6", "1800,0.7"), robot=robot)) == 2
+
+
+def test_rig_check_does_not_call_runs_backward_unsettled(tmp_path, capsys):
+    rig_of(tmp_path, BRAKE)
+    data = table(tmp_path, "900,0.62", "-900,-0.61", "2000,0.64", "-2000,-0.65")
+    assert rig_check.check(tmp_path / "rig.toml", str(data), (), False) == 0
+    out = capsys.readouterr().out
+    assert "motor_speed_rpm" in out and "settles" not in out
+    assert not any(word in out for word in ("slope_deg", "payload_kg", "supply_voltage_V"))
+
+
+def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
+    (tmp_path / "rig.toml").write_text("")
+    assert rig_check.check(tmp_path / "rig.toml", None, (), False) == 0
+    assert 'is its base\'s, a packaged robot (base = "none" starts from nothing)' in " ".join(
+        capsys.readouterr().out.split()
+    )
