@@ -1,10 +1,12 @@
 """What a new user gets wrong of a rig: one sentence each, with where, what came, what is allowed."""
 
+import numpy as np
 import pytest
 
 from calibration.data import robot_file, stated
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
+from calibration.inference import bases, observers
 from mmrjax import channels
 from sweeps import rig_check
 
@@ -126,3 +128,30 @@ def test_rig_check_says_what_a_file_without_base_takes(tmp_path, capsys):
     assert 'is its base\'s, a packaged robot (base = "none" starts from nothing)' in " ".join(
         capsys.readouterr().out.split()
     )
+
+
+def test_histories_of_a_shaft_have_bases_of_what_may_be_missing(tmp_path):
+    """None of them a wave of a belt's: a shaft runs on no tracks."""
+    text = BRAKE.replace('imposed = "motor_speed"', "").replace(
+        "[motor]", "[motor]\nresistance = 3.0\ninertia = 1e-6"
+    )
+    robot = rig_of(tmp_path, text)
+    times = np.linspace(0.0, 0.5, 12)
+    rows = [f"a,{t:.3f},12,{0.9 - 0.5 * t:.3f}" for t in times]
+    data = table(tmp_path, *rows, header="run_id,time_s,supply_voltage_V,total_current_A")
+    runs = records.read(data, robot=robot)
+    observer = observers.Histories.of(runs, robot)
+    seen = {
+        "supply_voltage_V": np.full(12, 12.0),
+        "motor_speed_rpm": np.linspace(0, 2000, 12),
+        "total_current_A": np.linspace(0.9, 0.65, 12),
+        "slope_deg": np.zeros(12),
+        "total_mass_kg": np.zeros(12),
+        "speed_mm_s": np.zeros(12),
+        "time_s": times,
+        "configuration": np.full(12, "brake"),
+        "run_id": np.full(12, "a"),
+        "payload_kg": np.zeros(12),
+    }
+    found = observer.bases(seen, np.ones(12, bool), robot)
+    assert not any("belt" in str(name) for name in bases.names(found))

@@ -545,7 +545,8 @@ class Histories(Observer):
             )
             columns = {**columns, "supply_voltage_V": at_motors}
         angle = np.nan_to_num(np.asarray(_angle(self, robot)))
-        on_tracks = np.asarray(jax.vmap(robot.chassis)(self.conditions.configuration).on_tracks > 0.5)
+        which = self.conditions.configuration
+        on_tracks = np.broadcast_to(jax.vmap(robot.chassis)(which).on_tracks > 0.5, np.shape(which))
         waves = bases_room.waves(on_tracks[self.run], angle, np.asarray(self.rows_of), np.asarray(self.knots), robot)
         weight = included.astype(float)
         return (*bases_room.families(columns, weight, robot), *bases_room.windows(columns, weight, robot), *waves)
