@@ -118,6 +118,7 @@ def calibrate(
     known = noise_room.of(runs, observe.sizes(runs), noise)
     robot = observe.begun(robot, runs, known)
     default = priors.default_names(present, robot, computed=facts.computes)
+    default = (*default, *priors.delays(robot, observe.free()[0]))
     names = priors.choose(robot, default, free, fix)
     unread = fidelities.unread(model, names)
     if unread:

@@ -59,6 +59,8 @@ SURFACE_OF_RIGS = {**SURFACE, "ground.rolling_resistance": 1.0}
 FRICTION_OF_RIGS = (".friction_coulomb", ".friction_viscous", ".loss_coulomb", ".loss_viscous", ".rolling_resistance")
 RELATIVE_OF_RIGS = 0.5
 
+DELAY = "rig.delay"
+
 SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
 
 
@@ -141,9 +143,15 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
 
 
 def _not_zero(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
-    """Those of a robot's parameters that are not zero: one that is set to zero is held there."""
-    fields = known(robot)
-    return tuple(n for n in names if float(fields[n].value) != 0.0)
+    """Those of a robot's parameters that are not zero: one that is set to zero is held there, unless the rig's file
+    says how sure that zero is."""
+    fields, stated = known(robot), {name for name, _, _ in robot.rig.priors}
+    return tuple(n for n in names if float(fields[n].value) != 0.0 or n in stated)
+
+
+def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+    """Of these, the delay of a rig whose file says how sure it is."""
+    return tuple(n for n in names if n == DELAY and n in {name for name, _, _ in robot.rig.priors})
 
 
 def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = ()) -> tuple[str, ...]:

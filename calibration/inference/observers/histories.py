@@ -32,6 +32,7 @@ from calibration.inference.normal_equations import backward, cholesky, forward
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Optimum, linearised, searches_long
+from calibration.inference.priors import DELAY
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
 from mmrjax.channels import RPM
@@ -290,7 +291,7 @@ class Histories(Observer):
 
     @classmethod
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        return ("motor.inductance", "motor.inertia"), ("inertia", *SLIDING)
+        return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *SLIDING)
 
     @classmethod
     def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:

@@ -1,0 +1,142 @@
+"""Histories of rigs: an imposed speed with a delay, and beginnings that are measured or free, given back."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.inference import noise, observers, priors
+from calibration.inference.calibrate import calibrate
+from mmrjax import channels, params
+from mmrjax.rig import Begin, Begins
+
+DRIVE = """
+schema = "mmrjax.robot/2"
+base = "none"
+imposed = "{imposed}"
+channels = [{channels}]
+start = "{start}"
+[motor]
+resistance = 3.0
+torque_constant = 0.05
+inertia = 2e-6
+friction_coulomb = 2e-3
+[gearbox]
+ratio = 16
+efficiency_load = 0.8
+"""
+BENCH = """
+[rig]
+delay = "0 ± 0.05"
+[bench]
+load = "shaft"
+inertia = 0.02
+loss_coulomb = "0.2 ± 50 %"
+loss_viscous = 0.01
+"""
+ARM = """
+[arm]
+load = "shaft"
+inertia = 0.01
+loss_coulomb = "0.05 ± 50 %"
+loss_viscous = 0.01
+torque_gravity = "0.6 ± 20 %"
+"""
+OPTIONS = {"model": "drive", "starts": 4, "blocks": False, "profiles": False}
+
+
+def history(tmp_path, robot, truth, columns, sd, seed):
+    """A table whose readings are those of `truth` with noise of the sds [the columns' units]."""
+    rows = len(columns["time_s"])
+    path = tmp_path / "table.csv"
+
+    def write(readings):
+        names = [*columns, *(n for c in channels.CHANNELS for n in (c.column, c.sd_column))]
+        cells = [*columns.values(), *(x for k in range(len(sd)) for x in (readings[:, k], np.full(rows, sd[k])))]
+        lines = [",".join(names), *(",".join(str(c[k]) for c in cells) for k in range(rows))]
+        path.write_text("\n".join(lines))
+        return records.read(path, robot=robot)
+
+    blank = write(np.zeros((rows, len(sd))))
+    shown = np.asarray(observers.kind(blank).of(blank, truth)(truth).reading)
+    factor = np.array([c.factor for c in channels.CHANNELS])
+    noise = np.array(sd) * np.random.default_rng(seed).standard_normal(shown.shape)
+    return write(shown / factor + noise)
+
+
+@pytest.mark.slow
+def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH)
+    robot = robot_file.load(str(path))
+    truth = params.replace(robot, {"rig.delay": 0.03, "bench.loss_coulomb": 0.26})
+    t = np.arange(0, 4, 0.03)
+    speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / channels.RPM
+    with channels.panel(robot.rig.channels):
+        runs = history(tmp_path, robot, truth, {"time_s": t, "motor_speed_rpm": speed}, [0.01], 1)
+        found = calibrate(runs, robot, **OPTIONS)
+    delay, friction = found.parameters["rig.delay"], found.parameters["bench.loss_coulomb"]
+    assert abs(delay.value - 0.03) < 4 * delay.sd < 4e-3
+    assert abs(friction.value - 0.26) < 4 * friction.sd < 0.02
+
+
+@pytest.mark.slow
+def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed", "output_angle"', start="free") + ARM
+    )
+    robot = robot_file.load(str(path))
+    begins = Begins({"begin_a": Begin(motor_speed=30.0, angle=0.3), "begin_b": Begin(motor_speed=-20.0, angle=0.1)})
+    truth = params.replace(robot, {"arm.torque_gravity": 0.66, "arm.loss_coulomb": 0.08})
+    truth = dataclasses.replace(truth, rig=dataclasses.replace(truth.rig, begins=begins))
+    t = np.arange(0, 3, 0.03)
+    voltage = 2.5 * np.sin(1.5 * t) + 0.5
+    columns = {
+        "run_id": np.repeat(["a", "b"], len(t)),
+        "time_s": np.tile(t, 2),
+        "supply_voltage_V": np.concatenate([voltage, -voltage]),
+    }
+    with channels.panel(robot.rig.channels):
+        runs = history(tmp_path, robot, truth, columns, [0.01, 20.0, 0.6], 2)
+        found = calibrate(runs, robot, **OPTIONS)
+    expected = {
+        "arm.torque_gravity": 0.66, "arm.loss_coulomb": 0.08, "rig.begin_a.motor_speed": 30.0,
+        "rig.begin_a.angle": 0.3, "rig.begin_b.motor_speed": -20.0, "rig.begin_b.angle": 0.1,
+    }  # fmt: skip
+    for name, value in expected.items():
+        estimate = found.parameters[name]
+        assert abs(estimate.value - value) < 4 * estimate.sd, name
+    assert found.parameters["arm.torque_gravity"].sd < 0.01
+
+
+def test_beginnings_are_measured_by_the_first_samples(tmp_path):
+    """A line through five samples, whatever channel shows the speed; only free ones are free."""
+    path = tmp_path / "rig.toml"
+    for start in ("measured", "free"):
+        path.write_text(DRIVE.format(imposed="voltage", channels='"output_speed", "output_angle"', start=start) + ARM)
+        robot = robot_file.load(str(path))
+        with channels.panel(robot.rig.channels):
+            table = tmp_path / "table.csv"
+            lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
+            lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
+            table.write_text("\n".join(lines))
+            runs = records.read(table, robot=robot)
+            kind = observers.kind(runs)
+            known = noise.of(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
+            begun = kind.begun(robot, runs, known)
+        assert begun.rig.begins.names == ("begin_",)
+        begin = begun.rig.begins.members[0]
+        assert float(begin.motor_speed) == pytest.approx(60 * channels.RPM * 16, rel=1e-9)
+        assert float(begin.angle) == pytest.approx(np.radians(30), abs=0.002)
+        assert bool(priors.begins(begun)) == (start == "free")
+
+
+def test_a_robot_at_rest_has_no_beginnings(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + ARM)
+    robot = robot_file.load(str(path))
+    assert robot.rig.begins is None and jnp.asarray(robot.rig.delay) == 0
