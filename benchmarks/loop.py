@@ -159,7 +159,7 @@ def remainders(case: g.Case) -> dict[str, list[np.ndarray]]:
     for name, form in pool_of(case).items():
         grid = [{}]
         for shape, (low, high) in form.shapes.items():
-            grid = [{shape: v} for v in np.geomspace(low, high, 5)]
+            grid = [{**others, shape: v} for others in grid for v in np.geomspace(low, high, 5)]
         for shapes in grid:
             sign = g.signature(c, p, [g.Term(name, 0.02 * form.size, shapes)], show)
             left = g.remainder(np.nan_to_num(sign), slopes)

@@ -59,7 +59,7 @@ def runs_batches(fidelity: Fidelity, robot) -> None:
     assert isinstance(done, Run) and done.history is None
     assert all(x.shape == (2,) for x in jax.tree.leaves(done))
     assert set(np.asarray(done.result.status)) <= set(range(len(STATUSES)))
-    assert set(done.result.reading) == set(channels.names())
+    assert set(done.result.reading) == {c.name for c in channels.known()}
 
 
 def keeps_histories(fidelity: Fidelity, robot) -> None:
@@ -71,7 +71,7 @@ def keeps_histories(fidelity: Fidelity, robot) -> None:
     assert isinstance(history, History)
     assert history.time.shape == history.distance.shape and len(history.time) == 2
     assert (np.diff(history.time) > 0).all() and abs(history.time[0, -1] - SHORT) < 1e-9
-    assert set(history.reading) == set(channels.names())
+    assert set(history.reading) == {c.name for c in channels.known()}
     for name, reading in history.reading.items():
         assert reading.shape == history.time.shape and np.isfinite(reading).all(), name
     assert (np.abs(history.distance[:, 0]) < 1e-3).all() and (history.reading["total_current"][:, -1] > 0).all()
