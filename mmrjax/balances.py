@@ -37,6 +37,15 @@ BALANCES = {
 }
 
 
+def absent(robot: Robot) -> frozenset[str]:
+    """Balances that a robot has not, or that nothing of it shows: the ground's of a load on a shaft, those of the
+    voltage where the motors' speed is imposed."""
+    ground = {"ground", "slip", "mass"} if robot.on_shaft else set()
+    supply = set() if robot.rig.imposed == "voltage" else {"supply"}
+    winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
+    return frozenset(ground | supply | winding)
+
+
 def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
     """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit; an effect adds nothing
     in configurations on which it does not act."""
@@ -194,6 +203,7 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
     inertia = chassis_room.inertia_reduced(inertia_motor, gear.ratio, efficiency, inertia_wheel)
     acceleration = net / inertia
     torque_input = signals.torque_motor - inertia_motor * gear.ratio * acceleration
+    torque_gear = gear.ratio * efficiency * (torque_input - idle)
     return _fill(
         signals,
         torque_idle=idle,
@@ -203,8 +213,8 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
         torque_net=net,
         acceleration_wheel=acceleration,
         torque_input=torque_input,
-        torque_gear=gear.ratio * efficiency * (torque_input - idle),
-        torque_output=gear.ratio * efficiency * (torque_input - idle) - own,
+        torque_gear=torque_gear,
+        torque_output=torque_gear - own,
     )
 
 

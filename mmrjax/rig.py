@@ -118,6 +118,16 @@ class Rig(eqx.Module):
     blank: bool = eqx.field(default=False, static=True)
     loose: bool = eqx.field(default=False, static=True)
 
+    @property
+    def stated(self) -> frozenset[str]:
+        """Parameters of which the file says how sure it is."""
+        return frozenset(name for name, _, _ in self.priors)
+
+    @property
+    def shows_voltage(self) -> bool:
+        """Whether the motors' voltage is imposed or read."""
+        return self.imposed == "voltage" or "motor_voltage" in self.channels
+
     def instrument(self, channel: str) -> Instrument:
         """That of a channel."""
         return next((i for i in self.instruments if i.channel == channel), Instrument(channel))

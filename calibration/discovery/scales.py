@@ -20,7 +20,7 @@ import numpy as np
 from calibration.data.effect_file import Library
 from calibration.inference.linearization import amplitude_of, shape_of
 from mmrjax import channels, params, robots
-from mmrjax.balances import BALANCES, added
+from mmrjax.balances import BALANCES, absent, added
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.steady import operating
@@ -79,13 +79,7 @@ def library_for(robot: Robot, conditions: Conditions, library: Library) -> Libra
 
 def present(kind: type[Effect], robot: Robot) -> bool:
     """Whether a rig has the balance that an effect enters, and what it needs there."""
-    nowhere: set[str] = set()
-    if robot.on_shaft:
-        nowhere |= {"ground", "slip", "mass"}
-    voltage = robot.rig.imposed == "voltage"
-    if not voltage:
-        nowhere |= {"supply"} if "motor_voltage" in robot.rig.channels else {"supply", "electrical", "inductance"}
-    if kind.balance in nowhere or (robot.on_shaft and (kind.movers or kind.needs_belt)):
+    if kind.balance in absent(robot) or (robot.on_shaft and (kind.movers or kind.needs_belt)):
         return False
     return kind.balance != "sensor" or kind.channel in robot.rig.channels
 

@@ -17,6 +17,7 @@ from numpy.polynomial import legendre
 from calibration.data.columns import SPEED, Layout
 from calibration.inference.linearization import PROBED, Linearization
 from mmrjax import channels
+from mmrjax.balances import absent
 from mmrjax.effects import UNNAMED
 from mmrjax.robot import Robot
 
@@ -146,10 +147,7 @@ def balances_of(robot: Robot | None) -> tuple[str, ...]:
     """Those of `BALANCES` that a robot has; None: any."""
     if robot is None:
         return BALANCES
-    lacks = {"ground", "slip"} if robot.on_shaft else set()
-    if robot.rig.imposed != "voltage" and "motor_voltage" not in robot.rig.channels:
-        lacks |= {"electrical"}
-    return tuple(b for b in BALANCES if b not in lacks)
+    return tuple(b for b in BALANCES if b not in absent(robot))
 
 
 def axes_of(robot: Robot | None) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from calibration.data.errors import BadConfiguration, choices, number
+from calibration.data.surfaces import GROUND
 from mmrjax import params
 from mmrjax.params import Parameter
 from mmrjax.robot import Robot
@@ -39,8 +40,6 @@ TIED = (
     ("ground.friction.dynamic", "ground.friction.static"),
     ("ground.friction.speed_dynamic", "ground.friction.speed_static"),
 )
-#: Beginning of the parameters of a configuration that are its surface's.
-GROUND = "ground."
 #: What a surface may be where nobody states it: relative sds around the robot's friction that hold dry grounds of
 #: every kind (μ_s from 0.2 to 1, V_s from 2 to 60 mm/s) within two sds. The fields' own are those of the surface of
 #: Table 5.
@@ -145,13 +144,13 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
 def _not_zero(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     """Those of a robot's parameters that are not zero: one that is set to zero is held there, unless the rig's file
     says how sure that zero is."""
-    fields, stated = known(robot), {name for name, _, _ in robot.rig.priors}
+    fields, stated = known(robot), robot.rig.stated
     return tuple(n for n in names if float(fields[n].value) != 0.0 or n in stated)
 
 
 def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     """Of these, the delay of a rig whose file says how sure it is."""
-    return tuple(n for n in names if n == DELAY and n in {name for name, _, _ in robot.rig.priors})
+    return tuple(n for n in names if n == DELAY and n in robot.rig.stated)
 
 
 def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = ()) -> tuple[str, ...]:
@@ -173,9 +172,8 @@ def begins(robot: Robot) -> tuple[str, ...]:
     """Speeds and angles at which histories begin, where a rig leaves them free."""
     if robot.rig.begins is None or robot.rig.start != "free":
         return ()
-    stated = {name for name, _, _ in robot.rig.priors}
     every = (f"rig.{run}.{field}" for run in robot.rig.begins.names for field in ("motor_speed", "angle"))
-    return tuple(name for name in every if name in stated)
+    return tuple(name for name in every if name in robot.rig.stated)
 
 
 #: Freed by the loop beside friction: what benches and makers state, with their tolerances.
@@ -234,7 +232,7 @@ ELECTRICAL = ("motor.resistance", "motor.inductance")
 
 def _drive(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     """Parameters of the drive, less those that only the voltage shows where it is neither imposed nor read."""
-    if robot.rig.imposed == "voltage" or "motor_voltage" in robot.rig.channels:
+    if robot.rig.shows_voltage:
         return tuple(names)
     return tuple(n for n in names if n not in ELECTRICAL)
 
