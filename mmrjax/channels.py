@@ -64,6 +64,13 @@ class Channel:
     other_units: tuple[tuple[str, float], ...] = ()
 
 
+def _winding_temperature(robot: Robot, signals: Signals) -> Any:
+    """Of the winding [°C]: where it is followed as it is, else after long running at this current."""
+    if signals.temperature is not None:
+        return signals.temperature
+    return robot.motor.temperature_settled(signals.current)
+
+
 #: Every channel that there is.
 EVERY: tuple[Channel, ...] = (
     Channel(
@@ -205,7 +212,7 @@ EVERY: tuple[Channel, ...] = (
         word="temperature",
         range=(-50.0, 500.0),
         sd_largest=100.0,
-        read=lambda robot, signals: robot.motor.temperature_settled(signals.current),
+        read=_winding_temperature,
         sd_share=0.02,
         unit_si="°C",
         over_time=False,
@@ -266,6 +273,11 @@ def known() -> tuple[Channel, ...]:
 def names() -> tuple[str, ...]:
     """Names of the channels at hand, in order."""
     return tuple(c.name for c in CHANNELS)
+
+
+def over_time() -> tuple[Channel, ...]:
+    """The channels at hand that histories show."""
+    return tuple(c for c in CHANNELS if c.over_time)
 
 
 def index(name: str) -> int:

@@ -239,7 +239,7 @@ def courses(history: Any, status: np.ndarray, names: Sequence[str]) -> list[Cour
 
     answer = []
     for k, name in enumerate(names):
-        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in channels.CHANNELS}
+        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in channels.over_time()}
         finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
         of = {channel: values[upto] for channel, values in readings.items()}
@@ -249,10 +249,10 @@ def courses(history: Any, status: np.ndarray, names: Sequence[str]) -> list[Cour
 
 def over_time(shown: list[Course]) -> Figure:
     """A row for each run, a panel for each channel."""
-    fig, grid = figure(len(shown), len(channels.CHANNELS), 2.6 * len(shown))
+    fig, grid = figure(len(shown), len(channels.over_time()), 2.6 * len(shown))
     for row, course in zip(grid, shown, strict=True):
         row[0].set_title(course.name)
-        for axes, channel in zip(row, channels.CHANNELS, strict=True):
+        for axes, channel in zip(row, channels.over_time(), strict=True):
             axes.plot(course.time, course.readings[channel.name], color=BLUE)
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))
         if course.status not in words.SETTLED:

@@ -96,6 +96,8 @@ def _histories(
     history, status = histories.history, np.asarray(histories.result.status)
     assert history is not None  # the fidelity was asked for it
     if robot.on_shaft:
+        if not channels.over_time():
+            return {}
         shown = figures_history.courses(history, status, names[:HISTORIES])
         album.add("courses", lambda: figures_history.over_time(shown))
         return {"shown": len(shown), "courses": shown, "starts": []}

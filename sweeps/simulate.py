@@ -193,7 +193,8 @@ def _names(runs: records.Runs) -> np.ndarray:
 def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
-    shown = [c for c in channels.known() if c in channels.CHANNELS or (robot.on_shaft and c.name in OF_SHAFT)]
+    of_rig = {*channels.names(), *(OF_SHAFT if robot.on_shaft else ())}
+    shown = [c for c in channels.known() if c.over_time and c.name in of_rig]
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),

@@ -43,7 +43,7 @@ def test_rates_match_reference_at_random_states(robot, grid):
         battery=on_battery,
     )
     moving = jax.jit(jax.vmap(balances.moving, in_axes=(None, 0, 0)))
-    s = moving(robot, runs, State(*jnp.asarray(states.T)))
+    s = moving(robot, runs, State(*jnp.asarray(states.T), distance=jnp.zeros(n)))
     inductance, ratio = 0.000119, 48.0
     for k in range(n):
         side = reference.Side(rows[k, 3], slopes[k], rows[k, 2], bool(rows[k, 0]), bool(on_battery[k]))

@@ -128,7 +128,8 @@ def test_result_has_the_schema_of_the_issue(done):
     assert {"name", "class", "balance", "equation", "parameters", "p_value", "score"} <= set(effect)
     assert effect["name"] == effect["class"][0] and "churning" in effect["class"]
     amplitude = effect["parameters"]["amplitude"]
-    assert set(amplitude) == {"value", "sd", "unit"} and amplitude["sd"] > 0 and 0 < effect["p_value"] < 0.05
+    assert set(amplitude) == {"value", "sd", "unit", "held_by_prior"} and not amplitude["held_by_prior"]
+    assert amplitude["sd"] > 0 and 0 < effect["p_value"] < 0.05
     if effect["name"] == "churning":
         truth = done.case.label["effects"][0]["amplitude"]
         assert abs(amplitude["value"] - truth) < 4 * amplitude["sd"] and amplitude["unit"] == "N·m·s^2"

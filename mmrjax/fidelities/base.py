@@ -9,7 +9,7 @@ from typing import Protocol
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from mmrjax import balances, fidelities
+from mmrjax import balances, channels, fidelities
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import Effort, Facts, Option
 from mmrjax.params import Scalar
@@ -26,7 +26,7 @@ class History(eqx.Module):
 
     Attributes:
         time: [s]; distance: travelled along the slope [m].
-        signals: every signal; reading: what the instruments show [SI], by channel.
+        signals: every signal; reading: what the instruments show [SI], by channel, of those that change in a history.
         reactions: loads inside the running gear of one side, where the fidelity resolves them.
     """
 
@@ -41,7 +41,9 @@ class History(eqx.Module):
         robot: Robot, time: Array, distance: Array, signals: Signals, reactions: Reactions | None = None
     ) -> History:
         """A history with its readings."""
-        return History(time, distance, signals, balances.sensor(robot, signals), reactions)
+        shown = balances.sensor(robot, signals)
+        reading = {c.name: shown[c.name] for c in channels.known() if c.over_time}
+        return History(time, distance, signals, reading, reactions)
 
 
 class Run(eqx.Module):
