@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Array
 
 from mmrjax import energy
 from mmrjax.channels import MM, RPM
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Run
 from mmrjax.fidelities.mission import TOLERANCE, Mission, Start, Totals, mission
@@ -215,7 +215,7 @@ def _rows_of(profile: Profile, rows: np.ndarray) -> Profile:
     return jax.tree.map(lambda x: x[rows] if x.ndim == 2 else x, profile)
 
 
-@eqx.filter_jit
+@compiled
 def together(
     robot: Robot,
     conditions: Conditions,

@@ -118,6 +118,11 @@ class Rig(eqx.Module):
     blank: bool = eqx.field(default=False, static=True)
     loose: bool = eqx.field(default=False, static=True)
 
+    def for_equations(self) -> Rig:
+        """Without what only files, priors and reports read."""
+        rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if not i.signed)
+        return dataclasses.replace(self, instruments=rectified, columns=(), priors=(), start=STARTS[0], surfaces=())
+
     @property
     def stated(self) -> frozenset[str]:
         """Parameters of which the file says how sure it is."""

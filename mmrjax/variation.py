@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import fidelities, missions, params
 from mmrjax import outputs as table_of_outputs
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Run
@@ -164,7 +165,7 @@ def evaluate(
     return {name: found[name] for name in (*outputs, STATUS)}  # jit sorts the names
 
 
-@eqx.filter_jit
+@compiled
 def _evaluate(
     variation: Variation,
     fidelity: str,

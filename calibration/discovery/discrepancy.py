@@ -31,6 +31,7 @@ from calibration.inference.optimizers import informing
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.effects import UNNAMED
 from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import PLACES
@@ -207,7 +208,7 @@ class Shaped(eqx.Module):
         return params.replace(there, {n: y[k] for k, n in enumerate(self.names)})
 
 
-@eqx.filter_jit
+@compiled
 def _curvature(problem: Problem, z: Array) -> Array:
     """JᵀJ over readings and priors."""
 

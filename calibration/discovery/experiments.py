@@ -17,7 +17,6 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +35,7 @@ from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
 from mmrjax.channels import RPM
+from mmrjax.compiling import compiled
 
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
 PAD = 4
@@ -194,7 +194,7 @@ def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dic
 # --- what they foresee ------------------------------------------------------------------------------
 
 
-@eqx.filter_jit
+@compiled
 def _foreseen(
     problem: Problem, other: priors.Coordinates | None, batch: foreseen.Batch, which: Array, z: Array
 ) -> tuple[foreseen.Foreseen, Array]:

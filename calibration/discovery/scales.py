@@ -165,6 +165,7 @@ def _scaled(kind: type[Effect], factor: float, stretch: float) -> type[Effect]:
         "__module__": kind.__module__,
         "__doc__": kind.__doc__,
         "name": kind.name,
+        "plain": kind,
         **fields,
     }
     return type(kind.__name__, (kind,), dict(body))

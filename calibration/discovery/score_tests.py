@@ -17,10 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.inference.bases import Bases, compiled, signature
+from calibration.inference.bases import Bases, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.problem import Problem
+from mmrjax.compiling import compiled
 
 #: Share of a signature's norm below which the free parameters explain it all.
 ABSORBED = 1e-3
@@ -163,13 +164,9 @@ def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
 Diagnosed = tuple[Linearization, ScoreTable, Statistics]
 
 
+@compiled
 def diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
     """A fit linearised, what effects and curves could explain of its residual, and the strongest of that."""
-    return _diagnosed(problem, z, effects, compiled(bases))
-
-
-@eqx.filter_jit
-def _diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
     linear = problem.observe.linearise(problem, z, problem.data, effects)
     scores = score_tests(linear, bases)
     return linear, scores, strongest(scores, linear)
@@ -219,7 +216,7 @@ def beside_columns(
     jacobian, residual = map(jnp.asarray, widened(linear, filled))
     linear = jax.tree.map(jnp.asarray, linear)
     padded = dataclasses.replace(linear, jacobian=jacobian, residual=residual)
-    scores = _score_tests(padded, compiled(bases))
+    scores = _score_tests(padded, bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(of)), -np.inf, np.asarray(scores.curve))
     nothing = jnp.asarray(-jnp.inf)
@@ -234,7 +231,7 @@ def beside_columns(
     return found, deviate
 
 
-_score_tests = eqx.filter_jit(score_tests)
+_score_tests = compiled(score_tests)
 
 
 def bootstrap(
@@ -254,14 +251,14 @@ def bootstrap(
         problem: of the base alone, z its fit; linear: the same fit, linearised.
         seed: random seed.
     """
-    count, nameless = -(-replicates // CHUNK), compiled(bases)
+    count = -(-replicates // CHUNK)
     keys = jax.random.split(jax.random.key(seed), (count, CHUNK))
-    parts = [jax.device_get(_replicates(problem, jnp.asarray(z), linear, effects, nameless, k)) for k in keys]
+    parts = [jax.device_get(_replicates(problem, jnp.asarray(z), linear, effects, bases, k)) for k in keys]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)
 
 
-@eqx.filter_jit
+@compiled
 def _replicates(
     problem: Problem, z: Array, linear: Linearization, effects: tuple[ScoredEffect, ...], bases: Bases, keys: Array
 ) -> Statistics:

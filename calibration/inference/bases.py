@@ -80,8 +80,7 @@ class Basis(eqx.Module):
     Attributes:
         columns: of each family, shape (families, rows, terms).
         places: of each family; all are balances, or all are channels.
-        variables: of each family, over which it is; a window's is the table's own, so it is no part of what is
-            compiled.
+        variables: of each family, over which it is.
     """
 
     columns: Float[Array, "families rows terms"]
@@ -99,6 +98,10 @@ class Basis(eqx.Module):
         """(place, variable) of each family."""
         return tuple(zip(self.places, self.variables, strict=True))
 
+    def for_equations(self) -> Basis:
+        """Without the variables of its families: a window's is the table's own."""
+        return dataclasses.replace(self, variables=())
+
     def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
         """Change of the whitened readings by every family's columns."""
         of_channels = in_readings(self.places[0])
@@ -107,11 +110,6 @@ class Basis(eqx.Module):
 
 
 Bases = tuple[Basis, ...]
-
-
-def compiled(bases: Bases) -> Bases:
-    """Bases without the variables of their families: those of tables of one size are of one kind to a compiler."""
-    return tuple(dataclasses.replace(basis, variables=()) for basis in bases)
 
 
 def in_readings(place: str) -> bool:

@@ -129,7 +129,6 @@ def calibrate(
     if priors.GUIDE_SHARE in facts.computes:
         base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
-    coordinates = dataclasses.replace(coordinates, stated=tuple(stated))
     foreign = foreign_priors(robot, stated)
     for sentence in foreign:
         tell(sentence)

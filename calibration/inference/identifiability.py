@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Array
 from calibration.inference import optimizers as fit
 from calibration.inference.optimizers import Pin
 from calibration.inference.problem import Data, Problem
+from mmrjax.compiling import compiled
 
 #: Two-sided 95 % of the standard normal distribution.
 Z95 = 1.959963984540054
@@ -97,7 +97,7 @@ class Identifiability:
         return weak
 
 
-@eqx.filter_jit
+@compiled
 def _jacobians(problem: Problem, z: Array, data: Data) -> tuple[Array, Array]:
     whole = fit.residuals(problem, data, fit.no_pin(z.shape[0]))
     jacobian = jax.jacfwd(whole)(z)
@@ -157,7 +157,7 @@ class Profile:
     better: float
 
 
-@eqx.filter_jit
+@compiled
 def _profiles(problem: Problem, data: Data, starts: Array, pins: Pin) -> fit.Optimum:
     return jax.vmap(lambda z, pin: fit.levenberg_marquardt(problem, z, data, pin)[0])(starts, pins)
 
@@ -195,7 +195,7 @@ def _ends(at: np.ndarray, root: np.ndarray) -> tuple[float, float]:
     return float(np.interp(-Z95, rising, at)), float(np.interp(Z95, rising, at))
 
 
-@eqx.filter_jit
+@compiled
 def _redraw(problem: Problem, truth: Array, data: Data, keys: Array, profiles: bool) -> tuple[fit.Optimum, Array]:
     clean = problem.observation(truth).reading
 

@@ -102,7 +102,7 @@ class ScoredEffect(eqx.Module):
     effect: Effect
     shape: str = eqx.field(static=True)
     at: tuple[float, ...] = eqx.field(static=True)
-    values: tuple[float, ...] = eqx.field(static=True)
+    values: Float[Array, " grid"]
 
     @property
     def absent(self) -> Effect:
@@ -113,7 +113,7 @@ class ScoredEffect(eqx.Module):
         """`function` of the effect at every point of the grid, along a new leading axis."""
         if not self.shape:
             return function(self.effect)[None]
-        return jax.vmap(lambda v: function(params.replace(self.effect, {self.shape: v})))(jnp.asarray(self.values))
+        return jax.vmap(lambda v: function(params.replace(self.effect, {self.shape: v})))(self.values)
 
 
 def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
@@ -121,10 +121,9 @@ def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     shape, amplitude = shape_of(effect), amplitude_of(effect)
     unit = params.replace(effect, {amplitude.name: jnp.asarray(amplitude.spec.prior_sd(0.0))})
     if shape is None:
-        return ScoredEffect(unit, "", (0.0,), ())
+        return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))
     grid = TURN if _phase(shape) else grid
-    values = np.asarray(shaped(shape_scales(shape), jnp.asarray(grid)))
-    return ScoredEffect(unit, shape.name, tuple(grid), tuple(map(float, values)))
+    return ScoredEffect(unit, shape.name, tuple(grid), shaped(shape_scales(shape), jnp.asarray(grid)))
 
 
 # --- the fit ------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.normal_equations import Normal, cholesky, forward
 from calibration.inference.problem import MISSING, Data, Observation, Problem
+from mmrjax.compiling import compiled
 from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
@@ -185,7 +186,7 @@ def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observ
     return *_counted(r, jacobian, data), seen
 
 
-@eqx.filter_jit
+@compiled
 def _linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
     # Of a row that leaves some of its adhesion's margin the penalty is negative here, and has its slope.
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + z.size, bool)])
@@ -244,7 +245,7 @@ def evaluated(problem: Problem, z: Z, data: Data) -> Array:
     return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
 
 
-@eqx.filter_jit
+@compiled
 def _step(solver: Search, y: Z, state: Any, r: Array, jacobian: Array) -> tuple[Z, Any, Array]:
     def tangent(z: Z, _: None) -> tuple[Array, None]:
         return r + jacobian @ (z - state.y_eval), None  # evaluated at y_eval alone
@@ -310,7 +311,7 @@ def search_long(
 Evaluate = Callable[[Array], tuple[Array, Array, Observation]]
 
 
-@eqx.filter_jit
+@compiled
 def _begun(solver: Search, starts: Array, r: Array, jacobian: Array) -> Any:
     def one(y: Array, r: Array, jacobian: Array) -> Any:
         shape = jax.eval_shape(lambda: r)
@@ -319,12 +320,12 @@ def _begun(solver: Search, starts: Array, r: Array, jacobian: Array) -> Any:
     return eqx.filter_vmap(one)(starts, r, jacobian)
 
 
-@eqx.filter_jit
+@compiled
 def _steps(solver: Search, y: Array, state: Any, r: Array, jacobian: Array) -> tuple[Array, Any, Array]:
     return eqx.filter_vmap(lambda *x: _step(solver, *x))(y, state, r, jacobian)
 
 
-@eqx.filter_jit
+@compiled
 def _optima(jacobian: Array, r: Array, z: Array, data: Data, weights: Array, steps: Array) -> Optimum:
     def one(jacobian: Array, r: Array, z: Array, weight: Array, steps: Array) -> Optimum:
         there = dataclasses.replace(data, weight=weight)
@@ -407,7 +408,7 @@ def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) 
     return _finish(problem, z, data, pin, k)[0]
 
 
-@eqx.filter_jit
+@compiled
 def searches(
     problem: Problem, starts: Float[Array, "starts parameters"], data: Data
 ) -> tuple[Optimum, Int[Array, "starts rows"], Int[Array, "starts rows"]]:
@@ -424,7 +425,7 @@ def searches(
     return jax.vmap(search)(starts)
 
 
-@eqx.filter_jit
+@compiled
 def read(problem: Problem, robot: Robot) -> Observation:
     """What the model says of every row of the problem for any robot, compiled."""
     return problem.observe(robot)

@@ -28,6 +28,7 @@ from calibration.inference import noise as noise_room
 from calibration.inference.noise import Noise
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
+from mmrjax.compiling import compiled
 from mmrjax.signals import FLAGS, STATUSES
 
 #: Members that are run together: on processors, and on an accelerator.
@@ -191,7 +192,7 @@ class Members:
         return Rows(*map(np.array, zip(*map(self._kept.__getitem__, keys), strict=True)))
 
 
-@eqx.filter_jit
+@compiled
 def _observed(posed: Problem, points: Float[Array, "points parameters"]) -> Observation:
     return jax.vmap(posed.observation)(points)
 

@@ -85,8 +85,8 @@ class Coordinates(eqx.Module):
     Attributes:
         location, spread, low, high: in units of θ, or of log θ for a scale; shape (parameters,).
         names, units, scale: of each parameter.
-        tied: (follower, index of its leader, ratio) of each parameter that follows a free one.
-        stated: names whose prior the user has stated.
+        ratios: of each parameter that follows a free one to that; shape (followers,).
+        followers: (its name, index of the free one) of each.
     """
 
     location: Float[Array, " parameters"]
@@ -96,11 +96,16 @@ class Coordinates(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     scale: tuple[bool, ...] = eqx.field(static=True)
-    tied: tuple[tuple[str, int, float], ...] = eqx.field(static=True, default=())
-    stated: tuple[str, ...] = eqx.field(static=True, default=())
+    ratios: Float[Array, " followers"]
+    followers: tuple[tuple[str, int], ...] = eqx.field(static=True, default=())
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def tied(self) -> tuple[tuple[str, int, float], ...]:
+        """(Follower, index of its leader, ratio) of each parameter that follows a free one."""
+        return tuple((name, k, float(self.ratios[n])) for n, (name, k) in enumerate(self.followers))
 
     def value(self, z: Float[Array, "... parameters"]) -> Float[Array, "... parameters"]:
         """Parameters θ [SI] at coordinates z."""
@@ -116,7 +121,7 @@ class Coordinates(eqx.Module):
         """`base` with the free parameters, and those tied to them, at coordinates z."""
         theta = self.value(z)
         values = {name: theta[k] for k, name in enumerate(self.names)}
-        values |= {follower: ratio * theta[k] for follower, k, ratio in self.tied}
+        values |= {follower: self.ratios[n] * theta[k] for n, (follower, k) in enumerate(self.followers)}
         return params.replace(base, values)
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
@@ -400,8 +405,8 @@ def coordinates(
         tuple(names),
         tuple(fields[name].spec.unit for name in names),
         scale,
-        tied,
-        tuple(stated),
+        jnp.asarray([ratio for _, _, ratio in tied]),
+        tuple((follower, k) for follower, k, _ in tied),
     )
 
 

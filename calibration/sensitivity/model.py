@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax import channels, derived, fidelities
 from mmrjax import outputs as table_of_outputs
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.derived import Derived
 from mmrjax.outputs import Output
@@ -216,10 +216,10 @@ def _derived(
     return {name: made[name] for name in (*names, STATUS)}
 
 
-_values = eqx.filter_jit(_outputs)
+_values = compiled(_outputs)
 
 
-@eqx.filter_jit
+@compiled
 def _derivatives(
     variation: Variation,
     source: str,

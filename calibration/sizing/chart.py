@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from jaxtyping import Array
 from calibration.data.requirements import Requirement, Requirements
 from calibration.sizing import sheet
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.requirements import Point, Ratings, heat_left, ratings, travel
 from mmrjax.robot import Robot
 
@@ -45,7 +45,7 @@ class Chart:
     margin: np.ndarray
 
 
-@eqx.filter_jit
+@compiled
 def _left(robot: Robot, of: Ratings, points: Point, speeds: Array, wanted: Array) -> Array:
     """Margins by limit, shape (points, limits)."""
 

@@ -20,6 +20,7 @@ from calibration.data.requirements import Requirements
 from calibration.sizing import sheet
 from calibration.sizing.design import CONTINUOUS, OBJECTIVES, Design, Task, build, evaluate, task
 from calibration.sizing.options import Drive, Options, options
+from mmrjax.compiling import compiled
 from mmrjax.robot import Robot
 
 #: Cells in series that are tried, cells in parallel, and the radius as a multiple of the robot's (on tracks 1.3 is as
@@ -112,13 +113,13 @@ class Sizing:
     evaluated: int
 
 
-@eqx.filter_jit
+@compiled
 def _measured(of: Task, designs: Design) -> tuple[Array, Array]:
     """Objectives and margins of designs, shapes (designs, objectives), (designs, margins)."""
     return jax.vmap(lambda d: evaluate(of, d))(designs)
 
 
-@eqx.filter_jit
+@compiled
 def _descended(
     of: Task,
     designs: Design,

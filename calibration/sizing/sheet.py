@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.requirements import Envelope, Requirement, Requirements
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.requirements import AMBIENT, AXES, CHARGE, OUTCOMES, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED
@@ -201,7 +201,7 @@ def _unrated(robot: Robot) -> Robot:
     return params.strong(robot)
 
 
-@eqx.filter_jit
+@compiled
 def _over(
     robot: Robot,
     of: Ratings,
@@ -220,7 +220,7 @@ def _over(
     return jax.vmap(lambda theta: jax.vmap(lambda p: one(theta, p))(at))(rows)
 
 
-@eqx.filter_jit
+@compiled
 def _gradient(robot: Robot, of: Ratings, names: tuple[str, ...], theta: Array, at: Point, name: str) -> Array:
     """Derivative of a quantity at one point by the parameters."""
 

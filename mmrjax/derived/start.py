@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import TIME_SETTLED, drive
 from mmrjax.robot import Robot
@@ -63,7 +63,7 @@ def crossing(
     return k, jnp.clip(share, 0.0, 1.0)
 
 
-@eqx.filter_jit
+@compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """One start from standstill by `drive`, over `TIME_SETTLED`.
 

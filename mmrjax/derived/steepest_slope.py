@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import operating, operating_point
 from mmrjax.params import Scalar
@@ -38,7 +38,7 @@ def travel_margin(robot: Robot, signals: Signals) -> Float[Array, ""]:
     return jnp.minimum(1.0 - signals.demand / signals.adhesion_limit, slowest / rest - 1.0)
 
 
-@eqx.filter_jit
+@compiled
 def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     """Steepest slope held by one run's voltage and payload; its own slope does not matter.
 

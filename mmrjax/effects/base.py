@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 import inspect
 import math
 import re
@@ -68,6 +69,7 @@ class Effect(eqx.Module):
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
             temperature, a phase); None has none. A run starts with memory 0.
         memory_unit: unit of its memory.
+        plain: of a class with priors of its own, the class that it differs from by these alone.
         configurations: names of the configurations that it acts on; none: all, or those with its `movers`. A
             field: what a class states is the default, and a robot file may say `configurations = ["4W2T"]`.
 
@@ -90,6 +92,7 @@ class Effect(eqx.Module):
     needs_belt: ClassVar[bool] = False
     memory_size: ClassVar[float | None] = None
     memory_unit: ClassVar[str] = "-"
+    plain: ClassVar[type[Effect] | None] = None
 
     if TYPE_CHECKING:
         # Made without arguments an effect is absent.
@@ -106,6 +109,12 @@ class Effect(eqx.Module):
         if isinstance(stated := vars(cls).get("configurations"), tuple):
             cls.__annotations__ = {**inspect.get_annotations(cls), "configurations": tuple[str, ...]}
             cls.configurations = eqx.field(default=stated, static=True, kw_only=True)
+
+    def for_equations(self) -> Effect:
+        """The same of the class that it differs from by its priors alone."""
+        if (plain := type(self).plain) is None:
+            return self
+        return plain(**{f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.init})
 
     @classmethod
     def family(cls) -> str:

@@ -14,6 +14,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.rest import current_at_rest, firmness
@@ -76,10 +77,10 @@ def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
 
 
 #: The signals of an instant, traced once for each kind of robot however often a program asks for them.
-moving = eqx.filter_jit(balances.moving)
+moving = compiled(balances.moving)
 
 
-@eqx.filter_jit
+@compiled
 def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]."""
     signals = moving(robot, conditions, state_of(robot, y))
@@ -248,7 +249,7 @@ def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, d
     return jnp.where(done & jnp.isfinite(end.speed), status, FAILED)
 
 
-@eqx.filter_jit
+@compiled
 def drive_batch(
     robot: Robot,
     conditions: Conditions,

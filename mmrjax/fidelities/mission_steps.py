@@ -6,13 +6,13 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
 from mmrjax import balances, energy
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.rarely import rarely
 from mmrjax.fidelities.rest import current_at_rest, firmness
@@ -100,7 +100,7 @@ def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, st
     return Asked(robot, conditions, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0))
 
 
-@eqx.filter_jit
+@compiled
 def instant(
     robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
 ) -> tuple[Signals, Array, Array, Asked]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import mass_matrix, roll, stand, system
 from mmrjax.fidelities.stability import PROBE, step_derivative
@@ -82,7 +83,7 @@ def modes(robot: Robot, conditions: Conditions, positions: int = POSITIONS) -> l
     return [_named(rate, mass) for rate, mass in zip(rates, masses, strict=True)]
 
 
-@eqx.filter_jit
+@compiled
 def _linearised(
     robot: Robot, conditions: Conditions, positions: int
 ) -> tuple[Float[Array, "runs positions 11 11"], Float[Array, "runs positions 5 5"]]:

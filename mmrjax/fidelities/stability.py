@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import Motion, System, advance, roll, stand, system
 from mmrjax.robot import Robot
@@ -31,7 +31,7 @@ def step_derivative(run: System, at: Motion) -> Float[Array, "11 11"]:
     return jax.jacfwd(after)(jnp.concatenate([at.q, at.v, jnp.asarray(at.current)[None]]))
 
 
-@eqx.filter_jit
+@compiled
 def _maps(
     robot: Robot, conditions: Conditions, steps: Float[Array, "runs starts"]
 ) -> Float[Array, "runs starts 11 11"]:

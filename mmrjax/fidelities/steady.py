@@ -7,12 +7,12 @@ import operator
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mmrjax import balances, channels, ground, outputs, params
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
@@ -43,10 +43,10 @@ def _state(unknowns: Vector, discharge: Float[Array, ""]) -> State:
     return State(_CURRENT * current, _SPEED_MOTOR * speed_motor, _SPEED * speed, discharge)
 
 
-_balanced = eqx.filter_jit(balances.settled)
+_balanced = compiled(balances.settled)
 
 
-@eqx.filter_jit
+@compiled
 def _residual(unknowns: Vector, robot: Robot, conditions: Conditions) -> Vector:
     _, conditions = _sound(robot, conditions)
     sense = direction(robot, conditions)
@@ -167,7 +167,7 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     return withhold(point, (point.status == CONVERGED) | (point.status == STALLED) | turned(point.status), sound)
 
 
-@eqx.filter_jit
+@compiled
 def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array]:
     """`steady` with the numbers left in whatever the status, for a fit that has to find its way back.
 
@@ -228,7 +228,7 @@ def _over_points(function: Callable[..., Any], *arguments: Any) -> Any:
     return jax.tree.map(lambda x: jnp.reshape(x, points), found)
 
 
-@eqx.filter_jit
+@compiled
 def steady_batch(robot: Robot, conditions: Conditions) -> Result:
     """`steady` over a batch, compiled.
 
@@ -250,7 +250,7 @@ def _check_outputs(names: Iterable[str]) -> None:
             raise KeyError(f"no output {name}; there are {', '.join(_getters())}")
 
 
-@eqx.filter_jit
+@compiled
 def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...]) -> dict[str, Array]:
     """`steady` over a batch, of which only what is asked for is computed.
 
@@ -274,7 +274,7 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
     return _over_points(one, robot, conditions)
 
 
-@eqx.filter_jit
+@compiled
 def steady_derivatives(
     robot: Robot, conditions: Conditions, names: tuple[str, ...], parameters: tuple[str, ...]
 ) -> dict[str, dict[str, Float[Array, " points"]]]:

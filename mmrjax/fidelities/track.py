@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax import contact, fidelities, undercarriage
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
@@ -262,7 +263,7 @@ def track_batch(
     return _batch(robot, conditions, duration, step, sample, rolling)
 
 
-@eqx.filter_jit
+@compiled
 def _batch(
     robot: Robot,
     conditions: Conditions,
@@ -298,13 +299,13 @@ def _in_parts(
     return _end(robot, conditions, start, records, step, sample, samples)
 
 
-@eqx.filter_jit
+@compiled
 def _begin(robot: Robot, conditions: Conditions, step: float, rolling: bool) -> Motion:
     begin = roll if rolling else stand
     return jax.vmap(lambda one: begin(system(robot, one, step)))(conditions)
 
 
-@eqx.filter_jit
+@compiled
 def _part(
     robot: Robot, conditions: Conditions, motions: Motion, step: float, sample: float, samples: int
 ) -> tuple[Motion, Record]:
@@ -314,7 +315,7 @@ def _part(
     return jax.vmap(one)(conditions, motions)
 
 
-@eqx.filter_jit
+@compiled
 def _end(
     robot: Robot,
     conditions: Conditions,

@@ -36,6 +36,7 @@ from calibration.inference.priors import DELAY
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
 from mmrjax.channels import RPM
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.drive import rates, state_of
@@ -736,12 +737,12 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
     return jnp.stack([shown[name] for name in channels.names()], -1)
 
 
-@eqx.filter_jit
+@compiled
 def _angle(observe: Histories, robot: Robot) -> Array:
     return observe.angle(observe.whole(robot))
 
 
-@eqx.filter_jit
+@compiled
 def _evaluate(problem: Problem, z: Array, weights: Array, active: Array | None) -> tuple[Array, Array, Observation]:
     def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation]:
         here = problem

@@ -24,6 +24,7 @@ from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Optimum, levenberg_marquardt
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.steady import operating_signals
@@ -256,7 +257,7 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
     return dict(zip(EQUATIONS, found.T, strict=True))
 
 
-@eqx.filter_jit
+@compiled
 def _fits(
     problem: Problem, starts: Array, weights: Array, active: Array | None, steps: int
 ) -> tuple[Optimum, Observation]:

@@ -13,7 +13,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +24,7 @@ from calibration.inference.optimizers import Optimum, Pin, levenberg_marquardt
 from calibration.inference.priors import TIED
 from calibration.inference.problem import Problem, data_of
 from mmrjax import channels
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
     return np.where(changed, (inside - np.asarray(c.location)) / np.asarray(c.spread), z)
 
 
-@eqx.filter_jit
+@compiled
 def _pinned(problem: Problem, starts: Array, held: Array) -> Optimum:
     def one(z: Array, held: Array) -> Optimum:
         return levenberg_marquardt(problem, z, problem.data, Pin(held, z), max_steps=STEPS)[0]
@@ -246,7 +246,7 @@ def _misfit_of_runs(problem: Problem, points: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(by_run), by_run, np.inf)
 
 
-@eqx.filter_jit
+@compiled
 def _misfits(problem: Problem, zs: Array) -> Array:
     """Whitened residuals of the readings at each point, shape (points, rows, channels)."""
     shape = problem.data.measured.shape

@@ -1,0 +1,39 @@
+"""Compiled functions whose programs serve all robots that equations cannot tell apart.
+
+A program belongs to the structure of its arguments, and a rig has much of that which no equation reads: priors,
+columns of files, the class of an effect whose prior is of another size. What has such things has a method
+`for_equations`, which gives it without them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _has_more(x: Any) -> bool:
+    return hasattr(x, "for_equations")
+
+
+def for_equations(x: T) -> T:
+    """Any arguments, with nothing in them that no equation reads."""
+    return jax.tree.map(lambda leaf: leaf.for_equations() if _has_more(leaf) else leaf, x, is_leaf=_has_more)
+
+
+def compiled(function: Callable[P, T]) -> Callable[P, T]:
+    """`eqx.filter_jit` of a function; one that returns a robot returns it as `for_equations` leaves it."""
+    inner = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*args: P.args, **named: P.kwargs) -> T:
+        args, named = for_equations((args, named))
+        return inner(*args, **named)
+
+    return call
