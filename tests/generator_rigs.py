@@ -220,8 +220,25 @@ def _linear(radius: float, power: float) -> float:
     return 2e3 * np.pi if np.isnan(power) else radius**power
 
 
-def rig(rng: np.random.Generator, kind: str | None = None, imposed: str | None = None) -> Rig:
-    """A rig, of a kind and with something imposed where these are given."""
+def rig(
+    rng: np.random.Generator, kind: str | None = None, imposed: str | None = None, like: Rig | None = None
+) -> Rig:
+    """A rig, of a kind and with something imposed where these are given.
+
+    Args:
+        like: another one, which it has in common with that its equations, channels and their signs and directions are
+            the same; its constants are its own.
+    """
+    if like is None:
+        return _any_rig(rng, kind, imposed)
+    while True:
+        own = _any_rig(rng, like.kind, like.imposed)
+        without = [{n for n, x in r.stated.items() if x == 0} for r in (own, like)]
+        if without[0] == without[1] and ("motor_current" not in like.channels or own.sides == 1):
+            return dataclasses.replace(own, channels=like.channels, reverse=like.reverse, signed=like.signed)
+
+
+def _any_rig(rng: np.random.Generator, kind: str | None, imposed: str | None) -> Rig:
     kind = kind or str(rng.choice(KINDS))
     imposed = imposed or str(rng.choice(IMPOSED))
     vehicle = kind in VEHICLES
@@ -520,14 +537,24 @@ def remainder(signature: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     return long - wide @ np.linalg.lstsq(wide, long, rcond=None)[0]
 
 
-def world(rng: np.random.Generator, kind: str | None = None, imposed: str | None = None) -> World:
-    """A rig with its truth and conditions all of whose rows are sound; instruments that suit its readings."""
-    for _ in range(500):
-        r = rig(rng, kind, imposed)
+def world(
+    rng: np.random.Generator,
+    kind: str | None = None,
+    imposed: str | None = None,
+    like: Rig | None = None,
+    rows: tuple[int, int] = ROWS,
+) -> World:
+    """A rig with its truth and conditions all of whose rows are sound; instruments that suit its readings.
+
+    Args:
+        kind, imposed, like: see `rig`; rows: fewest and most.
+    """
+    for _ in range(2000):
+        r = rig(rng, kind, imposed, like)
         p, z = truth(rng, r)
         c = conditions(rng, r, p)
         s, sound = solve(r, c, p)
-        if not sound.all() or not ROWS[0] <= len(c) <= ROWS[1]:
+        if not sound.all() or not rows[0] <= len(c) <= rows[1]:
             continue
         largest = np.abs(s.shown).max(1)
         sd, quantum = {}, {}
