@@ -20,6 +20,8 @@ from calibration.inference.problem import Observation
 
 #: Fewest rows that a base can be fitted to.
 FEWEST = 4
+#: Rise of the objective beyond which a fit with more effects is worse than without [½σ²].
+STUCK = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,6 +169,25 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
         candidate(space, names, jax.tree.map(lambda x: x[k], found), settings)  # noqa: B023
         for k, (names, _) in enumerate(proposals)
     ]
+
+
+def fit_beside(
+    space: CandidateSpace, wanted: Sequence[tuple[tuple[str, ...], Candidate, ScoreTable]], settings: Settings
+) -> list[Candidate]:
+    """Fit effects beside those of another fit, from where their scores say; what then explains less than that fit,
+    which has them at amplitude 0, has started beyond where a solution exists and is fitted again from there.
+
+    Args:
+        wanted: (active effects, the other fit, scores of what that leaves); all of its effects are active.
+    """
+    found = fit_candidates(space, [(w, start(space, at, w, settings, by)) for w, at, by in wanted], settings)
+    stuck = [k for k, (_, at, _) in enumerate(wanted) if not found[k].cost <= at.cost + STUCK]
+    again = fit_candidates(
+        space, [(wanted[k][0], start(space, wanted[k][1], wanted[k][0], settings)) for k in stuck], settings
+    )
+    for k, other in zip(stuck, again, strict=True):
+        found[k] = min(found[k], other, key=lambda c: c.cost)
+    return found
 
 
 def start(

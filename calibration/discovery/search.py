@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
+from calibration.discovery.candidates import Candidate, filled, fit_beside, fit_candidates, start
 from calibration.discovery.score_tests import ScoreTable, Statistics, diagnosed
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
@@ -131,7 +131,7 @@ def _ranked(space: CandidateSpace, scores: ScoreTable, without: Sequence[str] = 
 
 def _singles(space: CandidateSpace, base: Candidate, scores: ScoreTable, settings: Settings) -> list[Candidate]:
     wanted = [filled([name], settings) for name in _ranked(space, scores)[: _batch(space)]]
-    return fit_candidates(space, [(w, start(space, base, w, settings, scores)) for w in wanted], settings)
+    return fit_beside(space, [(w, base, scores) for w in wanted], settings)
 
 
 def _batch(space: CandidateSpace) -> int:
@@ -154,8 +154,7 @@ def _extend(
             one, other = filled(pair, settings), filled(pair[::-1], settings)
             if one not in sources and other not in sources:
                 sources[one] = (base, scores_base)
-    proposals = [(w, start(space, at, w, settings, by)) for w, (at, by) in sources.items()]
-    return fit_candidates(space, proposals, settings)
+    return fit_beside(space, [(w, at, by) for w, (at, by) in sources.items()], settings)
 
 
 def _pairs(space: CandidateSpace, scores: ScoreTable) -> list[tuple[str, str]]:
