@@ -91,7 +91,7 @@ class Rig(eqx.Module):
         instruments: of channels, where more is known than that they are there.
         delay: by which what is imposed acts later than its column says [s].
         columns: of tables: (column as this program calls it, column of the file, factor from its unit).
-        priors: (parameter, mean, sd) [SI] that the file states, in place of the parameters' own.
+        priors: (parameter, mean, sd) [SI] that the file states, in place of the parameters' own; of sd 0 it is exact.
         start: of histories: `rest`, `measured` (by the first samples) or `free`, which those are the prior of.
         begins: of histories that do not begin at rest, once their table is known.
         surfaces: (configuration, another from which it differs by its ground alone).
@@ -127,6 +127,11 @@ class Rig(eqx.Module):
     def stated(self) -> frozenset[str]:
         """Parameters of which the file says how sure it is."""
         return frozenset(name for name, _, _ in self.priors)
+
+    @property
+    def exact(self) -> frozenset[str]:
+        """Parameters that the file states as exactly known; no fit frees them."""
+        return frozenset(name for name, _, sd in self.priors if sd == 0)
 
     @property
     def shows_voltage(self) -> bool:

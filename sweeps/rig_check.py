@@ -288,7 +288,8 @@ def print_check(found: RigCheck) -> None:
     say(shown)
     shown = _table("\nnumbers", "parameter", "value>r", "±>r", "unit", "from")
     for o in found.origins:
-        shown.add_row(o.name, f"{o.value:.5g}", "" if o.sd is None else f"{o.sd:.2g}", o.unit, o.why)
+        sd = "" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact"
+        shown.add_row(o.name, f"{o.value:.5g}", sd, o.unit, o.why)
     say(shown)
     shown = _table("\nwhat follows", "", "value>r", "")
     for fact in found.facts:

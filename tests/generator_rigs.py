@@ -752,7 +752,7 @@ def toml(r: Rig) -> str:
         if r.written and table == r.name:
             key = LINEAR[name][0]
             value = r.written[key]
-        share = r.tolerances.get(name)
+        share = r.tolerances.get(name, 0.0 if name == "radius" and not r.vehicle else None)
         number = repr(float(value))
         tables.setdefault(table, {})[key] = number if share is None else f'"{number} ± {100 * share:g} %"'
     lines = [

@@ -12,6 +12,8 @@ import pytest
 
 from calibration.data import rig_facts, robot_file
 from calibration.data.errors import BadConfiguration
+from calibration.inference import priors
+from calibration.sensitivity import inputs
 from mmrjax import effects, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
@@ -247,6 +249,21 @@ def test_changed_parameter_takes_its_prior_along(tmp_path):
     assert robot.rig.priors[0] == ("motor.torque_constant", 0.06, 0.002)
 
 
+def test_what_is_known_exactly_is_never_freed(tmp_path):
+    lifted = BENCH.replace('["total_current"]', '["total_current", "speed"]') + 'radius = "0.02 ± 0"\n'
+    robot = read(tmp_path, lifted)
+    assert robot.rig.exact == {"bench.radius"} and same(again(tmp_path, robot), robot)
+    unsure = read(tmp_path, lifted.replace("0.02 ± 0", "0.02 ± 1 %"))
+    freed, held = (priors.free_names(r, ["bench"]) for r in (unsure, robot))
+    assert set(freed) - set(held) == {"bench.radius"}
+    dry = read(tmp_path, BENCH.replace("0.1 ± 0.05", "0.1 ± 0"))
+    assert "bench.loss_coulomb" not in (*priors.default_names(["bench"], dry), *priors.free_names(dry, ["bench"]))
+    assert "bench.radius" not in inputs.default_names(robot, ["bench"], battery=False)
+    with pytest.raises(BadConfiguration, match=r"--free bench\.radius: the robot's file states it as exact \(± 0\)"):
+        priors.coordinates(robot, ["bench.radius"])
+    assert len(priors.coordinates(robot, ["bench.radius"], {"bench.radius": (0.02, 0.001)})) == 1
+
+
 def test_inductance_that_is_not_stated_follows_the_resistance(tmp_path):
     robot = read(tmp_path, ROVER.replace("resistance = 1.0", "resistance = 3.0"))
     assert float(robot.motor.inductance) == pytest.approx(6e-4, rel=1e-12)
@@ -334,8 +351,8 @@ REFUSED = {
     ),
     "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, or false"),
     "± nothing": (BENCH.replace("0.1 ± 0.05", "0.1 ± "), r"bench\.loss_coulomb: got '0\.1 ± '; expected a number, or one with"),
-    "± zero": (BENCH.replace("0.1 ± 0.05", "0.1 ± 0"), r"the standard deviation must be more than 0"),
-    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"the standard deviation must be more than 0"),
+    "± less than zero": (BENCH.replace("0.1 ± 0.05", "0.1 ± -1"), r"the standard deviation must be 0 \(exact\) or more"),
+    "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"a share of 0 is 0: state the standard deviation"),
     "± out of bounds": (BENCH.replace("0.8 +- 0.03", "1.8 ± 0.1"), r"efficiency_load: got 1\.8; expected 0\.05 to 1"),
     "± of a rating": (BENCH + '[motor.x]\ny = 1\n', r"motor\.x\.y: no such parameter"),
     "two travels": (

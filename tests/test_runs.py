@@ -109,7 +109,7 @@ REFUSED = {
         f"{HEADER}\n{ROW.replace(',15,', ',0,')}",
         r"row 1, supply_voltage_V: got 0; expected a voltage, in a table of readings",
     ),
-    "NaN": (f"{HEADER}\n{ROW.replace('2.75', 'nan')}", r"row 1, total_current_A: got nan; expected -200 to 200"),
+    "NaN": (f"{HEADER}\n{ROW.replace('2.75', 'nan')}", r"row 1, total_current_A: got nan; expected -2000 to 2000"),
     "infinity": (f"{HEADER}\n{ROW.replace('4800', 'inf')}", r"motor_speed_rpm: got inf"),
     "no number": (
         f"{HEADER}\n{ROW.replace('4800', 'fast')}",

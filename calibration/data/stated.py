@@ -1,4 +1,4 @@
-"""Numbers with what is known of them: `5.95 ± 5 %`, `0.82 ± 0.02`."""
+"""Numbers with what is known of them: `5.95 ± 5 %`, `0.82 ± 0.02`; `12 ± 0` is known exactly."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
         where: opens the message of an error.
 
     Raises:
-        BadConfiguration: another form, no number, or an sd that is not positive.
+        BadConfiguration: another form, no number, or an sd below 0.
     """
     parts = re.split(_SIGNS, text)
     try:
@@ -32,11 +32,14 @@ def stated_number(text: str, where: str) -> tuple[float, float]:
         mean, size = float(value), float(sd.strip().removesuffix("%"))
     except ValueError:
         raise BadConfiguration(f"{where}: got {text!r}; {FORM}") from None
-    size *= abs(mean) / 100 if sd.strip().endswith("%") else 1.0
     if not math.isfinite(mean):
         raise BadConfiguration(f"{where}: got {text!r}; {FORM}")
-    if not (math.isfinite(size) and size > 0):
-        raise BadConfiguration(f"{where}: got {text!r}; the standard deviation must be more than 0; {FORM}")
+    if not (math.isfinite(size) and size >= 0):
+        raise BadConfiguration(f"{where}: got {text!r}; the standard deviation must be 0 (exact) or more; {FORM}")
+    if sd.strip().endswith("%"):
+        if mean == 0 and size > 0:
+            raise BadConfiguration(f"{where}: got {text!r}; a share of 0 is 0: state the standard deviation; {FORM}")
+        size *= abs(mean) / 100
     return mean, float(f"{size:.12g}")  # a percentage leaves digits of rounding
 
 

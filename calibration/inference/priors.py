@@ -143,19 +143,19 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
         names.insert(2, GUIDE_SHARE)
     if robot.rig.blank and "speed" not in robot.rig.channels:
         names = [n for n in names if not n.startswith("ground.friction.")]
-    return _not_zero(robot, (f"{configuration}.{name}" for name in names))
+    return _uncertain(robot, (f"{configuration}.{name}" for name in names))
 
 
-def _not_zero(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
-    """Those of a robot's parameters that are not zero: one that is set to zero is held there, unless the rig's file
-    says how sure that zero is."""
-    fields, stated = known(robot), robot.rig.stated
-    return tuple(n for n in names if float(fields[n].value) != 0.0 or n in stated)
+def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
+    """Those of a robot's parameters that are not held: what the rig's file states as exact is, and what is set to
+    zero, unless the file says how sure that zero is."""
+    fields, stated, exact = known(robot), robot.rig.stated, robot.rig.exact
+    return tuple(n for n in names if n not in exact and (float(fields[n].value) != 0.0 or n in stated))
 
 
 def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     """Of these, the delay of a rig whose file says how sure it is."""
-    return tuple(n for n in names if n == DELAY and n in robot.rig.stated)
+    return tuple(n for n in names if n == DELAY and n in robot.rig.stated - robot.rig.exact)
 
 
 def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = ()) -> tuple[str, ...]:
@@ -209,7 +209,7 @@ def free_names(
         for name in (*friction(robot, c), *_radius(robot, c), *(f"{c}.{n}" for n in chassis if _has(robot, c, n)))
     ]
     own = [n for n in own if _leader(robot, n) is None]
-    return (*_not_zero(robot, _drive(robot, (*BENCH, *drive))), *own, *begins(robot))
+    return (*_uncertain(robot, (*_drive(robot, (*BENCH, *drive)), *own)), *begins(robot))
 
 
 def _leader(robot: Robot, name: str) -> str | None:
@@ -367,10 +367,15 @@ def coordinates(
 
     Raises:
         BadConfiguration: a stated prior for an unknown or a fixed parameter, a mean out of bounds, or a
-            free parameter whose prior has no width (nominal value 0 with a relative sd).
+            free parameter whose prior has no width (nominal value 0 with a relative sd, or stated as exact).
     """
     stated = stated or {}
     fields = known(robot)
+    for name in names:
+        if name in robot.rig.exact and name not in stated:
+            raise BadConfiguration(
+                f"--free {name}: the robot's file states it as exact (± 0); state how sure it is with --prior"
+            )
     for name in stated:
         if name not in fields:
             raise BadConfiguration(f"--prior {name}: no such parameter; {choices(name, _near(name, list(fields)))}")

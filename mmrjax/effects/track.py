@@ -130,14 +130,13 @@ class CentrifugalTension(TrackEffect):
 class BendingLoss(TrackEffect):
     """ΔM_t = a 2x / (1 + x²), x = ω_k / ω_r: loss modulus of a standard linear solid.
 
-    Rubber that is bent round the pulleys relaxes while it passes.
+    Rubber that is bent round the pulleys (of a load on a shaft: of a belt drive or coupling) relaxes while it passes.
 
     Source: Ferry, Viscoelastic Properties of Polymers (1980), ch. 3, the loss modulus G'' of a Maxwell
     element; Gerbert, Traction Belt Mechanics (1999), bending loss of a belt at each run on and off a pulley.
     Far from ω_r it is like eq. (24)'s terms.
     """
 
-    needs_belt = True
     driver = "speed"
     dissipative = True
 
