@@ -169,8 +169,8 @@ REFUSED = {
     "not a number": (bench, f"{BENCH}1000,nan\n", r"row 1, total_current_A: got nan; expected -2000 to 2000"),
     "in its own unit": (
         bench,
-        "motor_speed_rpm,total_current_mA\n9,3e5\n",
-        r"total_current_mA: got 3e5; expected -200000",
+        "motor_speed_rpm,total_current_mA\n9,3e6\n",
+        r"total_current_mA: got 3e6; expected -2",
     ),
     "an empty speed": (bench, f"{BENCH},0.4\n", r"row 1, motor_speed_rpm: got an empty cell; expected a number"),
     "no speed": (
