@@ -24,22 +24,27 @@ class Instrument:
 
     Attributes:
         channel: its name.
-        signed: whether it shows the sign; else the magnitude alone.
-        quantum: step of its readings [SI]; 0: none.
+        signed: whether it shows the sign; False: the magnitude alone; None: its table tells.
+        quantum: step of its readings [SI]; 0: none; None: its table tells.
     """
 
     channel: str
-    signed: bool = True
-    quantum: float = 0.0
+    signed: bool | None = True
+    quantum: float | None = 0.0
+
+    @property
+    def free(self) -> bool:
+        """Whether its table has to tell something of it."""
+        return self.signed is None or self.quantum is None
 
     def shows(self, value: Scalar) -> Scalar:
         """What it shows of a value [SI]; its step is noise, see `variance`."""
-        return value if self.signed else jnp.abs(value)
+        return jnp.abs(value) if self.signed is False else value
 
     @property
     def variance(self) -> float:
-        """Of the error by its step, Δ²/12 [SI²] (Bennett, Spectra of quantized signals, 1948)."""
-        return self.quantum**2 / 12
+        """Of the error by its step, Δ²/12 [SI²] (Bennett, Spectra of quantized signals, 1948); 0 where it is free."""
+        return (self.quantum or 0.0) ** 2 / 12
 
 
 class Begin(eqx.Module):
@@ -120,7 +125,7 @@ class Rig(eqx.Module):
 
     def for_equations(self) -> Rig:
         """Without what only files, priors and reports read."""
-        rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if not i.signed)
+        rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if i.signed is False)
         return dataclasses.replace(self, instruments=rectified, columns=(), priors=(), start=STARTS[0], surfaces=())
 
     @property

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from calibration.data import instruments
 from calibration.data import runs as records
 from calibration.inference import errors as residual
 from calibration.inference.ranges import check_ranges
@@ -32,6 +33,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
     robot = load_robot(config)
     stated = runs = read_runs(source, robot, measured=True)
+    robot = instruments.as_read(robot, runs)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     said = check_ranges(runs, robot)

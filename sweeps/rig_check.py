@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import rig_facts, robot_file
+from calibration.data import instruments, rig_facts, robot_file
 from calibration.data.columns import ON_GROUND, SUPPLY
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
+from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.writing import finite
 from calibration.inference import foresight, identifiability
@@ -101,7 +102,7 @@ class RigCheck:
                     "channel": channel.name,
                     "column": theirs.get(channel.column, channel.column),
                     "signed": instrument.signed,
-                    "quantum": instrument.quantum / channel.factor,
+                    "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
                     "unit": channel.unit,
                     "sd": usual if self.foresight is None else self.foresight.noise[k],
                 }
@@ -256,7 +257,8 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    return dataclasses.replace(found, runs=runs, shown=_shown(runs, data), foresight=seen)
+    robot = instruments.as_read(robot, runs)
+    return dataclasses.replace(found, robot=robot, runs=runs, shown=_shown(runs, data), foresight=seen)
 
 
 def _shown(runs: Runs, data: str) -> dict[str, str]:
@@ -283,8 +285,9 @@ def print_check(found: RigCheck) -> None:
         say(sentence)
     shown = _table("\nchannels", "channel", "column", "sign", "step>r", "sd")
     for c in found.channels():
-        step = f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
-        shown.add_row(c["channel"], c["column"], "signed" if c["signed"] else "magnitude", step, c["sd"])
+        step = FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
+        sign = {None: FREE, True: "signed", False: "magnitude"}[c["signed"]]
+        shown.add_row(c["channel"], c["column"], sign, step, c["sd"])
     say(shown)
     shown = _table("\nnumbers", "parameter", "value>r", "±>r", "unit", "from")
     for o in found.origins:

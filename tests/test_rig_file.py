@@ -349,7 +349,7 @@ REFUSED = {
         BENCH + "[instruments.total_current]\nquantum = -1",
         r"quantum: got -1; expected the step of its readings, 0 or more A",
     ),
-    "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, or false"),
+    "signed in words": (BENCH + '[instruments.total_current]\nsigned = "no"', r"signed: got 'no'; expected true, false: shows magnitude"),
     "± nothing": (BENCH.replace("0.1 ± 0.05", "0.1 ± "), r"bench\.loss_coulomb: got '0\.1 ± '; expected a number, or one with"),
     "± less than zero": (BENCH.replace("0.1 ± 0.05", "0.1 ± -1"), r"the standard deviation must be 0 \(exact\) or more"),
     "percent of zero": (BENCH.replace("0.1 ± 0.05", "0 ± 5 %"), r"a share of 0 is 0: state the standard deviation"),

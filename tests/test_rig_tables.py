@@ -1,12 +1,13 @@
 """Tables of rigs: which columns a robot's file asks for, other units, surfaces, directions, and their refusals."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 
+from calibration.data import instruments, robot_file, surfaces
 from calibration.data import runs as records
-from calibration.data import surfaces
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import blocks, checks, noise, observers, priors
 from calibration.inference.calibrate import calibrate
@@ -464,3 +465,88 @@ def test_a_bench_is_compared_and_calibrated_from_two_files(mmrjax, tmp_path):
     for page in (tmp_path / "a" / "report.html", tmp_path / "b" / "report.html"):
         text = page.read_text(encoding="utf-8")
         assert "n [rpm]" in text and "slope [°]" not in text and "6T2A" not in text
+
+
+# --- instruments of which the table tells --------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("readings", "step"),
+    [
+        (0.026 * np.array([1, 3, 8, 2, 11, 4, 17, 9, 9]), 0.026),
+        (0.1 + 0.026 * np.array([1, 3, 8, 2, 11, 4, 17, 9]), 0.026),  # of a meter with an offset
+        (0.05 * np.array([3, 5, 10, 16, 23, 29, 40, 47]), 0.05),  # no two neighbours
+        (0.026 * np.array([1, 3, 8, 2, 11, 4, 17]), 0.0),  # too few
+        ([np.nan, *[3.0] * 9], 0.0),
+        ([], 0.0),
+        (np.random.default_rng(1).uniform(0, 1, 40), 0.0),
+    ],
+)
+def test_step_of_readings_is_their_common_divisor(readings, step):
+    assert instruments.step_of(np.array(readings)) == pytest.approx(step, rel=1e-9)
+
+
+def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
+    """Both ways, magnitudes in steps of 0.03 A: as if the file had stated that; the noise grows by the step."""
+    path = tmp_path / "t.csv"
+    speeds = [-3000, -2500, -2000, -1000, 1000, 1500, 2000, 3000]
+    shown = [0.51, 0.48, 0.42, 0.33, 0.36, 0.39, 0.45, 0.54]
+    rows = [f"{n},{i},0.01" for n, i in zip(speeds, shown, strict=True)]
+    path.write_text("\n".join(["motor_speed_rpm,total_current_A,total_current_sd_A", *rows]) + "\n", encoding="utf-8")
+    free = bench(instruments=(Instrument("total_current", None, None),))
+    stated = bench(instruments=(Instrument("total_current", False, 0.03),))
+    runs = records.read(path, robot=free)
+    (found,) = runs.layout.instruments
+    assert found.signed is False and found.quantum == pytest.approx(0.03, rel=1e-9)
+    assert instruments.as_read(free, runs).rig.instruments == runs.layout.instruments
+    assert instruments.as_read(stated, runs) is stated
+    size = np.ones((8, 1))
+    sds = [noise.of(records.read(path, robot=r), size).sd for r in (free, stated)]
+    np.testing.assert_allclose(sds[0], sds[1], rtol=1e-9)
+    np.testing.assert_allclose(sds[0], np.hypot(0.01, 0.03 / np.sqrt(12)), rtol=1e-9)
+    with pytest.raises(BadData, match="negative backward; or signed = false"):
+        records.read(path, robot=bench())
+    signed = re.sub(r"(-\d+),0", r"\1,-0", path.read_text(encoding="utf-8"))
+    path.write_text(signed, encoding="utf-8")
+    assert records.read(path, robot=free).layout.instruments[0].signed is True
+
+
+def test_a_calibration_of_a_free_instrument_leaves_what_it_found(tmp_path):
+    text = """
+base = "none"
+imposed = "motor_speed"
+channels = ["total_current"]
+[motor]
+torque_constant = "0.05 ± 3 %"
+friction_coulomb = "0.004 ± 20 %"
+[gearbox]
+ratio = 16
+efficiency_load = 0.8
+[brake]
+load = "shaft"
+inertia = 0.001
+loss_coulomb = "0.1 ± 50 %"
+loss_viscous = "0.002 ± 50 %"
+[instruments.total_current]
+signed = "free"
+quantum = "free"
+"""
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    assert robot.rig.instruments == (Instrument("total_current", None, None),)
+    robot_file.write(robot, tmp_path / "again.toml", note="of a test")
+    assert robot_file.read(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
+    channels.select(robot.rig.channels)
+    speeds = np.array([-4000, -3100, -2700, -1900, -1300, -1000, 1000, 1600, 2300, 2900, 3700, 4000.0])
+    robot_there = params.replace(robot, {"brake.loss_coulomb": 0.15})
+    truth = steady_batch(robot_there, Conditions(motor_speed=speeds * channels.RPM)).reading["total_current"]
+    assert float(truth[0]) < 0  # without a table it is shown with its sign
+    read = np.round(np.abs(np.asarray(truth)) / 0.004) * 0.004
+    path = tmp_path / "t.csv"
+    rows = "".join(f"{n:g},{i:.3f},0.002\n" for n, i in zip(speeds, read, strict=True))
+    path.write_text("motor_speed_rpm,total_current_A,total_current_sd_A\n" + rows, encoding="utf-8")
+    found = calibrate(records.read(path, robot=robot), robot, starts=2, profiles=False, blocks=False)
+    (instrument,) = found.robot.rig.instruments
+    assert instrument.signed is False and instrument.quantum == pytest.approx(0.004, rel=1e-6)
+    loss = found.parameters["brake.loss_coulomb"]
+    assert abs(loss.value - 0.15) < 3 * loss.sd

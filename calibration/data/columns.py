@@ -167,7 +167,7 @@ class Layout:
 
     def magnitude(self, channel: str) -> bool:
         """Whether the instrument of a channel shows its magnitude alone."""
-        return any(i.channel == channel and not i.signed for i in self.instruments)
+        return any(i.channel == channel and i.signed is False for i in self.instruments)
 
     def variance(self, channel: str) -> float:
         """Of the error by the step of a channel's instrument [SI²]."""

@@ -198,6 +198,10 @@ def _surfaces(stated: Any, loads: Sequence[str], where: str) -> tuple[tuple[str,
     return tuple(stated.items())
 
 
+#: What a file says of an instrument that its table tells.
+FREE = "free"
+
+
 def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrument, ...]:
     here = f"{where}, instruments"
     if not isinstance(stated, dict):
@@ -213,15 +217,19 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
                 raise BadConfiguration(f"{here}.{name}.{key}: no such key; {choices(key, ('signed', 'quantum'))}")
         signed, quantum = table.get("signed", True), table.get("quantum", 0.0)
         channel = next(c for c in channels.known() if c.name == name)
-        if not isinstance(signed, bool):
+        if not isinstance(signed, bool) and signed != FREE:
             raise BadConfiguration(
-                f"{here}.{name}.signed: got {signed!r}; expected true, or false: shows magnitude alone"
+                f"{here}.{name}.signed: got {signed!r}; expected true, false: shows magnitude alone, or {FREE!r}: "
+                "the table tells"
             )
-        if isinstance(quantum, bool) or not isinstance(quantum, int | float) or not 0 <= quantum < math.inf:
+        number = isinstance(quantum, int | float) and not isinstance(quantum, bool) and 0 <= quantum < math.inf
+        if not number and quantum != FREE:
             raise BadConfiguration(
-                f"{here}.{name}.quantum: got {quantum!r}; expected the step of its readings, 0 or more {channel.unit}"
+                f"{here}.{name}.quantum: got {quantum!r}; expected the step of its readings, 0 or more "
+                f"{channel.unit}, or {FREE!r}: the table tells"
             )
-        found.append(Instrument(name, signed, float(quantum) * channel.factor))
+        step = None if quantum == FREE else float(quantum) * channel.factor
+        found.append(Instrument(name, None if signed == FREE else signed, step))
     return tuple(found)
 
 
@@ -338,10 +346,11 @@ def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
         tables["surfaces"] += [f'{name} = "{other}"' for name, other in rig.surfaces]
     for instrument in rig.instruments:
         channel = next(c for c in channels.known() if c.name == instrument.channel)
-        step = [f"quantum = {instrument.quantum / channel.factor!r}  # [{channel.unit}] step of its readings"]
+        size = f'"{FREE}"' if instrument.quantum is None else repr(instrument.quantum / channel.factor)
+        step = [f"quantum = {size}  # [{channel.unit}] step of its readings"]
         tables[f"instruments.{channel.name}"] = [
-            f"signed = {str(instrument.signed).lower()}",
-            *(step if instrument.quantum else []),
+            f"signed = {json.dumps(FREE if instrument.signed is None else instrument.signed)}",
+            *([] if instrument.quantum == 0 else step),
         ]
     return head, tables
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data import surfaces
+from calibration.data import instruments, surfaces
 from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
@@ -268,6 +268,7 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) 
             columns[meaning.column] = np.array(
                 [_cell(at, meaning, cell, layout) for at, cell in zip(where, cells, strict=True)]
             )
+    layout = dataclasses.replace(layout, instruments=instruments.read_off(layout.instruments, columns))
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
     _check_mass(name, columns)

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import own_mass, robot_file, surfaces
+from calibration.data import instruments, own_mass, robot_file, surfaces
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -96,7 +96,7 @@ def discover(
     """
     menu.check_forbidden(forbidden, robot)
     distinct, numbers, notes = without_copies(runs)
-    robot = surfaces.separated(robot, distinct)
+    robot = surfaces.separated(instruments.as_read(robot, distinct), distinct)
     stated = surfaces.of_surfaces(stated or {}, robot, distinct)
     stated = robot_file.current_values(stated, robot, "--prior", notes)
     kind = observers.kind(distinct)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import own_mass, robot_file, surfaces
+from calibration.data import instruments, own_mass, robot_file, surfaces
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
@@ -103,7 +103,7 @@ def calibrate(
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
 
-    robot = surfaces.separated(robot, runs)
+    robot = surfaces.separated(instruments.as_read(robot, runs), runs)
     free, fix = (surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix))
     stated = surfaces.of_surfaces(stated or {}, robot, runs)
     former: list[str] = []

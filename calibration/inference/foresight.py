@@ -7,7 +7,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import own_mass, surfaces
+from calibration.data import instruments, own_mass, surfaces
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import identifiability, observers, priors
@@ -65,7 +65,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
         BadConfiguration: no parameter of the robot can be freed.
     """
     observe = observers.kind(runs)
-    robot = surfaces.separated(robot, runs)
+    robot = surfaces.separated(instruments.as_read(robot, runs), runs)
     robot = own_mass.weighed(robot, runs)
     known = noise_room.assumed(runs, observe.sizes(runs), noise)
     robot = observe.begun(robot, runs, known)

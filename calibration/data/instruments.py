@@ -1,0 +1,68 @@
+"""Instruments whose sign or step a rig's file leaves free: as the readings of a table show them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mmrjax import channels
+from mmrjax.rig import Instrument
+from mmrjax.robot import Robot
+
+if TYPE_CHECKING:
+    from calibration.data.runs import Runs
+
+#: Smallest step that counts as one, and what of a difference is rounding, as shares of the largest difference.
+SMALLEST, ROUNDING = 1e-5, 1e-9
+#: Fewest different readings that tell a step: of so many random multiples the common divisor is the step itself in
+#: 99 % of tables, of four in 83 %.
+FEWEST = 8
+
+
+def step_of(readings: np.ndarray) -> float:
+    """The largest step of which all differences between readings are multiples, by Euclid's algorithm; 0: there is
+    none that is larger than rounding, or too few different readings tell."""
+    levels = np.unique(readings[np.isfinite(readings)])
+    if levels.size < FEWEST:
+        return 0.0
+    found, largest = 0.0, float(np.ptp(levels))
+    for apart in np.diff(levels):
+        a, b = float(apart), found
+        while b > ROUNDING * largest:
+            rest = a - b * round(a / b)
+            a, b = b, abs(rest)
+        found = a
+        if found < SMALLEST * largest:
+            return 0.0
+    return found
+
+
+def read_off(instruments: tuple[Instrument, ...], columns: Mapping[str, np.ndarray]) -> tuple[Instrument, ...]:
+    """Instruments with nothing free: one shows magnitude alone where none of its readings is negative and some runs
+    go backward, and its step is that of its readings.
+
+    Args:
+        columns: of the table, in their units.
+    """
+    back = any((columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns)
+    found = []
+    for instrument in instruments:
+        channel = next(c for c in channels.known() if c.name == instrument.channel)
+        shown = columns.get(channel.column, np.zeros(0))
+        signed, quantum = instrument.signed, instrument.quantum
+        if signed is None:
+            signed = not back or bool((shown < 0).any())
+        if quantum is None:
+            quantum = step_of(shown) * channel.factor
+        found.append(Instrument(instrument.channel, signed, quantum))
+    return tuple(found)
+
+
+def as_read(robot: Robot, runs: Runs) -> Robot:
+    """`robot` with the instruments that its table shows."""
+    if not any(i.free for i in robot.rig.instruments):
+        return robot
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=runs.layout.instruments))
