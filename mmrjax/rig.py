@@ -125,6 +125,8 @@ class Rig(eqx.Module):
 
     def for_equations(self) -> Rig:
         """Without what only files, priors and reports read."""
+        if not (self.instruments or self.columns or self.priors or self.surfaces or self.start != STARTS[0]):
+            return self
         rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if i.signed is False)
         return dataclasses.replace(self, instruments=rectified, columns=(), priors=(), start=STARTS[0], surfaces=())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -93,6 +94,13 @@ class Robot(eqx.Module):
     running_gear: RunningGear = eqx.field(default_factory=RunningGear)
     driver: Driver = eqx.field(default_factory=Driver)
     rig: Rig = eqx.field(default_factory=Rig)
+
+    def for_equations(self) -> Robot:
+        """Without what only files, priors and reports read."""
+        rig, effects = self.rig.for_equations(), tuple(e.for_equations() for e in self.effects)
+        if rig is self.rig and all(a is b for a, b in zip(effects, self.effects, strict=True)):
+            return self
+        return dataclasses.replace(self, rig=rig, effects=effects)
 
     @property
     def on_shaft(self) -> bool:
