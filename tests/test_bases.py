@@ -7,6 +7,7 @@ import pytest
 from calibration.inference import bases
 from calibration.inference.bases import COLLINEAR, Window, collinearity, families, names, window, windows
 from mmrjax import channels
+from mmrjax.compiling import for_equations
 
 RNG = np.random.default_rng(0)
 ROWS = 60
@@ -144,7 +145,7 @@ def test_a_table_without_order_or_levels_has_no_windows():
 
 def shapes(columns, counts):
     whole = (*families(columns, counts), *windows(columns, counts))
-    return jax.tree.structure(bases.compiled(whole)), [b.columns.shape for b in whole]
+    return jax.tree.structure(for_equations(whole)), [b.columns.shape for b in whole]
 
 
 @pytest.mark.parametrize("seed", range(4))

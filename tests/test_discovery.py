@@ -238,9 +238,9 @@ def test_signatures_are_derivatives_of_the_readings(clean):
 
     first = np.cumsum([0, *(len(c.at) for c in instances)])[:-1]
     for point in (0, 1):
-        values = [c.values[point] if c.values else 1.0 for c in instances]
+        values = [c.values[point] if c.shape else 1.0 for c in instances]
         expected = np.asarray(direct(jnp.zeros(len(names)), jnp.asarray(values)))
-        got = np.asarray(linear.signatures)[:, first + [point if c.values else 0 for c in instances]]
+        got = np.asarray(linear.signatures)[:, first + [point if c.shape else 0 for c in instances]]
         scale = np.abs(expected).max(0)
         shown = scale > 0
         # These rows climb: no load drives a gear.

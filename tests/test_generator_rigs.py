@@ -136,7 +136,9 @@ def test_file_states_what_was_drawn_around(worlds, tmp_path):
         number, _, share = str(content["motor"]["resistance"]).partition(" ± ")
         assert float(number) == w.rig.stated["motor.resistance"] and share == "5 %"
         if w.rig.kind == "linear":
-            lead = load["lead_mm"]
+            lead, _, share = load["lead_mm"].partition(" ± ")
+            assert share == "0 %"  # known exactly
+            lead = float(lead)
             assert lead / 1e3 == pytest.approx(2 * np.pi * w.rig.stated["radius"], rel=1e-12)
             force = float(load["force_coulomb_N"].partition(" ")[0])
             assert force * w.rig.stated["radius"] == pytest.approx(w.rig.stated["loss_coulomb"], rel=1e-12)

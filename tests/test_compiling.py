@@ -1,0 +1,113 @@
+"""Programs are shared by what equations cannot tell apart, and by nothing else."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import generator_rigs as gr
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.discovery import candidates, discover, scales
+from calibration.discovery.candidates import Candidate
+from calibration.discovery.settings import settings_for
+from calibration.inference import noise, observers
+from mmrjax import channels, effects, params, robots
+from mmrjax.compiling import compiled, for_equations
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.steady import steady
+from mmrjax.rig import Instrument, Rig
+
+
+def space_of(world, folder):
+    """The space of candidates of a clean case, as the loop makes it."""
+    gr.case(world).write(folder)
+    robot = robot_file.read(folder / "rig.toml")
+    with channels.panel(robot.rig.channels):
+        runs = records.read(folder / "table.csv", robot=robot)
+        observer = observers.kind(runs)
+        library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
+        sd = noise.of(runs, observer.sizes(runs)).sd
+        return discover.pose(runs, robot, sd, settings_for(observer), library=library)
+
+
+@pytest.mark.parametrize("kind", ["wheeled", "bench", "linear"])
+def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
+    rng = np.random.default_rng([5, len(kind)])
+    one = gr.world(rng, kind, rows=(33, 48))
+    other = gr.world(rng, like=one.rig, rows=(33, 48))
+    spaces = [space_of(w, tmp_path / str(k)) for k, w in enumerate((one, other))]
+    assert spaces[0].bare.base.rig != spaces[1].bare.base.rig  # priors, at least
+    seen = [for_equations((s.equipped, s.bare, s.library.scored)) for s in spaces]
+    assert jax.tree.structure(seen[0]) == jax.tree.structure(seen[1])
+    assert [x.shape for x in jax.tree.leaves(seen[0])] == [x.shape for x in jax.tree.leaves(seen[1])]
+    sizes = [[float(effects_sd(e)) for e in s.library.effects] for s in spaces]
+    assert not np.allclose(*sizes)  # while effects are of another size in each
+
+
+def effects_sd(effect):
+    return next(p.spec.prior_sd(0.0) for p in params.walk(effect) if p.spec.amplitude)
+
+
+def test_what_equations_read_keeps_programs_apart():
+    bare = robots.nominal()
+    alike = dataclasses.replace(bare, rig=Rig(priors=(("motor.resistance", 0.6, 0.01),), columns=(("a", "b", 2.0),)))
+    unsigned = dataclasses.replace(bare, rig=Rig(instruments=(Instrument("total_current", False, 0.1),)))
+    held = dataclasses.replace(bare, rig=Rig(instruments=(Instrument("total_current", True, 0.1),)))
+    speed = dataclasses.replace(bare, rig=Rig(imposed="motor_speed"))
+    shapes = [jax.tree.structure(for_equations(r)) for r in (bare, alike, held, unsigned, speed)]
+    assert shapes[0] == shapes[1] == shapes[2] and len(set(shapes)) == 3
+    assert for_equations(bare) is bare
+
+    traced = []
+
+    @compiled
+    def current(robot, conditions):
+        traced.append(robot.rig)
+        return steady(robot, conditions).reading["total_current"]
+
+    run = Conditions(voltage=-24.0)
+    shown = [float(current(r, run)) for r in (bare, alike, held, unsigned)]
+    assert len(traced) == 2 and not traced[0].priors
+    assert shown[0] == shown[1] == shown[2] == -shown[3] < 0
+
+
+def test_an_effect_of_another_size_is_the_same_to_equations():
+    kind = effects.BY_NAME["churning"]
+    wide = scales._scaled(kind, 3.0, 1.0)
+    one = wide(amplitude=jnp.asarray(2e-4))
+    assert effects_sd(one) == pytest.approx(3 * effects_sd(kind()))
+    plain = for_equations(one)
+    assert type(plain) is kind and float(plain.amplitude) == 2e-4 and for_equations(plain) is plain
+
+
+def candidate(active, cost):
+    zero = np.zeros(2)
+    return Candidate(active, zero, zero, cost, zero, zero, True, True, True)
+
+
+def test_a_fit_that_ends_above_the_one_it_builds_on_starts_again_there(monkeypatch):
+    """A start where no solution exists keeps no effect from being found."""
+    asked = []
+
+    def fit(space, proposals, settings):
+        asked.append([(names, float(z)) for names, z in proposals])
+        # from a large amplitude the second one is lost beyond a fold; from 0 it is found
+        return [
+            candidate(n, {("a", 9.0): 10.0, ("b", 9.0): 5000.0, ("b", 0.0): 3.0}[n[0], float(z)])
+            for n, z in proposals
+        ]
+
+    monkeypatch.setattr(candidates, "fit_candidates", fit)
+    monkeypatch.setattr(candidates, "start", lambda space, at, names, settings, scores=None: 9.0 if scores else 0.0)
+    base = candidate((), 20.0)
+    found = candidates.fit_beside(None, [(("a",), base, "scores"), (("b",), base, "scores")], None)
+    assert [c.cost for c in found] == [10.0, 3.0]
+    assert asked == [[(("a",), 9.0), (("b",), 9.0)], [(("b",), 0.0)]]
