@@ -270,6 +270,15 @@ def known() -> tuple[Channel, ...]:
     return tuple({c.name: c for c in (*EVERY, *CHANNELS)}.values())
 
 
+def of(name: str) -> Channel:
+    """The channel of a name, whether the robot at hand has it or not.
+
+    Raises:
+        KeyError: no such channel.
+    """
+    return {c.name: c for c in known()}[name]
+
+
 def names() -> tuple[str, ...]:
     """Names of the channels at hand, in order."""
     return tuple(c.name for c in CHANNELS)

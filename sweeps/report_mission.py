@@ -184,7 +184,7 @@ def _demand(found: Missions, k: int) -> str:
     mode = source.modes[k]
     said = []
     if mode in CONTROLLED:
-        channel = next(c for c in channels.known() if c.name == mode)
+        channel = channels.of(mode)
         said.append(span(source.demand, channel.factor, channel.unit))
     elif mode == "voltage":
         said.append(span(source.values["duty"], 0.01, "% duty") if "duty" in source.values else "100 % duty")

@@ -50,7 +50,7 @@ def read_off(instruments: tuple[Instrument, ...], columns: Mapping[str, np.ndarr
     back = any((columns[c] < 0).any() for c in ("supply_voltage_V", "motor_speed_rpm", "duty") if c in columns)
     found = []
     for instrument in instruments:
-        channel = next(c for c in channels.known() if c.name == instrument.channel)
+        channel = channels.of(instrument.channel)
         shown = columns.get(channel.column, np.zeros(0))
         signed, quantum = instrument.signed, instrument.quantum
         if signed is None:

@@ -245,7 +245,7 @@ def evaluated(problem: Problem, z: Z, data: Data) -> Array:
     return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
 
 
-@compiled
+@eqx.filter_jit
 def _step(solver: Search, y: Z, state: Any, r: Array, jacobian: Array) -> tuple[Z, Any, Array]:
     def tangent(z: Z, _: None) -> tuple[Array, None]:
         return r + jacobian @ (z - state.y_eval), None  # evaluated at y_eval alone
@@ -311,7 +311,7 @@ def search_long(
 Evaluate = Callable[[Array], tuple[Array, Array, Observation]]
 
 
-@compiled
+@eqx.filter_jit
 def _begun(solver: Search, starts: Array, r: Array, jacobian: Array) -> Any:
     def one(y: Array, r: Array, jacobian: Array) -> Any:
         shape = jax.eval_shape(lambda: r)
@@ -320,12 +320,12 @@ def _begun(solver: Search, starts: Array, r: Array, jacobian: Array) -> Any:
     return eqx.filter_vmap(one)(starts, r, jacobian)
 
 
-@compiled
+@eqx.filter_jit
 def _steps(solver: Search, y: Array, state: Any, r: Array, jacobian: Array) -> tuple[Array, Any, Array]:
     return eqx.filter_vmap(lambda *x: _step(solver, *x))(y, state, r, jacobian)
 
 
-@compiled
+@eqx.filter_jit
 def _optima(jacobian: Array, r: Array, z: Array, data: Data, weights: Array, steps: Array) -> Optimum:
     def one(jacobian: Array, r: Array, z: Array, weight: Array, steps: Array) -> Optimum:
         there = dataclasses.replace(data, weight=weight)

@@ -464,7 +464,7 @@ class Histories(Observer):
                     put[amplitude] = value[amplitude] + a[k] * sds[k]
                     if e.shape:
                         shape = f"effects.{e.effect.name}.{e.shape}"
-                        wanted = jnp.asarray(e.values)[jnp.minimum(point, len(e.values) - 1)]
+                        wanted = e.values[jnp.minimum(point, len(e.values) - 1)]
                         put[shape] = jnp.where(value[amplitude] == 0, wanted, value[shape])
                 there = params.replace(whole, put)
                 return problem.whitened(self(there), data)[: data.measured.size]
