@@ -133,7 +133,7 @@ class Resolved(SettledRuns):
         def joined(get: Any) -> Array:
             return jnp.concatenate([jnp.asarray(get(one)) for one in found])
 
-        reading = jnp.stack([joined(lambda one, n=name: one.reading[n]) for name in channels.names()], -1)
+        reading = jnp.stack([joined(lambda one, n=name: one.reading[n]) for name in channels.USUAL], -1)
         return Observation(reading, joined(lambda one: one.adhesion_used), joined(lambda one: one.status))
 
 
@@ -206,13 +206,13 @@ class Posed:
         """Slip of runs [%]."""
         chassis, ratio = self.problem.base.configurations, float(self.problem.base.gearbox.ratio)
         radius = np.where(self.tracked, float(chassis["6T2A"].radius), float(chassis["4W2T"].radius))[self.row]
-        motor, speed = (reading[..., channels.index(name)] for name in ("motor_speed", "speed"))
+        motor, speed = (reading[..., channels.USUAL.index(name)] for name in ("motor_speed", "speed"))
         with np.errstate(all="ignore"):
             return 100 * (1 - speed * ratio / (motor * radius))
 
     def cost(self, z: np.ndarray, found: Rows, search: Search) -> np.ndarray:
         """Half the sum of squares of members, by the rows that a search sees."""
-        current, motor, speed = (channels.index(n) for n in ("total_current", "motor_speed", "speed"))
+        current, motor, speed = (channels.USUAL.index(n) for n in ("total_current", "motor_speed", "speed"))
         error = self.percent(found.reading)
         weight = (search.seen / np.bincount(self.row))[self.row]
         sd = SD_SLIP[self.what]
@@ -271,7 +271,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     paper = paper.where(paper["configuration"] == "6T2A")
     if not all(np.array_equal(paper[n], table.where(tracked)[n]) for n in ("supply_voltage_V", "slope_deg")):
         raise ValueError("the simulated rows of the paper are not those measured")
-    motor, speed = (paper.measured()[:, channels.index(name)] for name in ("motor_speed", "speed"))
+    motor, speed = (paper.measured()[:, channels.USUAL.index(name)] for name in ("motor_speed", "speed"))
     simulated = np.full(len(measured), np.nan)
     simulated[tracked] = 100 * (1 - speed * float(robot.gearbox.ratio) / (motor * float(robot.radius_pulley)))
     data = data_of(measured[row], SettledRuns.sizes(table)[row], len(names))
@@ -286,7 +286,7 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     robot = dataclasses.replace(robot, effects=(*robot.effects, zero))
     stated = priors.guided(robots.nominal(), "6T2A")[1]
     share = {"total_current": SD_CURRENT, "motor_speed": SD_MOTOR, "speed": SD_SPEED}
-    size = np.abs(posed.measured) * np.array([0.01 * share[name] for name in channels.names()])
+    size = np.abs(posed.measured) * np.array([0.01 * share[name] for name in channels.USUAL])
     data = data_of(posed.measured, size, len(names))
     coordinates = priors.coordinates(robot, names, stated, any_surface=True)
     problem = Problem(params.strong(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
@@ -498,7 +498,7 @@ def main() -> None:
     print(json.dumps({
         "machine": machine(), "what": posed.what, "generations": count, "seconds": round(took, 1),
         "members": count * len(searches) * arguments.population, "names": posed.problem.coordinates.names,
-        "columns": [*channels.names(), "slip"],
+        "columns": [*channels.USUAL, "slip"],
     }), flush=True)  # fmt: skip
     held: dict[str, list[np.ndarray]] = {}
     for k, search in enumerate(searches):

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from mmrjax import missions, outputs
+from mmrjax.channels import Channel, usual
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.mission import Mission
@@ -46,6 +47,7 @@ class Results(eqx.Module):
         model: the fidelity.
         mission: of runs over a profile, totals, segments and course; None without a profile.
         stated: conditions that the profile states, in place of those of the runs.
+        channels: of the robot, in the order of columns.
     """
 
     conditions: Conditions
@@ -57,6 +59,7 @@ class Results(eqx.Module):
     model: str = eqx.field(static=True)
     mission: Mission | None = None
     stated: tuple[str, ...] = eqx.field(static=True, default=())
+    channels: tuple[Channel, ...] = eqx.field(static=True, default_factory=usual)
 
     def __getattr__(self, name: str) -> Any:
         result, further = self.__dict__.get("result"), self.__dict__.get("further")
@@ -94,7 +97,7 @@ class Results(eqx.Module):
         columns = {column: np.asarray(getattr(conditions, name)) for name, column in of.items()}
         columns["supply_voltage_V"] = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
         columns |= {of[name]: nan for name in self.stated if name in of}
-        found = outputs.columns(self.result, self.further)
+        found = outputs.columns(self.result, self.channels, self.further)
         if self.mission is not None:
             found = {name: found[name] for name in (*missions.names(), *CODES)}
         return {
@@ -114,13 +117,15 @@ class Results(eqx.Module):
             rows: most that are shown.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
-        rows_of: tuple[outputs.Output | missions.Output, ...] = (*outputs.table(), *missions.OUTPUTS)
+        rows_of: tuple[outputs.Output | missions.Output, ...] = (*outputs.table(self.channels), *missions.OUTPUTS)
         about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
         if columns is None and self.mission is not None:
             columns = ["configuration", *missions.USUAL, "status"]
         elif columns is None:
             shown = [
-                output.column for output in outputs.table() if output.column in _SHOWN or output.name in self.reading
+                output.column
+                for output in outputs.table(self.channels)
+                if output.column in _SHOWN or output.name in self.reading
             ]
             columns = [
                 "configuration",

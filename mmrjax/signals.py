@@ -132,7 +132,7 @@ class Result(eqx.Module):
     """One settled operating point (or the end of a run), with its status.
 
     Attributes:
-        reading: what the instruments show [SI], by the name of the channel (`channels.CHANNELS`); each is an
+        reading: what the instruments show [SI], by the name of the channel (`channels.EVERY`); each is an
             attribute too: `result.total_current`.
         theoretical_speed: r_k ω_k, eq. (32) [m/s].
         slip: 1 - V / V_theoretical, eq. (33) [-]; 0 at rest.

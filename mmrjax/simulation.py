@@ -85,7 +85,9 @@ def simulate(
     run = _run(fidelities.get(model), robot, flat, stated, history and fidelities.facts(model).histories)
     run = jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), run)
     names = robot.configurations.names
-    return Results(conditions, total_mass, run.result, run.columns, run.history, names, model)
+    return Results(
+        conditions, total_mass, run.result, run.columns, run.history, names, model, channels=robot.channels
+    )
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
@@ -118,8 +120,9 @@ def _missions(
     shape, names = conditions.shape, robot.configurations.names
     found, further, course = jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), (found, further, course))
     return Results(
-        conditions, total_mass, found.result, further, course, names, missions.MODEL, found, profile.stated
-    )
+        conditions, total_mass, found.result, further, course, names, missions.MODEL, found, profile.stated,
+        robot.channels,
+    )  # fmt: skip
 
 
 def _run(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmrjax import channels
-from mmrjax.channels import MM
+from mmrjax.channels import MM, Channel
 from sweeps import words
 from sweeps.figures_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note
 
@@ -229,17 +229,18 @@ class Course:
         return float(values[-1]) if values.size else np.nan
 
 
-def courses(history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
+def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
     """Members of a batch of runs as their instruments show them.
 
     Args:
-        history: of the batch; status: codes of how its members ended; names: headings of the members.
+        read: channels of the robot; history: of the batch; status: codes of how its members ended.
+        names: headings of the members.
     """
     from mmrjax.signals import STATUSES
 
-    answer = []
+    answer, shown = [], tuple(c for c in read if c.over_time)
     for k, name in enumerate(names):
-        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in channels.over_time()}
+        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in shown}
         finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
         of = {channel: values[upto] for channel, values in readings.items()}
@@ -249,10 +250,11 @@ def courses(history: Any, status: np.ndarray, names: Sequence[str]) -> list[Cour
 
 def over_time(shown: list[Course]) -> Figure:
     """A row for each run, a panel for each channel."""
-    fig, grid = figure(len(shown), len(channels.over_time()), 2.6 * len(shown))
+    read = channels.rows(shown[0].readings)
+    fig, grid = figure(len(shown), len(read), 2.6 * len(shown))
     for row, course in zip(grid, shown, strict=True):
         row[0].set_title(course.name)
-        for axes, channel in zip(row, channels.over_time(), strict=True):
+        for axes, channel in zip(row, read, strict=True):
             axes.plot(course.time, course.readings[channel.name], color=BLUE)
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))
         if course.status not in words.SETTLED:

@@ -297,7 +297,7 @@ def _course(
     return {
         "run_id": np.full(len(picked), name),
         "time_s": course.time,
-        **{c.column: np.asarray(reading[c.name]) / c.factor for c in channels.CHANNELS},
+        **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / channels.MM,
         "distance_m": course.distance,
         "voltage_V": signals.voltage,

@@ -111,7 +111,7 @@ _FITS = {
 
 def said_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
     """rms errors in the units of their channels, in a line; by fit and channel."""
-    units = {c.name: (c.label, c.unit) for c in channels.CHANNELS}
+    units = {c.name: (c.label, c.unit) for c in channels.EVERY}
     parts = [
         f"{_FITS[when]} " + ", ".join(f"{units[name][0]} {value:.3g} {units[name][1]}" for name, value in by.items())
         for when, by in rms.items()

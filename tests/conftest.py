@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import channels, params, robots
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
@@ -185,7 +185,6 @@ def mmrjax(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it, for this process alone
 
-    monkeypatch.setattr(channels, "CHANNELS", channels.CHANNELS)  # a command takes those of its robot
     monkeypatch.setattr(os, "_exit", sys.exit)  # how an interrupted command ends; this process goes on
 
     def command(*arguments):

@@ -632,10 +632,11 @@ def test_missing_readings_weigh_nothing_and_are_said(mmrjax, tmp_path):
 FOURTH = """
 import dataclasses
 from mmrjax import channels
-channels.CHANNELS += (dataclasses.replace(
-    channels.CHANNELS[0], name="voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V",
+channels.EVERY += (dataclasses.replace(
+    channels.EVERY[0], name="voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V",
     label="voltage at the motors", word="voltage", range=(0.0, 100.0), read=lambda robot, signals: signals.voltage,
 ),)
+channels.USUAL += ("voltage",)
 from sweeps.cli import main; main()
 """
 

@@ -162,7 +162,7 @@ def terms(effect: Effect, robot=None, signals: Signals = STATES) -> np.ndarray:
 def readings(robot, signals: Signals) -> jax.Array:
     """What the instruments show, channels last, in their order."""
     shown = balances.sensor(robot, signals)
-    return jnp.stack([shown[name] for name in channels.names()], -1)
+    return jnp.stack([shown[name] for name in channels.USUAL], -1)
 
 
 def floats(tree) -> jax.Array:
@@ -178,7 +178,7 @@ def outputs_start(robot):
     """Readings through a start: for what settled travel does not show."""
     times = jnp.asarray([0.0, 0.002, 0.01, 0.1, 0.4])
     signals = jax.vmap(lambda c: drive(robot, c, times).signals)(CONDITIONS)
-    return readings(robot, signals)[:, 1:].reshape(-1, len(channels.CHANNELS))
+    return readings(robot, signals)[:, 1:].reshape(-1, len(channels.usual()))
 
 
 @functools.cache
@@ -217,7 +217,7 @@ def law_declared(effect: type[Effect]) -> None:
     assert not effect.settles_to or (effect.settles_to in BY_NAME and effect.settles_to != effect.name)
     assert effect.balance in balances.BALANCES
     assert bool(effect.channel) == (effect.balance == "sensor")
-    assert not effect.channel or effect.channel in channels.names()
+    assert not effect.channel or effect.channel in channels.USUAL
     declared = {p.name: p for p in params.walk(effect())}
     assert [n for n, p in declared.items() if p.spec.amplitude] == ["amplitude"]
     amplitude = declared["amplitude"]
@@ -293,7 +293,7 @@ def law_alive_at_zero(effect: type[Effect]) -> None:
     values, slopes = at_zero(outputs_start if effect.transient else outputs_steady, there)
     slopes = slopes[..., there.index(effect)]
     assert np.isfinite(values).all() and np.isfinite(slopes).all()
-    count = len(channels.known())  # the readings
+    count = len(channels.EVERY)  # the readings
     moved = np.abs(slopes[:, :count]) * size(effect) / np.maximum(np.abs(values[:, :count]), 1e-9)
     assert moved.max() > 1e-6, "dead gradient"
 
@@ -792,7 +792,7 @@ def test_drive_and_steady_both_feel(k, drive_readings):
         return
     of_steady = compiled(outputs_steady, ALL)[0]
     base, moved = of_steady(jnp.zeros(len(ALL))), of_steady(jnp.zeros(len(ALL)).at[k].set(share))
-    count = len(channels.known())  # the readings
+    count = len(channels.EVERY)  # the readings
     assert (np.abs(moved - base)[:, :count] / np.maximum(np.abs(base[:, :count]), 1e-9)).max() > 1e-5
 
 

@@ -307,7 +307,7 @@ def test_running_gear_is_found_through_the_track_model(tmp_path):
     robot = params.replace(robots.nominal(), changed)
     shown = track_batch(robot, table.conditions(robot), duration=0.6, step=5e-5, rolling=True).result.reading
     columns = dict(table.columns)
-    for channel in channels.CHANNELS:
+    for channel in channels.usual():
         columns[channel.column] = np.asarray(shown[channel.name]) / channel.factor
     data = dataclasses.replace(table, columns=columns)
     found = calibrate(

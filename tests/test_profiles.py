@@ -97,7 +97,7 @@ def test_units_in_names(read, column, cell, field, value):
 
 
 def test_units_of_a_channel_are_those_of_its_row():
-    for channel in channels.CHANNELS:
+    for channel in channels.usual():
         found = units.of_channel(channel.name)
         assert channel.column == f"{channel.name}_{next(iter(found))}"
         assert len(found) == 1 + len(channel.other_units)

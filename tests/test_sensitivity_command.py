@@ -45,7 +45,7 @@ def study(robot):
         np.array(["6T2A", "4W2T", "6T2A", "6T2A"]), np.array([24.0, 15, 33, 24]), np.array([3.0, 0, 8, 0]),
         np.array([0.0, 5, 0, 25]),
     )  # fmt: skip
-    return Study(robot, inputs, points, chosen_outputs(("total_current", "speed")))
+    return Study(robot, inputs, points, chosen_outputs(("total_current", "speed"), robot))
 
 
 def table(path):
@@ -120,7 +120,7 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), covariance), {})
     points = Points(*(x[:1] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("total_current",)))
+    one = Study(robot, inputs, points, chosen_outputs(("total_current",), robot))
     found = analyse(one, "shapley", 20_000)
     z_slopes = local(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
     truth = shapley.linear(z_slopes, covariance)
@@ -136,7 +136,7 @@ def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlatio
     covariance = 0.02 * np.array([[1, 0.6, 0, 0], [0.6, 1, 0.5, 0], [0, 0.5, 1, 0], [0, 0, 0, 1.0]])
     inputs = room.of_posterior(robot, of_coordinates(priors.coordinates(robot, names), np.zeros(4), covariance), {})
     points = Points(*(x[:2] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     found = analyse(one, "shapley", 40_000)
     slopes = local(one).by_score["speed"] @ np.linalg.inv(inputs.parameters.root)
     at = found.outputs["speed"].at_points["shapley"]
@@ -155,7 +155,7 @@ def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance
     coordinates = priors.coordinates(robot, (NAMES[0], NAMES[3]))
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.diag(variances)), {})
     points = Points(*(x[:1] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     np.testing.assert_array_equal(inert(one, local(one), 0), [False, True])
 
 
@@ -163,7 +163,7 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
     coordinates = priors.coordinates(robot, NAMES[:2])
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.array([[1, 0.5], [0.5, 1.0]])), {})
     points = Points(*(x[[0, 3]] for x in study.points.columns().values()))
-    two = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    two = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     edge = np.inf
 
     def sample(values, group):
@@ -191,7 +191,7 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
 def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
     inputs = room.of_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
     points = Points(*(x[:2] for x in study.points.columns().values()))
-    found = analyse(Study(robot, inputs, points, chosen_outputs(("speed",))), method, 3000)
+    found = analyse(Study(robot, inputs, points, chosen_outputs(("speed",), robot)), method, 3000)
     assert sum(found.sampled["steady"].values()) == found.evaluations > 0
     if method == "sobol":
         assert found.outputs["speed"].convergence[-1][0] == found.evaluations

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import vectorised
 
-from mmrjax import outputs, params
+from mmrjax import channels, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities import steady as room
@@ -16,7 +16,7 @@ from mmrjax.fidelities.steady import steady_batch, steady_derivatives, steady_ou
 from mmrjax.signals import STATUSES
 
 EFFECTS = {"series_resistance": 0.3, "churning": 5e-4, "winding_heating": 1.0, "nonlinear_slip": 0.05}
-ALL = tuple(output.name for output in outputs.table())
+ALL = tuple(output.name for output in outputs.table(channels.usual()))
 #: Driving, sliding, stalled and overhauling in one batch, in both configurations.
 MIXED = dict(
     voltage=[24.0, 33.0, 0.5, 24.0, 15.0, 24.0],
@@ -81,7 +81,7 @@ def test_steady_outputs_are_those_of_steady_batch(robot, effects):
         "converged", "slides", "stalled", "converged", "converged", "failed",
     ]  # fmt: skip
     found = steady_outputs(robot, runs, (*ALL, "status", "flags"))
-    for output in outputs.table():
+    for output in outputs.table(channels.usual()):
         np.testing.assert_allclose(found[output.name], output.get(whole), rtol=1e-13, err_msg=output.name)
     np.testing.assert_array_equal(found["status"], whole.status)
     np.testing.assert_array_equal(found["flags"], whole.flags)

@@ -182,7 +182,7 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
     """No literal outside the table of channels spells two or more of them."""
     if path.parts[0] == "mmrjax" or path.parts[:2] == REPRODUCTION:
         return
-    spelled = {word: c.name for c in channels.CHANNELS for word in (c.name, c.column, c.sd_column)}
+    spelled = {word: c.name for c in channels.usual() for word in (c.name, c.column, c.sd_column)}
     place, inner = places(tree), set()
     for node in ast.walk(tree):
         if id(node) in inner or not isinstance(node, ast.Tuple | ast.List | ast.Set | ast.Dict):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import fidelities, outputs, params, robots
+from mmrjax import channels, fidelities, outputs, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady
@@ -125,7 +125,7 @@ def test_unknown_output_is_refused_with_the_choices(variation, model):
     options = fidelities.facts(model).resolved()
     with pytest.raises(UsageError, match=r"outputs: got total_curent; did you mean total_current.*efficiency_motor"):
         check_outputs(variation, model, Conditions(), options, ("total_curent",))
-    check_outputs(variation, model, Conditions(), options, outputs.names())
+    check_outputs(variation, model, Conditions(), options, outputs.names(channels.usual()))
 
 
 def test_a_fidelitys_own_column_is_an_output(variation):

@@ -63,7 +63,6 @@ EITHER_WAY = 0.05
 MANY = 0.03
 
 
-@channels.of_the_robot
 def discover(
     runs: Runs,
     robot: Robot,
@@ -95,6 +94,7 @@ def discover(
             that are not known.
     """
     menu.check_forbidden(forbidden, robot)
+    runs = runs.of(robot)
     distinct, numbers, notes = without_copies(runs)
     robot = surfaces.separated(instruments.as_read(robot, distinct), distinct)
     stated = surfaces.of_surfaces(stated or {}, robot, distinct)
@@ -124,8 +124,9 @@ def discover(
             progress(f"the verdict with {factor:g} times the assumed noise")
             sds = noise_room.assumed(distinct, kind.sizes(distinct), noise, factor)
             sensitivity.append(in_short(factor, trace(distinct, robot, sds, settings, stated, library)))
-        silent = ", ".join(c for c, w in zip(channels.names(), known.source, strict=True) if w == "assumed")
-        notes.append(f"no sd is stated for {silent}: {noise_room.default()} is assumed; state yours with --noise")
+        silent = ", ".join(c.name for c, w in zip(known.channels, known.source, strict=True) if w == "assumed")
+        usual = noise_room.default(known.channels)
+        notes.append(f"no sd is stated for {silent}: {usual} is assumed; state yours with --noise")
     return dataclasses.replace(found, notes=(*notes, *found.notes), sensitivity=tuple(sensitivity))
 
 
@@ -359,7 +360,7 @@ def visible(
 
 def both_ways(runs: Runs) -> bool:
     """Whether runs go forward as well as backward, by any speed that they state or by what drives them."""
-    moved = [c.column for c in channels.known() if c.zero_at_rest]
+    moved = [c.column for c in channels.EVERY if c.zero_at_rest]
     columns = [runs[name] for name in (*moved, "supply_voltage_V", "duty") if runs.has(name)]
     found = [x[np.isfinite(x)] for x in columns]
     return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in found if x.size)
@@ -379,7 +380,7 @@ def bases_at(runs: Runs, base: BaseFit) -> Bases:
     index, _ = padded(len(runs), problem.observe.sizes_padded)
     columns = dict(runs.where(index).columns)
     reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
-    columns |= {c.column: reading[:, k] for k, c in enumerate(channels.CHANNELS)}
+    columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
     robot = problem.robot(jnp.asarray(base.candidate.z[: base.space.free]))
     return problem.observe.bases(columns, base.space.included, robot)
 
@@ -564,7 +565,7 @@ def _residuals(
     Args:
         linear: the fit at z, linearised; reading: what it says of every row [SI], shape (rows or more, channels).
     """
-    rows, count = len(runs), len(channels.CHANNELS)
+    rows, count = len(runs), len(runs.channels)
     there = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
     jacobian = np.asarray(linear.jacobian)[: rows * count, : len(z)]
     whitened = np.where(there, np.asarray(linear.by_row())[:rows], 0.0)
@@ -596,7 +597,7 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
     return {
         name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
-        for k, name in enumerate(channels.names())
+        for k, name in enumerate(channels.names(noise.channels))
         if noise.source[k] != "no readings"
     }
 

@@ -36,7 +36,7 @@ from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
-from mmrjax import channels, fidelities
+from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 
@@ -48,7 +48,6 @@ FRICTION = "ground.friction."
 _OF_PRODUCT = "its product with the share of the guides, as in the other fidelities"
 
 
-@channels.of_the_robot
 def calibrate(
     runs: Runs,
     robot: Robot,
@@ -95,6 +94,7 @@ def calibrate(
         raise BadConfiguration(
             'calibrate: JAX computes in single precision; set jax.config.update("jax_enable_x64", True) first'
         )
+    runs = runs.of(robot)
     observe = observers.kind(runs)
     facts = observers.facts(model)
     effort = facts.effort
@@ -184,6 +184,7 @@ def calibrate(
     result = CalibrationResult(
         robot=fitted,
         source=runs.source,
+        channels=runs.channels,
         model=model,
         seed=seed,
         parameters=estimates.parameters(posed, base, z, about, profile, beside, sources),
@@ -191,11 +192,11 @@ def calibrate(
         noise=estimates.noise(posed, known, found.shares, measured),
         percent_of=observe.percent_of,
         axis=observe.axis,
-        errors_before=estimates.errors(observe, seen_before, measured, sd),
-        errors_after=estimates.errors(observe, seen, measured, sd),
+        errors_before=estimates.errors(observe, runs.channels, seen_before, measured, sd),
+        errors_after=estimates.errors(observe, runs.channels, seen, measured, sd),
         held_out={kind: estimates.held_out(posed, h, measured, sd) for kind, h in held.items()},
         conditions=estimates.conditions(observe, runs),
-        readings=estimates.readings(observe, measured, sd, seen_before, seen),
+        readings=estimates.readings(observe, runs.channels, measured, sd, seen_before, seen),
         status_before=np.array(STATUSES)[status_before],
         status=np.array(STATUSES)[status],
         adhesion_used=np.asarray(after.adhesion_used),

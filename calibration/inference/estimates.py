@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -29,6 +31,7 @@ from calibration.inference.result import (
     Tie,
 )
 from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
 #: How many data sds one prior sd has to move the readings to be measured by them at all.
@@ -116,17 +119,21 @@ def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
             100 * float(np.nanmedian(share[:, k])) if np.isfinite(share[:, k]).any() else np.nan,
             100 * float(shares[k]) if known.estimated[k] else None,
         )
-        for k, name in enumerate(channels.names())
+        for k, name in enumerate(channels.names(posed.channels))
     }
 
 
-def errors(observe: type[Observer], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> Errors:
+def errors(
+    observe: type[Observer], shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
+) -> Errors:
     """Errors by channel, in percent of what the observer says and in σ; arrays of shape (rows, channels)."""
-    return _errors(simulated, measured, sd, observe.percent(simulated, measured))
+    return _errors(shown, simulated, measured, sd, observe.percent(simulated, measured))
 
 
-def _errors(simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray) -> Errors:
-    found = channel_errors(simulated, measured, sd, percent)
+def _errors(
+    shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
+) -> Errors:
+    found = channel_errors(shown, simulated, measured, sd, percent)
     return {
         name: ChannelErrors(int(e["rows"]), float(e["rms_percent"]), float(e["max_percent"]), float(e["rms_sigma"]))
         for name, e in found.items()
@@ -141,10 +148,12 @@ def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np
         inside = held.block == k
         alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
         blocks[label] = Block(
-            _errors(alone[0], measured, sd, alone[1]), _counted(inside & lost), bool(held.converged[k])
+            _errors(posed.channels, alone[0], measured, sd, alone[1]),
+            _counted(inside & lost),
+            bool(held.converged[k]),
         )
-    reading = dict(zip(channels.names(), held.reading.T, strict=True))
-    return HeldOut(_errors(held.reading, measured, sd, percent), _counted(lost), blocks, reading)
+    reading = dict(zip(channels.names(posed.channels), held.reading.T, strict=True))
+    return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _counted(lost), blocks, reading)
 
 
 def _counted(rows: np.ndarray) -> tuple[int, ...]:
@@ -153,13 +162,18 @@ def _counted(rows: np.ndarray) -> tuple[int, ...]:
 
 
 def readings(
-    observe: type[Observer], measured: np.ndarray, sd: np.ndarray, before: np.ndarray, after: np.ndarray
+    observe: type[Observer],
+    shown: Sequence[Channel],
+    measured: np.ndarray,
+    sd: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
     """Readings by channel; arrays of shape (rows, channels), NaN where there is none."""
     percent, sigma = observe.percent(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
-        for k, name in enumerate(channels.names())
+        for k, name in enumerate(channels.names(shown))
     }
 
 

@@ -42,7 +42,7 @@ class History(eqx.Module):
     ) -> History:
         """A history with its readings."""
         shown = balances.sensor(robot, signals)
-        reading = {c.name: shown[c.name] for c in channels.known() if c.over_time}
+        reading = {c.name: shown[c.name] for c in channels.EVERY if c.over_time}
         return History(time, distance, signals, reading, reactions)
 
 

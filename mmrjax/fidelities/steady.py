@@ -241,7 +241,7 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
 
 def _getters() -> dict[str, Callable[[Result], Array]]:
     codes = {name: operator.attrgetter(name) for name in CODES}
-    return {**{output.name: output.get for output in outputs.table(channels.known())}, **codes}
+    return {**{output.name: output.get for output in outputs.table(channels.EVERY)}, **codes}
 
 
 def _check_outputs(names: Iterable[str]) -> None:
@@ -299,7 +299,7 @@ def steady_derivatives(
     _check_outputs(names)
     for name in set(names) & set(CODES):
         raise KeyError(
-            f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table(channels.known()))}"
+            f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table(channels.EVERY))}"
         )
     values = {p.name: p.value for p in params.walk(robot)}
     params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have

@@ -35,7 +35,7 @@ from calibration.inference.optimizers import Optimum, linearised, searches_long
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
-from mmrjax.channels import RPM
+from mmrjax.channels import RPM, Channel
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
@@ -86,7 +86,7 @@ class HistoriesLinearization(Linearization):
     def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
         moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
         there = jnp.where(self.rows_of < 0, self.rows, self.rows_of)  # beyond the last row: dropped
-        out = jnp.zeros((self.rows, len(channels.CHANNELS), shapes.shape[1])).at[there].set(moved, mode="drop")
+        out = jnp.zeros((self.rows, len(self.channels), shapes.shape[1])).at[there].set(moved, mode="drop")
         return out.reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
@@ -217,8 +217,8 @@ class Histories(Observer):
         names, measured = _names(runs), runs.measured()
         # Current rises within a millisecond; what moves does not.
         resting = robot.rig.start == "rest" and robot.rig.imposed == "voltage"
-        moving = [k for k, c in enumerate(channels.CHANNELS) if c.zero_at_rest and resting]
-        for channel in (c for c in channels.CHANNELS if not c.over_time and runs.has(c.column)):
+        moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
+        for channel in (c for c in runs.channels if not c.over_time and runs.has(c.column)):
             raise BadData(
                 f"{runs.source}, {channel.column}: histories do not follow it; remove the column, or give settled "
                 "runs without time_s"
@@ -236,7 +236,7 @@ class Histories(Observer):
                 size = np.max(np.nan_to_num(np.abs(measured[mine, k])))
                 limit = max(RESTING * size, RESTING_SD * noise.sd[first, k])
                 if runs["time_s"][first] < EARLY and abs(measured[first, k]) > limit:
-                    column, unit = channels.CHANNELS[k].column, channels.CHANNELS[k].unit
+                    column, unit = runs.channels[k].column, runs.channels[k].unit
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
                         f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
@@ -488,6 +488,7 @@ class Histories(Observer):
             self.knots,
             self.time,
             self.angle(runs),
+            channels=channels.names(problem.channels),
         )
 
     def replicate(
@@ -585,7 +586,7 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
     x = np.asarray(linear.series())
     power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
     of = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
-    return {name: [float(lag[k]) for lag in of] for k, name in enumerate(channels.names())}
+    return {name: [float(lag[k]) for lag in of] for k, name in enumerate(linear.channels)}
 
 
 def _changes(runs: Runs, each: list[np.ndarray]) -> list[np.ndarray]:
@@ -655,7 +656,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
         mine = mine[np.argsort(runs["time_s"][mine], kind="stable")]
         key = begin_name(str(name))
         at: dict[str, tuple[float, float]] = {}
-        for k, channel in enumerate(channels.CHANNELS):
+        for k, channel in enumerate(runs.channels):
             field = "angle" if channel.unit_si == "rad" else "motor_speed"
             there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
             if channel.zero_at_rest and field not in at and len(there):
@@ -669,7 +670,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(found), priors=priors))
 
 
-def _shown_of_unit(robot: Robot, configuration: int, channel: channels.Channel) -> float:
+def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
     """What a channel shows while the motor shafts turn by 1 rad/s, the load rolls with them and the output's angle is
     1 rad [SI]."""
     radius = float(robot.configurations.members[configuration].radius)
@@ -703,7 +704,7 @@ def _check_signs(runs: Runs) -> None:
     for run in stretches(runs):
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
-            for k, channel in enumerate(channels.CHANNELS):
+            for k, channel in enumerate(runs.channels):
                 shown = measured[rows, k][np.isfinite(measured[rows, k])]
                 size = np.nanmax(np.abs(measured[:, k]), initial=0.0)
                 if channel.zero_at_rest and channel.directed and shown.size and np.median(shown) > RESTING * size:
@@ -734,7 +735,7 @@ def _knots(rows: np.ndarray, most: int) -> np.ndarray:
 
 def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
     shown = balances.sensor(robot, signals)
-    return jnp.stack([shown[name] for name in channels.names()], -1)
+    return jnp.stack([shown[name] for name in channels.names(robot.channels)], -1)
 
 
 @compiled
