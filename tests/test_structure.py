@@ -248,6 +248,115 @@ def front_door_fits_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[B
                 yield line, f"sweeps imports {room}"
 
 
+#: What is kept between calls, with why no answer depends on it.
+KEPT = {
+    ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
+    ("mmrjax/mjcf.py", "_template"): "pure: the topology of the track model",
+    ("mmrjax/params.py", "own_spec"): "pure, of hashable arguments",
+    ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
+    ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
+    ("calibration/data/parts.py", "motors"): "a packaged table",
+    ("calibration/data/parts.py", "gearboxes"): "a packaged table",
+    ("calibration/data/parts.py", "cells"): "a packaged table",
+    ("calibration/data/requirements.py", "paper"): "a packaged file",
+    ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
+    ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
+    ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/cluster.py", "_compiled"): "a worker's compiled job, by its name; computes the same when compiled again",
+    ("sweeps/cluster.py", "_start"): "prepares jax, once a process",
+    ("sweeps/cluster.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
+    ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",
+    ("sweeps/design.py", "_directions"): "pure, of hashable arguments",
+    ("sweeps/identity.py", "_code"): "hashes of the files of this program",
+}
+#: Methods that change what they are called on, and decorators that remember what a function returned.
+CHANGES = {
+    "add", "append", "appendleft", "clear", "discard", "extend", "extendleft", "insert", "pop", "popitem", "popleft",
+    "remove", "reverse", "setdefault", "sort", "update",
+}  # fmt: skip
+CACHES = ("cache", "lru_cache")
+CARRIERS = ("ContextVar", "threading.local")
+Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
+
+
+def _stored(tree: ast.AST) -> set[str]:
+    return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+
+
+def _at_the_top(tree: ast.Module) -> tuple[set[str], set[str]]:
+    """Names of a module's own that functions can see, and those that it imports."""
+    own, imported = set(), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            imported |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            own.add(node.name)
+        else:
+            own |= _stored(node)
+    return own, imported
+
+
+def _parameters(function: Function) -> set[str]:
+    a = function.args
+    return {x.arg for x in (*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg)))}
+
+
+def _dotted(node: ast.expr) -> str:
+    """`a.b` of what is `a.b[c].d`."""
+    while isinstance(node, ast.Subscript):
+        node = node.value
+    if isinstance(node, ast.Attribute):
+        inner = _dotted(node.value)
+        return f"{inner}.{node.attr}" if inner else ""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _changed(node: ast.AST, inside: bool) -> Iterator[str]:
+    """What a node rebinds, changes or remembers, as a dotted name."""
+    if isinstance(node, ast.Global):
+        yield from node.names
+    elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        made = (d.func if isinstance(d, ast.Call) else d for d in node.decorator_list)
+        yield from (node.name for d in made if ast.unparse(d).rpartition(".")[2] in CACHES)
+    elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(CARRIERS):
+        yield ast.unparse(node.func)
+    elif isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del) and inside:
+        yield "globals" if ast.unparse(node).startswith("globals()[") else _dotted(node)
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and inside:
+        if node.func.attr in CHANGES:
+            yield _dotted(node.func.value)
+    elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("setattr", "delattr") and inside:
+        yield f"{_dotted(node.args[0])}.{ast.unparse(node.func)}"
+
+
+def modules_keep_no_state(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+    """No function changes what belongs to a module, its own or another, but for what is `KEPT`."""
+    own, imported = _at_the_top(tree)
+
+    def walk(node: ast.AST, hidden: set[str], inside: bool) -> Iterator[Breach]:
+        for name in _changed(node, inside):
+            first, _, rest = name.partition(".")
+            called = isinstance(node, ast.Call) and first in imported and (not rest or first in ("np", "jnp"))
+            kept = (path.as_posix(), name) in KEPT
+            always = isinstance(node, ast.Global | Function) or name.endswith(CARRIERS) or name == "globals"
+            if not kept and (always or (first in (own | imported) - hidden and not called)):
+                yield node.lineno, f"keeps state in {name}"
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, Function):
+                mine = (_parameters(child) | _stored(child)) - _rebound(child)
+                yield from walk(child, hidden | mine, True)
+            else:
+                yield from walk(child, hidden, inside)
+
+    yield from walk(tree, set(), False)
+
+
+def _rebound(function: Function) -> set[str]:
+    return {name for n in ast.walk(function) if isinstance(n, ast.Global) for name in n.names}
+
+
 RULES: tuple[Rule, ...] = (
     rooms_have_names_of_their_own,
     layers_import_those_before_them,
@@ -259,6 +368,7 @@ RULES: tuple[Rule, ...] = (
     configurations_are_data,
     discovery_keeps_its_stages,
     front_door_fits_nothing,
+    modules_keep_no_state,
 )
 
 
@@ -330,6 +440,33 @@ BAD = {
         "def f():\n    from calibration.inference.held_out import held_out",
     ),
     "sweeps imports calibration.discovery.candidates": ("sweeps/bad.py", "import calibration.discovery.candidates"),
+    "keeps state in X": ("mmrjax/bad.py", "X = ()\ndef f():\n    global X\n    X = (1,)"),
+    "keeps state in X 2": ("calibration/bad.py", "X = {}\ndef f(k):\n    X[k] = 1"),
+    "keeps state in X 3": ("calibration/bad.py", "X = []\nf = lambda k: X.append(k)"),
+    "keeps state in X 4": ("sweeps/bad.py", "X: dict[str, list[int]] = {}\ndef f(k):\n    X['a'].append(k)"),
+    "keeps state in X 5": ("sweeps/bad.py", "X = {}\ndef f(k):\n    def g():\n        del X[k]\n    return g"),
+    "keeps state in f": (
+        "mmrjax/bad.py",
+        "import functools\n@functools.lru_cache(maxsize=2)\ndef f(k):\n    return k",
+    ),
+    "keeps state in f.seen": ("calibration/bad.py", "def f(k):\n    f.seen = k"),
+    "keeps state in channels.CHANNELS": (
+        "sweeps/bad.py",
+        "from mmrjax import channels\ndef f(rows):\n    channels.CHANNELS = rows",
+    ),
+    "keeps state in channels.CHANNELS 2": (
+        "sweeps/bad.py",
+        "def f(row):\n    from mmrjax import channels\n    channels.CHANNELS.append(row)",
+    ),
+    "keeps state in channels.setattr": (
+        "sweeps/bad.py",
+        "from mmrjax import channels\ndef f(rows):\n    setattr(channels, 'CHANNELS', rows)",
+    ),
+    "keeps state in contextvars.ContextVar": (
+        "mmrjax/bad.py",
+        "import contextvars\nCHANNELS = contextvars.ContextVar('channels')",
+    ),
+    "keeps state in threading.local": ("calibration/bad.py", "import threading\nX = threading.local()"),
 }
 #: What no rule may mind.
 GOOD = {
@@ -343,6 +480,8 @@ GOOD = {
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",
     "calibration/inference/bases.py": "VARIABLES = {'a': 'speed_mm_s', 'b': 'motor_speed_rpm'}\n",
     "sweeps/__init__.py": "",
+    "sweeps/cluster.py": "_compiled = {}\ndef f(k):\n    _compiled[k] = 1\n",
+    "sweeps/local.py": "import numpy as np\nX = {}\nX[1] = 2\ndef f(X, y):\n    X[1] = y\n    z = np.append(y, 1)\n    z[0] = 1\n",
     "sweeps/options.py": "X = option(help='6T2A or 4W2T')\nfrom calibration.discovery.discover import discover\n",
     "sweeps/paper/rows.py": "X = {'6T2A': ('total_current_A', 'speed_mm_s')}\n",
     "sweeps/words.py": "X = ['write 6T2A, or else 4W2T']\n",
@@ -367,6 +506,12 @@ def test_every_rule_is_broken_by_a_bad_module(tmp_path):
     for path, source in BAD.values():
         broken |= {rule.__name__ for rule in RULES if [*rule(PurePosixPath(path), ast.parse(source))]}
     assert broken == {rule.__name__ for rule in RULES}
+
+
+def test_what_is_kept_is_there():
+    assert all((ROOT / path).exists() for path, _ in KEPT)
+    text = {path: (ROOT / path).read_text(encoding="utf-8") for path, _ in KEPT}
+    assert all(name in text[path] for path, name in KEPT)
 
 
 def test_front_door_loads_nothing_heavy():
