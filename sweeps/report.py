@@ -183,11 +183,11 @@ def _grade(value: Any) -> str:
     return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
 
 
-def render(folder: Path, template: str, album: Album, *, shown: Iterable[Channel] = (), **known: Any) -> Path:
+def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[Channel] = (), **known: Any) -> Path:
     """Write `report.html` from a template, the album's pictures and what the template asks for.
 
     Args:
-        shown: the channels that the page is about.
+        of_channels: that the page is about.
     """
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(lambda n: (resources.files("sweeps") / "templates" / n).read_text("utf-8")),
@@ -198,7 +198,7 @@ def render(folder: Path, template: str, album: Album, *, shown: Iterable[Channel
     )
     environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
     environment.globals |= {
-        "channels": {c.name: (c.label, c.unit) for c in shown},
+        "channels": {c.name: (c.label, c.unit) for c in of_channels},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
         "settled_words": words.SETTLED,
         "version": __version__,

@@ -40,7 +40,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         folder,
         "calibration.html.j2",
         album,
-        shown=found.channels,
+        of_channels=found.channels,
         title=f"Calibration of {words_shown(Path(robot_name).name)} to {Path(found.source).name}",
         document=found.to_json(),
         rows=first_rows(table),

@@ -48,7 +48,7 @@ def write(
         folder,
         "comparison.html.j2",
         album,
-        shown=robot.channels,
+        of_channels=robot.channels,
         title=f"{known['robot']} against {Path(data_name).name}",
         model=model,
         data_name=Path(data_name).name,

@@ -75,7 +75,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         Path(folder),
         "loop.html.j2",
         album,
-        shown=found.channels,
+        of_channels=found.channels,
         title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
         document=found.to_json(),
         p=findings.said_p(found.before.p_value),

@@ -63,7 +63,7 @@ def write(
         folder,
         "runs.html.j2",
         album,
-        shown=robot.channels,
+        of_channels=robot.channels,
         title=f"Run of {names[0]}" if single else f"{len(names)} runs",
         model=model,
         total=len(names),

@@ -45,7 +45,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Tabl
         folder,
         "sweep.html.j2",
         album,
-        shown=robot.channels,
+        of_channels=robot.channels,
         title=f"Sweep of {len(runs['status'])} runs",
         model=model,
         counts=counts(own.of(robot, runs), robot.channels),
