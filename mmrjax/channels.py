@@ -59,6 +59,10 @@ class Channel:
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
 
+    def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
+        """Pickled by its name, so that tables and results go to other processes and back."""
+        return of, (self.name,)
+
 
 def _winding_temperature(robot: Robot, signals: Signals) -> Any:
     """Of the winding [°C]: where it is followed as it is, else after long running at this current."""

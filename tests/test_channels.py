@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
+import pickle
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
@@ -112,6 +113,7 @@ def test_a_robot_has_the_channels_of_its_rig(bench):
     with pytest.raises(KeyError, match="no channel torque; there are total_current, "):
         channels.rows(("speed", "torque"))
     assert channels.names(channels.rows(reversed(TORQUE))) == TORQUE  # in the order of the table
+    assert pickle.loads(pickle.dumps(bench.channels)) == bench.channels and len({bench.channels, bench.channels}) == 1
 
 
 @pytest.mark.parametrize("unit", [None, "mNm"])

@@ -20,6 +20,7 @@ SLOW, SLIDING = 0.7, 0.7
 
 def conduct(runs: Runs, robot: Robot) -> list[str]:
     """Say which runs end before they are under way, and which never grip."""
+    runs = runs.of(robot)
     kind = observers.kind(runs)
     ends, shown, lasts = kind.settled(runs)
     if not kind.axis or not len(ends) or robot.on_shaft or "speed" not in robot.rig.channels:

@@ -64,6 +64,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be freed.
     """
+    runs = runs.of(robot)
     observe = observers.kind(runs)
     robot = surfaces.separated(instruments.as_read(robot, runs), runs)
     robot = own_mass.weighed(robot, runs)

@@ -42,6 +42,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
         BadData: a factor beyond `REFUSED`; of histories, which need not get under way, only where a known confusion
             of units explains it.
     """
+    runs = runs.of(robot)
     kind = observers.kind(runs)
     runs, measured, lasts = kind.settled(runs)
     if not len(runs):

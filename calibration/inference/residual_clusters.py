@@ -277,7 +277,7 @@ def _words(cells: np.ndarray) -> np.ndarray:
 
 def _known(runs: Runs) -> Iterator[np.ndarray]:
     """Columns that have a role, but for readings and their sds, and what labels say together."""
-    readings = {name for c in channels.EVERY for name in (c.column, c.sd_column)}
+    readings = {name for c in runs.channels for name in (c.column, c.sd_column)}
     known = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
     labels = [known[name] for name in _labels(runs)]
     yield from known.values()
