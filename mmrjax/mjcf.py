@@ -7,6 +7,7 @@ running gear enters as a generalized force. The same text loads in C MuJoCo and 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import io
 from typing import Any, NamedTuple
@@ -14,8 +15,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from mmrjax import params
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -39,6 +42,7 @@ class Masses(eqx.Module):
         chassis: mass of all that does not turn with the pulleys.
         forward, up: its centre from the middle of the wheelbase.
         inertia: its moment of inertia in pitch about that centre.
+        body: mass of what neither turns nor is lever, track or payload.
         pulley: mass of what turns on one axle: main and additional pulley, in 4W2T the wheel.
         inertia_pulley: about its axle, front and rear alike: half of J_w of eq. (31) each.
     """
@@ -47,6 +51,7 @@ class Masses(eqx.Module):
     forward: Scalar
     up: Scalar
     inertia: Scalar
+    body: Scalar
     pulley: Scalar
     inertia_pulley: Scalar
 
@@ -121,13 +126,49 @@ def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     body = _Part(weighs, gear.centre_offset, gear.centre_height, weighs * gear.body_gyration**2)
 
     pulleys = [_Part(pulley, side * gear.wheelbase / 2, nothing, inertia_pulley) for side in (1.0, -1.0)]
-    folded = [body._replace(inertia=nothing), belt, *_levers(gear, tracked, jnp.pi, jnp.zeros_like(tracked)), *pulleys]
+    folded = [
+        body._replace(inertia=nothing),
+        belt,
+        *_levers(gear, tracked, jnp.pi, jnp.zeros_like(tracked)),
+        *pulleys,
+    ]
     stated = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
     left = stated - _together(folded).inertia
     body = body._replace(inertia=jnp.where(left > 0, left, body.inertia))
 
     chassis = _together([body, belt, *levers, payload])
-    return Masses(*chassis, pulley, inertia_pulley)
+    return Masses(*chassis, body.mass, pulley, inertia_pulley)
+
+
+def check_parts(robot: Robot) -> None:
+    """Refuse a robot of which nothing is left for the body.
+
+    Raises:
+        ValueError: its parts weigh as much as a configuration, or have more inertia than is stated of the whole.
+    """
+    folded = {"lever_front": jnp.asarray(np.pi), "lever_rear": jnp.asarray(0.0)}
+    bare = {
+        "body_gyration": jnp.asarray(0.0),
+        "inertia_tracked": jnp.asarray(0.0),
+        "inertia_wheeled": jnp.asarray(0.0),
+    }
+    gear = params.replace(robot.running_gear, folded | bare)
+    bare_robot = dataclasses.replace(robot, running_gear=gear)
+    for k, (name, chassis) in enumerate(robot.configurations.items()):
+        own = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
+        half = masses(bare_robot, Conditions(k).resolved(robot), chassis.mass)
+        if np.any(np.asarray(half.body) <= 0):
+            parts = np.max(np.asarray(chassis.mass - robot.sides * half.body))
+            raise ValueError(
+                f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, what its "
+                "pulleys, wheels, tracks and levers weigh (running_gear.pulley_mass and the like)"
+            )
+        stated, least = getattr(robot.running_gear, own), robot.sides * half.inertia_pitch(gear.wheelbase)
+        if np.any((np.asarray(stated) > 0) & (np.asarray(stated) <= np.asarray(least))):
+            raise ValueError(
+                f"running_gear.{own}: got {np.min(np.asarray(stated)):.3g} kg·m^2; expected 0, or more than "
+                f"{np.max(np.asarray(least)):.3g} kg·m^2, what the parts of {name} have without the body's own"
+            )
 
 
 def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) -> str:
