@@ -146,28 +146,25 @@ def check_parts(robot: Robot) -> None:
     Raises:
         ValueError: its parts weigh as much as a configuration, or have more inertia than is stated of the whole.
     """
-    folded = {"lever_front": jnp.asarray(np.pi), "lever_rear": jnp.asarray(0.0)}
-    bare = {
-        "body_gyration": jnp.asarray(0.0),
-        "inertia_tracked": jnp.asarray(0.0),
-        "inertia_wheeled": jnp.asarray(0.0),
-    }
-    gear = params.replace(robot.running_gear, folded | bare)
-    bare_robot = dataclasses.replace(robot, running_gear=gear)
+    without = {"body_gyration": 0.0, "inertia_tracked": 0.0, "inertia_wheeled": 0.0}
+    folded = {"lever_front": np.pi, "lever_rear": 0.0}
+    gear = params.replace(robot.running_gear, {name: jnp.asarray(x) for name, x in (without | folded).items()})
+    bodiless = dataclasses.replace(robot, running_gear=gear)
     for k, (name, chassis) in enumerate(robot.configurations.items()):
-        own = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
-        half = masses(bare_robot, Conditions(k).resolved(robot), chassis.mass)
+        half = masses(bodiless, Conditions(k).resolved(robot), chassis.mass)
         if np.any(np.asarray(half.body) <= 0):
             parts = np.max(np.asarray(chassis.mass - robot.sides * half.body))
             raise ValueError(
-                f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, what its "
-                "pulleys, wheels, tracks and levers weigh (running_gear.pulley_mass and the like)"
+                f"{name}.mass: got {np.min(np.asarray(chassis.mass)):.3g} kg; expected more than {parts:.3g} kg, "
+                "what its pulleys, wheels, tracks and levers weigh (running_gear.pulley_mass and the like)"
             )
-        stated, least = getattr(robot.running_gear, own), robot.sides * half.inertia_pitch(gear.wheelbase)
-        if np.any((np.asarray(stated) > 0) & (np.asarray(stated) <= np.asarray(least))):
+        whole = "inertia_tracked" if chassis.on_tracks > 0.5 else "inertia_wheeled"
+        stated = np.asarray(getattr(robot.running_gear, whole))
+        least = np.asarray(robot.sides * half.inertia_pitch(gear.wheelbase))
+        if np.any((stated > 0) & (stated <= least)):
             raise ValueError(
-                f"running_gear.{own}: got {np.min(np.asarray(stated)):.3g} kg·m^2; expected 0, or more than "
-                f"{np.max(np.asarray(least)):.3g} kg·m^2, what the parts of {name} have without the body's own"
+                f"running_gear.{whole}: got {np.min(stated):.3g} kg·m^2; expected 0, or more than "
+                f"{np.max(least):.3g} kg·m^2, what the parts of {name} have without the body's own"
             )
 
 
