@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import contact, fidelities, undercarriage
+from mmrjax import contact, fidelities, mjcf, undercarriage
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
@@ -215,7 +215,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
     Raises:
         ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
             ground; the step is above the largest stable one, which the message states; a load without ground, an
-            imposed motor speed, movers without inertia.
+            imposed motor speed, movers without inertia, parts heavier than the robot or of more inertia than stated.
     """
     if robot.on_shaft:
         raise ValueError("the robot's load is a shaft, which has no running gear; steady and drive take it")
@@ -235,6 +235,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
                 f"{name}.inertia: got 0; expected the inertia of what turns with the movers of one side, which this "
                 "model needs [kg·m^2]"
             )
+    mjcf.check_parts(robot)
     refuse(robot, conditions, step, sample)
 
 
