@@ -1,4 +1,4 @@
-"""Stages of a start from standstill (Figs. 23, 24): starting, acceleration with slipping, steady travel; their slip."""
+"""Stages of a start from standstill (Figs. 23, 24): starting, acceleration with slipping, uniform travel; their slip."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
 #: What the stages are called, in order.
-NAMES = ("starting", "acceleration with slipping", "steady travel")
+NAMES = ("starting", "acceleration with slipping", "uniform")
 #: Share of the last speed within which a start is over [-], and the end of a run over which that is averaged [s].
 WITHIN, LAST = 0.01, 0.15
 
@@ -59,6 +59,15 @@ class Stages:
         }
 
 
+def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
+    """Means over a `period` about each instant of evenly spaced samples, over less of it at the ends."""
+    count = round(period / (time[-1] / len(time))) if time[-1] > 0 else 0
+    if count < 2:
+        return values
+    window = np.ones(min(count | 1, len(values)))
+    return np.asarray(np.convolve(values, window, "same") / np.convolve(np.ones_like(values), window, "same"))
+
+
 def mean_slip(
     time: Float[np.ndarray, " times"],
     speed: Float[np.ndarray, " times"],
@@ -84,19 +93,23 @@ def stages(
     theoretical: Float[np.ndarray, " times"],
     sliding: Float[np.ndarray, " times"],
     speed_static: float,
+    way: float = 0.0,
 ) -> Stages:
     """The stages of one start, of samples without gaps.
 
     Args:
         time: [s]; speed, theoretical, sliding: V, r_k ω_k and the contact patch's speed over the ground [m/s].
         speed_static: V_s of the friction law [m/s].
+        way: of the movers between two contacts that make them ripple [m]; slide and speed are judged by their means
+            over that at the last speed. 0: nothing ripples.
     """
     sense = -1.0 if theoretical[-1] < -1e-4 else 1.0
-    beyond = np.flatnonzero(sense * sliding > speed_static)
     starting = float(time[int(np.argmax(sense * sliding))])
+    sliding, even = (_smoothed(time, x, way / max(abs(float(theoretical[-1])), 1e-3)) for x in (sliding, speed))
+    beyond = np.flatnonzero((sense * sliding > speed_static) & (time >= starting))
     slipping = float(time[min(int(beyond[-1]) + 1, len(time) - 1)]) if beyond.size else starting
     last = speed[ending(time)].mean()
-    late = np.flatnonzero(np.abs(speed - last) > WITHIN * abs(last))
+    late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
     settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
     each = [mean_slip(time, speed, theoretical, a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
@@ -115,8 +128,11 @@ def of_histories(robot: Robot, history: History, which: Sequence[int]) -> list[S
         upto = numbers(np.asarray(history.signals.total_current[k]))
         time, signals = np.asarray(history.time[k])[:upto], history.signals
         motion = [np.asarray(x[k])[:upto] for x in (signals.speed, signals.speed_theoretical, signals.speed_sliding)]
-        static = float(robot.configurations.members[int(index)].ground.friction.speed_static)
-        found.append(stages(time, motion[0], motion[1], motion[2], static) if upto else None)
+        chassis = robot.configurations.members[int(index)]
+        static, way = float(chassis.ground.friction.speed_static), 0.0
+        if history.reactions is not None:  # contacts are resolved
+            way = PITCH_GROUSER if float(chassis.on_tracks) > 0.5 else PITCH_TOOTH
+        found.append(stages(time, motion[0], motion[1], motion[2], static, way) if upto else None)
     return found
 
 
