@@ -104,6 +104,7 @@ def _histories(
         return {"shown": len(shown), "courses": shown, "starts": []}
     starts = figures_history.starts(robot, history, status, which, names[:HISTORIES])
     album.add("history", lambda: figures_history.from_standstill(starts))
+    album.add("slip", lambda: figures_history.slip_over_start(starts))
     known: dict[str, Any] = {"shown": len(starts), "starts": starts}
     if history.reactions is not None:
         from sweeps import figures_gear

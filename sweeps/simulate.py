@@ -13,7 +13,7 @@ from rich.table import Table
 
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
-from mmrjax import channels, fidelities, outputs
+from mmrjax import channels, fidelities, ground, outputs, stages
 from mmrjax.channels import Channel
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result
@@ -27,8 +27,8 @@ from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
-#: Channels that histories of a shaft have in any case.
-OF_SHAFT = ("motor_speed", "output_angle")
+#: Channels that histories of a shaft, and those of a vehicle, have in any case.
+OF_SHAFT, OF_VEHICLE = ("motor_speed", "output_angle"), ("speed",)
 #: Column of the largest current of all motors in a run over time.
 PEAK = "peak_current_A"
 #: Column of the time that a run's current may flow before its windings are at their limit.
@@ -75,6 +75,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
                 histories=histories,
             )  # fmt: skip
         further: dict[str, Any] = {"notes": notes}
+        if histories is not None and not robot.on_shaft:
+            further["starts"] = starts(robot, histories, runs)
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         return run.leave(folder, config, run.SimulationResult("simulate", config.model, robot, runs, table, further))
@@ -195,17 +197,31 @@ def _names(runs: records.Runs) -> np.ndarray:
 def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
-    of_rig = {*robot.rig.channels, *(OF_SHAFT if robot.on_shaft else ())}
+    of_rig = {*robot.rig.channels, *(OF_SHAFT if robot.on_shaft else OF_VEHICLE)}
     shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
+        "slip": np.ravel(ground.slip(signals.speed, signals.speed_theoretical)),
         "distance_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
         "traction_N": float(robot.sides) * np.ravel(signals.traction),
     }
+
+
+def starts(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]:
+    """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
+    get under way."""
+    assert batch.history is not None  # the fidelity was asked for it
+    found = stages.of_histories(robot, batch.history, runs.configurations(robot))
+    nothing = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
+    under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
+    return [
+        {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
+        for name, s, goes in zip(_names(runs), found, under_way, strict=True)
+    ]
 
 
 def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarray]:

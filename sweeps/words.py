@@ -73,6 +73,8 @@ FOR_EVER = "for ever"
 
 #: Statuses of runs that ended as their conditions ask, with numbers; `signals.DONE` by name.
 SETTLED = ("converged", "reverses")
+#: Those of runs from standstill that get under way, so that there are stages of the start to tell apart.
+UNDER_WAY = (*SETTLED, "rolls_back", "not_settled")
 
 
 def settled(counted: Mapping[str, int]) -> int:

@@ -1,5 +1,8 @@
 """Friction of contacts that shake: the averaged law, and the slip of track-model runs that follows from their ripple."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +13,9 @@ from calibration.discovery.discover import discover
 from mmrjax import channels, params, robots, vibration
 from mmrjax.conditions import Conditions
 from mmrjax.contact import Friction
+from mmrjax.effects.slip import VibrationSlip
 from mmrjax.fidelities.track import track, track_batch
-from mmrjax.signals import CONVERGED, NOT_SETTLED
+from mmrjax.signals import CONVERGED, NOT_SETTLED, Signals
 
 LAW = Friction(static=0.6, dynamic=0.5, speed_static=0.01, speed_dynamic=0.1)
 
@@ -23,6 +27,23 @@ def fig7(speed):
     y = np.clip((size - 0.01) / 0.09, 0, 1)
     rising = 0.6 * x * (3 - x**2) / 2
     return np.sign(speed) * np.where(size < 0.01, rising, 0.6 - 0.1 * y**2 * (3 - 2 * y))
+
+
+@pytest.mark.parametrize("place", ["docs/vibration.md", "docs/effects.md", "mmrjax/effects/slip.py"])
+def test_the_equation_that_is_written_is_the_one_that_runs(place):
+    """The equation of vibration_slip, read off the page and evaluated, up to the limit and beyond."""
+    text = (Path(__file__).parents[1] / place).read_text("utf-8")
+    (said,) = set(re.findall(r"ΔV = a (√.*?0\.05²\))", text))
+    for written, python in (("∣", "|"), ("|u|", "abs(u)"), ("√", "sqrt"), ("²", "**2"), ("^p u", "**p * u")):
+        said = said.replace(written, python)
+    used = np.array([-0.95, -0.3, 0.0, 0.2, 0.5, 0.8, 0.95, 1.2])
+    speed, exponent, first = 0.7, 2.3, 0.9
+    known = {"u": used, "p": exponent, "V_teor": speed, "V_1": first, "sqrt": np.sqrt, "abs": np.abs}
+    expected = 0.03 * eval(said, {"__builtins__": {}}, known)
+    effect = VibrationSlip(amplitude=0.03, exponent=exponent, speed_reference=first)
+    got = effect.term(robots.nominal(), Signals(demand=20.0 * used, adhesion_limit=20.0, speed_theoretical=speed))
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    assert expected[6] / (0.03 * (speed / first) ** exponent * 19) < 0.72  # rounded off
 
 
 def averaged(speed, swing):

@@ -31,7 +31,8 @@ from mmrjax.fidelities.mission_steps import (
     instant,
     units,
 )
-from mmrjax.fidelities.result import mask, result, slips, travels, withhold
+from mmrjax.fidelities.rest import status_moving
+from mmrjax.fidelities.result import mask, result, slips, withhold
 from mmrjax.params import Scalar
 from mmrjax.profile import BRAKE, COAST, MOTOR_SPEED, SPEED, Profile
 from mmrjax.robot import Robot
@@ -39,7 +40,6 @@ from mmrjax.signals import (
     BATTERY_EMPTY,
     CONVERGED,
     FAILED,
-    NOT_SETTLED,
     ROLLS_BACK,
     SLIDES,
     STALLED,
@@ -148,15 +148,12 @@ def _ends(
     robot: Robot, segment: Profile, signals: Signals, asked: Asked, stands: Array, mode: Array
 ) -> tuple[Array, Array]:
     """Status of a segment at its end, and whether the robot has missed what was demanded."""
-    settling = jnp.abs(signals.acceleration) * 0.1 > 1e-3 * jnp.abs(signals.speed)
     driven = signals.duty * signals.voltage_source
+    now = dataclasses.replace(asked.conditions, discharge=signals.discharge)
+    status = jnp.where(stands, STALLED, status_moving(robot, now, signals, driven))
     rests = stands | ((jnp.abs(signals.direction) < 1.0) & (jnp.abs(signals.direction_travel) < 1.0))
     wanted = (mode != BRAKE) & (mode != COAST) & (jnp.abs(driven) > 1e-6)
-    status = jnp.where(settling & ~stands, NOT_SETTLED, travels(signals.speed, driven))
-    slides = jnp.abs(signals.demand) > signals.adhesion_limit
-    status = jnp.where(rests, STALLED, status)
-    status = jnp.where(slides & ~stands, SLIDES, status)
-    status = jnp.where(~wanted & rests & ~slides, CONVERGED, status)  # it stands, as it should
+    status = jnp.where(~wanted & rests & (status == STALLED), CONVERGED, status)  # it stands, as it should
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     per_speed = robot.gearbox.ratio / robot.chassis(signals.configuration).radius
     # A ramp that ends in a stop is measured by where it began.

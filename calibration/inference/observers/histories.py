@@ -177,7 +177,8 @@ class Histories(Observer):
             order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
         index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
-        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=robot.rig.blank)
+        delayed = robot.rig.blank or not robot.rig.prompt
+        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=delayed)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -407,16 +408,7 @@ class Histories(Observer):
     def _delayed(self, robot: Robot, whole: Signals) -> Float[Array, "rows channels"]:
         """Readings of every row, between the instants before and after it less the delay."""
         every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(whole)  # runs, instants, channels
-        wanted = self.time - robot.rig.delay
-
-        def between(run: Array, t: Array) -> Array:
-            times = self.times[run]
-            k = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, times.shape[0] - 2)
-            gap = times[k + 1] - times[k]
-            share = jnp.where(gap > 0, (t - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0)
-            return every[run, k] + jnp.clip(share, 0.0, 1.0) * (every[run, k + 1] - every[run, k])
-
-        return jax.vmap(between)(self.run, wanted)
+        return jax.vmap(lambda run, at: robot.rig.late(self.times[run], every[run], at))(self.run, self.time)
 
     def __call__(self, robot: Robot) -> Observation:
         whole = self.whole(robot)
