@@ -27,6 +27,8 @@ class Spec:
     `relative_sd` is the prior's standard deviation as a share of the prior mean, `sd` the absolute one
     in the field's unit; one of the two is set. The prior mean is the nominal robot's value.
     `bounds` are what a file may state and what a fit may reach, never what a constructor checks.
+    `scanned` says that the misfit over it may be a staircase or have several basins (a dead time, a phase, a gap):
+    a fit of histories looks at it over its prior's range and not by its gradient alone.
     """
 
     unit: str
@@ -36,6 +38,7 @@ class Spec:
     relative_sd: float | None = None
     sd: float | None = None
     amplitude: bool = False
+    scanned: bool = False
 
     def prior_sd(self, mean: float) -> float:
         """Standard deviation of the prior [the field's unit] around `mean`."""
@@ -52,11 +55,12 @@ def parameter(
     relative_sd: float | None = None,
     sd: float | None = None,
     amplitude: bool = False,
+    scanned: bool = False,
 ) -> Any:
     """Declare a differentiable scalar of a component; see `Spec` for the arguments."""
     if (relative_sd is None) == (sd is None):
         raise ValueError("a parameter states either relative_sd or sd")
-    spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude)
+    spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude, scanned)
     keywords: dict[str, Any] = {} if default is None else {"default": default}
     return eqx.field(converter=as_float, metadata={"spec": spec}, kw_only=True, **keywords)
 

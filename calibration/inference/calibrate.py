@@ -23,6 +23,7 @@ from calibration.inference import (
     observers,
     population,
     priors,
+    scans,
 )
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
@@ -163,6 +164,9 @@ def calibrate(
     searched = found.searched
     about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
     notes += searched.statements() if searched is not None else []
+    seen_over = scans.profiles(posed, z)
+    about = scans.with_scanned_sds(about, seen_over)
+    notes += scans.statements(posed, seen_over)
     if not np.isfinite(about.covariance).all():
         notes.append("the posterior has no finite covariance: values stand, intervals do not")
     jumps = np.flatnonzero(np.asarray(after.flags) >> FLAGS.index("jumps") & 1)
@@ -186,7 +190,7 @@ def calibrate(
         source=runs.source,
         model=model,
         seed=seed,
-        parameters=estimates.parameters(posed, base, z, about, profile, beside, sources),
+        parameters=estimates.parameters(posed, base, z, about, profile, beside, sources, seen_over),
         tied=estimates.tied(posed),
         noise=estimates.noise(posed, known, found.shares, measured),
         percent_of=observe.percent_of,
