@@ -144,14 +144,11 @@ def work(task: Task) -> dict:
 
 def judged(robot, runs, label: dict, stated: dict, task: Task) -> dict:
     """The loop over a case, verdict and label side by side."""
-    from calibration.discovery.discover import trace
-    from calibration.discovery.settings import settings_for
-    from calibration.inference import noise, observers
+    from calibration.discovery.discover import prepared
 
     began = time.perf_counter()
-    observer = observers.kind(runs)
-    settings = settings_for(observer, task.replicates, task.seed)
-    found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings, stated)
+    given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
+    found, settings = given.trace(), given.settings
     seconds = time.perf_counter() - began
     facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
     return {

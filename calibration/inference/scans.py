@@ -55,7 +55,7 @@ class Scan:
         return self._crossing(inside[0], -1), self._crossing(inside[-1], 1)
 
     def _crossing(self, k: int, side: int) -> float:
-        """Where the rise passes 3.84 between the k-th point, inside, and the next; the last point where it does not."""
+        """Where the rise passes 3.84 between the k-th point, inside, and the next; the last point if it does not."""
         if not 0 <= k + side < len(self.at):
             return float(self.at[k])
         one, two = (np.sqrt(max(2 * (self.cost[j] - self.cost.min()), 0.0)) for j in (k, k + side))
