@@ -27,8 +27,9 @@ class Spec:
     `relative_sd` is the prior's standard deviation as a share of the prior mean, `sd` the absolute one
     in the field's unit; one of the two is set. The prior mean is the nominal robot's value.
     `bounds` are what a file may state and what a fit may reach, never what a constructor checks.
-    `scanned` says that the misfit over it may be a staircase or have several basins (a dead time, a phase, a gap):
-    a fit of histories looks at it over its prior's range and not by its gradient alone.
+    `scanned` is set where the misfit over it may be a staircase or have several basins (a dead time, a phase, a gap):
+    the half width of a basin, at least [the field's unit]. A fit of histories whose prior reaches further looks at
+    the misfit over all of its range, and not at its gradient alone.
     """
 
     unit: str
@@ -38,7 +39,7 @@ class Spec:
     relative_sd: float | None = None
     sd: float | None = None
     amplitude: bool = False
-    scanned: bool = False
+    scanned: float | None = None
 
     def prior_sd(self, mean: float) -> float:
         """Standard deviation of the prior [the field's unit] around `mean`."""
@@ -55,7 +56,7 @@ def parameter(
     relative_sd: float | None = None,
     sd: float | None = None,
     amplitude: bool = False,
-    scanned: bool = False,
+    scanned: float | None = None,
 ) -> Any:
     """Declare a differentiable scalar of a component; see `Spec` for the arguments."""
     if (relative_sd is None) == (sd is None):

@@ -68,7 +68,7 @@ class Shaft(eqx.Module):
         bounds=(-6.3, 6.3),
         sd=0.05,
         source=_STATED,
-        scanned=True,
+        scanned=1.5,
     )
     backlash: Scalar = parameter(
         0.0,
@@ -77,7 +77,7 @@ class Shaft(eqx.Module):
         bounds=(0.0, 1.0),
         relative_sd=0.3,
         source=_STATED,
-        scanned=True,
+        scanned=0.0,
     )
     radius: Scalar = parameter(
         1.0,

@@ -161,6 +161,10 @@ def calibrate(
     seen_over = scans.profiles(posed, z)
     about = scans.with_scanned_sds(about, seen_over)
     notes += scans.statements(posed, seen_over)
+    elsewhere = scans.apart(seen_over, found.starts.z, found.starts.converged)
+    if elsewhere:
+        over = ", ".join(posed.coordinates.names[k] for k in seen_over)
+        notes.append(f"{elsewhere} of {len(found.starts.cost)} searches converged at other values of {over}")
     if not np.isfinite(about.covariance).all():
         notes.append("the posterior has no finite covariance: values stand, intervals do not")
     jumps = np.flatnonzero(np.asarray(after.flags) >> FLAGS.index("jumps") & 1)
@@ -198,7 +202,7 @@ def calibrate(
         status=np.array(STATUSES)[status],
         adhesion_used=np.asarray(after.adhesion_used),
         objective=float(found.best.cost),
-        converged=bool(found.best.converged),
+        converged=bool(found.best.converged) and not elsewhere,
         starts=found.starts,
         searched=searched,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),

@@ -37,11 +37,13 @@ class Starts:
         cost: objective of each [½σ²], shape (starts,).
         converged: of each.
         infeasible: starts at which some row slides or fails.
+        z: where each ended, shape (starts, parameters); None where that is not kept.
     """
 
     cost: np.ndarray
     converged: np.ndarray
     infeasible: int
+    z: np.ndarray | None = None
 
     @property
     def _at_best(self) -> np.ndarray:
@@ -221,7 +223,7 @@ def _member(found: fit.Optimum, k: int) -> fit.Optimum:
 
 def _ended(found: fit.Optimum, feasible: np.ndarray) -> Starts:
     cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
-    return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)))
+    return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)), np.asarray(found.z))
 
 
 def _settling(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:

@@ -128,11 +128,10 @@ def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: A
     decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))
-    return Optimum(pin.apply(z), sd, cost, decrement, small(decrement, cost), steps)
+    return Optimum(pin.apply(z), sd, cost, decrement, _small(decrement, cost), steps)
 
 
-def small(decrement: Any, cost: Any) -> Array:
-    """Whether a fall of the objective that is still predicted is none that counts."""
+def _small(decrement: Any, cost: Array) -> Array:
     return jnp.asarray(decrement < DECREMENT + DECREMENT_SHARE * cost)
 
 
@@ -273,7 +272,7 @@ def search_long(
     def judged(z: Z, steps: int, r: Array, jacobian: Array) -> tuple[Optimum, np.ndarray]:
         ahead, gain = step_ahead(np.asarray(r), np.asarray(jacobian), np.asarray(_penalties(data)))
         found = _optimum(*_counted(r, jacobian, data)[::-1], z, data, pin, jnp.asarray(steps))
-        return dataclasses.replace(found, decrement=jnp.asarray(gain), converged=small(gain, found.cost)), ahead
+        return dataclasses.replace(found, decrement=jnp.asarray(gain), converged=_small(gain, found.cost)), ahead
 
     for steps in range(1, max_steps + 1):
         at = start if state is None else state.y_eval

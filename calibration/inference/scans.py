@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.inference.identifiability import Z95, Identifiability
-from calibration.inference.optimizers import Optimum, evaluated, small
+from calibration.inference.optimizers import Optimum, evaluated
 from calibration.inference.priors import known
 from calibration.inference.problem import Data, Observation, Problem
 
@@ -84,45 +84,48 @@ def scanned(problem: Problem) -> tuple[int, ...]:
     return problem.observe.scanned(problem)
 
 
-def flagged(problem: Problem) -> tuple[int, ...]:
-    """Coordinates whose fields say that the misfit over them may have cliffs or several basins."""
-    fields = known(problem.base)
-    names = problem.coordinates.names
-    return tuple(k for k, n in enumerate(names) if n in fields and fields[n].spec.scanned)
+def beyond_a_basin(problem: Problem) -> tuple[int, ...]:
+    """Coordinates whose prior reaches beyond one basin of the misfit, as their fields say (`Spec.scanned`)."""
+    fields, c = known(problem.base), problem.coordinates
+    values = [np.asarray(c.value(jnp.full(len(c), side * RANGE))) for side in (-1.0, 1.0)]
+    half = 0.5 * (values[1] - values[0])
+    widths = [fields[n].spec.scanned if n in fields else None for n in c.names]
+    return tuple(k for k, width in enumerate(widths) if width is not None and half[k] > width)
 
 
 def scan(problem: Problem, z: np.ndarray, data: Data, k: int) -> Scan:
     """The misfit over coordinate k, the others near z: evenly over the prior's range, and closer where it is low."""
     count = problem.observe.scan_points(problem, k)
-    even = np.linspace(-RANGE, RANGE, count)
-    seen = _sorted([_looked(problem, z, data, k, even)])
-    step, few = even[1] - even[0], count // CLOSER
-    around = [*seen.at[seen.basins()], *([z[k]] * CLOSER)][:CLOSER]
-    around = [z[k], *around[: CLOSER - 1]]  # where the search stands too
-    close = np.concatenate([c + step * np.linspace(-1, 1, few) for c in around])
-    close = np.concatenate([close, np.repeat(z[k], count - len(close))])
-    return _sorted([(seen.at, seen.cost, seen.others), _looked(problem, z, data, k, np.clip(close, -RANGE, RANGE))])
+    seen = _seen(problem, z, data, k, np.linspace(-RANGE, RANGE, count))
+    around, few = np.array([z[k], *seen.at[seen.basins()]])[:CLOSER], count // CLOSER
+    close = (around[:, None] + 2 * RANGE / (count - 1) * np.linspace(-1, 1, few)).ravel()
+    if few > 2:
+        seen = _with(seen, _seen(problem, z, data, k, np.resize(close, count)))
+    low, high = seen.interval()
+    return _with(seen, _seen(problem, z, data, k, np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, count)))
 
 
-def _looked(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> tuple[np.ndarray, ...]:
+def _seen(problem: Problem, z: np.ndarray, data: Data, k: int, at: np.ndarray) -> Scan:
+    at = np.clip(at, -RANGE, RANGE)
     cost, others = problem.observe.scan(problem, jnp.asarray(z), data, k, jnp.asarray(at))
-    return at, np.asarray(cost), np.asarray(others)
+    return _sorted(at, np.asarray(cost), np.asarray(others))
 
 
-def _sorted(parts: list[tuple[np.ndarray, ...]]) -> Scan:
-    at, cost, others = (np.concatenate(x) for x in zip(*parts, strict=True))
+def _with(one: Scan, two: Scan) -> Scan:
+    return _sorted(*(np.concatenate(x) for x in ((one.at, two.at), (one.cost, two.cost), (one.others, two.others))))
+
+
+def _sorted(at: np.ndarray, cost: np.ndarray, others: np.ndarray) -> Scan:
     order = np.unique(at, return_index=True)[1]
-    cost = np.where(np.isfinite(cost), cost, np.inf)
-    return Scan(at[order], cost[order], others[order])
+    return Scan(at[order], np.where(np.isfinite(cost), cost, np.inf)[order], others[order])
 
 
 def placed(problem: Problem, starts: Float[np.ndarray, "starts z"]) -> Float[np.ndarray, "starts z"]:
-    """Starts of searches with what is scanned where the misfit is lowest, all else as it was."""
+    """Starts of searches with what is scanned where the misfit is lowest beside the first, all else as it was."""
     starts = np.array(starts, float)
     for k in scanned(problem):
-        for z in starts:
-            seen = scan(problem, z, problem.data, k)
-            z[k] = seen.at[np.argmin(seen.cost)]
+        seen = scan(problem, starts[0], problem.data, k)
+        starts[:, k] = seen.at[np.argmin(seen.cost)]
     return starts
 
 
@@ -148,33 +151,28 @@ def searched_on(
         return cost if np.isfinite(cost) else np.inf
 
     for _ in range(AGAIN):
-        best, _ = found
-        here, z = float(best.cost), np.asarray(best.z)
-        gain = 0.0
-        for k in every:
-            seen = scan(problem, z, data, k)
-            low = [j for j in seen.basins() if seen.cost[j] < here - WORTH][:TRIED]
-            gain = max(gain, here - float(seen.cost.min()))
-            starts = []
-            for j in low:
+        here, z = float(found[0].cost), np.asarray(found[0].z)
+        looked = {k: scan(problem, z, data, k) for k in every}
+        lower = found
+        for k, seen in looked.items():
+            for j in [j for j in seen.basins() if seen.cost[j] < here - WORTH][:TRIED]:
                 alone = np.where(np.arange(len(z)) == k, seen.at[j], z)
-                starts.append(min((seen.others[j], alone), key=objective))
-            ends = [search(start) for start in starts]
-            lower = min(ends, key=lambda e: float(e[0].cost), default=found)
-            if float(lower[0].cost) < here - WORTH:
-                names = problem.coordinates.names
-                tell(f"a lower basin of {names[k]}: objective {float(lower[0].cost):.4f}")
-                found = lower
-                break
-        else:
-            return _judged(found, gain)
-    return _judged(found, np.inf)
-
-
-def _judged(found: Found, gain: float) -> Found:
-    best, seen = found
-    settled = small(gain, best.cost) | (gain < WORTH) | bool(best.converged) & (gain < np.inf)
-    return dataclasses.replace(best, converged=jnp.asarray(settled)), seen
+                end = search(min((seen.others[j], alone), key=objective))
+                lower = min(lower, end, key=lambda f: float(f[0].cost))
+        if not float(lower[0].cost) < here - WORTH:
+            break
+        found = lower
+        over = " or ".join(problem.coordinates.names[k] for k in every)
+        tell(f"a lower basin of {over}: objective {float(found[0].cost):.4f}")
+    else:
+        return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
+    # At a kink there is a slope on either side: that nothing near is lower is what makes it an optimum.
+    lowest = min(float(seen.cost.min()) for seen in looked.values())
+    sd = np.asarray(found[0].sd).copy()
+    for k, seen in looked.items():
+        sd[k] = seen.sd()
+    settled = bool(found[0].converged) or here - lowest < WORTH
+    return dataclasses.replace(found[0], converged=jnp.asarray(settled), sd=jnp.asarray(sd)), found[1]
 
 
 def profiles(problem: Problem, z: np.ndarray) -> dict[int, Scan]:
@@ -189,6 +187,19 @@ def with_scanned_sds(about: Identifiability, scans: dict[int, Scan]) -> Identifi
         sd[k] = seen.sd()
     wider = sd / about.sd
     return dataclasses.replace(about, sd=sd, covariance=about.covariance * np.outer(wider, wider))
+
+
+def apart(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -> int:
+    """How many searches that converged ended where the profile at the best optimum has nothing.
+
+    Args:
+        z: where each ended, shape (searches, parameters), None where that is not known; converged: of each.
+    """
+    if z is None:
+        return 0
+    ends = {k: seen.interval() for k, seen in scans.items()}
+    outside = [(z[:, k] < low) | (z[:, k] > high) for k, (low, high) in ends.items()]
+    return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
 
 
 def statements(problem: Problem, scans: dict[int, Scan]) -> list[str]:

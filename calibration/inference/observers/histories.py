@@ -55,7 +55,7 @@ KNOTS, KNOT_STEPS = 256, 1e7
 #: Lags of a run's residual that are looked at, at most a quarter of its samples.
 LAGS = 12
 #: Values of a delay at which the misfit is looked at, fewest and most; and of what else is scanned, a run each.
-DELAYS, SCANNED = (64, 2048), 16
+DELAYS, SCANNED = (256, 2048), 32
 #: Of a chassis' friction law what only sliding shows.
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
@@ -180,7 +180,9 @@ class Histories(Observer):
             order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
         index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
-        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=robot.rig.blank)
+        rig = robot.rig
+        delayed = rig.blank or DELAY in rig.stated or float(rig.delay) != 0
+        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=delayed)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -527,7 +529,7 @@ class Histories(Observer):
         return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
 
     def scanned(self, problem: Problem) -> tuple[int, ...]:
-        return scans.flagged(problem)
+        return scans.beyond_a_basin(problem)
 
     def scan_points(self, problem: Problem, k: int) -> int:
         """Of a delay so many that none is further from the next than half of the rise of a current L/R or an eighth
