@@ -68,7 +68,7 @@ class Shaft(eqx.Module):
         bounds=(-6.3, 6.3),
         sd=0.05,
         source=_STATED,
-        scanned=1.5,
+        scanned=1.0,
     )
     backlash: Scalar = parameter(
         0.0,
