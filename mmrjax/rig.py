@@ -112,6 +112,7 @@ class Rig(eqx.Module):
         bounds=(-10.0, 10.0),
         sd=0.02,
         source="stated by whoever owns the rig",
+        scanned=0.0,
     )
     begins: Begins | None = None
     imposed: str = eqx.field(default=IMPOSED[0], static=True)

@@ -525,6 +525,79 @@ def test_front_door_loads_nothing_heavy():
     assert answer.stdout.strip() == "[]"
 
 
+#: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
+INNER = {
+    "as_read", "separated", "of_surfaces", "weighed", "begun", "with_begins", "check_start", "assumed", "library_for",
+    "settings_for", "without_copies", "pose", "fit_base", "trace", "discover_at",
+}  # fmt: skip
+#: Campaigns and notebooks that call a part of that all the same, and why.
+CALLED: dict[tuple[str, str], str] = {
+    ("loop_baselines", "pose"): "other ways to select effects, on the loop's own problem after its own preparation",
+    ("loop_baselines", "fit_base"): "the same",
+    ("calibrate", "pose"): "coverage about a known truth: problems without a table of their own",
+    ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
+    ("05_your_rig", "separated"): "an effect of the rig's size, shown by itself before it is calibrated as users do",
+    ("05_your_rig", "library_for"): "the same",
+    ("track_table", "weighed"): "the same rows, searched by members and not by `calibrate`",
+}
+
+
+def inner_calls(source: str) -> Iterator[tuple[int, str]]:
+    """Calls of `INNER` functions in a module, but of methods of what `prepared` gives."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            whose, _, name = ast.unparse(node.func).rpartition(".")
+            prepared = whose == "given" or whose.startswith("prepared(")
+            if name in INNER and not (name == "trace" and prepared):
+                yield node.lineno, name
+
+
+def test_campaigns_and_notebooks_take_the_way_of_users():
+    """A campaign that prepares a table by itself measures a program that nobody runs."""
+    own = {"fastsim_comparison": {"trace"}, "track_table": {"begun"}}  # a driving trace, searches that have begun
+    found = {
+        (file.stem, name)
+        for folder in ("benchmarks", "notebooks")
+        for file in sorted((ROOT / folder).glob("*.py"))
+        for _, name in inner_calls(file.read_text(encoding="utf-8"))
+        if name not in own.get(file.stem, ())
+    }
+    assert found == set(CALLED)
+    for campaign in ("loop", "loop_series", "loop_baselines", "rigs"):
+        tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
+        assert any(name == "calibration.discovery.discover.prepared" for name, _ in names_imported(tree, "")), (
+            campaign
+        )
+
+
+def test_a_campaign_of_its_own_way_is_found():
+    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.assumed(runs)"
+    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "assumed"]
+    assert not [*inner_calls("given = prepared(runs, robot)\ngiven.trace()\nprepared(runs).trace()\ncalibrate(runs)")]
+
+
+def test_one_preparation_serves_all():
+    """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
+    inner = {"as_read", "separated", "begun", "check_start"}
+    allowed = {
+        "calibration/inference/preparation.py",
+        "sweeps/compare.py",
+        "sweeps/rig_check.py",
+    }  # two that fit nothing
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for layer in ("calibration", "sweeps")
+        for path in (ROOT / layer).rglob("*.py")
+        for _, name in inner_calls(path.read_text(encoding="utf-8"))
+        if name in inner
+    }
+    assert found == allowed
+    for room in ("inference/calibrate", "inference/foresight", "discovery/discover"):
+        tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
+        calls = {ast.unparse(n.func).rpartition(".")[2] for n in ast.walk(tree) if isinstance(n, ast.Call)}
+        assert "prepare" in calls, room
+
+
 def test_reference_implementation_imports_nothing_of_ours():
     tree = ast.parse((ROOT / "tests" / "reference.py").read_text(encoding="utf-8"))
     assert not {name.partition(".")[0] for name, _ in imports(tree, "tests")} & {*LAYERS, "jax"}

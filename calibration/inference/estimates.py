@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +30,7 @@ from calibration.inference.result import (
     ProfileCurve,
     Tie,
 )
+from calibration.inference.scans import Scan
 from mmrjax import channels
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
@@ -48,6 +49,7 @@ def parameters(
     profile: Profile | None,
     beside: np.ndarray | None,
     sources: dict[str, str],
+    scans: Mapping[int, Scan],
 ) -> dict[str, Estimate]:
     """Every free parameter by its name.
 
@@ -55,7 +57,8 @@ def parameters(
         posed, base: the problem, and the robot whose values are the prior means.
         z: the optimum; beside: that of the same problem with `steady`, or None.
         about, profile: the linear analysis there, and the profiles, if any.
-        sources: of the priors that are not the fields'.
+        sources: of the priors that are not the fields'; scans: of the coordinates that are scanned, whose intervals
+            are those of their profiles.
     """
     coordinates = posed.coordinates
     at, sd = jnp.asarray(z), jnp.asarray(about.sd)
@@ -72,6 +75,10 @@ def parameters(
             interval = np.array([profile.low[k], profile.high[k]])
             shift = np.interp(interval, profile.value[k], profile.z[k])
             is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
+        if k in scans:
+            shift, is_open = np.array(scans[k].interval()), scans[k].open()
+            ends = [jnp.where(jnp.arange(len(z)) == k, x, at) for x in shift]
+            interval = np.array([coordinates.value(end)[k] for end in ends])
         found[name] = Estimate(
             value=float(value[k]),
             sd=float(about.sd[k] * slope[k]),

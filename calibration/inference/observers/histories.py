@@ -23,6 +23,7 @@ from calibration.data.courses import names as _names
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
+from calibration.inference import scans
 from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
 from calibration.inference.errors import OF_SIZE, sized_error
@@ -33,7 +34,7 @@ from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Optimum, linearised, searches_long
 from calibration.inference.priors import DELAY
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
 from mmrjax.channels import RPM, Channel
 from mmrjax.compiling import compiled
@@ -42,7 +43,7 @@ from mmrjax.effects import Effect
 from mmrjax.fidelities.drive import rates, state_of
 from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, grid, growth, histories, respond, states
 from mmrjax.params import Scalar
-from mmrjax.rig import Begin, Begins
+from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals, State
 
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
 KNOTS, KNOT_STEPS = 256, 1e7
 #: Lags of a run's residual that are looked at, at most a quarter of its samples.
 LAGS = 12
+#: Values of a delay at which the misfit is looked at, fewest and most; and of what else is scanned, a run each.
+DELAYS, SCANNED = (256, 2048), 32
 #: Of a chassis' friction law what only sliding shows.
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
@@ -177,7 +180,8 @@ class Histories(Observer):
             order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
         index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
-        delayed = robot.rig.blank or not robot.rig.prompt
+        rig = robot.rig
+        delayed = rig.blank or DELAY in rig.stated or not rig.prompt
         return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=delayed)
 
     @classmethod
@@ -405,15 +409,15 @@ class Histories(Observer):
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
         return jax.tree.map(lambda x: jnp.asarray(x[cases]), turned)
 
-    def _delayed(self, robot: Robot, whole: Signals) -> Float[Array, "rows channels"]:
-        """Readings of every row, between the instants before and after it less the delay."""
-        every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(whole)  # runs, instants, channels
-        return jax.vmap(lambda run, at: robot.rig.late(self.times[run], every[run], at))(self.run, self.time)
+    def late(self, every: Float[Array, "runs instants ..."], rig: Rig) -> Float[Array, "rows ..."]:
+        """Of every row, what is there between the instants before and after it less the rig's delay."""
+        return jax.vmap(lambda run, at: rig.late(self.times[run], every[run], at))(self.run, self.time)
 
     def __call__(self, robot: Robot) -> Observation:
         whole = self.whole(robot)
         if self.delayed:
-            reading = self._delayed(robot, whole)
+            every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(whole)
+            reading = self.late(every, robot.rig)
         else:
             reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(whole))
         followed = jnp.all(jnp.isfinite(reading), 1)
@@ -512,22 +516,60 @@ class Histories(Observer):
             return jax.tree.map(lambda *x: np.concatenate(x), *jax.device_get(parts))
 
         if problem.base.on_shaft or problem.base.rig.imposed != "voltage":  # no ground whose grip makes for valleys
-            return super().starts(problem, random, count)
+            return scans.placed(problem, super().starts(problem, random, count))
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
-        return settled_ends.starts(problem, draws, search)[:count]
+        return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
+
+    def scanned(self, problem: Problem) -> tuple[int, ...]:
+        return scans.beyond_a_basin(problem)
+
+    def scan_points(self, problem: Problem, k: int) -> int:
+        """Of a delay so many that none is further from the next than half of the rise of a current L/R or an eighth
+        of a sample, as far as `DELAYS` go."""
+        if problem.coordinates.names[k] != DELAY:
+            return SCANNED
+        motor, time = problem.base.motor, np.unique(np.round(np.asarray(self.time), 9))
+        rise = float(motor.inductance) / float(motor.resistance)
+        fine = min(0.125 * float(np.median(np.diff(time))), max(0.5 * rise, 1e-6)) if len(time) > 1 else 1.0
+        wanted = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
+        return int(2 ** np.clip(np.ceil(np.log2(wanted)), *np.log2(DELAYS)))
+
+    def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
+        """As the protocol says. A delay shifts what a run shows and does not change it: one run and its derivatives
+        serve for all."""
+        if problem.coordinates.names[k] == DELAY:
+            return _over_delays(problem, z, data, jnp.arange(len(z)) == k, values)
+        found = [
+            _moved(*linearised(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k)
+            for v in values
+        ]
+        return jnp.stack([cost for cost, _ in found]), jnp.stack([at for _, at in found])
 
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
     ) -> tuple[Optimum, Observation]:
         """As the protocol says; the runs are compiled once for all steps."""
-        return searches_long(
-            lambda z: _evaluate(problem, z, weights, active),
-            starts,
-            problem.data,
-            weights,
-            self.policy.steps,
-            rivals=rivals,
+
+        def batch(starts: Array) -> tuple[Optimum, Observation]:
+            return searches_long(
+                lambda z: _evaluate(problem, z, weights, active),
+                starts,
+                problem.data,
+                weights,
+                self.policy.steps,
+                rivals=rivals,
+            )
+
+        found = batch(starts)
+        if not rivals or not scans.scanned(problem):
+            return found
+        k = int(np.nanargmin(found[0].cost))
+        one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
+        data = dataclasses.replace(problem.data, weight=weights[k])
+        best = scans.searched_on(
+            problem, one(found), data, lambda z: one(batch(jnp.tile(z, (len(starts), 1)))), lambda _: None
         )
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
@@ -733,6 +775,41 @@ def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
 @compiled
 def _angle(observe: Histories, robot: Robot) -> Array:
     return observe.angle(observe.whole(robot))
+
+
+@compiled
+def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
+    observe: Histories = problem.observe  # type: ignore[assignment]
+
+    def shown(z: Array) -> tuple[Array, Array]:
+        robot = problem.robot(z)
+        every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(observe.whole(robot))
+        return every, every
+
+    slope, every = jax.jacfwd(shown, has_aux=True)(z)
+    both = jnp.concatenate([every[..., None], slope], -1)
+
+    def one(value: Array) -> tuple[Array, Array]:
+        at = jnp.where(scanned, value, z)
+        late = observe.late(both, problem.robot(at).rig)
+        error = data.weight * (late[..., 0] - data.measured) / data.sd
+        there = jnp.all(jnp.isfinite(late), -1)
+        error = jnp.where(there, error, MISSING * data.weight)
+        jacobian = jnp.where(there[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
+        residual = jnp.concatenate([error.ravel(), at - data.centre])
+        whole = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
+        return _moved(residual, whole, at, scanned)
+
+    return jax.lax.map(one, values, batch_size=16)
+
+
+@compiled
+def _moved(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
+    """Objective at the minimum of a linearisation in which one coordinate is held, and the coordinates there."""
+    free = jnp.where(held, 0.0, jacobian)
+    lower = cholesky(free.T @ free + jnp.diag(held.astype(float)))
+    step = -backward(lower, forward(lower, free.T @ residual))
+    return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
 
 
 @compiled
