@@ -1,4 +1,4 @@
-"""What both benchmarks share: the machine in words, timing, memory, and which limit a batch meets."""
+"""What benchmarks share: the machine in words, timing, memory, and which limit a batch meets."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # the plain reference model
 
@@ -65,6 +66,26 @@ def seconds(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
         jax.block_until_ready(call())
         times.append(time.perf_counter() - start)
     return min(times), sorted(times)[len(times) // 2]
+
+
+def yardstick_points(size: int) -> tuple[np.ndarray, ...]:
+    """Configuration, voltage [V], slope [deg] and payload [kg], over what nominal adhesion holds of Table 8."""
+    rng = np.random.default_rng(8)
+    wheeled, slope, payload, voltage = rng.uniform((0, 0, 0, 15), (1, 12, 8, 33), (size, 4)).T.copy()
+    return np.round(wheeled).astype(int), voltage, slope, payload
+
+
+def in_turn(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, np.ndarray]:
+    """Wall and processor times [s] of each call, one of each in every round, shape (rounds, 2)."""
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
+    for call in calls.values():
+        jax.block_until_ready(call())
+    for _ in range(rounds):
+        for name, call in calls.items():
+            start, spent = time.perf_counter(), time.process_time()
+            jax.block_until_ready(call())
+            times[name].append((time.perf_counter() - start, time.process_time() - spent))
+    return {name: np.array(t) for name, t in times.items()}
 
 
 def memory() -> dict[str, int]:

@@ -19,8 +19,6 @@ import dataclasses
 import json
 import os
 import sys
-import time
-from collections.abc import Callable
 from typing import Any
 
 options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -40,7 +38,7 @@ if arguments.platform == "cpu":
 
 import jax
 import numpy as np
-from measure import machine, set_precision
+from measure import in_turn, machine, set_precision, yardstick_points
 
 set_precision(single=False)
 
@@ -63,34 +61,14 @@ PARAMETERS = (
 )  # fmt: skip
 
 
-def points(size: int) -> tuple[np.ndarray, ...]:
-    """Configuration, voltage [V], slope [deg] and payload [kg], over what nominal adhesion holds of Table 8."""
-    rng = np.random.default_rng(8)
-    wheeled, slope, payload, voltage = rng.uniform((0, 0, 0, 15), (1, 12, 8, 33), (size, 4)).T.copy()
-    return np.round(wheeled).astype(int), voltage, slope, payload
-
-
 def conditions(size: int) -> Conditions:
     """The same, on the device."""
-    return jax.block_until_ready(Conditions(*points(size)))
+    return jax.block_until_ready(Conditions(*yardstick_points(size)))
 
 
 def with_effects(robot: Robot) -> Robot:
     """The robot with the four effects."""
     return dataclasses.replace(robot, effects=tuple(BY_NAME[k](amplitude=v) for k, v in EFFECTS.items()))
-
-
-def in_turn(calls: dict[str, Callable[[], Any]], rounds: int) -> dict[str, np.ndarray]:
-    """Wall and processor times [s] of each call, one of each in every round, shape (rounds, 2)."""
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in calls}
-    for call in calls.values():
-        jax.block_until_ready(call())
-    for _ in range(rounds):
-        for name, call in calls.items():
-            start, spent = time.perf_counter(), time.process_time()
-            jax.block_until_ready(call())
-            times[name].append((time.perf_counter() - start, time.process_time() - spent))
-    return {name: np.array(t) for name, t in times.items()}
 
 
 def largest_difference(ours: dict[str, Any], theirs: dict[str, np.ndarray]) -> float:
@@ -100,7 +78,7 @@ def largest_difference(ours: dict[str, Any], theirs: dict[str, np.ndarray]) -> f
 
 def compared(size: int, rounds: int) -> dict[str, Any]:
     """Both sides at one number of points: differences, rates and ratios."""
-    robot, runs, given = robots.nominal(), conditions(size), points(size)
+    robot, runs, given = robots.nominal(), conditions(size), yardstick_points(size)
     effects, amplitudes = with_effects(robot), tuple(EFFECTS.values())
     for one in (robot, effects):
         assert (np.asarray(steady_outputs(one, runs, ("status",))["status"]) == CONVERGED).all()

@@ -87,7 +87,12 @@ class Conditions(eqx.Module):
             said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
         self.configuration = (np if which.dtype.kind == "U" else jnp).broadcast_to(which, shape)
-        numbers = [jnp.broadcast_to(x, shape) for x in numbers]
+        # what is stated by the same number for all shares one array: most fields of a large batch are 0 or 1
+        shared = {v: jnp.broadcast_to(x, shape) for v, x in zip(given, numbers, strict=True) if isinstance(v, float)}
+        numbers = [
+            shared[v] if isinstance(v, float) else jnp.broadcast_to(x, shape)
+            for v, x in zip(given, numbers, strict=True)
+        ]
         self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
         self.order, self.duty, self.open = numbers[6:]
         held = {name: jnp.broadcast_to(x, shape) for name, x in optional.items()}
@@ -113,7 +118,18 @@ class Conditions(eqx.Module):
         """
         if not isinstance(self.configuration, np.ndarray) or self.configuration.dtype.kind != "U":
             return self
-        which = np.empty(self.configuration.shape, int)
-        for name in np.unique(self.configuration):
-            which[self.configuration == name] = robot.configurations.index(str(name))
+        names = robot.configurations.names
+        which = indices(self.configuration, names)
+        if which.size and which.min() < 0:
+            robot.configurations.index(str(np.unique(self.configuration[which < 0])[0]))
         return dataclasses.replace(self, configuration=jnp.asarray(which))
+
+
+def indices(words: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Place of each word among some names; -1 where it is none of them."""
+    # one word for all, as `Conditions` broadcasts it, is looked up once
+    once = words[tuple(slice(1) if stride == 0 else slice(None) for stride in words.strides)]
+    found = np.full(once.shape, -1)
+    for k, name in enumerate(names):
+        found[once == name] = k
+    return np.broadcast_to(found, words.shape)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from mmrjax import missions, outputs
 from mmrjax.channels import Channel, usual
+from mmrjax.channels import names as channel_names
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.mission import Mission
 from mmrjax.params import Scalar
 from mmrjax.signals import CODES, STATUSES, Result
+
+if TYPE_CHECKING:
+    from mmrjax.simulation import Pending
 
 #: Columns of a printed table beside conditions and channels.
 _SHOWN = ("slip", "adhesion_used", "power_supply_W", "temperature_winding_C")
@@ -30,8 +34,13 @@ _CONDITIONS = {
 _WORDS = {"status": ("status", "", 0), "flags": ("flags", "", 0)}
 
 
-class Results(eqx.Module):
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Results:
     """Results of one run, or of a batch, of one fidelity; a pytree.
+
+    Of `steady`, numbers are computed when they are first asked for and kept: what the instruments show and how the
+    runs ended by one program, everything else (and the results as a pytree) by another. The two round differently, by
+    some 1e-15 of a number; what has been asked for stays as it is.
 
     Every field of `Result`, every channel and every column that the fidelity adds is an attribute:
     `results.slip`, `results.total_current`, `results.guide_share`. All numbers have the shape of the conditions.
@@ -55,13 +64,42 @@ class Results(eqx.Module):
     result: Result
     further: dict[str, Scalar]
     history: History | None
-    configurations: tuple[str, ...] = eqx.field(static=True)
-    model: str = eqx.field(static=True)
+    configurations: tuple[str, ...]
+    model: str
     mission: Mission | None = None
-    stated: tuple[str, ...] = eqx.field(static=True, default=())
-    channels: tuple[Channel, ...] = eqx.field(static=True, default_factory=usual)
+    stated: tuple[str, ...] = ()
+    channels: tuple[Channel, ...] = dataclasses.field(default_factory=usual)
+
+    @staticmethod
+    def pending(batch: Pending, configurations: tuple[str, ...], model: str) -> Results:
+        """Results of which nothing has been computed yet."""
+        results = object.__new__(Results)
+        known = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}
+        results.__dict__.update(
+            known, configurations=configurations, model=model, channels=batch.robot.channels, _pending=batch
+        )
+        return results
+
+    def _compute(self, name: str) -> None:
+        """Compute what holds a name, where nothing that has been computed does."""
+        own, batch = self.__dict__, self.__dict__.get("_pending")
+        if batch is None or name.startswith("_"):
+            return
+        if name == "total_mass":
+            own[name] = batch.total_mass()
+        elif "result" not in own and name in (*channel_names(batch.robot.channels), "status"):
+            own.update(own.setdefault("_shown", batch.shown()))
+        elif "result" not in own:
+            whole = batch.result()
+            shown = own.get("_shown", {})
+            reading = {k: shown.get(k, x) for k, x in whole.reading.items()}
+            status = shown.get("status", whole.status)
+            own["result"] = dataclasses.replace(whole, reading=reading, status=status)
 
     def __getattr__(self, name: str) -> Any:
+        self._compute(name)
+        if name in self.__dict__:
+            return self.__dict__[name]
         result, further = self.__dict__.get("result"), self.__dict__.get("further")
         if further is not None and name in further:
             return further[name]
@@ -75,7 +113,7 @@ class Results(eqx.Module):
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the batch; () for one run."""
-        return self.result.status.shape
+        return self.conditions.shape if "_pending" in self.__dict__ else self.result.status.shape
 
     @property
     def configuration(self) -> np.ndarray:
@@ -85,7 +123,7 @@ class Results(eqx.Module):
     @property
     def statuses(self) -> np.ndarray:
         """How the runs ended, in words of `STATUSES`; `status` holds their codes."""
-        return np.array(STATUSES)[np.asarray(self.result.status)]
+        return np.array(STATUSES)[np.asarray(self.status)]
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Conditions and outcomes by the columns of `runs.csv`, units in the names; arrays of the batch's shape.
@@ -155,4 +193,11 @@ class Results(eqx.Module):
     def __repr__(self) -> str:
         if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(self)):
             return f"Results of {self.model}, traced"
-        return f"Results of {self.model}, {max(self.result.status.size, 1)} runs\n{self.table()}"
+        return f"Results of {self.model}, {max(self.status.size, 1)} runs\n{self.table()}"
+
+
+jax.tree_util.register_dataclass(
+    Results,
+    data_fields=["conditions", "total_mass", "result", "further", "history", "mission"],
+    meta_fields=["configurations", "model", "stated", "channels"],
+)

@@ -223,7 +223,7 @@ def sweep(
     chunk: _Chunk = None,
     posterior: _Posterior = None,
     zarr: Annotated[
-        bool, typer.Option("--zarr", help="Write a Zarr store, also of the grid of the options.")
+        bool, typer.Option("--zarr", help="Write a Zarr store, also of a small grid of options.")
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say points, chunks, bytes and time; write nothing.")
@@ -244,9 +244,10 @@ def sweep(
 ) -> int:
     """Simulate every combination of a grid in vmapped batches: Table 8 in every configuration by default.
 
-    An axis is 0,5,10 or first:last:step as 0:20:0.5. With a CONFIG.toml any parameter or condition varies, as a grid
-    or sampled, and results go to a Zarr store (docs/sweeps.md). An interrupted sweep goes on with the same command
-    and the same --out.
+    An axis is 0,5,10 or first:last:step as 0:20:0.5. Up to 100 000 runs leave runs.csv; results of more go to a Zarr
+    store, and to runs.csv too with --export csv. So do those of a CONFIG.toml, where any parameter or condition
+    varies, as a grid or sampled (docs/sweeps.md). An interrupted sweep goes on with the same command and the same
+    --out.
     """
     from sweeps import config, config_campaign
 
@@ -274,15 +275,16 @@ def sweep(
         raise InputError(f"--config: got {config_file} beside {file}; expected one of them")
     file = config_file if file is None else file
     how = config_campaign.how(shard, scheduler, export, dry_run)
+    where = file.name if file is not None else "options"
     if zarr or how != config_campaign.How() or config_campaign.is_campaign(file):
         stored = _prepared(config_campaign.resolve_campaign(file, options), no_cache)
         from sweeps import campaign
 
-        return campaign.campaign(stored, file.name if file is not None else "options", out, force, how)
+        return campaign.campaign(stored, where, out, force, how)
     resolved = _prepared(config.resolve(config.Sweep, file, options), no_cache)
     from sweeps import sweep as room
 
-    return room.sweep(resolved, out, force)
+    return room.sweep(resolved, where, out, force)
 
 
 @app.command(epilog="Example: mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")

@@ -80,6 +80,25 @@ def check(config: GridPart, robot: Robot) -> None:
         raise BadConfiguration(f"option surface: got {surface!r}; {choices(surface, SURFACES)}")
 
 
+def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:
+    """Values of each axis of a grid by the column of a table, the slope last.
+
+    Args:
+        config: as `resolved` makes it; battery: whether the runs are on the battery.
+
+    Raises:
+        BadConfiguration: a configuration that the robot does not have.
+    """
+    layout = Layout.of(robot)
+    found: dict[str, tuple[object, ...]] = {
+        "configuration": configurations(config, robot),
+        layout.imposed_column: (math.nan,) if battery else getattr(config, AXIS[layout.imposed]),
+    }
+    if not layout.on_shaft:
+        found |= {"payload_kg": config.payloads_kg or (), "slope_deg": config.slopes_deg or ()}
+    return found
+
+
 def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
     """Every combination of the axes as a table of conditions, slope varying fastest.
 
@@ -90,19 +109,12 @@ def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
         BadConfiguration: as `resolved`.
     """
     config = resolved(config, robot, battery)
-    layout = Layout.of(robot)
-    values = getattr(config, AXIS[layout.imposed])
-    axes: dict[str, tuple[object, ...]] = {
-        "configuration": configurations(config, robot),
-        layout.imposed_column: (math.nan,) if battery else values,
-    }
-    if not layout.on_shaft:
-        axes |= {"payload_kg": config.payloads_kg or (), "slope_deg": config.slopes_deg or ()}
-    points = list(itertools.product(*axes.values()))
-    columns = {name: np.array(column) for name, column in zip(axes, zip(*points, strict=True), strict=True)}
+    values = axes(config, robot, battery)
+    points = list(itertools.product(*values.values()))
+    columns = {name: np.array(column) for name, column in zip(values, zip(*points, strict=True), strict=True)}
     if config.surface is not None:
         columns["surface"] = np.full(len(points), config.surface)
-    return Runs(source="the grid", columns=columns, layout=layout)
+    return Runs(source="the grid", columns=columns, layout=Layout.of(robot))
 
 
 def configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:

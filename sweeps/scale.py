@@ -81,9 +81,7 @@ def device_kind() -> str:
 
 def default_chunk(model: str, accelerator: bool, devices: int) -> int:
     """Points of a chunk where none is stated, over all devices."""
-    facts = fidelities.facts(model)
-    own = facts.chunk if facts.chunk_stored is None else facts.chunk_stored[accelerator]
-    return own * devices
+    return fidelities.facts(model).at_once(accelerator) * devices
 
 
 class Compiled:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +11,32 @@ from rich.table import Table
 from sweeps import config as configuration
 from sweeps import run, uncertainty, words
 from sweeps.console import say, tell
-from sweeps.grid import grid, resolved
+from sweeps.grid import axes, grid, resolved
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.store import open_folder
+from sweeps.zarr_store import STORE
+
+#: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
+TABLE = 100_000
 
 
-def sweep(config: configuration.Sweep, out: Path | None, force: bool) -> int:
-    """Simulate a grid and leave a run folder; returns the exit code."""
+def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool) -> int:
+    """Simulate a grid and leave a run folder, of more than `TABLE` runs one with a store; returns the exit code.
+
+    Args:
+        config: the configuration; where: its file, for messages; out: the run folder; force: replace one.
+    """
     robot = load_robot(config)
     notes: list[str] = []
-    config = resolved(config, robot, config.battery, notes)
+    stated = config
+    config = resolved(stated, robot, stated.battery, notes)
+    count = math.prod(map(len, axes(config, robot, config.battery).values()))
+    if count > TABLE and config.posterior is None:
+        from sweeps import campaign
+
+        tell(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; the same "
+             "command with --export csv writes it too")  # fmt: skip
+        return campaign.campaign(stated, where, out, force)
     for note in notes:
         tell(note)
     runs = grid(config, robot, config.battery)

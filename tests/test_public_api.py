@@ -195,21 +195,38 @@ def test_track_keeps_histories_with_reactions(robot):
     assert many.guide_share.shape == (2,) and "guide_share" in many.to_dict() and "guide share" in many.table()
 
 
-def test_large_batches_run_in_chunks(robot, monkeypatch):
-    runs = mm.Conditions(voltage=np.linspace(10.0, 30.0, 10))
-    whole = mm.simulate(robot, runs)
+def in_fours(monkeypatch):
+    """Runs in one call of `steady` four at a time; returns the shapes of the calls that are made."""
     sizes = []
-    run = fidelities.get("steady").run
+    whole = fidelities.get("steady")
 
-    def counted(robot, conditions, options):
-        sizes.append(conditions.shape)
-        return run(robot, conditions, options)
+    def run(robot, conditions, options):
+        sizes.append(("run", conditions.shape))
+        return whole.run(robot, conditions, options)
 
-    monkeypatch.setitem(fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), chunk=4))
-    few = dataclasses.replace(fidelities.get("steady"), run=counted)
+    def some(robot, conditions, names):
+        sizes.append((names, conditions.shape))
+        return whole.outputs(robot, conditions, names)
+
+    monkeypatch.setitem(
+        fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), chunk_stored=(4, 4))
+    )
+    few = dataclasses.replace(whole, run=run, outputs=some)
     monkeypatch.setattr("mmrjax.fidelities.steady.FIDELITY", few)
-    np.testing.assert_allclose(mm.simulate(robot, runs).total_current, whole.total_current, rtol=1e-13)
-    assert sizes == [(4,)] * 3
+    return sizes
+
+
+def test_large_batches_run_in_chunks(robot, monkeypatch):
+    """Ten runs by four: the last call repeats two of the one before, which are left out."""
+    runs = mm.Conditions(voltage=np.linspace(10.0, 30.0, 10))
+    together = mm.simulate(robot, runs)
+    sizes = in_fours(monkeypatch)
+    by_fours = mm.simulate(robot, runs)
+    assert sizes == []
+    np.testing.assert_allclose(by_fours.total_current, together.total_current, rtol=1e-13)
+    assert sizes == [(("total_current", "motor_speed", "speed", "status"), (4,))] * 3
+    np.testing.assert_allclose(by_fours.slip, together.slip, rtol=1e-13)
+    assert sizes[3:] == [("run", (4,))] * 3
 
 
 def test_new_fidelity_answers_at_once(toy, robot):

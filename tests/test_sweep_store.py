@@ -61,6 +61,20 @@ def arrays(folder):
     return {str(f.relative_to(store)): f.read_bytes() for f in sorted(store.rglob("*")) if f.is_file()}
 
 
+def same_table(table, exported):
+    """A store's runs.csv has the rows and numbers of the table of the same grid, in fewer columns."""
+    with table.open() as one, exported.open() as other:
+        rows, others = list(csv.DictReader(one)), list(csv.DictReader(other))
+    assert len(rows) == len(others) == 12 and set(others[0]) < set(rows[0])
+    for a, b in zip(rows, others, strict=True):
+        for key, value in b.items():
+            if key in ("configuration", "status"):
+                assert a[key] == value
+            else:
+                assert (a[key] == "") == (value == "")
+                assert not value or float(a[key]) == pytest.approx(float(value), rel=1e-8)
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """The store that the configuration above gives when nothing goes wrong."""
@@ -116,22 +130,54 @@ def test_result_counts_statuses_and_states_ranges(whole):
     assert manifest["statuses"] == result["statuses"] and manifest["seed"] == 7
 
 
+def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrjax, tmp_path, monkeypatch):
+    """Above the limit: no runs.csv, which is said; the same command with --export csv writes it, simulating nothing."""
+    grid = ["sweep", "--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--no-report"]
+    monkeypatch.setattr("sweeps.sweep.TABLE", 12)
+    small, _, _ = mmrjax(*grid, "--out", "small")
+    assert small == 3  # some slide
+    assert (tmp_path / "small" / "runs.csv").exists() and not (tmp_path / "small" / zarr_store.STORE).exists()
+    monkeypatch.setattr("sweeps.sweep.TABLE", 11)
+    code, out, said = mmrjax(*grid, "--out", "large")
+    assert code == small and out.splitlines()[-1] == "large"
+    assert "12 points: results.zarr in place of runs.csv, which a sweep of at most 11 has" in said
+    assert "--export csv" in said
+    left = {f.name for f in (tmp_path / "large").iterdir()}
+    assert left == {
+        "config.resolved.toml", "identity.json", "journal", "manifest.json", "result.json", "results.zarr", "robot.toml",
+    }  # fmt: skip
+    results = [json.loads((tmp_path / name / "result.json").read_text()) for name in ("small", "large")]
+    assert results[0]["statuses"] == results[1]["statuses"] and results[0]["runs"] == results[1]["points"] == 12
+    written = arrays(tmp_path / "large")
+    assert mmrjax(*grid, "--out", "large", "--export", "csv")[0] == small
+    assert arrays(tmp_path / "large") == written
+    same_table(tmp_path / "small" / "runs.csv", tmp_path / "large" / "runs.csv")
+    robots_ = [(tmp_path / name / "robot.toml").read_text().splitlines()[1:] for name in ("small", "large")]
+    assert robots_[0] == robots_[1]
+
+
+def test_large_grid_of_a_file_leaves_a_store_too(mmrjax, tmp_path, monkeypatch):
+    monkeypatch.setattr("sweeps.sweep.TABLE", 3)
+    (tmp_path / "grid.toml").write_text("slopes_deg = [0, 5]\npayloads_kg = [0]\nbattery = true\nreport = false\n")
+    code, _, said = mmrjax("sweep", "--config", "grid.toml", "--out", "s")
+    assert code == 0 and "4 points: results.zarr" in said and (tmp_path / "s" / zarr_store.STORE).is_dir()
+
+
+def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
+    monkeypatch.setattr("sweeps.sweep.TABLE", 3)
+    monkeypatch.setattr(campaign, "MARGIN", 10**18)
+    code, _, said = mmrjax("sweep", "--slopes", "0,5", "--out", "s")
+    assert code == 2 and "--out: the results would take" in said
+    assert not list(tmp_path.iterdir())
+
+
 def test_store_agrees_with_the_table_of_the_same_grid(mmrjax, tmp_path):
     grid = ["--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--surface", "asphalt", "--no-report"]
     assert (
         mmrjax("sweep", *grid, "--out", "table")[0]
         == mmrjax("sweep", *grid, "--zarr", "--export", "csv", "--out", "z")[0]
     )
-    with (tmp_path / "table" / "runs.csv").open() as one, (tmp_path / "z" / "runs.csv").open() as other:
-        table, exported = list(csv.DictReader(one)), list(csv.DictReader(other))
-    assert len(table) == len(exported) == 12 and set(exported[0]) < set(table[0])
-    for a, b in zip(table, exported, strict=True):
-        for key, value in b.items():
-            if key in ("configuration", "status"):
-                assert a[key] == value
-            else:
-                assert (a[key] == "") == (value == "")
-                assert not value or float(a[key]) == pytest.approx(float(value), rel=1e-8)
+    same_table(tmp_path / "table" / "runs.csv", tmp_path / "z" / "runs.csv")
 
 
 def test_exports_hold_the_store_row_by_row(sweep, tmp_path, whole):

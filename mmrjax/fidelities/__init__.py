@@ -55,8 +55,8 @@ class Facts:
         module: that holds its `FIDELITY`.
         description: one line.
         chunk: runs in one vmapped call.
-        chunk_stored: runs in one call of a sweep into a store, a file a chunk: many on a processor, and on an
-            accelerator; None: `chunk`.
+        chunk_stored: runs in one call where there are many, in a sweep into a store (a file a chunk) or from Python:
+            on a processor, and on an accelerator; None: `chunk`.
         effort: of a calibration through it.
         options: that it has.
         rollout: whether it integrates over time; searches through it then run one by one, and end sooner.
@@ -79,6 +79,10 @@ class Facts:
     resolves: tuple[str, ...] = ()
     slow: bool = False
     one_thread: bool = False
+
+    def at_once(self, accelerator: bool) -> int:
+        """Runs in one call where there are many, on processors or on an accelerator."""
+        return self.chunk if self.chunk_stored is None else self.chunk_stored[accelerator]
 
     def resolved(self, **given: float | None) -> dict[str, float]:
         """Every option by name: as given, else (absent or None) its default.

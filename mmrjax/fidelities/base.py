@@ -130,6 +130,8 @@ class Fidelity:
         settled: a batch of conditions to results, pure and traceable, with numbers wherever it can give some,
             whatever the status: what calibrations differentiate (forward).
         run: results of a batch, as sweeps make them.
+        outputs: those of a batch that are named alone [SI], of `outputs.table`, and `status`, which is quicker than
+            `run`; None where it would not be. A fidelity that has it has no options.
         histories: a batch from standstill, kept over time; None where there is no time.
         check: refuses, with ValueError, what some run of any batch could not bear; before the first is simulated.
         cautions: what to know before the settled readings of a calibrated robot are trusted, a sentence each.
@@ -138,6 +140,7 @@ class Fidelity:
     name: str
     settled: Callable[[Robot, Conditions], Result]
     run: Simulate
+    outputs: Callable[[Robot, Conditions, tuple[str, ...]], dict[str, Array]] | None = None
     histories: Simulate | None = None
     check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _nothing_to_refuse
     cautions: Callable[[Robot, Conditions], list[str]] = _nothing_to_say

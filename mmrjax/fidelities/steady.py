@@ -319,4 +319,4 @@ def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -
             )
 
 
-FIDELITY = Fidelity("steady", settled=_settled, run=_run, check=_check)
+FIDELITY = Fidelity("steady", settled=_settled, run=_run, outputs=steady_outputs, check=_check)
