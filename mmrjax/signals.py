@@ -17,8 +17,11 @@ GRAVITY = 9.80665  # [m/s²], standard gravity
 #: Outcomes of one member of a batch, in the order of their codes.
 STATUSES = (
     "converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips", "reverses", "rolls_back",
+    "cut_off",
 )  # fmt: skip
-CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, ROLLS_BACK = range(len(STATUSES))
+CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, ROLLS_BACK, CUT_OFF = range(
+    len(STATUSES)
+)
 
 #: Statuses of a run that ended as its conditions ask: `reverses` travels backward since its voltage is negative.
 DONE = (CONVERGED, REVERSES)

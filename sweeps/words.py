@@ -48,6 +48,11 @@ STATUSES: dict[str, Status] = {
         "gravity drives the robot, against its motors or without their voltage",
         "gravity drives the robot, against its motors or without their voltage: it travels downhill steadily",
     ),
+    "cut_off": Status(
+        "cut off",
+        "a cell below its cut-off voltage, where the battery switches itself off",
+        "the cells stayed below their cut-off voltage for longer than they may, with charge left",
+    ),
 }
 
 FLAGS = {
@@ -84,7 +89,6 @@ def settled(counted: Mapping[str, int]) -> int:
 
 #: What a requirement's quantity may come to beside a status of a run: in one line.
 OUTCOMES = {
-    "cut_off": "a cell below its cut-off voltage, where the battery switches itself off",
     "unbounded": "no value: the temperature never settles",
 }
 

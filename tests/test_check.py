@@ -21,8 +21,8 @@ from calibration.sizing import sheet
 from mmrjax import params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
-from mmrjax.requirements import CUT_OFF, OUTCOMES, QUANTITIES, Point, evaluate, packed, ratings
-from mmrjax.signals import CONVERGED, SLIDES, STALLED
+from mmrjax.requirements import CUT_OFF, QUANTITIES, Point, evaluate, packed, ratings
+from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
 from sweeps import cli
 from tests.pages import Tables, drawn, outside
 
@@ -239,7 +239,7 @@ def test_paper_file_states_where_each_aim_comes_from():
     asked = requirements.paper()
     assert all("Section" in r.source or "Table" in r.source or "sheet" in r.source for r in asked.each)
     assert {r.name for r in asked.each} >= {"speed_m_s", "slope_deg", "payload_kg", "endurance_min", "mass_kg"}
-    assert set(OUTCOMES) >= {"cut_off", "slides"} and len({q.name for q in QUANTITIES.values()}) == len(QUANTITIES)
+    assert set(STATUSES) >= {"cut_off", "slides"} and len({q.name for q in QUANTITIES.values()}) == len(QUANTITIES)
 
 
 REFUSED = {
