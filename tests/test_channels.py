@@ -258,7 +258,9 @@ def test_two_rigs_are_calibrated_side_by_side_as_alone(tmp_path):
         with (tmp_path / "found" / "rows.csv").open() as file:
             rows = list(csv.DictReader(file))
         for c in robot.channels:
-            np.testing.assert_allclose([float(r[c.column]) for r in rows], runs[c.column], rtol=1e-9)
+            np.testing.assert_allclose(
+                [float(r[c.column]) for r in rows], runs[c.column], rtol=1e-8
+            )  # as many digits as a file has
             assert np.abs(found.readings[c.name].sigma).max() < 4
         loss = found.parameters["brake.loss_coulomb"]
         assert abs(loss.value - 0.4) < 4 * loss.sd
