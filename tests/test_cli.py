@@ -56,6 +56,7 @@ def test_sweep_repeats_from_what_it_left(mmrjax, tmp_path):
     assert runs[0] == runs[1] == runs[2] and runs[0].count("\n") == 7
 
 
+@pytest.mark.slow
 def test_drive_sweep_agrees_with_steady(mmrjax, tmp_path):
     axes = ["--slopes", "0,10", "--payloads", "0,8", "--voltages", "15,33", "--no-report", *CLIMBS]
     assert mmrjax("sweep", *axes, "--out", "steady")[0] == 0
@@ -451,7 +452,8 @@ def test_progress_is_on_stderr_and_stdout_ends_with_the_path(tmp_path):
 def test_help_is_quick_and_imports_no_jax():
     def best(arguments):
         spent = []
-        for _ in range(6):  # processor time: what the tests beside this one take does not count
+        while len(spent) < 6 and min(spent, default=1.0) >= 0.5:
+            # processor time: what the tests beside this one take counts little
             start = os.times()
             done = subprocess.run([*MMRJAX, *arguments], capture_output=True, text=True, check=True)
             end = os.times()
@@ -522,6 +524,7 @@ def test_doctor_finds_this_installation_healthy(mmrjax):
     assert "compilation cache" in out and ("programs" in out or "off" in out)
 
 
+@pytest.mark.slow
 def test_cache_is_neither_read_nor_written_when_it_is_not_wanted(tmp_path):
     here = {**os.environ, "MMRJAX_CACHE": str(tmp_path / "cache"), "JAX_PLATFORMS": "cpu"}
     for name, option in (("without", ["--no-cache"]), ("with", [])):
@@ -640,6 +643,7 @@ from sweeps.cli import main; main()
 """
 
 
+@pytest.mark.slow
 def test_a_fourth_channel_is_one_row(tmp_path):
     """Appended to the table before the command line is imported: every command has it, and no code knew."""
     (tmp_path / "runs.csv").write_text(

@@ -58,6 +58,7 @@ def motion_of(robot, run, k):
     return Motion(q, v, jnp.asarray(1.5 + draw.random()), jnp.asarray(20.0), memory)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RUNS))
 @pytest.mark.parametrize("k", range(3))
 def test_slopes_of_the_sums_are_their_derivatives(recessed, name, k):
@@ -153,6 +154,7 @@ def backward():
     return eqx.filter_jit(eqx.filter_grad(lambda at: _some(*_stepped(*at, advance))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RUNS))
 @pytest.mark.parametrize("k", range(3))
 def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, backward, name, k):
@@ -166,6 +168,7 @@ def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, 
     assert sum(float(jnp.sum(a * b)) for a, b in pairs) == pytest.approx(float(_some(*ours)), rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["running_gear.contact_stiffness", "6T2A.track.guide_friction"])
 def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name):
     """What else is constant has no derivative to begin with."""
@@ -185,6 +188,7 @@ def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name)
     assert max(float(jnp.abs(x).max()) for x in jax.tree.leaves(theirs[0])) > 0
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_what_is_computed(recessed):
     run = Conditions(**RUNS["tracked"])
     motion = motion_of(recessed, run, 1)

@@ -115,7 +115,7 @@ def _from_the_middle(robot, conditions, options, progress=None):
         (knows_itself, "steady", {"histories": _from_the_middle}),
         (settles_traceably, "steady", {"settled": _one_row}),
         (runs_batches, "steady", {"run": _no_readings}),
-        (keeps_histories, "drive", {"histories": _from_the_middle}),
+        pytest.param(keeps_histories, "drive", {"histories": _from_the_middle}, marks=pytest.mark.slow),
     ],
     ids=["knows_itself", "settles_traceably", "runs_batches", "keeps_histories"],
 )

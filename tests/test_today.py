@@ -275,6 +275,7 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     assert up.ended[0] > 1.2 * float(flat.total_current)
 
 
+@pytest.mark.slow
 def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     asked = ("simulate", "--battery", "--model", "drive", "--discharge", "2190", "--duration")
     code, out, _ = mmrjax(*asked, "60", "--out", "a")
@@ -373,6 +374,7 @@ def test_rated_limits_stand_in_the_report():
     assert shown["voltage of a cell, charged"]["limit"] == "4.20 V"
 
 
+@pytest.mark.slow
 def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(mmrjax, monkeypatch):
     from sweeps import render
 

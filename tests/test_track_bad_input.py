@@ -169,6 +169,7 @@ def changed(robot, values):
     return params.replace(robot, {name: jnp.asarray(value) for name, value in values.items()})
 
 
+@pytest.mark.slow
 def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
     """Set S at 33 V on 15 deg leaves the ground for a twentieth of the time; at 15 V it shakes and stays on it."""
     runs = Conditions(
@@ -182,6 +183,7 @@ def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
     assert np.mean(window[1] < 0.01 * window[1].mean()) > 0.01
 
 
+@pytest.mark.slow
 def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
     """A payload 0.66 m up: gravity alone would not turn it over on 20 deg, its start does; at 15 V it climbs."""
     high = {
