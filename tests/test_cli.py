@@ -484,7 +484,15 @@ def test_track_model_runs_xla_on_one_thread_unless_told_otherwise(monkeypatch, g
     assert os.environ.get("XLA_FLAGS") == (ours if given is None else given)
 
 
-def test_flag_is_set_before_jax_is_imported(tmp_path):
+@pytest.mark.parametrize(
+    ("arguments", "flag"),
+    [
+        (["sweep", "--config", "grid.toml"], "--xla_cpu_multi_thread_eigen=false"),
+        pytest.param(["compare", "--model", "track"], "--xla_cpu_multi_thread_eigen=false", marks=pytest.mark.slow),
+        pytest.param(["sweep"], "None", marks=pytest.mark.slow),
+    ],
+)
+def test_flag_is_set_before_jax_is_imported(tmp_path, arguments, flag):
     """In a process of its own, up to where the options are checked and a folder refused."""
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "thesis.txt").write_text("years of work")
@@ -498,14 +506,9 @@ def test_flag_is_set_before_jax_is_imported(tmp_path):
         "from sweeps.cli import main; main()"
     )
     bare = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"} | {"JAX_PLATFORMS": "cpu"}
-    for arguments, flag in (
-        (["sweep", "--config", "grid.toml"], "--xla_cpu_multi_thread_eigen=false"),
-        (["compare", "--model", "track"], "--xla_cpu_multi_thread_eigen=false"),
-        (["sweep"], "None"),
-    ):
-        words = [sys.executable, "-c", probe, *arguments, "--out", "taken"]
-        done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, env=bare)
-        assert done.returncode == 2 and done.stdout.split() == [flag], done.stderr
+    words = [sys.executable, "-c", probe, *arguments, "--out", "taken"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, env=bare)
+    assert done.returncode == 2 and done.stdout.split() == [flag], done.stderr
 
 
 def test_help_shows_what_an_option_is_when_it_is_not_given(monkeypatch, capsys):

@@ -217,6 +217,7 @@ def test_unknown_fidelity_lists_those_there_are():
             ask("fast")
 
 
+@pytest.mark.slow
 def test_check_refuses_a_step_that_a_run_cannot_bear(robot):
     track = fidelities.get("track")
     stiff = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e9)})

@@ -104,7 +104,13 @@ DOWNHILL = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("model", [(), ("--model", "drive", "--duration", "20")], ids=["steady", "drive"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param((), id="steady"),
+        pytest.param(("--model", "drive", "--duration", "20"), id="drive", marks=pytest.mark.slow),
+    ],
+)
 def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
     code, out, _ = mmrjax(*DOWNHILL, *model, "--out", "a")
     assert code == 0
