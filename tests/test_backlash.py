@@ -47,6 +47,7 @@ def test_a_little_backlash_is_a_rigid_gear_once_things_have_settled():
     np.testing.assert_allclose(np.asarray(tight.current)[ends], np.asarray(rigid.current)[ends], rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_steady_travel_knows_no_backlash():
     conditions = Conditions(voltage=np.array([6.0, -6.0]))
     run = drive_batch(bench(0.05), conditions, jnp.asarray([0.0, 3.0])).result

@@ -115,7 +115,7 @@ def _from_the_middle(robot, conditions, options, progress=None):
         (knows_itself, "steady", {"histories": _from_the_middle}),
         (settles_traceably, "steady", {"settled": _one_row}),
         (runs_batches, "steady", {"run": _no_readings}),
-        (keeps_histories, "drive", {"histories": _from_the_middle}),
+        pytest.param(keeps_histories, "drive", {"histories": _from_the_middle}, marks=pytest.mark.slow),
     ],
     ids=["knows_itself", "settles_traceably", "runs_batches", "keeps_histories"],
 )
@@ -217,6 +217,7 @@ def test_unknown_fidelity_lists_those_there_are():
             ask("fast")
 
 
+@pytest.mark.slow
 def test_check_refuses_a_step_that_a_run_cannot_bear(robot):
     track = fidelities.get("track")
     stiff = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e9)})

@@ -247,6 +247,11 @@ def test_grad_and_forward_mode_go_through(robot):
     central = (current(x + h, robot, run) - current(x - h, robot, run)) / (2 * h)
     np.testing.assert_allclose(jax.grad(current)(x, robot, run), central, rtol=1e-6)
     np.testing.assert_allclose(jax.jacfwd(current)(x, robot, run), central, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_forward_mode_goes_through_a_run_over_time(robot):
+    run, x, h = mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=5.0), jnp.asarray(0.611), 1e-5
     short = dict(model="drive", duration=0.01, history=False)
     driven = (current(x + h, robot, run, **short) - current(x - h, robot, run, **short)) / (2 * h)
     np.testing.assert_allclose(jax.jacfwd(lambda r: current(r, robot, run, **short))(x), driven, rtol=1e-3)

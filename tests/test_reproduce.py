@@ -82,6 +82,7 @@ def test_page_has_every_figure_and_refers_to_nothing_outside(paper):
     assert (folder / "report.html").stat().st_size < 5e6
 
 
+@pytest.mark.slow
 def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced, tmp_path, capsys):
     (tmp_path / "crawler.toml").write_text('configurations = ["crawler"]\n[crawler]\nlike = "6T2A"\n')
     code, folder = reproduced("--robot", tmp_path / "crawler.toml")

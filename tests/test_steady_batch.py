@@ -73,7 +73,7 @@ def test_comparison_with_numpy_can_fail(robot):
 # --- outputs that are asked for ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("effects", [False, True])
+@pytest.mark.parametrize("effects", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_steady_outputs_are_those_of_steady_batch(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
     whole = steady_batch(robot, runs)
@@ -121,7 +121,7 @@ def test_steady_outputs_compile_once_for_other_numbers(robot, compilations):
     assert not compilations
 
 
-@pytest.mark.parametrize("size", [96, 97])
+@pytest.mark.parametrize("size", [96, pytest.param(97, marks=pytest.mark.slow)])
 def test_steady_blocks_change_no_number(robot, monkeypatch, size):
     """97 points have no block that divides them, and go together."""
     runs = Conditions(*points(size))
@@ -144,7 +144,7 @@ PARAMETERS = ("motor.resistance", "6T2A.mass", "gearbox.ratio", "4W2T.ground.fri
 WANTED = ("total_current", "speed", "efficiency_chassis")
 
 
-@pytest.mark.parametrize("effects", [False, True])
+@pytest.mark.parametrize("effects", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_steady_derivatives_are_those_of_jacfwd(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
     at = jnp.asarray([p.value for name in PARAMETERS for p in params.walk(robot) if p.name == name])

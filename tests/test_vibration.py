@@ -130,6 +130,7 @@ def shaken():
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gear", GEARS)
 def test_slip_of_track_model_runs_follows_from_their_ripple(shaken, gear):
     slip, law, _, normal = shaken[gear]
@@ -137,6 +138,7 @@ def test_slip_of_track_model_runs_follows_from_their_ripple(shaken, gear):
     assert (normal.max() > 0.3) == (gear != "flush")
 
 
+@pytest.mark.slow
 def test_fig_7_alone_misses_the_slip_of_the_gear_that_shakes(shaken):
     slip, law, alone, _ = shaken["recess 0.35 mm, soft"]
     assert np.sqrt(np.mean((law - slip) ** 2)) < 0.5 * np.sqrt(np.mean((alone - slip) ** 2))
