@@ -11,7 +11,7 @@ from calibration.inference import multistart, noise, observers, priors, scans
 from calibration.inference.calibrate import calibrate
 from calibration.inference.optimizers import evaluated
 from calibration.inference.scans import Scan
-from mmrjax import channels, params
+from mmrjax import params
 
 OPTIONS = {"model": "drive", "starts": 1, "blocks": False, "profiles": False}
 TRUTH = 0.0312
@@ -28,8 +28,7 @@ def coarse(tmp_path_factory):
     truth = params.replace(robot, {"rig.delay": TRUTH, "bench.loss_coulomb": 0.24})
     t = np.arange(0, 0.32, 0.02)
     columns = {"time_s": t, "supply_voltage_V": np.where(t < 0.16, 12.0, 6.0)}
-    with channels.panel(robot.rig.channels):
-        runs = history(folder, robot, truth, columns, [0.02], 1)
+    runs = history(folder, robot, truth, columns, [0.02], 1)
     return robot, runs
 
 
@@ -42,14 +41,11 @@ def posed(robot, runs):
 def test_a_search_finds_a_delay_between_coarse_samples(coarse):
     """From the prior mean, 1.5 prior sds away and behind two cliffs."""
     robot, runs = coarse
-    with channels.panel(robot.rig.channels):
-        problem, kind = posed(robot, runs), observers.kind(runs)
-        known = noise.of(runs, kind.sizes(runs))
-        starts = problem.observe.starts(problem, np.random.default_rng(0), 1)
-        found = multistart.search_one_by_one(
-            problem, known, starts, multistart.first_shares(known), lambda said: None
-        )
-        low, high = (0.02 * z for z in scans.profiles(problem, found.best.z)[1].interval())
+    problem, kind = posed(robot, runs), observers.kind(runs)
+    known = noise.of(runs, kind.sizes(runs))
+    starts = problem.observe.starts(problem, np.random.default_rng(0), 1)
+    found = multistart.search_one_by_one(problem, known, starts, multistart.first_shares(known), lambda said: None)
+    low, high = (0.02 * z for z in scans.profiles(problem, found.best.z)[1].interval())
     assert found.best.converged
     assert low <= TRUTH <= high and 0.02 < low < high < 0.04
     assert abs(0.02 * found.best.z[1] - TRUTH) < 4 * 0.02 * found.best.sd[1] < 0.01
@@ -58,8 +54,7 @@ def test_a_search_finds_a_delay_between_coarse_samples(coarse):
 @pytest.mark.slow
 def test_a_calibration_states_the_delay_that_its_profile_shows(coarse):
     robot, runs = coarse
-    with channels.panel(robot.rig.channels):
-        found = calibrate(runs, robot, free=("bench.loss_coulomb", "rig.delay"), **OPTIONS)
+    found = calibrate(runs, robot, free=("bench.loss_coulomb", "rig.delay"), **OPTIONS)
     delay = found.parameters["rig.delay"]
     low, high = delay.interval
     assert found.converged
@@ -71,23 +66,21 @@ def test_a_calibration_states_the_delay_that_its_profile_shows(coarse):
 def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
     """A delay shifts one run: where the others are held, the scan's objective is that of a run of its own."""
     robot, runs = coarse
-    with channels.panel(robot.rig.channels):
-        problem = posed(robot, runs)
-        only = dataclasses.replace(problem, coordinates=priors.coordinates(robot, ("rig.delay",)))
-        only = dataclasses.replace(only, data=dataclasses.replace(only.data, centre=only.data.centre[:1]))
-        at = np.array([-0.5, 0.3, 1.1, 1.6])
-        cost, others = only.observe.scan(only, np.zeros(1), only.data, 0, at)
-        alone = [0.5 * np.sum(np.asarray(evaluated(only, z, only.data)) ** 2) for z in at[:, None]]
+    problem = posed(robot, runs)
+    only = dataclasses.replace(problem, coordinates=priors.coordinates(robot, ("rig.delay",)))
+    only = dataclasses.replace(only, data=dataclasses.replace(only.data, centre=only.data.centre[:1]))
+    at = np.array([-0.5, 0.3, 1.1, 1.6])
+    cost, others = only.observe.scan(only, np.zeros(1), only.data, 0, at)
+    alone = [0.5 * np.sum(np.asarray(evaluated(only, z, only.data)) ** 2) for z in at[:, None]]
     np.testing.assert_allclose(cost, alone, rtol=1e-9)
     np.testing.assert_array_equal(np.asarray(others)[:, 0], at)
 
 
 def test_a_scan_is_as_fine_as_the_rise_of_a_current(coarse):
     robot, runs = coarse
-    with channels.panel(robot.rig.channels):
-        problem = posed(robot, runs)
-        assert scans.scanned(problem) == (1,)
-        count = problem.observe.scan_points(problem, 1)
+    problem = posed(robot, runs)
+    assert scans.scanned(problem) == (1,)
+    count = problem.observe.scan_points(problem, 1)
     assert 2 * scans.RANGE * 0.02 / count <= 0.5 * 1e-3 / 3.0
 
 
