@@ -9,6 +9,7 @@ import math
 import sys
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jsonschema
@@ -41,28 +42,36 @@ def read(text):
     return requirements.read(text, "r.toml")
 
 
-#: Those of the paper's aims that are computed without a search in the search.
-FEW = ("schema", "speed_m_s", "speed_end_of_charge_m_s", "mass_kg", "winding_C")
-
-
-def few() -> str:
-    """The paper's file with few of its aims, in the same envelope."""
-    head, envelope, tail = (
-        (Path(requirements.__file__).parent / "aims" / "paper.toml").read_text("utf-8").partition("[envelope]")
-    )
-    lines = [line for line in head.splitlines() if line.startswith(FEW)]
+def some_of_the_papers(*kept: str) -> str:
+    """The paper's file with some of its aims, in the same envelope; of the endurances that of standing still."""
+    text = (Path(requirements.__file__).parent / "aims" / "paper.toml").read_text("utf-8")
+    head, envelope, tail = text.partition("[envelope]")
+    lines = [line for line in head.splitlines() if line.partition(" ")[0] in ("schema", *kept)]
     (standing,) = (line.strip() for line in head.splitlines() if 'duty = "standing"' in line)
-    return "\n".join([*lines, f"endurance_min = [{standing}]", envelope + tail])
+    lines += [f"endurance_min = [{standing}]"] if "endurance_min" in kept else []
+    return "\n".join([*lines, envelope + tail])
 
 
 @pytest.fixture(scope="module", params=["few", pytest.param("every", marks=pytest.mark.slow)])
 def folder(request, tmp_path_factory):
-    """What the command leaves of the paper's robot against the paper's aims."""
+    """What the command leaves of the paper's robot against the paper's aims, or few of them."""
     path = tmp_path_factory.mktemp("runs")
-    file = path / "few.toml"
-    file.write_text(few(), encoding="utf-8")
-    assert command(["check", *([file] if request.param == "few" else []), "--out", path / "check"]) == 3
+    (path / "few.toml").write_text(some_of_the_papers("speed_m_s", "mass_kg"), encoding="utf-8")
+    assert command(["check", *([path / "few.toml"] if request.param == "few" else []), "--out", path / "check"]) == 3
     return path / "check"
+
+
+@pytest.fixture(scope="module")
+def values(folder):
+    """The result of more aims; where the folder lacks them, without what would change them."""
+    found = json.loads((folder / "result.json").read_text())
+    if "winding_C" in {r["name"] for r in found["requirements"]}:
+        return found
+    path = folder.with_name("values")
+    aims = some_of_the_papers("speed_m_s", "speed_end_of_charge_m_s", "mass_kg", "endurance_min", "winding_C")
+    path.with_suffix(".toml").write_text(aims, encoding="utf-8")
+    assert command(["check", path.with_suffix(".toml"), "--no-changes", "--no-report", "--out", path]) == 3
+    return json.loads((path / "result.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -79,9 +88,9 @@ def test_result_is_as_its_schema_says(result):
     assert result["met"] + result["missed"] == len(result["requirements"]) and result["missed"] > 0
 
 
-def test_papers_robot_misses_the_papers_aims(result):
+def test_papers_robot_misses_the_papers_aims(values):
     """0.95 m/s on a full battery; 2200 mAh with 1.5 A for other consumers last 88 minutes standing still."""
-    speed, standing = row(result, "speed_m_s"), row(result, "endurance_min")
+    speed, standing = row(values, "speed_m_s"), row(values, "endurance_min")
     assert not speed["met"] and speed["value"] == pytest.approx(0.95, abs=0.005)
     assert speed["at"] == {
         "configuration": "6T2A", "surface": "lacquered_wood", "payload_kg": 0.0, "slope_deg": 0.0,
@@ -89,23 +98,23 @@ def test_papers_robot_misses_the_papers_aims(result):
     }  # fmt: skip
     assert not standing["met"] and standing["value"] == pytest.approx(2.2 / 1.5 * 60, rel=1e-9)
     assert standing["margin"] == pytest.approx(88 - 180, rel=1e-9) and standing["at"]["duty"] == "standing"
-    assert row(result, "mass_kg")["value"] == pytest.approx(13.1) and row(result, "mass_kg")["met"]
-    for r in result["requirements"]:
+    assert row(values, "mass_kg")["value"] == pytest.approx(13.1) and row(values, "mass_kg")["met"]
+    for r in values["requirements"]:
         assert r["met"] == (r["margin"] is not None and r["margin"] >= 0)
         if r["value"] is not None:
             assert r["margin"] == pytest.approx((r["value"] - r["required"]) * (1 if r["sense"] == "least" else -1))
 
 
-def test_speed_is_that_of_steady(result, robot):
+def test_speed_is_that_of_steady(values, robot):
     for name, charge in (("speed_m_s", 1.0), ("speed_end_of_charge_m_s", 0.0)):
         discharge = float(robot.battery.capacity) * (1 - charge) * (1 - 1e-9)
         run = steady_batch(robot, Conditions(0, battery=1.0, discharge=[discharge]))
-        assert row(result, name)["value"] == pytest.approx(float(run.speed[0]), rel=1e-7)
+        assert row(values, name)["value"] == pytest.approx(float(run.speed[0]), rel=1e-7)
 
 
-def test_worst_corner_is_the_worst_of_a_finer_grid(result, robot):
+def test_worst_corner_is_the_worst_of_a_finer_grid(values, robot):
     """The hottest winding of a grid four times finer is the sheet's."""
-    found = row(result, "winding_C")
+    found = row(values, "winding_C")
     capacity = float(robot.battery.capacity)
     axes = np.linspace(0, 8, 9), np.linspace(0, 10, 17), np.linspace(0, capacity * (1 - 1e-9), 17)
     payload, slope, discharge = (x.ravel() for x in np.meshgrid(*axes))
@@ -114,9 +123,9 @@ def test_worst_corner_is_the_worst_of_a_finer_grid(result, robot):
     assert found["at"]["payload_kg"] == 8 and found["at"]["slope_deg"] == 10
 
 
-def test_every_change_meets_its_requirement_and_breaks_what_it_says(result, robot):
+def test_every_change_meets_its_requirement_and_breaks_what_it_says(folder, result, robot):
     """Each stated value, put into the robot as `--set` does, and checked anew; and half of the change does not."""
-    asked, tried = requirements.load(None), 0
+    asked, tried = requirements.load(folder / "requirements.toml"), 0
     names = [r["name"] for r in result["requirements"]]
     for k, r in enumerate(result["requirements"]):
         assert bool(r["change"]) <= (not r["met"])
@@ -133,7 +142,7 @@ def test_every_change_meets_its_requirement_and_breaks_what_it_says(result, robo
             (short,) = sheet.check(robot_file.change(robot, {c["parameter"]: near}, "test"), alone, changes=False)
             assert not short.met, (r["name"], c, near)
             tried += 1
-    assert tried > 8
+    assert tried > (8 if len(names) > 5 else 1)
 
 
 def test_change_follows_the_derivative(result):
@@ -197,7 +206,7 @@ def test_cells_as_a_number_are_the_batterys_cells(robot):
 def test_endurance_is_the_integral_over_the_charge(robot):
     """Against the trapezoidal rule over 2000 operating points."""
     at = point(share=0.5)
-    found = evaluate(robot, at, ratings(robot), "endurance_min")
+    found = eqx.filter_jit(evaluate)(robot, at, ratings(robot), "endurance_min")
     charge = np.linspace(0, float(robot.battery.capacity) * (1 - 1e-9), 2001)
     runs = steady_batch(robot, Conditions(0, battery=1.0, discharge=charge))
     flowing = 0.5 * np.asarray(runs.total_current) + 1.5

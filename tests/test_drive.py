@@ -274,6 +274,7 @@ def test_drive_statuses(small):
     assert names(short.result)[0] == "not_settled"
 
 
+@pytest.mark.slow
 def test_drive_out_of_steps_has_failed(robot):
     run = drive_batch(robot, Conditions(voltage=[24.0]), jnp.linspace(0.0, 1.0, 3), 1e-6, 5)
     assert names(run.result) == ["failed"]

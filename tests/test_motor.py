@@ -79,7 +79,8 @@ def test_temperatures_in_closed_form_match_scipy(current):
 
 def test_permissible_time_is_when_the_limit_is_reached():
     motor = Motor()
-    permissible, slope = jax.jit(motor.time_permissible), jax.jit(jax.grad(motor.time_permissible))
+    permissible = jax.jit(lambda current: motor.time_permissible(current))
+    slope = jax.jit(jax.grad(lambda current: motor.time_permissible(current)))
     for current in (4.5, 8.0, 30.0):
         time = float(permissible(current))
         assert float(motor.temperatures_after(current, time, 25.0, 25.0)[0]) == pytest.approx(125.0, rel=1e-9)

@@ -77,11 +77,11 @@ def test_a_run_settles_where_steady_says():
 
 
 def test_friction_holds_a_shaft_that_its_motors_cannot_turn():
-    robot, conditions = bench(loss_coulomb=5.0), Conditions(voltage=np.array([1.0, -1.0]))
-    run = drive_batch(robot, conditions, jnp.asarray([0.0, 1.0])).result
-    assert [STATUSES[s] for s in np.asarray(run.status)] == ["stalled"] * 2
+    robot, conditions = bench(loss_coulomb=5.0), Conditions(voltage=np.array([1.0, -1.0, 0.5]))
+    run = drive_batch(robot, conditions, jnp.asarray([0.0, 0.5, 1.0])).result  # in the shapes of the test above
+    assert [STATUSES[s] for s in np.asarray(run.status)] == ["stalled"] * 3
     np.testing.assert_array_equal(run.motor_speed, 0.0)
-    np.testing.assert_allclose(run.motor_current, [1 / 3, -1 / 3], rtol=1e-6)
+    np.testing.assert_allclose(run.motor_current, [1 / 3, -1 / 3, 1 / 6], rtol=1e-6)
 
 
 def test_derivatives_at_an_imposed_speed_are_those_of_the_formula():

@@ -319,6 +319,7 @@ payload = [0, 8]
 """
 
 
+@pytest.mark.slow
 def test_sweep_over_a_profile_stores_the_missions_numbers(mmrjax, done, capsys, monkeypatch):
     import xarray as xr
 

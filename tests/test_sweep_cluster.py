@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from test_cli import MMRJAX
 from test_effect_file import GOOD
@@ -18,7 +19,7 @@ from test_sweep_store import CONFIG, arrays
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import robots
-from sweeps import axes, campaign, cluster, identity
+from sweeps import axes, campaign, cluster, identity, scale
 from sweeps.config_campaign import Campaign
 
 pytest.importorskip("distributed")
@@ -77,6 +78,7 @@ def command(folder, *options, timeout=300):
     return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=timeout)
 
 
+@pytest.mark.slow
 def test_sweep_on_two_workers_leaves_the_same_store(tmp_path, two_workers):
     (tmp_path / "plan.toml").write_text(CONFIG.replace("chunk = 40", "chunk = 5"))
     there = command(tmp_path, "--scheduler", two_workers.address, "--out", "there")
@@ -143,6 +145,7 @@ def test_scheduler_without_workers_is_refused(tmp_path, monkeypatch):
         alone.close()
 
 
+@pytest.mark.slow
 def test_worker_with_another_program_is_refused(two_workers, monkeypatch):
     honest = identity._code()
     changed = tuple((f, "0" * 16 if f == "mmrjax/motor.py" else h) for f, h in honest)
@@ -169,6 +172,7 @@ def connect_when_up(address):
             return
 
 
+@pytest.mark.slow
 def test_users_own_effects_travel_to_the_workers(tmp_path, two_workers):
     (tmp_path / "mine.py").write_text(GOOD)
     (tmp_path / "sealed.toml").write_text("[effects.seal_drag]\namplitude = 0.05\n")
@@ -188,6 +192,7 @@ def job():
     return campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of dask, about what it loses here
 @pytest.mark.parametrize(
     "victim, message", [("workers", "no worker has been there for 1 s; start one"), ("scheduler", "it has gone away")]
@@ -223,6 +228,40 @@ def test_chunk_that_kills_its_workers_ends_the_sweep(tmp_path, job, monkeypatch)
         restarting.close()
 
 
+class Completed(list):
+    """As dask's `as_completed`, of futures that are finished as they come."""
+
+    def __init__(self, futures=(), loop=None):
+        super().__init__(futures)
+
+    add, is_empty = list.append, lambda self: not self
+
+
+def test_chunks_that_workers_compute_are_those_of_this_process(job, monkeypatch):
+    """What travels, computed where it arrives, in a process that has not yet seen the job; here this one."""
+    import distributed
+
+    class Client:
+        loop = None
+
+        def submit(self, work, *arguments, key, **_):
+            result = work(*arguments)
+            return SimpleNamespace(key=key, result=lambda timeout=None: result, release=lambda: None)
+
+    monkeypatch.setattr(distributed, "as_completed", Completed)
+    monkeypatch.setattr(cluster.Pool, "_workers", lambda _: 1)
+    monkeypatch.setattr(cluster.Pool, "_next", lambda _, under_way: under_way.pop(0))
+    compiled, found = scale.Compiled(job), {}
+    for piece in cluster.Pool(Client(), cluster.introduce()[1]).produce(job, range(3)):
+        found[piece.chunk] = piece.arrays
+    assert set(found) == {0, 1, 2}
+    for chunk, arrays_there in found.items():
+        here = compiled(compiled.points(chunk))
+        assert set(arrays_there) == set(here)
+        for name, values in here.items():
+            np.testing.assert_array_equal(np.asarray(arrays_there[name]), np.asarray(values))
+
+
 def test_workers_that_come_later_get_chunks(job, monkeypatch):
     import distributed
 
@@ -232,12 +271,6 @@ def test_workers_that_come_later_get_chunks(job, monkeypatch):
         def submit(self, *_, key, **__):
             self.under_way += 1
             return SimpleNamespace(key=key, result=dict, release=lambda: None)
-
-    class Completed(list):
-        def __init__(self, futures=(), loop=None):
-            super().__init__(futures)
-
-        add, is_empty = list.append, lambda self: not self
 
     client, workers, seen = Client(), [1], []
 

@@ -252,6 +252,7 @@ def climb():
     return robot, api.simulate(robot, api.Conditions(0, [33.0, -33.0], [10.0, -10.0]), "drive", duration=5.0)
 
 
+@pytest.mark.slow
 def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     _, found = climb
     fine = drive_batch(robots.nominal(), api.Conditions(0, [33.0], 10.0), np.linspace(0.0, 2e-3, 2001))
