@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import fidelities, missions, params
+from mmrjax import fidelities, missions, params, power
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
@@ -79,6 +80,7 @@ def simulate(
     conditions = _resolved(robot, conditions)
     total_mass = _total_mass(robot, conditions)
     _check_conditions(conditions, total_mass)
+    _check_battery(robot, conditions)
     shape, flat = conditions.shape, jax.tree.map(jnp.ravel, conditions)
     if profile is not None:
         return _missions(robot, conditions, total_mass, flat, profile, start, history)
@@ -86,6 +88,19 @@ def simulate(
     run = jax.tree.map(lambda x: jnp.reshape(x, shape + x.shape[1:]), run)
     names = robot.configurations.names
     return Results(conditions, total_mass, run.result, run.columns, run.history, names, model)
+
+
+def _check_battery(robot: Robot, conditions: Conditions) -> None:
+    """Refuse a cut-off at which no cell gives current, and warn of one that hardly acts, where a run is on the
+    battery."""
+    if _traced((robot.battery, conditions.battery)) or not (np.asarray(conditions.battery) > 0.5).any():
+        return
+    if any(np.ndim(x) for x in jax.tree.leaves(robot.battery)):  # a batch of robots
+        return
+    if refused := power.cutoff_refused(robot.battery):
+        raise UsageError(f"battery.voltage_cutoff: {refused}")
+    if remark := power.cutoff_remark(robot.battery):
+        warnings.warn(f"battery.voltage_cutoff: {remark}", stacklevel=3)
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
@@ -110,6 +125,15 @@ def _missions(
     history: bool,
 ) -> Results:
     """Every run of a batch over the same profile."""
+    if not _traced((robot, flat, profile, start)):
+        cell = missions.begins_below(robot, flat, profile, start)
+        if np.isfinite(cell).any():
+            k = int(np.argmax(np.isfinite(cell)))
+            at = f"[{k}]" if len(cell) > 1 else ""
+            raise UsageError(
+                f"discharge{at}: got {float(np.asarray(flat.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
+                f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
+            )
     found = missions.batch(robot, flat, profile, start, history=history)
     further = missions.columns(missions.numbers(robot, flat, found))
     course = None
