@@ -156,6 +156,20 @@ def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, A
     }
 
 
+def begins_below(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None) -> np.ndarray:
+    """Voltage of a cell as missions on the battery begin [V], where it is below the cut-off, else NaN; shape (runs,).
+
+    Not traceable. The motors draw what they do at the start; at rest that is nothing.
+    """
+    battery, first = robot.battery, jax.tree.map(lambda x: x[..., 0], profile)
+    other = battery.current_other if first.current_other is None else first.current_other
+    duty = conditions.duty if first.duty is None else first.duty
+    motors = robot.sides * (Start() if start is None else start).current * duty
+    cell = battery.voltage_no_load(conditions.discharge) - (motors + other) * battery.resistance
+    below = (conditions.battery > 0.5) & (cell < battery.voltage_cutoff)
+    return np.asarray(jnp.where(below, cell, jnp.nan))
+
+
 def columns(found: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers [SI] by the columns of tables, in the columns' units."""
     return {output.column: found[output.name] / output.factor for output in OUTPUTS if output.name in found}

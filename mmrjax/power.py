@@ -96,9 +96,33 @@ class Battery(eqx.Module):
         """Voltage of the whole battery U_b [V], eqs. (9), (12), for the motors' `total_current` [A]."""
         return self.cells * self.voltage_cell(total_current, discharge)
 
+    @property
+    def voltage_empty(self) -> Scalar:
+        """No-load voltage of an empty cell [V]."""
+        return self.voltage_no_load(self.capacity)
+
     def empty(self, discharge: Scalar) -> Bool[Array, "..."]:
         """Whether the charge taken [C] has reached the capacity; the parabola (13) turns up past it."""
         return jnp.asarray(discharge >= self.capacity)
+
+
+def cutoff_refused(battery: Battery) -> str | None:
+    """Why no mission can begin on a battery [a sentence without its place]; None: one can. Not traceable."""
+    full = float(battery.voltage_full)
+    if battery.voltage_cutoff < full:
+        return None
+    return (
+        f"got {battery.voltage_cutoff:g} V; expected less than voltage_full, {full:g} V: a full cell would be cut off"
+    )
+
+
+def cutoff_remark(battery: Battery) -> str | None:
+    """What to know of a cut-off that an empty cell is above without load; None of the assumed one. Not traceable."""
+    cutoff, empty, resistance = battery.voltage_cutoff, float(battery.voltage_empty), float(battery.resistance)
+    if cutoff >= empty or cutoff == Battery.voltage_cutoff:
+        return None
+    acts = f"it acts only beyond {(empty - cutoff) / resistance:.3g} A" if resistance > 0 else "it never acts"
+    return f"{cutoff:g} V is below the {empty:.3g} V of an empty cell without load: {acts}"
 
 
 def voltage_source(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mmrjax import channels, fidelities, missions, params
+from mmrjax import channels, fidelities, missions, params, power
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions, indices
 from mmrjax.errors import UsageError, choices
@@ -83,6 +84,7 @@ def simulate(
     _check_robot(robot)
     conditions = _resolved(robot, conditions)
     _check_conditions(conditions)
+    _check_battery(robot, conditions)
     if profile is not None:
         return _missions(robot, conditions, profile, start, history)
     fidelity, traced = fidelities.get(model), _traced((robot, conditions))
@@ -101,6 +103,19 @@ def simulate(
     )  # fmt: skip
 
 
+def _check_battery(robot: Robot, conditions: Conditions) -> None:
+    """Refuse a cut-off at which no cell gives current, and warn of one that hardly acts, where a run is on the
+    battery."""
+    if _traced((robot.battery, conditions.battery)) or not (np.asarray(conditions.battery) > 0.5).any():
+        return
+    if any(np.ndim(x) for x in jax.tree.leaves(robot.battery)):  # a batch of robots
+        return
+    if refused := power.cutoff_refused(robot.battery):
+        raise UsageError(f"battery.voltage_cutoff: {refused}")
+    if remark := power.cutoff_remark(robot.battery):
+        warnings.warn(f"battery.voltage_cutoff: {remark}", stacklevel=3)
+
+
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
     if profile is None:
         raise UsageError("start: got one without a profile; expected profile=mmrjax.profile.profile(...) beside it")
@@ -116,6 +131,15 @@ def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]
 def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool) -> Results:
     """Every run of a batch over the same profile."""
     flat = _flat(conditions)
+    if not _traced((robot, flat, profile, start)):
+        cell = missions.begins_below(robot, flat, profile, start)
+        if np.isfinite(cell).any():
+            k = int(np.argmax(np.isfinite(cell)))
+            at = f"[{k}]" if len(cell) > 1 else ""
+            raise UsageError(
+                f"discharge{at}: got {float(np.asarray(flat.discharge)[k]):g} C; a cell is then at {cell[k]:.4g} V, "
+                f"below its cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
+            )
     found = missions.batch(robot, flat, profile, start, history=history)
     further = missions.columns(missions.numbers(robot, flat, found))
     course = None

@@ -25,12 +25,13 @@ _BARS = {
 }  # fmt: skip
 
 
-def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool) -> Figure:
+def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
     """A run over its profile, a row a subject; beside it its first cycle, where it has several.
 
     Args:
         rows: of history.csv, of one run; cycle: end of its first cycle [s], None where it has one only.
         limit: of the winding's temperature [°C]; linear: whether the profile's values are, between rows.
+        sides: how many motors there are.
     """
     spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
     titles = ["the mission", "its first cycle"]
@@ -44,7 +45,7 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, li
         axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
         _speed(axes[0], time, shown, linear, legend=first)
         axes[1].set_title("current of all motors, and duty of the driver")
-        _current(axes[1], time, shown, legend=first)
+        _current(axes[1], time, shown, sides, legend=first)
         unlimited = limit >= UNLIMITED or "winding_C" not in rows
         beyond = (
             "" if unlimited or _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
@@ -96,8 +97,8 @@ def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear:
         _legend(axes, slope)
 
 
-def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], legend: bool) -> None:
-    current = rows["motor_current_A"]
+def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], sides: float, legend: bool) -> None:
+    current = sides * rows["motor_current_A"]
     axes.plot(time, current, color=VERMILION, lw=1.0, label="current")
     top = int(np.argmax(np.abs(current)))
     axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
@@ -149,6 +150,9 @@ def _source(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray]) -> Non
         axes.set_ylim(0, 105)
     beside = _beside(axes, "voltage [V]", BLUE)
     beside.plot(time, volts, color=BLUE, lw=0.8, alpha=0.8)
+    for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
+        axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
+        note(axes, "cells below their cut-off from the broken line on", x=0.02, y=0.06, va="bottom", color=FAINT)
 
 
 def energy(run: Mapping[str, Any], on_battery: bool) -> Figure:

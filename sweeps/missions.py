@@ -19,6 +19,7 @@ from mmrjax import balances, channels, ground, missions, outputs
 from mmrjax.conditions import Conditions
 from mmrjax.energy import SINKS
 from mmrjax.fidelities.mission import Mission
+from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.missions import JOULE_PER_WH
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
@@ -32,6 +33,7 @@ from sweeps.store import open_folder
 #: Rows of history.csv: of a run at most, at least, and of all runs together.
 MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
 _SHOWN = 6  # runs on the console
+_LASTING = MARKS.index("battery_empty")  # events from here on are kept in history.csv: stops and starts are too many
 #: What the console shows of a mission.
 _PRINTED = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
@@ -91,8 +93,8 @@ def simulate(
         stated: columns of conditions that options state, with those options.
 
     Raises:
-        BadConfiguration: a condition that both the options and the profile state, a battery that is empty at the
-            start.
+        BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
+            its cut-off at the start.
         BadData: a wrong profile or table of runs.
     """
     assert config.profile is not None
@@ -116,6 +118,7 @@ def simulate(
             tell(f"{runs.source}, {column}: not used, {source.source} states it")
     if "current_other" in source.values and not config.battery:
         tell(f"{source.source}, current_other_A: not used, other consumers are on the battery")
+    _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         found = simulated(robot, runs, source, config)
         folder.write_table("segments.csv", own.of(robot, found.segments))
@@ -167,6 +170,20 @@ def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
         raise BadConfiguration(
             f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
             "mission begins"
+        )
+
+
+def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:
+    """Refuse missions that begin with cells below their cut-off."""
+    if not config.battery:
+        return
+    conditions = run.commanded(robot, runs, config)
+    cell = missions.begins_below(robot, conditions, source.profile(robot, conditions), source.start)
+    below = np.flatnonzero(np.isfinite(cell))
+    if len(below):
+        raise BadConfiguration(
+            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[below[0]]:.4g} V, below its "
+            f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
         )
 
 
@@ -253,11 +270,12 @@ def _segment_of(found: Mission, k: int) -> np.ndarray:
     return np.where(of < 0, np.iinfo(of.dtype).max, of)
 
 
-def thinned(segment: np.ndarray, current: np.ndarray, most: int) -> np.ndarray:
-    """Which rows of a course to keep, in order: the peak of current of each segment, and evenly spread ones.
+def thinned(segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None) -> np.ndarray:
+    """Which rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
 
     Args:
-        segment: of each row, not decreasing; current: of each row; most: rows to keep at most.
+        segment: of each row, not decreasing; current: of each row; most: rows to keep at most; marked: rows to keep,
+            of many the last ones.
     """
     if len(segment) <= most:
         return np.arange(len(segment))
@@ -266,6 +284,8 @@ def thinned(segment: np.ndarray, current: np.ndarray, most: int) -> np.ndarray:
     peaks = np.array([a + np.argmax(np.abs(current[a:b])) for a, b in zip(firsts, ends, strict=True)])
     if len(peaks) > most // 2:  # of so many segments the highest
         peaks = peaks[np.argsort(-np.abs(current[peaks]), kind="stable")[: most // 2]]
+    if marked is not None:
+        peaks = np.union1d(peaks, np.flatnonzero(marked)[-(most // 4) :])
     spread = np.round(np.linspace(0, len(segment) - 1, most - len(peaks))).astype(int)
     return np.unique(np.concatenate([peaks, spread]))
 
@@ -277,7 +297,8 @@ def _course(
     course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
     there = course.segment >= 0
     signals = course.signals
-    picked = np.flatnonzero(there)[thinned(course.segment[there], signals.current[there], most)]
+    marked = course.event[there] >= _LASTING
+    picked = np.flatnonzero(there)[thinned(course.segment[there], signals.current[there], most, marked)]
     course = jax.tree.map(lambda x: x[picked], course)
     signals, reading = course.signals, balances.sensor(robot, course.signals)
     # What the profile demands acts this much later than its rows say, and all that is written beside it with it.
@@ -302,14 +323,15 @@ def _course(
         **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / channels.MM,
         "slip": np.asarray(ground.slip(signals.speed, signals.speed_theoretical)),
-        "distance_m": course.distance,
+        "distance_m": course.path,
+        "displacement_m": course.distance,
         "voltage_V": signals.voltage,
         "traction_N": float(robot.sides) * signals.traction,
         "demanded_speed_mm_s": demanded / channels.MM,
         **turning,
         "duty": signals.duty,
         "source_voltage_V": signals.voltage_source,
-        "motor_current_A": float(robot.sides) * signals.current,
+        "motor_current_A": np.asarray(reading["motor_current"]),
         "slope_deg": np.degrees(signals.slope),
         "winding_C": course.temperature_winding,
         "housing_C": course.temperature_housing,
@@ -317,7 +339,17 @@ def _course(
         "state_of_charge": left if battery else np.full(len(picked), np.nan),
         "cycle": course.segment // source.segments + 1,
         "segment": segment + 1,
+        "event": np.array([*MARKS, ""])[course.event],
     }
+
+
+def _charge_left(table: dict[str, np.ndarray], status: str) -> str:
+    """At what charge missions were cut off."""
+    left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
+    if status != "cut_off" or not len(left):
+        return ""
+    span = f"{left.min():.1f}" if len(left) == 1 else f"{left.min():.1f} to {left.max():.1f}"
+    return f"; ended with {span} % of the charge left"
 
 
 def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
@@ -337,7 +369,7 @@ def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
     say(shown)
     for status in dict.fromkeys(table["status"]):
         if status != STATUSES[0]:
-            say(f"{status}: {words.STATUSES[status].why}")
+            say(f"{status}: {words.STATUSES[status].why}{_charge_left(table, status)}")
     for flag in FLAGS:
         flagged = int(np.sum([flag in str(f).split(";") for f in table["flags"]]))
         if flagged:

@@ -22,7 +22,7 @@ OF_GROUND = (
 )  # fmt: skip
 #: Those of travel, which a shaft has where a channel shows it.
 OF_TRAVEL = (
-    "theoretical_speed_mm_s", "distance_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
+    "theoretical_speed_mm_s", "distance_m", "displacement_m", "demanded_speed_mm_s", "energy_per_metre_Wh", "range_m",
 )  # fmt: skip
 #: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
 OF_HEAT = (

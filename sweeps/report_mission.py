@@ -40,7 +40,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
     limit = float(robot.motor.temperature_limit)
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
     on_battery = bool(np.isfinite(first["state_of_charge"]))
-    album.add("course", lambda: figures_mission.course(rows, cycle, limit, source.linear))
+    album.add("course", lambda: figures_mission.course(rows, cycle, limit, source.linear, float(robot.sides)))
     album.add("energy", lambda: figures_mission.energy(first, on_battery))
     names = _names(runs)
     return render(

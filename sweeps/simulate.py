@@ -29,7 +29,8 @@ _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
 #: Channels that histories of a shaft, and those of a vehicle, have in any case.
 OF_SHAFT, OF_VEHICLE = ("motor_speed", "output_angle"), ("speed",)
-#: Column of the largest current of all motors in a run over time.
+#: Column of the largest current of all motors together in a run over time (not of the supply, which gives the duty's
+#: share of it).
 PEAK = "peak_current_A"
 #: Column of the time that a run's current may flow before its windings are at their limit.
 PERMISSIBLE = "permissible_time_s"
@@ -115,8 +116,9 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     there = np.isfinite(current)
     last = np.where(there.any(-1), there.shape[-1] - 1 - np.argmax(there[..., ::-1], -1), 0)
     rows = np.arange(len(last))
-    columns[PEAK] = np.abs(np.where(there, current, 0.0)).max(-1)
-    columns["distance_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
+    motors = float(robot.sides) * np.asarray(history.signals.current)
+    columns[PEAK] = np.abs(np.where(there, motors, 0.0)).max(-1)
+    columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
     empty = (status == BATTERY_EMPTY) & ~there[rows, -1]
     if empty.any():
         signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
@@ -128,7 +130,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
         left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
         left = np.where(empty & there.any(-1), np.clip(np.nan_to_num(left), 0.0, after), 0.0)
         columns["time_end_s"] = columns["time_end_s"] + left
-        columns["distance_m"] = np.nan_to_num(columns["distance_m"] + left * np.nan_to_num(signals.speed))
+        columns["displacement_m"] = np.nan_to_num(columns["displacement_m"] + left * np.nan_to_num(signals.speed))
     return columns
 
 
@@ -181,7 +183,7 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
                 f"{float(robot.motor.current_continuous):.2f} A"
             )
         if status == "battery_empty" and "time_end_s" in table:
-            when, far = float(table["time_end_s"][k]), float(table["distance_m"][k])
+            when, far = float(table["time_end_s"][k]), float(table["displacement_m"][k])
             said.append(
                 f"{name}battery_empty: after {when:.1f} s and {far:.2f} m; the numbers are those just before"
                 if when > 0
@@ -205,7 +207,7 @@ def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[st
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
         "slip": np.ravel(ground.slip(signals.speed, signals.speed_theoretical)),
-        "distance_m": np.ravel(history.distance),
+        "displacement_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
         "traction_N": float(robot.sides) * np.ravel(signals.traction),
     }
@@ -249,7 +251,7 @@ def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
         **({} if "supply_voltage_V" in table else {"motor_speed_rpm": ("motor speed [rpm]", ".1f")}),
         "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
         **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in shown},
-        PEAK: ("peak of the total current [A]", ".1f"), "distance_m": ("distance [m]", ".2f"),
+        PEAK: ("peak current, all motors [A]", ".1f"), "displacement_m": ("displacement [m]", ".2f"),
         "time_end_s": ("time [s]", ".6g"), "voltage_cell_V": ("voltage of a cell [V]", ".3f"),
         "slip": ("slip", ".4f"),
         "power_supply_W": ("power from supply P_e [W]", ".2f"), "power_motor_W": ("at motor shafts N_d [W]", ".2f"),

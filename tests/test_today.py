@@ -259,7 +259,7 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     peak = float(np.max(np.asarray(fine.signals.total_current)))
     assert float(np.max(np.asarray(found.history.signals.total_current[0]))) == pytest.approx(peak, rel=2e-3)
     code, out, _ = mmrjax("simulate", "--model", "drive", "--slope", 10, "--no-report", "--out", "a")
-    assert code == 0 and re.search(rf"peak of the total current \[A\] +│ {peak:.1f}", out)
+    assert code == 0 and re.search(rf"peak current, all motors \[A\] +│ {peak:.1f}", out)
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert float(row[PEAK]) == pytest.approx(peak, rel=2e-3)
     kept = [float(r["total_current_A"]) for r in table(tmp_path / "a" / "history.csv")]
@@ -289,13 +289,13 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     assert code == 3
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert row["status"] == "battery_empty" and float(row["speed_mm_s"]) > 500 and float(row["total_current_A"]) > 1
-    when, far = float(row["time_end_s"]), float(row["distance_m"])
+    when, far = float(row["time_end_s"]), float(row["displacement_m"])
     assert f"after {when:.1f} s and {far:.2f} m" in out and "└" in out
     # The same run, ended just before and just after: where the charge runs out does not depend on the samples.
     assert mmrjax(*asked, f"{when - 0.01:.4f}", "--no-report", "--out", "b")[0] == 0
     assert mmrjax(*asked, f"{when + 0.01:.4f}", "--no-report", "--out", "c")[0] == 3
     (before,) = table(tmp_path / "b" / "runs.csv")
-    assert float(before["distance_m"]) == pytest.approx(far, abs=0.01)
+    assert float(before["displacement_m"]) == pytest.approx(far, abs=0.01)
     charge = 3.6 * 10 - np.trapezoid(
         [float(r["total_current_A"]) + 1.5 for r in table(tmp_path / "b" / "history.csv")],
         [float(r["time_s"]) for r in table(tmp_path / "b" / "history.csv")],

@@ -17,7 +17,7 @@ from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadConfiguration, choices, number
-from mmrjax import effects, params, robots
+from mmrjax import effects, params, power, robots
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
 from mmrjax.tables import TRACKED, WHEELED
@@ -284,6 +284,8 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         part, _, key = name.partition(".")
         robot = dataclasses.replace(robot, **{part: dataclasses.replace(getattr(robot, part), **{key: value})})
     _check_pairs(robot, where)
+    if notes is not None and "battery.voltage_cutoff" in values and (remark := power.cutoff_remark(robot.battery)):
+        notes.append(f"{where}, battery.voltage_cutoff: {remark}")
     return _with_backlash(robot, where)
 
 
@@ -349,6 +351,8 @@ def _check_pairs(robot: Robot, where: str) -> None:
             f"{where}, battery.voltage_cutoff: got {robot.battery.voltage_cutoff:g}; expected less than "
             f"voltage_charge, {robot.battery.voltage_charge:g} V"
         )
+    if refused := power.cutoff_refused(robot.battery):
+        raise BadConfiguration(f"{where}, battery.voltage_cutoff: {refused}")
     for name, load in robot.configurations.items():
         if isinstance(load, Shaft):
             continue

@@ -42,7 +42,7 @@ TABLE: tuple[Derived, ...] = (
     Derived(
         "steepest_slope", "steepest_slope_deg", "deg", 1.0, "steepest slope held", _SLOPE, 2, ignores=("slope_deg",)
     ),
-    Derived("peak_current", "peak_current_A", "A", 1.0, "peak current of the start", _START, 2),
+    Derived("peak_current", "peak_current_A", "A", 1.0, "peak current of the start, all motors", _START, 2),
     Derived("time_to_speed", "time_to_speed_s", "s", 1.0, "time to 95 % of speed", _START, 3),
     Derived("energy_start", "energy_start_J", "J", 1.0, "electrical energy of the start", _START, 2),
 )

@@ -82,7 +82,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
     whole = jnp.concatenate([jnp.zeros(1), jnp.cumsum(width * (power[1:] + power[:-1]) / 2)])
     here = power[k] + share * (power[k + 1] - power[k])
     found = {
-        "peak_current": peak(current),
+        "peak_current": peak(jnp.asarray(robot.sides * signals.current)),
         "time_to_speed": times[k] + share * width[k],
         "energy_start": whole[k] + share * width[k] * (power[k] + here) / 2,
     }

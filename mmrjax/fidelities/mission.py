@@ -107,7 +107,8 @@ class Course(eqx.Module):
     Attributes:
         time: since the mission began [s]; segment: index of the segment, -1 after the last.
         event: index into `MARKS` of what a step has landed on, -1 for none.
-        distance: along the ground [m]; temperature_winding, temperature_housing: [°C].
+        distance: along the ground, forward less backward [m]; path: either way [m].
+        temperature_winding, temperature_housing: [°C].
         energy: taken from the source on balance [J].
         signals: every signal.
     """
@@ -116,6 +117,7 @@ class Course(eqx.Module):
     segment: Int[Array, " kept"]
     event: Int[Array, " kept"]
     distance: Float[Array, " kept"]
+    path: Float[Array, " kept"]
     energy: Float[Array, " kept"]
     temperature_winding: Float[Array, " kept"]
     temperature_housing: Float[Array, " kept"]
@@ -221,9 +223,9 @@ def mission(
         buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool), jnp.full(keep, -1))
     carry = Carry(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(begin.speed == 0.0), ended=false,
-        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=jnp.full(len(PEAKS), -jnp.inf, dtype), flags=whole,
-        events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false, kept=whole, buffer=buffer,
-        slope=jnp.zeros((), dtype),
+        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=jnp.full(len(PEAKS), -jnp.inf, dtype),
+        flags=whole, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false,
+        kept=whole, buffer=buffer, slope=jnp.zeros_like(y0),
     )  # fmt: skip
 
     def one(carry: Carry, k: Array) -> tuple[Carry, tuple]:
@@ -302,6 +304,7 @@ def _course(robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ea
         segment=jnp.where(there, of, -1),
         event=jnp.where(there, marks, -1),
         distance=shown(so_far["distance"]),
+        path=shown(so_far["path"]),
         energy=shown(so_far["drawn"] - so_far["returned"]),
         temperature_winding=shown(ys[:, WINDING] * UNITS[WINDING]),
         temperature_housing=shown(ys[:, HOUSING] * UNITS[HOUSING]),

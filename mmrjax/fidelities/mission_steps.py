@@ -176,7 +176,7 @@ class Carry(NamedTuple):
     accepted: Array
     rejected: Array
     failed: Array
-    slope: Array  # of the current, in its unit [1/s]
+    slope: Array  # of the unknowns, in their units [1/s]
     kept: Array
     buffer: tuple[Array, ...] | None
 
@@ -235,9 +235,7 @@ def events_of(
     empty = jnp.where(asked.conditions.battery > 0.5, (state.discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
     above = _cell_above(asked, state)
     falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
-    return jnp.stack(
-        [jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers]
-    )
+    return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
 
 def _onto(
@@ -334,11 +332,15 @@ def follow(
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, longest)
         signals, dy, _, _ = instant(robot, otherwise, segment, y, stands)
-        between_ends = _top(c.y[CURRENT], y[CURRENT], h * c.slope, h * dy[CURRENT])
-        peaks = jnp.maximum(c.peaks, _peaks_of(robot, signals))
-        within = jnp.where(taken, robot.sides * UNITS[CURRENT] * between_ends, -jnp.inf)
-        peaks = peaks.at[list(PEAKS).index("current")].max(within)
-        flags = _flags(robot, signals, cut_off)
+        # What is itself an unknown may be largest within the step.
+        tops = _top(c.y, y, h * c.slope, h * dy) * units(robot).astype(y.dtype)
+        within = {
+            "current": robot.sides * tops[CURRENT], "motor_speed": tops[MOTOR], "speed": tops[GROUND],
+            "temperature": jnp.where(y[WINDING] > 0, tops[WINDING], -jnp.inf),
+        }  # fmt: skip
+        highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in PEAKS])
+        peaks = jnp.maximum(jnp.maximum(c.peaks, _peaks_of(robot, signals)), highest)
+        flags = _flags(robot, signals, cut_off) | jnp.where(taken, _flags_within(robot, tops), 0)
         failed = c.failed | (~good & (h <= SHORTEST))
         ended = c.ended | cut_off | (which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
@@ -352,7 +354,7 @@ def follow(
             y=y, q=q, step=step, stands=stands, ended=ended, below=below, low=low, cut_off=cut_off, peaks=peaks,
             flags=c.flags | flags,
             events=events_now, accepted=c.accepted + taken, rejected=c.rejected + ~taken, failed=failed,
-            kept=kept + taken, buffer=buffer, slope=dy[CURRENT],
+            kept=kept + taken, buffer=buffer, slope=dy,
         )  # fmt: skip
 
     # The segment's beginning may have taken away what held the robot.
@@ -369,7 +371,7 @@ def follow(
         y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, below=below, low=low, cut_off=cut_off,
         ended=carry.ended | cut_off, events=events,
     )  # fmt: skip
-    begin = begin._replace(slope=instant(robot, otherwise, segment, y, stands)[1][CURRENT])
+    begin = begin._replace(slope=instant(robot, otherwise, segment, y, stands)[1])
     c = jax.lax.while_loop(going, turn, begin)
     failed = c.failed | ((c.y[CLOCK] < nearly) & ~c.ended)
     return c._replace(failed=failed, ended=c.ended | failed)
@@ -385,6 +387,18 @@ def _step_longest(robot: Robot, conditions: Conditions) -> Scalar:
     """The longest step that still resolves every effect with a memory [s]."""
     limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
     return jax.lax.stop_gradient(jnp.min(jnp.stack([*limits, jnp.asarray(jnp.inf)])))
+
+
+def _flags_within(robot: Robot, tops: Array) -> Array:
+    """What the largest sizes of unknowns within a step exceed."""
+    return mask(
+        {
+            "motor_overspeed": tops[MOTOR] > robot.motor.speed_limit,
+            "gearbox_overspeed": tops[MOTOR] > robot.gearbox.speed_limit,
+            "current_limited": robot.driver.limits(tops[CURRENT]),
+            "too_hot": tops[WINDING] > robot.motor.temperature_limit,
+        }
+    )
 
 
 def _flags(robot: Robot, signals: Signals, cut_off: Array) -> Array:

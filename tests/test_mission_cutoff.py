@@ -1,0 +1,314 @@
+"""Missions that a battery's cut-off ends: beside an independent integration, its derivative, its words, bad input."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import mmrjax as mm
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
+from mmrjax import missions, params, robots
+from mmrjax.fidelities.mission import mission
+from mmrjax.fidelities.mission_steps import MARKS
+from mmrjax.profile import profile
+from mmrjax.signals import STATUSES
+from sweeps import cli
+
+HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
+#: Room for the steps of a mission.
+KEEP = 1024
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return params.strong(robots.nominal())
+
+
+def with_battery(robot, cutoff=3.3, delay=1.0, **changes):
+    battery = dataclasses.replace(robot.battery, voltage_cutoff=cutoff, delay_cutoff=delay)
+    return params.replace(
+        dataclasses.replace(robot, battery=battery), {f"battery.{n}": x for n, x in changes.items()}
+    )
+
+
+# --- an independent integration -------------------------------------------------------------------------------------
+
+
+def integrated(robot, cutoff, delay=1.0, slope_deg=10.0, payload=5.0):
+    """Time [s] and distance [m] at which tracks at full duty are cut off: SciPy's Radau on plain rates of one motor's
+    current, motor speed, speed, charge, winding, housing and way, with its root of the cell's voltage."""
+    p = {q.name: float(q.value) for q in params.walk(robot)}
+    own = {name.removeprefix("6T2A."): x for name, x in p.items() if name.startswith("6T2A.")}
+    ratio, k, radius, cells = p["gearbox.ratio"], p["motor.torque_constant"], own["radius"], robot.battery.cells
+    mass, slope = (own["mass"] + payload) / 2, np.radians(slope_deg)
+    normal, uphill = mass * 9.80665 * np.cos(slope), mass * 9.80665 * np.sin(slope)
+    guide = own["track.guide_friction"] * own["track.guide_share"] * normal
+    static, dynamic, v_s, v_d = (
+        own[f"ground.friction.{n}"] for n in ("static", "dynamic", "speed_static", "speed_dynamic")
+    )
+    R_wh, R_ha = p["motor.resistance_thermal_winding"], p["motor.resistance_thermal_housing"]
+
+    def way(v, rest):
+        x = np.clip(v / rest, -1, 1)
+        return x * (3 - x * x) / 2
+
+    def adhesion(v):
+        u = np.clip((abs(v) - v_s) / (v_d - v_s), 0, 1)
+        return (
+            static * way(v, v_s) if abs(v) < v_s else np.sign(v) * (static + (dynamic - static) * u * u * (3 - 2 * u))
+        )
+
+    def cell(y):
+        none = p["battery.curvature"] * y[3] ** 2 + p["battery.slope"] * y[3] + p["battery.voltage_full"]
+        return none - p["battery.resistance"] * (2 * y[0] + p["battery.current_other"])
+
+    def rates(t, y):
+        current, w, v, _, winding, housing, _ = y
+        resistance, wheel = p["motor.resistance"] * (1 + 0.00393 * (winding - 25)), w / ratio
+        turns = way(radius * wheel, 0.1 * v_s)
+        pull = adhesion(radius * wheel - v) * normal
+        drive = k * current - (p["motor.friction_coulomb"] + p["gearbox.friction_coulomb"]) * turns
+        drive -= (p["motor.friction_viscous"] + p["gearbox.friction_viscous"]) * w
+        load = own["track.loss_coulomb"] * turns + own["track.loss_viscous"] * wheel + radius * (guide * turns + pull)
+        eta = 1 + turns * (p["gearbox.efficiency_load"] - 1)
+        turning = (ratio * eta * drive - load) / (own["inertia"] + eta * ratio**2 * p["motor.inertia"])
+        resists = uphill + own["ground.rolling_resistance"] * normal * way(v, 0.1 * v_s)
+        flow = (winding - housing) / R_wh
+        return [
+            (cells * cell(y) - k * w - resistance * current) / p["motor.inductance"], ratio * turning,
+            (pull - resists) / mass, 2 * current + p["battery.current_other"],
+            (resistance * current**2 - flow) * R_wh / 16.3, (flow - (housing - 25) / R_ha) * R_ha / 593.0, v,
+        ]  # fmt: skip
+
+    def falls(t, y):
+        return cell(y) - cutoff
+
+    falls.terminal, falls.direction = True, -1
+    accuracy = {"method": "Radau", "rtol": 1e-8, "atol": 1e-8 * np.array([10, 1000, 1, 100, 50, 50, 1.0])}
+    start = solve_ivp(rates, [0, 10], [0, 0, 0, 0, 25.0, 25.0, 0], **accuracy)
+    assert cell(start.y[:, -1]) > cutoff  # the surge of the start is over
+    found = solve_ivp(rates, [10, 3600], start.y[:, -1], events=falls, **accuracy)
+    after = solve_ivp(rates, [0, delay], found.y[:, -1], **accuracy)
+    return found.t[-1] + delay, after.y[6, -1]
+
+
+def random_robot(robot):
+    rng = np.random.default_rng(23)
+    changed = {
+        name: float(rng.uniform(0.9, 1.1)) * float({p.name: p.value for p in params.walk(robot)}[name])
+        for name in ("motor.resistance", "motor.torque_constant", "6T2A.mass", "battery.resistance", "gearbox.ratio")
+    }
+    return params.replace(with_battery(robot, 3.22), changed)
+
+
+@pytest.fixture(scope="module")
+def followed():
+    def one(robot, keep=KEEP):
+        at = mm.Conditions(configuration=np.array([0]), battery=np.array([1.0]))
+        found = jax.device_get(missions.together(robot, at, HOUR, None, keep))
+        return jax.tree.map(lambda x: x[0], found)
+
+    return one
+
+
+@pytest.fixture(scope="module")
+def cut(robot, followed):
+    return followed(with_battery(robot))
+
+
+def beside(found, robot, cutoff):
+    time, distance = integrated(robot, cutoff)
+    assert STATUSES[int(found.result.status)] == "cut_off"
+    assert float(found.total.time) == pytest.approx(time, rel=2e-5)
+    assert float(found.total.of["path"]) == pytest.approx(distance, rel=5e-5)
+
+
+def test_cutoff_ends_the_mission_where_an_independent_integration_does(cut, robot):
+    """990.3 s and 816 m, where whole steps gave 1161 s and 944 m."""
+    beside(cut, robot, 3.3)
+
+
+@pytest.mark.parametrize("case", ["resistance", "random"])
+def test_other_cutoffs_end_where_an_independent_integration_does(robot, followed, case):
+    changed = with_battery(robot, 3.0, resistance=0.09) if case == "resistance" else random_robot(robot)
+    beside(followed(changed), changed, changed.battery.voltage_cutoff)
+
+
+def test_steps_land_on_the_crossing_and_the_delay_counts_from_there(cut, robot):
+    course, count = cut.course, int(cut.steps - cut.rejected)
+    marks = [MARKS[k] if k >= 0 else "" for k in course.event[:count]]
+    assert marks[-1] == "cut_off" and marks.count("cut_off") == 1
+    k = len(marks) - 1 - marks[::-1].index("below_cut_off")
+    cell = course.signals.voltage_source[:count] / robot.battery.cells
+    assert cell[k] == pytest.approx(3.3, abs=1e-6)
+    assert (cell[k + 1 :] < 3.3).all() and "above_cut_off" not in marks[k:]
+    assert course.time[count - 1] - course.time[k] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_endurance_and_range_are_those_of_the_cut_off(cut, robot):
+    at = mm.Conditions(configuration=0, battery=1.0)
+    numbers = missions.numbers(with_battery(robot), at, cut)
+    assert float(numbers["endurance"]) == float(cut.total.time) and float(numbers["state_of_charge"]) > 0.1
+    assert float(numbers["range"]) == float(cut.total.of["path"])
+
+
+def test_the_inrush_recovers_in_time_and_a_longer_stay_below_does_not(robot, followed):
+    """The start presses the cells below for some 0.1 s: a delay that is shorter ends the mission there, timed."""
+    short = followed(with_battery(robot, delay=0.02))
+    assert STATUSES[int(short.result.status)] == "cut_off" and float(short.total.time) < 0.1
+    marks, count = short.course.event, int(short.steps - short.rejected)
+    k = int(np.flatnonzero(marks[:count] == MARKS.index("below_cut_off"))[-1])
+    assert short.course.time[count - 1] - short.course.time[k] == pytest.approx(0.02, abs=1e-12)
+
+
+def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
+    """By four parameters at once: the implicit function theorem at the event, through heat and charge."""
+    names = ("battery.resistance", "battery.voltage_full", "motor.resistance", "6T2A.mass")
+    low = with_battery(robot)
+    base = {p.name: float(p.value) for p in params.walk(low)}
+    at = mm.Conditions(configuration=0, battery=1.0, discharge=3000.0)
+    weigh = jnp.asarray([1.0, 0.02, 1.0, 1.0])
+
+    def ends(x):
+        changed = params.replace(low, {n: base[n] * (1 + w * e) for n, w, e in zip(names, weigh, x, strict=True)})
+        found = mission(changed, at, HOUR, tolerance=1e-7)
+        return jnp.stack([found.total.time, found.total.of["path"], found.discharge])
+
+    both = jax.jit(lambda x: (ends(x), jax.jacfwd(ends)(x)))
+    zero, h = jnp.zeros(4), 1e-3
+    _, exact = both(zero)
+    for k in range(4):
+        apart = (both(zero.at[k].add(h))[0] - both(zero.at[k].add(-h))[0]) / (2 * h)
+        np.testing.assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
+        assert abs(float(apart[0])) > 10.0  # s: the moment moves
+
+
+def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
+    """The energy of a battery follows from its charge: one that has drifted by 1.3e-4 is not overlooked."""
+    through = float(cut.total.of["drawn"])
+    assert abs(float(cut.total.unaccounted)) < 1e-6 * through
+    drifted = dataclasses.replace(cut.total, given=cut.total.given * (1 + 1.3e-4))
+    assert float(drifted.unaccounted) == pytest.approx(1.3e-4 * through, rel=1e-2)
+
+
+# --- what is said ---------------------------------------------------------------------------------------------------
+
+
+def command(capsys, monkeypatch, folder, *words):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("sys.argv", ["mmrjax", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr()
+    return int(ended.value.code or 0), said.out, said.err
+
+
+def written(folder, cutoff, text=""):
+    (folder / "low.toml").write_text(f"[battery]\nvoltage_cutoff = {cutoff}\n{text}")
+    (folder / "hour.csv").write_text("time_s,duty,slope_deg,payload_kg\n0,1,10,5\n3600,1,10,5\n")
+    return "simulate", "--robot", "low.toml", "--profile", "hour.csv", "--battery"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("cutoff")
+
+
+@pytest.fixture
+def run_folder(folder, capsys, monkeypatch):
+    if not (folder / "a").exists():
+        code, out, err = command(capsys, monkeypatch, folder, *written(folder, 3.3), "--no-report", "--out", "a")
+        assert code == 3, err
+        (folder / "out.txt").write_text(out)
+        (folder / "err.txt").write_text(err)
+    return folder / "a"
+
+
+def rows(path):
+    with path.open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
+    out, err = ((run_folder.parent / f"{name}.txt").read_text() for name in ("out", "err"))
+    result = json.loads((run_folder / "result.json").read_text())
+    left = 100 * result["state_of_charge"]
+    assert result["status"] == "cut_off" and result["flags_raised"] == ["cut_off"]
+    assert "no charge left" not in out and f"ended with {left:.1f} % of the charge left" in " ".join(out.split())
+    assert "3.3 V is below the 3.41 V of an empty cell without load: it acts only beyond 2.22 A" in " ".join(
+        err.split()
+    )
+    history = rows(run_folder / "history.csv")
+    assert history[-1]["event"] == "cut_off" and "below_cut_off" in [row["event"] for row in history]
+
+
+def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
+    """Current of one motor; of all motors as peak; distance either way; forward less backward."""
+    result = json.loads((run_folder / "result.json").read_text())
+    (run,), history = rows(run_folder / "runs.csv"), rows(run_folder / "history.csv")
+    segments = rows(run_folder / "segments.csv")
+    for row in history[:: len(history) // 20]:
+        duty = float(row["duty"])
+        assert 2 * duty * float(row["motor_current_A"]) == pytest.approx(float(row["total_current_A"]), rel=1e-6)
+    peak = max(2 * abs(float(row["motor_current_A"])) for row in history)
+    assert 0.98 * peak < float(run["peak_current_A"]) < 1.02 * peak
+    shared = set(run) & set(segments[0]) & set(missions.names())
+    for name in sorted(shared & set(result)):
+        if run[name] and result[name] is not None:
+            assert float(run[name]) == pytest.approx(result[name], rel=1e-6, abs=1e-9), name
+    for name in ("distance_m", "displacement_m", "energy_Wh", "state_of_charge"):
+        assert float(history[-1][name]) == pytest.approx(float(run[name]), rel=1e-6), name
+
+
+def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
+    (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 4.18\n")
+    with pytest.raises(BadConfiguration) as said:
+        robot_file.read(tmp_path / "low.toml")
+    assert str(said.value) == (
+        "low.toml, battery.voltage_cutoff: got 4.18 V; expected less than voltage_full, 4.17 V: a full cell would be "
+        "cut off"
+    )
+
+
+def test_a_cut_off_below_an_empty_cell_is_said_where_a_file_states_it(tmp_path):
+    (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 2.9\n")
+    notes: list[str] = []
+    robot_file.read(tmp_path / "low.toml", notes=notes)
+    assert notes == [
+        "low.toml, battery.voltage_cutoff: 2.9 V is below the 3.41 V of an empty cell without load: it acts only "
+        "beyond 10.4 A"
+    ]
+    (tmp_path / "low.toml").write_text("[battery]\nvoltage_cutoff = 3.45\n")
+    robot_file.read(tmp_path / "low.toml", notes=(quiet := []))
+    assert quiet == []
+
+
+def test_a_mission_that_begins_below_its_cut_off_is_refused(tmp_path, capsys, monkeypatch):
+    words = written(tmp_path, 3.5)
+    code, out, err = command(capsys, monkeypatch, tmp_path, *words, "--discharge", "2000", "--out", "b")
+    assert (code, out) == (2, "") and not (tmp_path / "b").exists()
+    assert (
+        "--discharge: got 2000 mAh; a cell is then at 3.377 V, below its cut-off of 3.5 V, before the mission" in err
+    )
+
+
+def test_python_says_what_is_wrong_with_a_cut_off(robot):
+    at = mm.Conditions(configuration=["6T2A", "6T2A"], battery=1.0, discharge=[0.0, 7000.0])
+    with pytest.raises(
+        mm.UsageError, match=r"discharge\[1\]: got 7000 C; a cell is then at 3.\d+ V, below its cut-off"
+    ):
+        mm.simulate(with_battery(robot, 3.5), at, profile=HOUR, history=False)
+    with pytest.raises(mm.UsageError, match=r"battery\.voltage_cutoff: got 4.19 V; expected less than voltage_full"):
+        mm.simulate(with_battery(robot, 4.19), at)
+    hungry = with_battery(robot, 2.9, current_other=20.0)
+    remark = pytest.warns(UserWarning, match=r"2\.9 V is below the 3\.41 V of an empty cell")
+    with remark, pytest.raises(mm.UsageError, match=r"discharge\[1\]: got 7000 C; a cell is then at 2\.\d+ V"):
+        mm.simulate(hungry, at, profile=HOUR, history=False)
