@@ -40,12 +40,12 @@ from mmrjax.running_gear import GROUSERS, TEETH_BELT  # noqa: E402
 from mmrjax.signals import STATUSES, State  # noqa: E402
 
 SET_S = {
-    "6T2A.ground.friction.static": 0.5735, "6T2A.ground.friction.dynamic": 0.5524,
-    "6T2A.ground.friction.speed_static": 0.01777, "6T2A.ground.friction.speed_dynamic": 0.1777,
+    "6T2A.ground.friction.static": 0.6093, "6T2A.ground.friction.dynamic": 0.5331,
+    "6T2A.ground.friction.speed_static": 0.00961, "6T2A.ground.friction.speed_dynamic": 0.0961,
     "6T2A.track.guide_friction": 0.06,
-    "running_gear.guide_recess": 3.327e-4, "running_gear.guide_gap": 0.01029,
-    "running_gear.contact_stiffness": 4.261e7, "running_gear.contact_damping": 806.9,
-    "running_gear.centre_offset": -0.00154, "running_gear.payload_height": 0.0675,
+    "running_gear.guide_recess": 3.648e-4, "running_gear.guide_gap": 0.01066,
+    "running_gear.contact_stiffness": 3.816e7, "running_gear.contact_damping": 649.2,
+    "running_gear.centre_offset": 0.00011, "running_gear.payload_height": 0.0595,
 }  # fmt: skip
 #: Adhesion on which the wheeled robot climbs 20 deg, Table 5: smooth concrete.
 WHEELED = {"4W2T.ground.friction.static": 0.60, "4W2T.ground.friction.dynamic": 0.48}

@@ -64,16 +64,17 @@ def test_broken_member_withholds_its_numbers_and_harms_no_other(runs):
 
 @pytest.mark.slow
 def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
-    """Guides recessed by 0.35 mm: the robot shakes on its grousers and slides beyond V_s on 20°."""
+    """Set S of docs/vibration.md, guides recessed by 0.36 mm: the robot shakes and slides beyond V_s on 20°."""
     shaking = params.replace(
         robot,
         {
-            "6T2A.ground.friction.static": jnp.asarray(0.59), "6T2A.ground.friction.dynamic": jnp.asarray(0.52),
-            "6T2A.ground.friction.speed_static": jnp.asarray(0.021),
-            "6T2A.ground.friction.speed_dynamic": jnp.asarray(0.21),
-            "6T2A.track.guide_friction": jnp.asarray(0.06), "running_gear.guide_recess": jnp.asarray(3.5e-4),
-            "running_gear.contact_stiffness": jnp.asarray(4.2e7),
-            "running_gear.contact_damping": jnp.asarray(840.0), "running_gear.guide_gap": jnp.asarray(0.012),
+            "6T2A.ground.friction.static": jnp.asarray(0.6093), "6T2A.ground.friction.dynamic": jnp.asarray(0.5331),
+            "6T2A.ground.friction.speed_static": jnp.asarray(0.00961),
+            "6T2A.ground.friction.speed_dynamic": jnp.asarray(0.0961),
+            "6T2A.track.guide_friction": jnp.asarray(0.06), "running_gear.guide_recess": jnp.asarray(3.648e-4),
+            "running_gear.contact_stiffness": jnp.asarray(3.816e7),
+            "running_gear.contact_damping": jnp.asarray(649.2), "running_gear.guide_gap": jnp.asarray(0.01066),
+            "running_gear.centre_offset": jnp.asarray(1.1e-4), "running_gear.payload_height": jnp.asarray(0.0595),
         },
     )  # fmt: skip
     commands = Conditions(voltage=jnp.asarray([15.0, 15.0]), slope_deg=jnp.asarray([10.0, 20.0]))
@@ -81,8 +82,8 @@ def test_robot_that_slips_on_average_and_goes_on_steadily_has_settled(robot):
     assert [STATUSES[s] for s in answer.result.status] == ["converged"] * 2
     slips = 1 << FLAGS.index("slips")
     assert [bool(f & slips) for f in np.asarray(answer.result.flags)] == [False, True]
-    # the slip of the search that found this gear, half its step: 1.9 and 4.9 % (with other constants beside)
-    np.testing.assert_allclose(100 * np.asarray(answer.result.slip), [1.9, 5.0], atol=0.15)
+    # the slip of the search that found this gear, at the step and at half and a quarter of it
+    np.testing.assert_allclose(100 * np.asarray(answer.result.slip), [1.8, 5.04], atol=0.15)
 
 
 def test_too_steep_a_slope_slides_it_down(runs):
