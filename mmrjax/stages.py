@@ -60,12 +60,11 @@ class Stages:
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
-    """Means over a `period` about each instant of evenly spaced samples, over less of it at the ends."""
-    count = round(period / (time[-1] / len(time))) if time[-1] > 0 else 0
-    if count < 2:
+    """Means over a `period` about each instant of evenly spaced samples; at the ends those of the nearest whole one."""
+    count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
+    if count < 3 or count > len(values):
         return values
-    window = np.ones(min(count | 1, len(values)))
-    return np.asarray(np.convolve(values, window, "same") / np.convolve(np.ones_like(values), window, "same"))
+    return np.pad(np.convolve(values, np.ones(count) / count, "valid"), count // 2, mode="edge")
 
 
 def mean_slip(
