@@ -1,13 +1,16 @@
-"""Stages of a start from standstill (Figs. 23, 24): starting, acceleration with slipping, uniform travel; their slip."""
+"""Stages of a start (Figs. 23, 24), starting, acceleration with slipping, uniform travel, and the slip over each."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+
+from mmrjax.tables import PITCH_GROUSER, PITCH_TOOTH
 
 if TYPE_CHECKING:
     from mmrjax.fidelities.base import History
@@ -60,7 +63,7 @@ class Stages:
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
-    """Means over a `period` about each instant of evenly spaced samples; at the ends those of the nearest whole one."""
+    """Means over a `period` about each instant of evenly spaced samples; at the ends of the nearest whole one."""
     count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
     if count < 3 or count > len(values):
         return values
@@ -111,7 +114,7 @@ def stages(
     late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
     settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
-    each = [mean_slip(time, speed, theoretical, a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    each = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
     over = mean_slip(time, speed, theoretical, 0.0, settled)
     return Stages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
 

@@ -77,7 +77,9 @@ def test_where_travel_asks_for_too_much_steady_says_what_an_independent_sum_says
     radius, ratio = of_kind(values, runs, "radius"), values["gearbox.ratio"]
     wheel = of_kind(values, runs, "ground.friction.speed_static") / radius
     motor = wheel * ratio
-    current = (sense * np.asarray(runs.voltage) - values["motor.torque_constant"] * motor) / values["motor.resistance"]
+    current = (sense * np.asarray(runs.voltage) - values["motor.torque_constant"] * motor) / values[
+        "motor.resistance"
+    ]
     dry = values["motor.friction_coulomb"] + values["gearbox.friction_coulomb"]
     viscous = values["motor.friction_viscous"] + values["gearbox.friction_viscous"]
     torque = values["motor.torque_constant"] * current - dry - viscous * motor
@@ -136,5 +138,7 @@ def test_statuses_agree_over_random_robots_slopes_and_voltages(effects):
     either = (share > 0.97 * dynamic) & (share < 1.03 * static) & np.isin(still, ("converged", "reverses"))
     assert set(driven[either]) <= {"slides", "not_settled", "converged", "reverses"}
     np.testing.assert_array_equal(still[~either], driven[~either])
-    counted = {word: int((still == word).sum()) for word in ("stalled", "slides", "converged", "reverses", "rolls_back")}
+    counted = {
+        word: int((still == word).sum()) for word in ("stalled", "slides", "converged", "reverses", "rolls_back")
+    }
     assert min(counted.values()) >= 5 and either.sum() < 60

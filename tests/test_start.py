@@ -2,9 +2,11 @@
 
 import csv
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import jsonschema
 import numpy as np
 import pytest
 import reference
@@ -18,6 +20,7 @@ from mmrjax.signals import Signals
 from sweeps import simulate
 
 VOLTAGE, V_S = 33.0, 0.02
+SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "simulate.schema.json").read_text("utf-8"))
 
 
 def table(path):
@@ -64,6 +67,7 @@ def by_hand():
 
 def test_slip_over_the_stages_is_that_of_an_independent_integration(written):
     history, result = written()
+    jsonschema.validate(result, SCHEMA)
     (start,) = result["starts"]
     assert [s["stage"] for s in start["stages"]] == ["starting", "acceleration with slipping", "uniform"]
     times, slips = by_hand()
@@ -84,7 +88,9 @@ def test_slip_over_the_stages_is_that_of_an_independent_integration(written):
 def test_mean_slip_is_the_share_of_the_way_that_is_lost():
     t = np.linspace(0, 2, 201)
     assert stages.mean_slip(t, 0.8 * t, 1.0 * t, 0.0, 2.0) == pytest.approx(0.2)
-    assert stages.mean_slip(t, t**2 / 4, np.ones_like(t), 0.005, 2.0) == pytest.approx(2 / 3, abs=2e-3)  # mean of 1 - t²/4
+    assert stages.mean_slip(t, t**2 / 4, np.ones_like(t), 0.005, 2.0) == pytest.approx(
+        2 / 3, abs=2e-3
+    )  # mean of 1 - t²/4
     assert stages.mean_slip(t, -0.8 * t, -1.0 * t, 0.35, 1.234) == pytest.approx(0.2)
     assert np.isnan(stages.mean_slip(t, t, t, 1.0, 1.0)) and np.isnan(stages.mean_slip(t, 0 * t, 0 * t, 0.0, 1.0))
 
