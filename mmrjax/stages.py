@@ -119,7 +119,7 @@ def stages(
     return Stages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
 
 
-def of_histories(robot: Robot, history: History, which: Sequence[int]) -> list[Stages | None]:
+def of_histories(robot: Robot, history: History, which: Sequence[int] | np.ndarray) -> list[Stages | None]:
     """Of each run of a batch from standstill up to its last number; None of one without numbers.
 
     Args:
@@ -127,9 +127,10 @@ def of_histories(robot: Robot, history: History, which: Sequence[int]) -> list[S
     """
     found: list[Stages | None] = []
     for k, index in enumerate(which):
-        upto = numbers(np.asarray(history.signals.total_current[k]))
-        time, signals = np.asarray(history.time[k])[:upto], history.signals
-        motion = [np.asarray(x[k])[:upto] for x in (signals.speed, signals.speed_theoretical, signals.speed_sliding)]
+        signals = history.signals
+        upto = numbers(np.asarray(signals.total_current)[k])
+        of_run = (history.time, signals.speed, signals.speed_theoretical, signals.speed_sliding)
+        time, *motion = (np.asarray(x)[k][:upto] for x in of_run)
         chassis = robot.configurations.members[int(index)]
         static, way = float(chassis.ground.friction.speed_static), 0.0
         if history.reactions is not None:  # contacts are resolved

@@ -141,4 +141,4 @@ def test_statuses_agree_over_random_robots_slopes_and_voltages(effects):
     counted = {
         word: int((still == word).sum()) for word in ("stalled", "slides", "converged", "reverses", "rolls_back")
     }
-    assert min(counted.values()) >= 5 and either.sum() < 60
+    assert min(counted.values()) >= 1 and sorted(counted.values())[1] > 40 and either.sum() < 60

@@ -87,8 +87,8 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
 def slides_in_place(robot: Robot, conditions: Conditions, state: State, sense: Scalar) -> Array:
     """Whether a robot that cannot travel, as the demand is above what the ground holds, slides; else it stands.
 
-    It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the motors
-    turn the movers faster than V_s, up to which the ground holds more the faster they slide.
+    It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the
+    motors turn the movers faster than V_s, up to which the ground holds more the faster they slide.
 
     Args:
         state: whose current and speeds are not read; sense: in which it would travel, 1 or -1.
