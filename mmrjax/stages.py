@@ -1,13 +1,16 @@
-"""Stages of a start from standstill (Figs. 23, 24): starting, acceleration with slipping, uniform travel; their slip."""
+"""Stages of a start (Figs. 23, 24), starting, acceleration with slipping, uniform travel, and the slip over each."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
+
+from mmrjax.tables import PITCH_GROUSER, PITCH_TOOTH
 
 if TYPE_CHECKING:
     from mmrjax.fidelities.base import History
@@ -60,12 +63,11 @@ class Stages:
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray, period: float) -> np.ndarray:
-    """Means over a `period` about each instant of evenly spaced samples, over less of it at the ends."""
-    count = round(period / (time[-1] / len(time))) if time[-1] > 0 else 0
-    if count < 2:
+    """Means over a `period` about each instant of evenly spaced samples; at the ends of the nearest whole one."""
+    count = min(round(period / (time[-1] / len(time))) | 1, len(values) | 1) if time[-1] > 0 else 1
+    if count < 3 or count > len(values):
         return values
-    window = np.ones(min(count | 1, len(values)))
-    return np.asarray(np.convolve(values, window, "same") / np.convolve(np.ones_like(values), window, "same"))
+    return np.pad(np.convolve(values, np.ones(count) / count, "valid"), count // 2, mode="edge")
 
 
 def mean_slip(
@@ -112,12 +114,12 @@ def stages(
     late = np.flatnonzero(np.abs(even - last) > WITHIN * abs(last))
     settled = float(time[min(int(late[-1]) + 1, len(time) - 1)]) if late.size else 0.0
     bounds = (0.0, starting, max(slipping, starting), float(time[-1]))
-    each = [mean_slip(time, speed, theoretical, a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    each = [mean_slip(time, speed, theoretical, a, b) for a, b in itertools.pairwise(bounds)]
     over = mean_slip(time, speed, theoretical, 0.0, settled)
     return Stages(sense, bounds[1], bounds[2], settled, bounds[3], (each[0], each[1], each[2]), over)
 
 
-def of_histories(robot: Robot, history: History, which: Sequence[int]) -> list[Stages | None]:
+def of_histories(robot: Robot, history: History, which: Sequence[int] | np.ndarray) -> list[Stages | None]:
     """Of each run of a batch from standstill up to its last number; None of one without numbers.
 
     Args:
@@ -125,9 +127,10 @@ def of_histories(robot: Robot, history: History, which: Sequence[int]) -> list[S
     """
     found: list[Stages | None] = []
     for k, index in enumerate(which):
-        upto = numbers(np.asarray(history.signals.total_current[k]))
-        time, signals = np.asarray(history.time[k])[:upto], history.signals
-        motion = [np.asarray(x[k])[:upto] for x in (signals.speed, signals.speed_theoretical, signals.speed_sliding)]
+        signals = history.signals
+        upto = numbers(np.asarray(signals.total_current)[k])
+        of_run = (history.time, signals.speed, signals.speed_theoretical, signals.speed_sliding)
+        time, *motion = (np.asarray(x)[k][:upto] for x in of_run)
         chassis = robot.configurations.members[int(index)]
         static, way = float(chassis.ground.friction.speed_static), 0.0
         if history.reactions is not None:  # contacts are resolved

@@ -98,7 +98,9 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
         sense = 1.0 if found is None else found.sense
         kind, ended, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
         times = np.asarray(history.time[k])[upto]
-        answer.append(Start(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found))
+        answer.append(
+            Start(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found)
+        )
     return answer
 
 
@@ -244,8 +246,8 @@ def _means(speeds: Axes, slip: Axes, start: Start, upto: float) -> None:
         slip.hlines(100 * mean, left, right, color=INK, lw=1.2, ls="--")
         if right - left > 0.15 * upto:
             slip.annotate(
-                f"mean {100 * mean:.1f} %", (right, 100 * mean), xytext=(-3, 4), textcoords="offset points", ha="right",
-                fontsize=8.5,
+                f"mean {100 * mean:.1f} %", (right, 100 * mean), xytext=(-3, 4), textcoords="offset points",
+                ha="right", fontsize=8.5,
             )  # fmt: skip
 
 

@@ -218,7 +218,7 @@ def starts(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]
     get under way."""
     assert batch.history is not None  # the fidelity was asked for it
     found = stages.of_histories(robot, batch.history, runs.configurations(robot))
-    nothing = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
+    nothing: dict[str, Any] = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
     under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
     return [
         {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}

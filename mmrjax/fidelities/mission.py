@@ -160,7 +160,7 @@ def _ends(
 ) -> tuple[Array, Array]:
     """Status of a segment at its end, and whether the robot has missed what was demanded."""
     driven = signals.duty * signals.voltage_source
-    now = dataclasses.replace(asked.conditions, discharge=signals.discharge)
+    now = dataclasses.replace(asked.conditions, discharge=jnp.asarray(signals.discharge))
     status = jnp.where(stands, STALLED, status_moving(robot, now, signals, driven))
     rests = stands | ((jnp.abs(signals.direction) < 1.0) & (jnp.abs(signals.direction_travel) < 1.0))
     wanted = (mode != BRAKE) & (mode != COAST) & (jnp.abs(driven) > 1e-6)

@@ -74,8 +74,8 @@ def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
 def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """How firmly friction would hold the robot at rest, negative where it cannot [-].
 
-    Its shafts stand where the motors and gravity together can turn them neither way against friction at rest, be it by
-    moving the robot or by sliding its movers under it; its movers where gravity along the slope less rolling
+    Its shafts stand where the motors and gravity together can turn them neither way against friction at rest, be it
+    by moving the robot or by sliding its movers under it; its movers where gravity along the slope less rolling
     resistance is below the ground's adhesion.
     """
     still = _still(state)
@@ -87,11 +87,11 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
 def slides_in_place(robot: Robot, conditions: Conditions, state: State, sense: Scalar) -> Array:
     """Whether a robot that cannot travel, as the demand is above what the ground holds, slides; else it stands.
 
-    It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the motors
-    turn the movers faster than V_s, up to which the ground holds more the faster they slide.
+    It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the
+    motors turn the movers faster than V_s, up to which the ground holds more the faster they slide.
 
     Args:
-        state: of which only what effects remember and the charge are read; sense: in which it would travel, 1 or -1.
+        state: whose current and speeds are not read; sense: in which it would travel, 1 or -1.
     """
     chassis = robot.chassis(conditions.configuration)
     still = _still(state)

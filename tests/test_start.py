@@ -1,0 +1,174 @@
+"""Runs from standstill as they are written: by the clock of the rig, with the slip over the stages of the start."""
+
+import csv
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+import reference
+
+from mmrjax import robots, stages
+from mmrjax.channels import MM
+from mmrjax.fidelities.base import History
+from mmrjax.params import replace
+from mmrjax.rig import Rig
+from mmrjax.signals import Signals
+from sweeps import simulate
+
+VOLTAGE, V_S = 33.0, 0.02
+SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "simulate.schema.json").read_text("utf-8"))
+
+
+def table(path):
+    with path.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(r[name]) for r in rows]) for name in rows[0] if name != "run_id"}
+
+
+@pytest.fixture
+def written(mmrjax, tmp_path):
+    """Run folder of a start on the flat, with the rig's lines of the robot's file."""
+
+    def left(rig=""):
+        (tmp_path / "own.toml").write_text(f'schema = "mmrjax.robot/2"\nbase = "nominal"\n{rig}')
+        asked = ("--model", "drive", "--robot", "own.toml", "--voltage", VOLTAGE, "--no-report", "--force")
+        assert mmrjax("simulate", *asked, "--out", "d")[0] == 0
+        return table(tmp_path / "d" / "history.csv"), json.loads((tmp_path / "d" / "result.json").read_text())
+
+    return left
+
+
+# --- slip over the stages of a start (33) -----------------------------------------------------------
+
+
+def by_hand():
+    """Stages and slip of the start, of an integration and sums that share nothing with the package."""
+    t = np.concatenate([np.linspace(0, 0.04, 4001), np.linspace(0.04, 0.8, 4001)[1:]])
+    side = reference.Side(VOLTAGE)
+    state = side.drive(t, rtol=1e-6, atol=1e-7)
+    rolled, gone = (np.append(x, x[-1]) for x in (side.r * state[:, 1] / side.i, state[:, 2]))
+    t = np.append(t, 5.0)  # nothing changes any more
+    first = t[np.argmax(rolled - gone)]
+    second = t[np.flatnonzero(rolled - gone > V_S)[-1] + 1]
+    under_way = t[np.flatnonzero(gone < 0.99 * gone[-1])[-1] + 1]
+
+    def lost(a, b):
+        own = (t >= a) & (t <= b)
+        step = np.diff(t[own])
+        way = [np.sum(step * (x[own][1:] + x[own][:-1]) / 2) for x in (gone, rolled)]
+        return 1 - way[0] / way[1]
+
+    return (first, second, under_way), (lost(0, first), lost(first, second), lost(second, 5.0), lost(0, under_way))
+
+
+def test_slip_over_the_stages_is_that_of_an_independent_integration(written):
+    history, result = written()
+    jsonschema.validate(result, SCHEMA)
+    (start,) = result["starts"]
+    assert [s["stage"] for s in start["stages"]] == ["starting", "acceleration with slipping", "uniform"]
+    times, slips = by_hand()
+    ends = [s["until_s"] for s in start["stages"]]
+    assert ends[0] == pytest.approx(times[0], abs=5e-4) and ends[1] == pytest.approx(times[1], abs=6e-3)
+    assert ends[2] == 5.0 and start["acceleration_time_s"] == pytest.approx(times[2], abs=6e-3)
+    assert [s["from_s"] for s in start["stages"]] == [0.0, *ends[:2]]
+    got = [s["slip"] for s in start["stages"]] + [start["slip_over_acceleration"]]
+    assert got[:2] == pytest.approx(slips[:2], abs=6e-3) and got[3] == pytest.approx(slips[3], abs=6e-3)
+    assert got[2] == pytest.approx(slips[2], abs=1e-4) and got[2] < 0.01 < 0.4 < got[1] < got[0]
+    # V_x, V_x_teor and s of every sample, as Fig. 24 plots them.
+    rolling = history["theoretical_speed_mm_s"] > 1e-3
+    expected = 1 - history["speed_mm_s"][rolling] / history["theoretical_speed_mm_s"][rolling]
+    np.testing.assert_allclose(history["slip"][rolling], expected, rtol=1e-6, atol=1e-8)
+    assert (history["slip"][~rolling] == 0).all() and history["slip"].max() > 0.9
+
+
+def test_mean_slip_is_the_share_of_the_way_that_is_lost():
+    t = np.linspace(0, 2, 201)
+    assert stages.mean_slip(t, 0.8 * t, 1.0 * t, 0.0, 2.0) == pytest.approx(0.2)
+    assert stages.mean_slip(t, t**2 / 4, np.ones_like(t), 0.005, 2.0) == pytest.approx(
+        2 / 3, abs=2e-3
+    )  # mean of 1 - t²/4
+    assert stages.mean_slip(t, -0.8 * t, -1.0 * t, 0.35, 1.234) == pytest.approx(0.2)
+    assert np.isnan(stages.mean_slip(t, t, t, 1.0, 1.0)) and np.isnan(stages.mean_slip(t, 0 * t, 0 * t, 0.0, 1.0))
+
+
+def test_stages_are_seen_through_the_ripple_of_a_running_gear():
+    """A start of 0.5 s whose speeds then swing by 3 %, its slide beyond V_s in every pitch."""
+    t = np.arange(1, 1501) * 1e-3
+    rolled = 1 - np.exp(-t / 0.003)
+    gone = np.minimum(2 * t, 0.99)
+    swing = 0.03 * np.cos(2 * np.pi * t / 0.035)
+    even = stages.stages(t, gone, rolled, rolled - gone, V_S, 0.035)
+    uneven = stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S, 0.035)
+    assert uneven.slipping == pytest.approx(even.slipping, abs=0.012) and 0.47 < uneven.slipping < 0.51
+    assert uneven.settled == pytest.approx(even.settled, abs=0.02)
+    assert uneven.slip == pytest.approx(even.slip, abs=0.01)
+    blind = stages.stages(t, gone + swing, rolled, rolled - gone - swing, V_S)
+    assert blind.slipping > 1.4 and blind.settled > 1.4
+
+
+# --- the rig's delay --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("delay", [0.05, -0.02])
+def test_a_history_is_written_by_the_rigs_clock(written, delay):
+    """What is imposed acts that much later than its column says, and all that is read with it."""
+    prompt, _ = written()
+    late, result = written(f"[rig]\ndelay = {delay}\n")
+    assert late["time_s"][0] == 0 and (late["time_s"] >= 0).all()
+    for name in set(late) - {"time_s", "voltage_V"}:
+        expected = np.interp(late["time_s"] - delay, prompt["time_s"], prompt[name])
+        np.testing.assert_allclose(late[name], expected, rtol=1e-6, atol=1e-6 * np.abs(prompt[name]).max())
+    if delay > 0:  # the peak of the inrush is kept
+        assert late["total_current_A"].max() == pytest.approx(prompt["total_current_A"].max(), rel=1e-6)
+    assert np.abs(late["speed_mm_s"] - np.interp(late["time_s"], prompt["time_s"], prompt["speed_mm_s"])).max() > 10
+    (start,) = result["starts"]
+    assert start["acceleration_time_s"] == pytest.approx(0.5 + delay, abs=0.01)
+
+
+def test_the_delay_of_histories_is_the_one_of_fits():
+    """`Rig.late` is the straight line between instants, held beyond them, also where a run ends in no numbers."""
+    t, delay = np.array([0.0, 0.01, 0.03, 0.08]), 0.004
+    x = np.stack([np.sin(40 * t), t**2], 1)
+    rig = Rig(delay=delay)
+    at = np.array([0.0, 0.003, 0.004, 0.014, 0.02, 0.07, 0.2])
+    got = jax.vmap(lambda a: rig.late(jnp.asarray(t), jnp.asarray(x), a))(at)
+    np.testing.assert_allclose(got, np.stack([np.interp(at - delay, t, c) for c in x.T], 1), rtol=1e-12, atol=1e-15)
+    ended = jnp.asarray(np.where(t > 0.02, np.nan, t))
+    assert float(rig.late(jnp.asarray(t), ended, 0.01 + delay)) == pytest.approx(0.01)
+    slope = jax.grad(lambda d: Rig(delay=d).late(jnp.asarray(t), jnp.asarray(x[:, 1]), 0.05))(delay)
+    assert float(slope) == pytest.approx(-(0.08**2 - 0.03**2) / 0.05)
+
+
+def test_a_delay_that_is_none_changes_no_number():
+    t = jnp.linspace(0, 1, 5)[None]
+    signals = Signals(speed=t, speed_theoretical=2 * t, current=t, speed_motor=t, total_current=t)
+    prompt = History.of(robots.nominal(), t, t, signals)
+    assert prompt.signals is signals and (np.asarray(prompt.time) == np.asarray(t)).all()
+    late = History.of(replace(robots.nominal(), {"rig.delay": 0.25}), t, t, signals)
+    np.testing.assert_allclose(late.time[0], [0, 0.5, 0.75, 1.0, 1.25])
+    np.testing.assert_allclose(late.reading["speed"][0], t[0])
+    np.testing.assert_allclose(late.signals.speed_theoretical[0], 2 * t[0])
+
+
+def test_a_vehicle_whose_rig_shows_no_speed_has_that_of_the_robot_in_its_history():
+    t = jnp.linspace(0, 1, 4)[None]
+    signals = Signals(
+        speed=0.5 * t, speed_theoretical=t, current=t, speed_motor=t, total_current=t, voltage=t, traction=t,
+        speed_sliding=0.5 * t, speed_output=t, angle=t,
+    )  # fmt: skip
+    history = History.of(robots.nominal(), t, t, signals)
+
+    class Runs:
+        def has(self, name):
+            return False
+
+        def __len__(self):
+            return 1
+
+    shown = simulate.history_table(robots.nominal(), history, Runs())
+    np.testing.assert_allclose(shown["speed_mm_s"], np.asarray(0.5 * t[0]) / MM)
+    np.testing.assert_allclose(shown["slip"], [0, 0.5, 0.5, 0.5])
