@@ -1,0 +1,58 @@
+"""Calibrations, the loop, its campaigns and `rig check` prepare a table and a robot alike."""
+
+import numpy as np
+import pytest
+from test_rig_histories import ARM, DRIVE
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.runs import Runs
+from calibration.discovery import discover
+from calibration.inference.calibrate import calibrate
+from calibration.inference.foresight import foresee
+from mmrjax import channels, robots
+
+ALL = {
+    "calibrate": lambda runs, robot: calibrate(runs, robot),
+    "discover": lambda runs, robot: discover.discover(runs, robot),
+    "a campaign": lambda runs, robot: discover.prepared(runs, robot),
+    "rig check": lambda runs, robot: foresee(runs, robot),
+}
+
+
+@pytest.mark.parametrize("who", ALL)
+def test_a_table_whose_masses_have_another_unit_is_refused_by_all(who):
+    """`calibrate` took the table's mass for the robot's own before it compared the two, and fitted a robot of 79 kg;
+    `rig check` compared nothing."""
+    runs = records.read("measured")
+    runs = Runs("runs.csv", {**runs.columns, "total_mass_kg": 6 * runs["total_mass_kg"]})
+    with pytest.raises(BadData, match=r"runs.csv, total_mass_kg: about 6\.2 times too large for this robot"):
+        ALL[who](runs, robots.nominal())
+
+
+def test_a_prior_of_a_mass_that_the_table_states_is_refused_by_the_loop_too():
+    with pytest.raises(BadConfiguration, match=r"--prior 4W2T\.mass: .* states total_mass_kg"):
+        discover.prepared(records.read("measured"), robots.nominal(), stated={"4W2T.mass": (11.0, 0.5)})
+
+
+def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
+    """Signs and steps that a rig's file leaves to its table: campaigns left them open."""
+    path = tmp_path / "rig.toml"
+    text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest")
+    text += '[instruments.total_current]\nsigned = "free"\nquantum = "free"\n'
+    path.write_text(text + ARM)
+    robot = robot_file.load(str(path))
+    assert robot.rig.instruments[0].free
+    volts = np.concatenate([np.linspace(-12, -4, 12), np.linspace(4, 12, 12)])
+    current = np.round(0.3 + 0.01 * np.abs(volts), 2)
+    columns = {"supply_voltage_V": volts, "total_current_A": current}
+    table = tmp_path / "table.csv"
+    table.write_text(
+        "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))])
+    )
+    with channels.panel(robot.rig.channels):
+        given = discover.prepared(records.read(table, robot=robot), robot)
+    seen = given.robot.rig.instruments[0]
+    assert seen.signed is False and seen.quantum == pytest.approx(0.01)
+    assert given.noise.sd.min() >= 0.01 / 12**0.5  # with the error of the step
