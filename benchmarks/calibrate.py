@@ -40,7 +40,7 @@ def accuracy(runs: records.Runs) -> dict[str, Any]:
     for name in ("nominal", "sm1", "sm2"):
         robot = params.replace(robots.ROBOTS[name](), {k: jnp.asarray(v) for k, v in CLIMBS.items()})
         shown = steady_batch(robot, runs.conditions(robot)).reading
-        simulated = np.stack([shown[name] for name in channels.names()], 1)
+        simulated = np.stack([shown[name] for name in channels.USUAL], 1)
         lines[f"{name}, adhesion raised to 0.6, not fitted"] = relative_error(simulated, measured)
     record: dict[str, Any] = {}
     for words, stated in (("noise estimated", None), (f"noise {STATED}", STATED)):

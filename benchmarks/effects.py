@@ -30,7 +30,7 @@ ADHESION = {
     f"{c}.ground.friction.{k}": v for c in (TRACKED, WHEELED) for k, v in (("static", 0.6), ("dynamic", 0.48))
 }
 #: In the units of the channels' columns; only the ratios of what a display resolves matter for look-alikes.
-SHOWN = 1 / np.array(channels.factors())
+SHOWN = 1 / np.array(channels.factors(channels.usual()))
 NOISE = np.array([0.02, 5.0, 3.0])
 #: Base parameters that every fit frees, projected out.
 FREED = (
@@ -61,7 +61,7 @@ def amplitude(effect: type[Effect]) -> params.Spec:
 
 
 def _shown(reading: dict[str, jax.Array]) -> jax.Array:
-    return jnp.stack([reading[name] for name in channels.names()], -1)
+    return jnp.stack([reading[name] for name in channels.USUAL], -1)
 
 
 def examples(battery: float = 0.0) -> Conditions:

@@ -197,9 +197,7 @@ def oracle(case: g.Case) -> list[dict]:
 def one(task: Task) -> dict:
     """A case made, looped over and scored against its label."""
     from calibration.data import runs as records
-    from calibration.discovery.discover import trace
-    from calibration.discovery.settings import settings_for
-    from calibration.inference import noise, observers
+    from calibration.discovery.discover import prepared
 
     case = attempt(task.kind, task.seed, task.narrow)
     if isinstance(case, str):
@@ -215,11 +213,10 @@ def one(task: Task) -> dict:
             robot = robot_file.read(table.with_suffix(".toml"))
     stated = {} if isinstance(case, gw.WideCase) else STATED
     began = time.perf_counter()
-    observer = observers.kind(runs)
-    settings = settings_for(observer, task.replicates, task.seed)
-    found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings, stated)
+    given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
+    found = given.trace()
     seconds = time.perf_counter() - began
-    return {"seconds": seconds, **verdict(found), **judged(task.kind, case, runs, found, settings)}
+    return {"seconds": seconds, **verdict(found), **judged(task.kind, case, given.runs, found, given.settings)}
 
 
 def verdict(found) -> dict:

@@ -8,11 +8,13 @@ Tables, priors and fits are the loop's; only the choice of effects is plain. PyS
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 import time
 import warnings
 from pathlib import Path
 
+import loop
 import numpy as np
 import pysindy
 from campaign import Task, campaign, robot_of
@@ -197,9 +199,7 @@ def one(robot, kind: str, seed: int) -> dict:
     """A case made, and what each method names."""
     from calibration.data import runs as records
     from calibration.discovery.candidates import fit_base
-    from calibration.discovery.discover import pose
-    from calibration.discovery.settings import settings_for
-    from calibration.inference import noise, observers
+    from calibration.discovery.discover import pose, prepared
 
     case = make(kind, seed)
     if case is None:
@@ -209,9 +209,9 @@ def one(robot, kind: str, seed: int) -> dict:
         case.write(table, Path(folder) / "label.json")
         runs = records.read(table)
     began = time.perf_counter()
-    observer = observers.kind(runs)
-    settings = settings_for(observer, seed=seed)
-    space = pose(runs, robot, noise.of(runs, observer.sizes(runs)).sd, settings, STATED)
+    given = prepared(runs, robot, stated=STATED, seed=seed)
+    runs, settings = given.runs, given.settings
+    space = pose(runs, given.robot, given.noise.sd, settings, given.stated)
     fitted = fit_base(space, settings, runs.source)
     space, ladder = fitted.space, Ladder(runs, fitted, settings)
     linear, scores = ladder.look(ladder.base)
@@ -294,5 +294,10 @@ def work(task: Task) -> dict:
     return one(robot_of(task.robot), task.kind, task.seed)
 
 
+def program(task: Task) -> tuple | dict:
+    """What tables have alike that share what is compiled, as of the loop's narrow tables."""
+    return loop.program(dataclasses.replace(task, narrow=True))
+
+
 if __name__ == "__main__":
-    campaign(__doc__, KINDS, work, summary, "runs/baselines.jsonl")
+    campaign(__doc__, KINDS, work, program, summary, "runs/baselines.jsonl")

@@ -10,6 +10,7 @@ scorer alone. Every set is one line of `--out`, and a run that is started again 
 
 from __future__ import annotations
 
+import csv
 import sys
 import tempfile
 import time
@@ -124,34 +125,43 @@ def program(task: Task) -> tuple | dict:
 def work(task: Task) -> dict:
     """One case in a worker."""
     from calibration.data import robot_file
-    from calibration.data.runs import Runs
+    from calibration.data import runs as records
 
     made = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(made, str):
         return {"skipped": made}
     table, label, case = made
     robot = robot_of(task.robot)
-    if case is not None and case.toml is not None:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "robot.toml"
-            path.write_text(case.toml, encoding="utf-8")
-            robot = robot_file.read(path)
-    line = judged(robot, Runs("synthetic", dict(table)), label, STATED if case is None else {}, task)
+    with tempfile.TemporaryDirectory() as folder:
+        if case is not None and case.toml is not None:
+            (Path(folder) / "robot.toml").write_text(case.toml, encoding="utf-8")
+            robot = robot_file.read(Path(folder) / "robot.toml")
+        runs = records.read(written(table, Path(folder) / "runs.csv"), robot=robot)
+    line = judged(robot, runs, label, STATED if case is None else {}, task)
     if task.kind in ("outside", "blind") and case is not None:
         line["truth"] = [{**t, **o} for t, o in zip(line["truth"], sw.oracle(case), strict=True)]
     return line
 
 
+def written(table: dict, path: Path) -> Path:
+    """A table as the file that a user has, missing readings as empty cells."""
+    cells = [
+        ["" if isinstance(x, float) and np.isnan(x) else x for x in np.asarray(c).tolist()] for c in table.values()
+    ]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(table)
+        out.writerows(zip(*cells, strict=True))
+    return path
+
+
 def judged(robot, runs, label: dict, stated: dict, task: Task) -> dict:
     """The loop over a case, verdict and label side by side."""
-    from calibration.discovery.discover import trace
-    from calibration.discovery.settings import settings_for
-    from calibration.inference import noise, observers
+    from calibration.discovery.discover import prepared
 
     began = time.perf_counter()
-    observer = observers.kind(runs)
-    settings = settings_for(observer, task.replicates, task.seed)
-    found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings, stated)
+    given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
+    found, settings = given.trace(), given.settings
     seconds = time.perf_counter() - began
     facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
     return {

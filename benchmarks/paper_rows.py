@@ -98,7 +98,7 @@ def base(changed: dict[str, float]) -> Robot:
 def errors(table: Runs, reading: dict[str, np.ndarray]) -> dict[str, Any]:
     """Of each channel [%]: rms, and row by row."""
     found = {}
-    for channel in channels.CHANNELS:
+    for channel in channels.usual():
         e = 100 * (np.asarray(reading[channel.name]) / channel.factor / table[channel.column] - 1)
         found[channel.name] = {"rms": round(float(np.sqrt(np.mean(e**2))), 3), "rows": e.round(2).tolist()}
     return found

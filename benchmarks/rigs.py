@@ -116,28 +116,18 @@ def work(task: Task) -> dict:
     if isinstance(case, str):
         return {"skipped": case}
     _ready()
-    from calibration.data import robot_file, surfaces
+    from calibration.data import robot_file
     from calibration.data import runs as records
-    from calibration.discovery import scales
-    from calibration.discovery.discover import trace, without_copies
-    from calibration.discovery.settings import settings_for
-    from calibration.inference import noise, observers
-    from mmrjax import channels, effects
+    from calibration.discovery.discover import prepared
 
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         case.write(Path(folder))
         robot = robot_file.read(Path(folder) / "rig.toml")
-        with channels.panel(robot.rig.channels):
-            # as `discover` does, without what only a report needs
-            runs = without_copies(records.read(Path(folder) / "table.csv", robot=robot))[0]
-            robot = surfaces.separated(robot, runs)
-            observer = observers.kind(runs)
-            library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
-            settings = settings_for(observer, task.replicates, task.seed)
-            found = trace(runs, robot, noise.of(runs, observer.sizes(runs)), settings, library=library)
-            said = verdict(found)
-            parameters = identified(found, case)
+        runs = records.read(Path(folder) / "table.csv", robot=robot)
+        found = prepared(runs, robot, replicates=task.replicates, seed=task.seed).trace()
+        said = verdict(found)
+        parameters = identified(found, case)
     line = {
         "seconds": time.perf_counter() - began,
         "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,

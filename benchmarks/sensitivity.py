@@ -114,7 +114,7 @@ def ours() -> tuple[room.Inputs, Model, Conditions]:
 
     robot = params.replace(nominal(), {k: jax.numpy.asarray(v) for k, v in ADHESION.items()})
     inputs = room.of_priors(robot, NAMES, {})
-    model = Model(robot, inputs.columns, "steady", {}, chosen_outputs(OUTPUTS))
+    model = Model(robot, inputs.columns, "steady", {}, chosen_outputs(OUTPUTS, robot))
     return inputs, model, Conditions(0, VOLTAGE, SLOPE, PAYLOAD)
 
 
@@ -220,7 +220,7 @@ def table8(repeats: int) -> dict[str, Any]:
     moving = np.ones(len(inputs), bool)
     times = []
     for _ in range(repeats + 1):
-        study = Study(robot, inputs, points, chosen_outputs(()))
+        study = Study(robot, inputs, points, chosen_outputs((), robot))
         began = time.perf_counter()
         by_derivative(study, moving, 0)
         times.append(time.perf_counter() - began)

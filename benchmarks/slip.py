@@ -66,7 +66,7 @@ class Longer(SettledRuns):
             return track(robot, conditions, duration=DURATION, rolling=True).result
 
         found = jax.vmap(one)(self.conditions)
-        reading = jnp.stack([found.reading[name] for name in channels.names()], -1)
+        reading = jnp.stack([found.reading[name] for name in channels.USUAL], -1)
         return Observation(reading, jnp.asarray(found.adhesion_used), found.status, found.flags)
 
 
@@ -84,7 +84,7 @@ def posed(against: str) -> tuple[Problem, np.ndarray]:
 def slip(problem: Problem, reading: np.ndarray) -> np.ndarray:
     """Slip [%] of readings, (..., rows)."""
     robot = problem.base
-    motor, speed = (reading[..., channels.index(name)] for name in ("motor_speed", "speed"))
+    motor, speed = (reading[..., channels.USUAL.index(name)] for name in ("motor_speed", "speed"))
     return 100 * (1 - speed / (motor / float(robot.gearbox.ratio) * float(robot.radius_pulley)))
 
 
@@ -145,7 +145,7 @@ def again(problem: Problem, z: np.ndarray) -> dict[str, Any]:
             for name in ("normal", "total_current", "speed"):
                 x = np.asarray(getattr(runs.signals, name))[:, np.asarray(last)[0]]
                 found[f"ripple of {name}"] = np.round(x.std(1) / x.mean(1), 4).tolist()
-            found["reading"] = {n: np.asarray(runs.result.reading[n]).round(4).tolist() for n in channels.names()}
+            found["reading"] = {n: np.asarray(runs.result.reading[n]).round(4).tolist() for n in channels.USUAL}
     return found
 
 

@@ -44,7 +44,7 @@ set_precision(single=False)
 
 import vectorised
 
-from mmrjax import outputs, robots
+from mmrjax import channels, outputs, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_derivatives, steady_outputs
@@ -52,7 +52,7 @@ from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED
 
 THREE = vectorised.NAMES
-ALL = tuple(output.name for output in outputs.table())
+ALL = tuple(output.name for output in outputs.table(channels.usual()))
 EFFECTS = {"series_resistance": 0.3, "churning": 5e-4, "winding_heating": 1.0, "nonlinear_slip": 0.05}
 PARAMETERS = (
     "motor.resistance", "motor.torque_constant", "motor.friction_coulomb", "motor.friction_viscous",

@@ -60,7 +60,7 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
 
     chunk = arguments.chunk or scale.default_chunk(arguments.model, scale.accelerated(), devices)
     config = Campaign(
-        model=arguments.model, chunk=min(chunk, points), storage=arguments.storage, outputs=channels.names(),
+        model=arguments.model, chunk=min(chunk, points), storage=arguments.storage, outputs=channels.USUAL,
         duration_s=arguments.duration if arguments.model != "steady" else None,
         **plan_of(points, arguments.sampled),
     )  # fmt: skip

@@ -98,8 +98,8 @@ def ours(robot: Any, start: np.ndarray, times: np.ndarray, ratio: float) -> Any:
         Conditions(voltage=VOLTAGES, adhesion=0.0),
         *map(jnp.asarray, (clock, run, sample, rows_of, rows_of[:, [0, -1]])),
     )
-    motor = channels.index("motor_speed")
-    only_speed = jnp.zeros(len(channels.CHANNELS)).at[motor].set(1.0)
+    motor = channels.USUAL.index("motor_speed")
+    only_speed = jnp.zeros(len(channels.usual())).at[motor].set(1.0)
     rows = count * samples
 
     def fitted(speeds: Any) -> fit.Optimum:

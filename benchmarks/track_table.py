@@ -2,7 +2,8 @@
 
     python benchmarks/track_table.py slip --seconds 480      # slip of the tracked rows, nine constants
     python benchmarks/track_table.py table --seconds 480     # all readings of all twenty rows
-    python benchmarks/track_table.py slip --simulated        # with the paper's simulated slip as a prior; table too
+    python benchmarks/track_table.py slip --simulated        # with the paper's simulated slip as a prior of what is
+                                                             # held out, and searches for that slip alone; table too
     python benchmarks/track_table.py lumped                  # slip of the tracked rows by `steady`, for comparison
     python benchmarks/track_table.py time --population 4096  # gears x 20 rows x 1.5 s by the track model
 
@@ -100,9 +101,10 @@ LUMPED = (
     "effects.vibration_slip.exponent",
 )
 #: Found on the paper's simulated slip by benchmarks/slip.py (set S of docs/vibration.md), which no measured row made;
-#: set M found on the measured slip.
+#: sets M and N found on the measured slip.
 SET_S = (0.5735, 0.5524, 0.01777, 3.327e-4, 0.01029, 4.261e7, 806.9, -0.00154, 0.0675)
 SET_M = (0.5846, 0.5765, 0.00788, 3.14e-4, 0.0096, 5.21e7, 758.0, -0.0026, 0.0702)
+SET_N = (0.522, 0.505, 0.0054, 3.24e-4, 0.0138, 4.1e7, 695.0, 0.007, 0.064)
 NEAR = 0.25  # spread of the first generation about a set [prior sd]
 SD_SLIP = {"slip": 0.4, "table": 0.8}  # [percentage points]
 SD_CURRENT, SD_MOTOR, SD_SPEED = 2.0, 0.5, 1.0  # [%]
@@ -133,8 +135,9 @@ class Resolved(SettledRuns):
         def joined(get: Any) -> Array:
             return jnp.concatenate([jnp.asarray(get(one)) for one in found])
 
-        reading = jnp.stack([joined(lambda one, n=name: one.reading[n]) for name in channels.names()], -1)
-        return Observation(reading, joined(lambda one: one.adhesion_used), joined(lambda one: one.status))
+        reading = jnp.stack([joined(lambda one, n=name: one.reading[n]) for name in channels.USUAL], -1)
+        used, status, flags = (joined(lambda one, n=n: getattr(one, n)) for n in ("adhesion_used", "status", "flags"))
+        return Observation(reading, used, status, flags)
 
 
 @dataclasses.dataclass
@@ -206,13 +209,13 @@ class Posed:
         """Slip of runs [%]."""
         chassis, ratio = self.problem.base.configurations, float(self.problem.base.gearbox.ratio)
         radius = np.where(self.tracked, float(chassis["6T2A"].radius), float(chassis["4W2T"].radius))[self.row]
-        motor, speed = (reading[..., channels.index(name)] for name in ("motor_speed", "speed"))
+        motor, speed = (reading[..., channels.USUAL.index(name)] for name in ("motor_speed", "speed"))
         with np.errstate(all="ignore"):
             return 100 * (1 - speed * ratio / (motor * radius))
 
     def cost(self, z: np.ndarray, found: Rows, search: Search) -> np.ndarray:
         """Half the sum of squares of members, by the rows that a search sees."""
-        current, motor, speed = (channels.index(n) for n in ("total_current", "motor_speed", "speed"))
+        current, motor, speed = (channels.USUAL.index(n) for n in ("total_current", "motor_speed", "speed"))
         error = self.percent(found.reading)
         weight = (search.seen / np.bincount(self.row))[self.row]
         sd = SD_SLIP[self.what]
@@ -271,7 +274,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     paper = paper.where(paper["configuration"] == "6T2A")
     if not all(np.array_equal(paper[n], table.where(tracked)[n]) for n in ("supply_voltage_V", "slope_deg")):
         raise ValueError("the simulated rows of the paper are not those measured")
-    motor, speed = (paper.measured()[:, channels.index(name)] for name in ("motor_speed", "speed"))
+    motor, speed = (paper.measured()[:, channels.USUAL.index(name)] for name in ("motor_speed", "speed"))
     simulated = np.full(len(measured), np.nan)
     simulated[tracked] = 100 * (1 - speed * float(robot.gearbox.ratio) / (motor * float(robot.radius_pulley)))
     data = data_of(measured[row], SettledRuns.sizes(table)[row], len(names))
@@ -286,7 +289,7 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     robot = dataclasses.replace(robot, effects=(*robot.effects, zero))
     stated = priors.guided(robots.nominal(), "6T2A")[1]
     share = {"total_current": SD_CURRENT, "motor_speed": SD_MOTOR, "speed": SD_SPEED}
-    size = np.abs(posed.measured) * np.array([0.01 * share[name] for name in channels.names()])
+    size = np.abs(posed.measured) * np.array([0.01 * share[name] for name in channels.USUAL])
     data = data_of(posed.measured, size, len(names))
     coordinates = priors.coordinates(robot, names, stated, any_surface=True)
     problem = Problem(params.strong(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
@@ -314,16 +317,20 @@ def begun(posed: Posed, arguments: argparse.Namespace, robot: Robot, table: Runs
         u = np.where(scale, np.log(np.maximum(np.array(values), 1e-12)), np.array(values))
         return (u - np.asarray(coordinates.location)[: len(values)]) / np.asarray(coordinates.spread)[: len(values)]
 
-    one, two = standard(SET_S), standard(SET_M)
-    gear = NEAR**2 * np.eye(len(one))
+    one, two, three = standard(SET_S), standard(SET_M), standard(SET_N)
+    gear, anywhere = NEAR**2 * np.eye(len(one)), np.eye(len(one))
     if posed.what == "slip":
-        plan = [
-            ("all rows, near S", rows, one),
-            ("all rows, near M", rows, two),
-            ("all rows, near both", rows, (one + two) / 2),
+        starts = [
+            ("all rows, near S", rows, True, one, gear),
+            ("all rows, near M", rows, True, two, gear),
+            ("all rows, near N", rows, True, three, gear),
+            ("all rows, anywhere", rows, True, 0 * one, anywhere),
         ]
-        plan += [(name, seen, one) for name, seen in slopes.items()]
-        starts = [(name, seen, True, centre, gear) for name, seen, centre in plan]
+        if arguments.simulated:
+            none = np.zeros_like(rows)
+            starts += [("simulation, near S", none, True, one, gear)]
+            starts += [("simulation, anywhere", none, True, 0 * one, anywhere)]
+        starts += [(name, seen, True, one, gear) for name, seen in slopes.items()]
     else:
         plan = [("all rows", rows, True), ("all rows, speeds apart", rows, False)]
         plan += [(name, seen, True) for name, seen in (slopes | voltages).items()]
@@ -337,8 +344,10 @@ def begun(posed: Posed, arguments: argparse.Namespace, robot: Robot, table: Runs
             starts.append((name, seen, together, np.concatenate([one, at[:count]]), both))
 
     def prior(seen: np.ndarray) -> float:
-        if not arguments.simulated:
+        if not arguments.simulated or (posed.what == "slip" and np.array_equal(seen, rows)):
             return np.inf
+        if not seen.any():
+            return SD_SLIP[posed.what]
         compared = seen & posed.tracked & (np.arange(len(seen)) > 0)
         measured = Posed.slip(dataclasses.replace(posed, row=np.arange(len(seen))), posed.measured)
         return float(np.sqrt(np.mean((posed.simulated - measured)[compared] ** 2)))
@@ -381,7 +390,7 @@ def finer(posed: Posed, points: np.ndarray, parts: int) -> Rows:
     """What members say at a part of the step."""
     observe = dataclasses.replace(posed.problem.observe, parts=parts)
     seen = jax.device_get(_again(dataclasses.replace(posed.problem, observe=observe), jnp.asarray(points)))
-    return Rows(*map(np.asarray, (seen.reading, seen.adhesion_used, seen.status)))
+    return Rows(*(np.asarray(getattr(seen, name)) for name in Rows._fields))
 
 
 def lumped_slip(arguments: argparse.Namespace) -> None:
@@ -471,6 +480,9 @@ def main() -> None:
     options.add_argument("--seconds", type=float, default=np.inf, help="after which no generation is begun")
     options.add_argument("--simulated", action="store_true", help="the paper's simulated slip counts too, as a prior")
     options.add_argument("--only", help="regular expression of the names of searches to run")
+    options.add_argument(
+        "--parts", type=int, nargs="+", default=[1, 2, 4], help="of the step, at which finalists run"
+    )
     options.add_argument("--seed", type=int, default=1)
     options.add_argument("--state", type=Path, help="file of the searches, from which they go on; only your own")
     options.add_argument("--members", type=Path, help="of `time`: file that keeps what was run")
@@ -492,32 +504,36 @@ def main() -> None:
     start = time.perf_counter()
     count = generations(posed, searches, members, arguments)
     took = time.perf_counter() - start
-    best = [search.best(FINALISTS) for search in searches]
+    finalists = min(FINALISTS, count * arguments.population)
+    best = [search.best(finalists) for search in searches]
     points = np.concatenate(best)
-    steps = [members.run(points), finer(posed, points, 2), finer(posed, points, 4)]
+    steps = [members.run(points) if parts == 1 else finer(posed, points, parts) for parts in arguments.parts]
     print(json.dumps({
         "machine": machine(), "what": posed.what, "generations": count, "seconds": round(took, 1),
         "members": count * len(searches) * arguments.population, "names": posed.problem.coordinates.names,
-        "columns": [*channels.names(), "slip"],
+        "columns": [*channels.USUAL, "slip"],
     }), flush=True)  # fmt: skip
     held: dict[str, list[np.ndarray]] = {}
     for k, search in enumerate(searches):
-        here = slice(k * FINALISTS, (k + 1) * FINALISTS)
+        here = slice(k * finalists, (k + 1) * finalists)
         own = [Rows(*(x[here] for x in s)) for s in steps]
         cost = np.mean([posed.cost(points[here], s, search) for s in own], 0)
         at = int(np.argmin(cost))
         seen = search.seen > 0
-        out = ~seen & ((posed.what == "table") | (np.arange(len(seen)) > 0))
+        shown = seen if seen.any() else posed.tracked
+        out = ~shown & ((posed.what == "table") | (np.arange(len(seen)) > 0))
         lowest = np.minimum.accumulate([c.min() for c in search.cost])
         errors = np.array([posed.mean(posed.percent(s.reading[at])) for s in own])
+        slip = np.array([posed.mean(posed.slip(s.reading[at])[:, None])[posed.tracked, 0] for s in own])
         if out.any():
             held.setdefault(search.name.split()[-1], []).append(errors[:, out])
         print(json.dumps({
             "search": search.name, "prior": search.prior if np.isfinite(search.prior) else None,
             "cost": cost[at].round(2), "gain of the last 8": float(lowest[-9:][0] - lowest[-1]),
-            "seen rms": [rms(e[seen]) for e in errors], "held-out error": errors[:, out].round(2).tolist(),
-            "errors": errors[0].round(2).tolist(), "slip": errors[:, posed.tracked, -1].round(2).tolist(),
-            "singular values": determined(posed, points[here], own, seen),
+            "seen rms": [rms(e[shown]) for e in errors], "held-out error": errors[:, out].round(2).tolist(),
+            "errors": errors[0].round(2).tolist(), "slip": slip.round(2).tolist(),
+            "simulated rms": rms((slip - posed.simulated[posed.tracked]).T),
+            "singular values": determined(posed, points[here], own, shown),
             "constants": np.asarray(posed.problem.coordinates.value(points[here][at])).tolist(),
             "z": points[here][at].round(2).tolist(),
         }), flush=True)  # fmt: skip

@@ -365,5 +365,5 @@ def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:
     """What the instruments show of every channel [SI], by its name."""
     return {
         c.name: robot.rig.instrument(c.name).shows(c.read(robot, signals) + added(robot, signals, "sensor", c.name))
-        for c in channels.known()
+        for c in channels.EVERY
     }

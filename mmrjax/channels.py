@@ -1,23 +1,19 @@
 """The table of channels: everything that an instrument can show, one row each. No other room counts them.
 
-Importable without jax. A new channel is a row of `EVERY`. Files, noise, fits, reports and sensor effects go by
-`CHANNELS`, those that the robot at hand has; `panel` changes them.
+Importable without jax. A new channel is a row of `EVERY`. Which of them there are belongs to the rig: a robot
+(`Robot.channels`), a table of its runs (`Runs.channels`) and every result carry theirs, in the order of `EVERY`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import functools
 import math
-from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
     from mmrjax.signals import Signals
-
-T = TypeVar("T")
 
 RPM = math.pi / 30  # rad/s
 MM = 1e-3  # m
@@ -62,6 +58,10 @@ class Channel:
     settled: bool = True
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
+
+    def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
+        """Pickled by its name, so that tables and results go to other processes and back."""
+        return of, (self.name,)
 
 
 def _winding_temperature(robot: Robot, signals: Signals) -> Any:
@@ -223,84 +223,50 @@ EVERY: tuple[Channel, ...] = (
 #: Of a robot whose file states none.
 USUAL = ("total_current", "motor_speed", "speed")
 
-#: Those of the robot at hand, in the order of columns, arrays and reports. Read through the module
-#: (`channels.CHANNELS`), so that a row more is a row more everywhere.
-CHANNELS: tuple[Channel, ...] = tuple(c for c in EVERY if c.name in USUAL)
 
-
-def select(names: Iterable[str]) -> None:
-    """Make channels those of the robot at hand, in the order of `EVERY`; rows that a program has added stay.
+def rows(names: Iterable[str]) -> tuple[Channel, ...]:
+    """The channels of these names, in the order of columns, arrays and reports, which is that of `EVERY`.
 
     Raises:
         KeyError: no such channel.
     """
-    global CHANNELS
-    wanted = {*names, *({c.name for c in CHANNELS} - {c.name for c in EVERY})}
-    if unknown := wanted - {c.name for c in (*EVERY, *CHANNELS)}:
+    wanted = set(names)
+    if unknown := wanted - {c.name for c in EVERY}:
         raise KeyError(f"no channel {min(unknown)}; there are {', '.join(c.name for c in EVERY)}")
-    table = {c.name: c for c in (*EVERY, *CHANNELS)}
-    CHANNELS = tuple(c for name, c in table.items() if name in wanted)
+    return tuple(c for c in EVERY if c.name in wanted)
 
 
-@contextlib.contextmanager
-def panel(names: Iterable[str]) -> Iterator[None]:
-    """`select` for a while."""
-    global CHANNELS
-    before = CHANNELS
-    select(names)
-    try:
-        yield
-    finally:
-        CHANNELS = before
-
-
-def of_the_robot(function: Callable[..., T]) -> Callable[..., T]:
-    """`function` of (runs, robot, ...) with the channels of that robot's rig."""
-
-    @functools.wraps(function)
-    def with_panel(runs: Any, robot: Robot, *others: Any, **named: Any) -> T:
-        with panel(robot.rig.channels):
-            return function(runs, robot, *others, **named)
-
-    return with_panel
-
-
-def known() -> tuple[Channel, ...]:
-    """Every channel that there is, those that a program has added among them."""
-    return tuple({c.name: c for c in (*EVERY, *CHANNELS)}.values())
+def usual() -> tuple[Channel, ...]:
+    """Those of a robot without a rig."""
+    return rows(USUAL)
 
 
 def of(name: str) -> Channel:
-    """The channel of a name, whether the robot at hand has it or not.
+    """The channel of a name.
 
     Raises:
         KeyError: no such channel.
     """
-    return {c.name: c for c in known()}[name]
+    return rows((name,))[0]
 
 
-def names() -> tuple[str, ...]:
-    """Names of the channels at hand, in order."""
-    return tuple(c.name for c in CHANNELS)
+def names(shown: Iterable[Channel]) -> tuple[str, ...]:
+    """Names of channels, in order."""
+    return tuple(c.name for c in shown)
 
 
-def over_time() -> tuple[Channel, ...]:
-    """The channels at hand that histories show."""
-    return tuple(c for c in CHANNELS if c.over_time)
-
-
-def index(name: str) -> int:
-    """Position of a channel in arrays.
+def index(name: str, shown: Iterable[Channel]) -> int:
+    """Position of a channel in arrays of those that are shown.
 
     Raises:
-        KeyError: no such channel.
+        KeyError: it is not among them.
     """
-    for k, channel in enumerate(CHANNELS):
-        if channel.name == name:
-            return k
-    raise KeyError(f"no channel {name}; there are {', '.join(names())}")
+    known = names(shown)
+    if name not in known:
+        raise KeyError(f"no channel {name}; there are {', '.join(known)}")
+    return known.index(name)
 
 
-def factors() -> tuple[float, ...]:
+def factors(shown: Iterable[Channel]) -> tuple[float, ...]:
     """SI value of one unit of each channel's column."""
-    return tuple(c.factor for c in CHANNELS)
+    return tuple(c.factor for c in shown)

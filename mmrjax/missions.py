@@ -20,7 +20,7 @@ from mmrjax.fidelities.mission import TOLERANCE, Mission, Start, Totals, mission
 from mmrjax.params import Scalar
 from mmrjax.profile import Profile
 from mmrjax.robot import Robot
-from mmrjax.signals import BATTERY_EMPTY
+from mmrjax.signals import BATTERY_EMPTY, CUT_OFF
 
 #: The fidelity that follows profiles.
 MODEL = "drive"
@@ -144,7 +144,7 @@ def numbers(robot: Robot, conditions: Conditions, found: Mission) -> dict[str, A
     on_battery, capacity = conditions.battery > 0.5, robot.battery.capacity
     used = found.discharge - conditions.discharge
     time, path = jnp.asarray(found.total.time), jnp.asarray(found.total.of["path"])
-    ended = found.result.status == BATTERY_EMPTY
+    ended = (found.result.status == BATTERY_EMPTY) | (found.result.status == CUT_OFF)
     times = jnp.where(ended, 1.0, _quotient(capacity - conditions.discharge, used))  # that the charge lasts
     return {
         **totals(found.total, found.peaks),

@@ -6,12 +6,12 @@ Columns of `runs.csv`, of `Results.to_dict` and of printed tables are these.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax import channels
+from mmrjax.channels import MM, Channel
 
 if TYPE_CHECKING:
     from mmrjax.signals import Result
@@ -42,7 +42,7 @@ class Output:
 #: Beside the channels, which come first.
 FURTHER: tuple[Output, ...] = (
     Output(
-        "theoretical_speed", "theoretical_speed_mm_s", "mm/s", channels.MM, "theoretical speed",
+        "theoretical_speed", "theoretical_speed_mm_s", "mm/s", MM, "theoretical speed",
         lambda r: r.theoretical_speed, 1,
     ),
     Output("slip", "slip", "-", 1.0, "slip", lambda r: r.slip, 4),
@@ -72,29 +72,27 @@ def _reading(channel: str) -> Callable[[Result], Any]:
     return lambda result: result.reading[channel]
 
 
-def table(shown: tuple[channels.Channel, ...] | None = None) -> tuple[Output, ...]:
-    """Every output, the channels first, in the order of columns.
-
-    Args:
-        shown: the channels; None: those of the robot at hand.
-    """
-    rows = channels.CHANNELS if shown is None else shown
-    read = tuple(Output(c.name, c.column, c.unit, c.factor, c.label, _reading(c.name), c.resolution) for c in rows)
+def table(shown: Iterable[Channel]) -> tuple[Output, ...]:
+    """Every output, the channels that are shown first, in the order of columns."""
+    read = tuple(Output(c.name, c.column, c.unit, c.factor, c.label, _reading(c.name), c.resolution) for c in shown)
     return read + FURTHER
 
 
-def names() -> tuple[str, ...]:
-    """Names of all outputs, the channels first."""
-    return tuple(output.name for output in table())
+def names(shown: Iterable[Channel]) -> tuple[str, ...]:
+    """Names of all outputs, the channels that are shown first."""
+    return tuple(output.name for output in table(shown))
 
 
-def columns(result: Result, further: Mapping[str, Any] | None = None) -> dict[str, np.ndarray]:
+def columns(
+    result: Result, shown: Iterable[Channel], further: Mapping[str, Any] | None = None
+) -> dict[str, np.ndarray]:
     """Results in the units and words of `runs.csv`.
 
     Args:
+        shown: channels, of the robot.
         further: what a fidelity adds, by column, in the column's unit (`fidelities.base.Run.columns`).
     """
-    found = {output.column: np.asarray(output.get(result)) / output.factor for output in table()}
+    found = {output.column: np.asarray(output.get(result)) / output.factor for output in table(shown)}
     return {
         **found,
         **codes(result.status, result.flags),

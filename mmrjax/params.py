@@ -27,6 +27,9 @@ class Spec:
     `relative_sd` is the prior's standard deviation as a share of the prior mean, `sd` the absolute one
     in the field's unit; one of the two is set. The prior mean is the nominal robot's value.
     `bounds` are what a file may state and what a fit may reach, never what a constructor checks.
+    `scanned` is set where the misfit over it may be a staircase or have several basins (a dead time, a phase, a gap):
+    the half width of a basin, at least [the field's unit]. A fit of histories whose prior reaches further looks at
+    the misfit over all of its range, and not at its gradient alone.
     """
 
     unit: str
@@ -36,6 +39,7 @@ class Spec:
     relative_sd: float | None = None
     sd: float | None = None
     amplitude: bool = False
+    scanned: float | None = None
 
     def prior_sd(self, mean: float) -> float:
         """Standard deviation of the prior [the field's unit] around `mean`."""
@@ -52,11 +56,12 @@ def parameter(
     relative_sd: float | None = None,
     sd: float | None = None,
     amplitude: bool = False,
+    scanned: float | None = None,
 ) -> Any:
     """Declare a differentiable scalar of a component; see `Spec` for the arguments."""
     if (relative_sd is None) == (sd is None):
         raise ValueError("a parameter states either relative_sd or sd")
-    spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude)
+    spec = Spec(unit, meaning, bounds, source, relative_sd, sd, amplitude, scanned)
     keywords: dict[str, Any] = {} if default is None else {"default": default}
     return eqx.field(converter=as_float, metadata={"spec": spec}, kw_only=True, **keywords)
 

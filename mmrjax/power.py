@@ -79,6 +79,11 @@ class Battery(eqx.Module):
         """No-load voltage of one cell [V] after `discharge` [C], eq. (13)."""
         return self.curvature * discharge**2 + self.slope * discharge + self.voltage_full
 
+    def energy(self, discharge: Scalar) -> Scalar:
+        """What the whole battery has given at no-load voltage [J] after `discharge` [C]: the integral of eq. (13)."""
+        per_charge = (self.curvature / 3 * discharge + self.slope / 2) * discharge + self.voltage_full
+        return self.cells * per_charge * discharge
+
     def current(self, total_current: Scalar) -> Scalar:
         """Load current of the battery I_b = I_s + I_p [A], eq. (10); also dC_b/dt, eq. (11)."""
         return total_current + self.current_other

@@ -20,12 +20,8 @@ from mmrjax.fidelities.steady import operating
 from mmrjax.motor import ALPHA, TEMPERATURE_REFERENCE
 from mmrjax.params import Index, Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, STATUSES, Signals
+from mmrjax.signals import CONVERGED, CUT_OFF, Signals
 from mmrjax.tables import CONDITION_LIMITS
-
-#: Outcomes of one point: the statuses of a run, and what ends a run on the battery before it is empty.
-OUTCOMES = (*STATUSES, "cut_off")
-CUT_OFF = OUTCOMES.index("cut_off")
 
 #: Of an envelope: what a point of it states.
 AXES = ("payload_kg", "slope_deg", "charge", "ambient_C")
@@ -124,7 +120,7 @@ class Found(eqx.Module):
     """What a point comes to.
 
     Attributes:
-        value: [SI], with some number whatever the outcome; outcome: code into `OUTCOMES`, `converged` where the
+        value: [SI], with some number whatever the outcome; outcome: code into `STATUSES`, `converged` where the
             value counts.
     """
 

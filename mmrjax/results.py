@@ -10,6 +10,8 @@ import jax
 import numpy as np
 
 from mmrjax import missions, outputs
+from mmrjax.channels import Channel, usual
+from mmrjax.channels import names as channel_names
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.mission import Mission
@@ -54,6 +56,7 @@ class Results:
         model: the fidelity.
         mission: of runs over a profile, totals, segments and course; None without a profile.
         stated: conditions that the profile states, in place of those of the runs.
+        channels: of the robot, in the order of columns.
     """
 
     conditions: Conditions
@@ -65,13 +68,16 @@ class Results:
     model: str
     mission: Mission | None = None
     stated: tuple[str, ...] = ()
+    channels: tuple[Channel, ...] = dataclasses.field(default_factory=usual)
 
     @staticmethod
     def pending(batch: Pending, configurations: tuple[str, ...], model: str) -> Results:
         """Results of which nothing has been computed yet."""
         results = object.__new__(Results)
         known = {"conditions": batch.conditions, "further": {}, "history": None, "mission": None, "stated": ()}
-        results.__dict__.update(known, configurations=configurations, model=model, _pending=batch)
+        results.__dict__.update(
+            known, configurations=configurations, model=model, channels=batch.robot.channels, _pending=batch
+        )
         return results
 
     def _compute(self, name: str) -> None:
@@ -81,7 +87,7 @@ class Results:
             return
         if name == "total_mass":
             own[name] = batch.total_mass()
-        elif "result" not in own and name in (*batch.channels, "status"):
+        elif "result" not in own and name in (*channel_names(batch.robot.channels), "status"):
             own.update(own.setdefault("_shown", batch.shown()))
         elif "result" not in own:
             whole = batch.result()
@@ -129,7 +135,7 @@ class Results:
         columns = {column: np.asarray(getattr(conditions, name)) for name, column in of.items()}
         columns["supply_voltage_V"] = np.where(np.asarray(conditions.battery) > 0.5, np.nan, conditions.voltage)
         columns |= {of[name]: nan for name in self.stated if name in of}
-        found = outputs.columns(self.result, self.further)
+        found = outputs.columns(self.result, self.channels, self.further)
         if self.mission is not None:
             found = {name: found[name] for name in (*missions.names(), *CODES)}
         return {
@@ -149,13 +155,15 @@ class Results:
             rows: most that are shown.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
-        rows_of: tuple[outputs.Output | missions.Output, ...] = (*outputs.table(), *missions.OUTPUTS)
+        rows_of: tuple[outputs.Output | missions.Output, ...] = (*outputs.table(self.channels), *missions.OUTPUTS)
         about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
         if columns is None and self.mission is not None:
             columns = ["configuration", *missions.USUAL, "status"]
         elif columns is None:
             shown = [
-                output.column for output in outputs.table() if output.column in _SHOWN or output.name in self.reading
+                output.column
+                for output in outputs.table(self.channels)
+                if output.column in _SHOWN or output.name in self.reading
             ]
             columns = [
                 "configuration",
@@ -191,5 +199,5 @@ class Results:
 jax.tree_util.register_dataclass(
     Results,
     data_fields=["conditions", "total_mass", "result", "further", "history", "mission"],
-    meta_fields=["configurations", "model", "stated"],
+    meta_fields=["configurations", "model", "stated", "channels"],
 )

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from mmrjax import channels
 from mmrjax.params import Index, Scalar, parameter
@@ -111,6 +112,7 @@ class Rig(eqx.Module):
         bounds=(-10.0, 10.0),
         sd=0.02,
         source="stated by whoever owns the rig",
+        scanned=0.0,
     )
     begins: Begins | None = None
     imposed: str = eqx.field(default=IMPOSED[0], static=True)
@@ -129,6 +131,39 @@ class Rig(eqx.Module):
             return self
         rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if i.signed is False)
         return dataclasses.replace(self, instruments=rectified, columns=(), priors=(), start=STARTS[0], surfaces=())
+
+    def late(self, times: Float[Array, " times"], values: Array, at: Scalar) -> Array:
+        """What happens at instants, by the clock of tables, whose column of what is imposed acts `delay` later.
+
+        Args:
+            times: since what is imposed acts [s], increasing; values: at those, shape (times, ...).
+            at: an instant of the tables' clock [s].
+
+        Returns:
+            The value at `at` - delay: on the straight line between the instants about it, held before the first and
+            after the last.
+        """
+        wanted = at - self.delay
+        k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, times.shape[0] - 2)
+        gap = times[k + 1] - times[k]
+        share = jnp.clip(jnp.where(gap > 0, (wanted - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0), 0.0, 1.0)
+        if not jnp.issubdtype(values.dtype, jnp.inexact):
+            return values[k]
+        # An instant itself takes nothing of the one after it, which may be no number.
+        after = jnp.where((share < 1e-9) & jnp.isnan(values[k + 1]), values[k], values[k + 1])
+        return values[k] + share * (after - values[k])
+
+    def clock(self, times: Float[Array, " times"]) -> Array:
+        """Instants of the tables' clock [s] at which a run is shown that is known at `times` since what is imposed
+        acts: `delay` later, from 0 on; the rest before the run begins at 0. The same where the delay is traced."""
+        if isinstance(self.delay, jax.core.Tracer):
+            return times
+        return jnp.where(times <= 0, jnp.minimum(times, 0.0), jnp.maximum(times + self.delay, 0.0))
+
+    @property
+    def prompt(self) -> bool:
+        """Whether it is known that what is imposed acts when its column says."""
+        return not isinstance(self.delay, jax.core.Tracer) and not bool(jnp.any(jnp.asarray(self.delay) != 0))
 
     @property
     def stated(self) -> frozenset[str]:

@@ -10,6 +10,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.chassis import Chassis
 from mmrjax.driver import Driver
 from mmrjax.gearbox import Gearbox
@@ -101,6 +103,11 @@ class Robot(eqx.Module):
         if rig is self.rig and all(a is b for a, b in zip(effects, self.effects, strict=True)):
             return self
         return dataclasses.replace(self, rig=rig, effects=effects)
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """Those that its rig's instruments show, in order."""
+        return channels.rows(self.rig.channels)
 
     @property
     def on_shaft(self) -> bool:

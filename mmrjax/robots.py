@@ -54,6 +54,7 @@ def _friction(adhesion: float) -> Friction:
 def nominal() -> Robot:
     """The proposed model (PM) with the parameters of Tables 1-7 and the makers' sheets."""
     bench = SURFACES[BENCH]
+    pulleys = 2 * (75e-6 + 140e-6)  # Table 7: two main and two additional pulleys a side
     belt = 40e-3 * RADIUS_PULLEY**2  # Table 7: main track 40 g
     belts_flippers = 2 * 25e-3 * RADIUS_PULLEY**2  # Table 7: additional tracks 25 g
     tracked = Chassis(
@@ -62,7 +63,7 @@ def nominal() -> Robot:
         on_tracks=1.0,
         mass=13.1,
         radius=RADIUS_PULLEY,
-        inertia=75e-6 + 140e-6 + belt + belts_flippers,
+        inertia=pulleys + belt + belts_flippers,
     )
     wheeled = Chassis(
         track=Track(loss_coulomb=0.070, loss_viscous=0.003, guide_share=0.0),
@@ -70,7 +71,7 @@ def nominal() -> Robot:
         on_tracks=0.0,
         mass=11.5,
         radius=RADIUS_WHEEL,
-        inertia=75e-6 + 140e-6 + belt + 2 * 152e-6,
+        inertia=pulleys + belt + 2 * 152e-6,
     )
     return Robot(Battery(), Motor(), Gearbox(), Configurations({TRACKED: tracked, WHEELED: wheeled}))
 

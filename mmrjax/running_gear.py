@@ -19,7 +19,8 @@ _ASSUMED = "assumed; the paper prints none"
 class RunningGear(eqx.Module):
     """Geometry (Table 6), masses (Table 7), belt and contacts (27)-(29) of one side of the chassis.
 
-    The rolling radius, the moments of inertia of the rotating parts, friction and losses are the robot's.
+    The rolling radius, the moments of inertia of the rotating parts, friction and losses are the robot's, and so is
+    its mass, of which the body has what the parts below leave.
     """
 
     wheelbase: Scalar = parameter(
@@ -89,7 +90,7 @@ class RunningGear(eqx.Module):
     belt_mass: Scalar = parameter(
         40e-3,
         unit="kg",
-        meaning="mass of one main track, for its centrifugal tension P_ct",
+        meaning="mass of one main track",
         bounds=(0.0, 2.0),
         relative_sd=0.05,
         source="Table 7",
@@ -158,21 +159,30 @@ class RunningGear(eqx.Module):
         sd=0.02,
         source="Fig. 19",
     )
+    body_gyration: Scalar = parameter(
+        0.1075,
+        unit="m",
+        meaning="radius of gyration in pitch of the body, all but payload, levers, pulleys, wheels and tracks",
+        bounds=(1e-3, 3.0),
+        relative_sd=0.05,
+        source="Table 7: sqrt(1.19e5 kg·mm² / 10.3 kg)",
+    )
     inertia_tracked: Scalar = parameter(
-        0.251,
+        0.0,
         unit="kg·m^2",
-        meaning="moment of inertia in pitch of the robot in 6T2A, transport posture",
-        bounds=(1e-3, 20.0),
-        relative_sd=0.1,
-        source="Table 7: 2.51e5 kg·mm²",
+        meaning="moment of inertia in pitch on tracks, levers folded, no payload, where it is known as a whole and "
+        "stated in place of body_gyration; 0: it follows from the parts",
+        bounds=(0.0, 20.0),
+        sd=5e-3,
+        source="not stated: the sum of the parts (Table 7's 0.251 is that of the robot with its levers outstretched)",
     )
     inertia_wheeled: Scalar = parameter(
-        0.145,
+        0.0,
         unit="kg·m^2",
-        meaning="moment of inertia in pitch of the robot in 4W2T",
-        bounds=(1e-3, 20.0),
-        relative_sd=0.1,
-        source="Table 7: 1.45e5 kg·mm²",
+        meaning="the same on wheels",
+        bounds=(0.0, 20.0),
+        sd=5e-3,
+        source="not stated: the sum of the parts (0.146; Table 7: 0.145)",
     )
     lever_mass: Scalar = parameter(
         0.495,
@@ -181,6 +191,22 @@ class RunningGear(eqx.Module):
         bounds=(0.0, 10.0),
         relative_sd=0.05,
         source="Table 7: 470 + 25 g",
+    )
+    lever_centre: Scalar = parameter(
+        0.083,
+        unit="m",
+        meaning="centre of a lever with its track from its axle",
+        bounds=(0.0, 1.0),
+        sd=5e-3,
+        source="with it the parts of the outstretched robot have Table 7's 0.251 kg·m²; middle of its track: 80 mm",
+    )
+    lever_inertia: Scalar = parameter(
+        1.6e-3,
+        unit="kg·m^2",
+        meaning="moment of inertia of one lever with its track about its own centre",
+        bounds=(0.0, 10.0),
+        relative_sd=0.1,
+        source="Table 7: 1470 kg·mm²; 170 of its track of 560 mm, less what turns with the pulley (40)",
     )
     lever_length: Scalar = parameter(
         0.205,
@@ -212,7 +238,15 @@ class RunningGear(eqx.Module):
         meaning="mass of one main pulley",
         bounds=(1e-3, 10.0),
         relative_sd=0.05,
-        source="Table 7",
+        source="Table 7: two a side, as 13.1 and 11.5 kg need",
+    )
+    additional_pulley_mass: Scalar = parameter(
+        104e-3,
+        unit="kg",
+        meaning="mass of the additional pulley beside it, which drives the lever's track or carries the wheel",
+        bounds=(0.0, 10.0),
+        relative_sd=0.05,
+        source="Table 7: two a side, as 13.1 and 11.5 kg need",
     )
     wheel_mass: Scalar = parameter(
         86e-3,

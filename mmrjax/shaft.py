@@ -68,6 +68,7 @@ class Shaft(eqx.Module):
         bounds=(-6.3, 6.3),
         sd=0.05,
         source=_STATED,
+        scanned=1.0,
     )
     backlash: Scalar = parameter(
         0.0,
@@ -76,6 +77,7 @@ class Shaft(eqx.Module):
         bounds=(0.0, 1.0),
         relative_sd=0.3,
         source=_STATED,
+        scanned=0.0,
     )
     radius: Scalar = parameter(
         1.0,

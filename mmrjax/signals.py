@@ -17,8 +17,11 @@ GRAVITY = 9.80665  # [m/s²], standard gravity
 #: Outcomes of one member of a batch, in the order of their codes.
 STATUSES = (
     "converged", "stalled", "slides", "not_settled", "battery_empty", "failed", "tips", "reverses", "rolls_back",
+    "cut_off",
 )  # fmt: skip
-CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, ROLLS_BACK = range(len(STATUSES))
+CONVERGED, STALLED, SLIDES, NOT_SETTLED, BATTERY_EMPTY, FAILED, TIPS, REVERSES, ROLLS_BACK, CUT_OFF = range(
+    len(STATUSES)
+)
 
 #: Statuses of a run that ended as its conditions ask: `reverses` travels backward since its voltage is negative.
 DONE = (CONVERGED, REVERSES)
@@ -132,7 +135,7 @@ class Result(eqx.Module):
     """One settled operating point (or the end of a run), with its status.
 
     Attributes:
-        reading: what the instruments show [SI], by the name of the channel (`channels.CHANNELS`); each is an
+        reading: what the instruments show [SI], by the name of the channel (`channels.EVERY`); each is an
             attribute too: `result.total_current`.
         theoretical_speed: r_k ω_k, eq. (32) [m/s].
         slip: 1 - V / V_theoretical, eq. (33) [-]; 0 at rest.

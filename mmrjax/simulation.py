@@ -93,9 +93,12 @@ def simulate(
             raise UsageError(f"model {model}, {error}") from error
     names = robot.configurations.names
     if fidelity.outputs is not None and not traced:
-        return Results.pending(Pending(robot, conditions, fidelity, channels.names()), names, model)
+        return Results.pending(Pending(robot, conditions, fidelity), names, model)
     run = _run(fidelity, robot, conditions, stated, history and fidelities.facts(model).histories)
-    return Results(conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model)
+    return Results(
+        conditions, total_mass(robot, conditions), run.result, run.columns, run.history, names, model,
+        channels=robot.channels,
+    )  # fmt: skip
 
 
 def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]) -> None:
@@ -120,7 +123,9 @@ def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Sta
         course = History.of(robot, found.course.time, found.course.distance, found.course.signals)
     found, further, course = _shaped((found, further, course), conditions.shape)
     names, mass = robot.configurations.names, total_mass(robot, conditions)
-    return Results(conditions, mass, found.result, further, course, names, missions.MODEL, found, profile.stated)
+    return Results(
+        conditions, mass, found.result, further, course, names, missions.MODEL, found, profile.stated, robot.channels
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,17 +134,15 @@ class Pending:
 
     Attributes:
         robot: concrete; conditions: of any shape, configurations resolved; fidelity: one that has `outputs`.
-        channels: names of those that the robot has.
     """
 
     robot: Robot
     conditions: Conditions
     fidelity: Fidelity
-    channels: tuple[str, ...]
 
     def shown(self) -> dict[str, jax.Array]:
         """What the robot's instruments show, by channel, and the codes of how the runs ended as `status`."""
-        outputs, names = self.fidelity.outputs, (*self.channels, STATUS)
+        outputs, names = self.fidelity.outputs, (*channels.names(self.robot.channels), STATUS)
         assert outputs is not None
         return _in_chunks(self.fidelity, lambda flat: outputs(self.robot, flat, names), self.conditions)
 

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import fidelities, missions, params
 from mmrjax import outputs as table_of_outputs
+from mmrjax.channels import Channel
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError, choices
@@ -151,7 +152,7 @@ def evaluate(
         fidelity: one of `fidelities.NAMES`; options: all that it has, from `Facts.resolved`.
         values: a row a point, in the order of `variation.names`.
         conditions: what does not vary, of shape () or (points,), names of configurations resolved.
-        outputs: names of `outputs.table()`, or of columns that the fidelity adds; also `flags`. Over a profile
+        outputs: names of `outputs.table`, or of columns that the fidelity adds; also `flags`. Over a profile
             columns of `missions.OUTPUTS`.
         profile: a mission that every point is to follow, by the fidelity `missions.MODEL`; fields of shape (rows,).
 
@@ -177,10 +178,11 @@ def _evaluate(
 ) -> dict[str, Array]:
     (points, _) = values.shape
     conditions = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
+    shown = variation.robot.channels
     if profile is None and fidelity == "steady":
         from mmrjax.fidelities.steady import steady_outputs
 
-        _known(names, table_of_outputs.names())
+        _known(names, table_of_outputs.names(shown))
         robot, each = variation.at(values, conditions)
         each = jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), each)
         return steady_outputs(robot, each, (*names, STATUS))
@@ -191,18 +193,18 @@ def _evaluate(
         return fidelities.get(fidelity).run(robot, conditions, options)
 
     if not variation.varies_robot:
-        return _picked(simulate(*variation.at(values, conditions)), names)
+        return _picked(simulate(*variation.at(values, conditions)), shown, names)
 
     def one(values: Array, conditions: Conditions) -> Run:
         robot, point = variation.at(values, conditions)
         run = simulate(robot, jax.tree.map(lambda x: x[None], point))
         return jax.tree.map(lambda x: x[0], run)
 
-    return _picked(jax.vmap(one)(values, conditions), names)
+    return _picked(jax.vmap(one)(values, conditions), shown, names)
 
 
-def _picked(run: Run, names: tuple[str, ...]) -> dict[str, Array]:
-    rows = {row.name: row for row in table_of_outputs.table()}
+def _picked(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
+    rows = {row.name: row for row in table_of_outputs.table(shown)}
     _known(names, (*rows, *run.columns))
     found = {n: rows[n].get(run.result) if n in rows else run.columns[n] for n in names if n != FLAGS}
     further = {FLAGS: run.result.flags} if FLAGS in names else {}
@@ -231,7 +233,7 @@ def check_outputs(
     if profile is not None:
         _known(names, missions.names())
         return
-    if set(names) <= {*table_of_outputs.names(), FLAGS}:
+    if set(names) <= {*table_of_outputs.names(variation.robot.channels), FLAGS}:
         return
     values = jax.ShapeDtypeStruct((1, len(variation.names)), jnp.result_type(float))
     eqx.filter_eval_shape(evaluate, variation, fidelity, values, conditions, options, names)

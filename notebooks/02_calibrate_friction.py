@@ -115,7 +115,7 @@ show(figures_calibration.before_after, found)
 # both voltages. Finding those effects is another tool's work; freeing the electrics here would only hide them.
 
 # %%
-show(figures_comparison.errors_over, found.rows())
+show(figures_comparison.errors_over, found.rows(), found.channels)
 
 # %%
 for note in found.notes:

@@ -83,7 +83,7 @@ inputs = uncertain.of_priors(robot, names, {})
 points = Points(
     np.full(4, "6T2A"), np.array([15.0, 33.0, 15.0, 33.0]), np.full(4, 3.0), np.array([0.0, 0.0, 5.0, 5.0])
 )
-study = Study(robot, inputs, points, chosen_outputs(("total_current", "speed", "slip", "steepest_slope")))
+study = Study(robot, inputs, points, chosen_outputs(("total_current", "speed", "slip", "steepest_slope"), robot))
 found = analyse(study, "sobol", evaluations=100_000)
 print(found.statement())
 print(f"{found.evaluations} runs of the model")

@@ -46,7 +46,6 @@ FOLDER = next(
 )
 FOLDER = FOLDER / "rigs" / "robotino"
 rig = calibration.read_robot(str(FOLDER / "robotino.toml"))
-channels.select(rig.rig.channels)
 runs = calibration.read_runs(str(FOLDER / "settled.csv"), robot=rig)
 print(f"{len(runs)} runs on {', '.join(np.unique(runs['surface']))}; imposed: {rig.rig.imposed}")
 print(f"channels: {', '.join(rig.rig.channels)}; columns without a role: {', '.join(runs.unknown)}")
@@ -62,7 +61,7 @@ print(f"channels: {', '.join(rig.rig.channels)}; columns without a role: {', '.j
 def rms(robot, rows):
     """Root mean square error of the ground speed [mm/s] over some rows."""
     conditions = runs.conditions(robot)
-    error = np.asarray(steady_batch(robot, conditions).speed) - runs.measured()[:, channels.index("speed")]
+    error = np.asarray(steady_batch(robot, conditions).speed) - channels.MM * runs["speed_mm_s"]
     return 1e3 * float(np.sqrt(np.mean(error[rows] ** 2)))
 
 
@@ -96,7 +95,7 @@ figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constra
 wheel = (
     runs["motor_speed_rpm"] * channels.RPM / float(rig.gearbox.ratio) * float(rig.configurations.members[0].radius)
 )
-measured = runs.measured()[:, channels.index("speed")]
+measured = channels.MM * runs["speed_mm_s"]
 for ax, (title, robot) in zip(axes, (("plain law", plain.robot), ("slip goes with speed", found.robot)), strict=True):
     shown = np.asarray(steady_batch(robot, runs.conditions(robot)).speed)
     for k, surface in enumerate(np.unique(runs["surface"])):

@@ -9,7 +9,6 @@ from rich.table import Table
 from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
 from calibration.inference.result import CalibrationResult
-from mmrjax import channels
 from sweeps import config as configuration
 from sweeps import words
 from sweeps.console import say, tell
@@ -63,7 +62,7 @@ def print_calibration(found: CalibrationResult) -> None:
         shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", "yes" * p.held_by_prior)
     say(shown)
     errors = Table(title=f"rms of simulated - measured [% of {found.percent_of}]", title_justify="left")
-    for heading in ("", "rows", *(c.label for c in channels.CHANNELS)):
+    for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
     lines = {"before": found.errors_before, "after": found.errors_after}
     lines |= {f"after, held out by {blocks.in_words(k)}": h.errors for k, h in found.held_out.items()}
@@ -72,7 +71,7 @@ def print_calibration(found: CalibrationResult) -> None:
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
     if is_rig(found.robot):
-        say(words.said_rms(rms(found.rows(), ("before", "after", "held_out"))))
+        say(words.said_rms(rms(found.rows(), found.channels, ("before", "after", "held_out"))))
     say(found.starts.statement())
     for note in found.notes:
         say(f"- {note}")

@@ -74,7 +74,8 @@ def campaign(
         config = config.model_copy(
             update={
                 "chunk": config.chunk or scale.default_chunk(config.model, accelerator, devices),
-                "outputs": config.outputs or (channels.names() if config.profile is None else missions.USUAL),
+                "outputs": config.outputs
+                or (channels.names(robot.channels) if config.profile is None else missions.USUAL),
             }
         )
         job = prepare(config, robot, plan, where)
@@ -177,7 +178,7 @@ def _bearable(variation: Variation, config: Campaign, plan: axes.Plan) -> None:
 def laid_out(config: Campaign, job: scale.Job) -> Layout:
     """Arrays of the store of a job, with units and long names."""
     further = () if job.profile is None else missions.OUTPUTS
-    rows: dict[str, outputs.Output | missions.Output] = {row.name: row for row in outputs.table()}
+    rows: dict[str, outputs.Output | missions.Output] = {row.name: row for row in outputs.table(job.robot.channels)}
     rows |= {row.column: row for row in further}
     variables = []
     for name in job.outputs:

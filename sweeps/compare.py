@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from calibration.data import instruments
 from calibration.data import runs as records
 from calibration.inference import errors as residual
 from calibration.inference.ranges import check_ranges
-from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 from sweeps import config as configuration
 from sweeps import run, uncertainty, words
@@ -42,14 +43,14 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
         table = run.evaluate(robot, runs, config, folder)
         comparison, summary = compared(stated, table, robot)
         folder.write_table("comparison.csv", comparison)
-        notes = [*missing(comparison), *said]
-        print_comparison(comparison, summary, notes, sized=not runs.layout.usual)
+        notes = [*missing(comparison, stated.channels), *said]
+        print_comparison(comparison, summary, stated.channels, notes, sized=not runs.layout.usual)
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             uncertainty.say_intervals(table, found)
             table |= found.columns
             ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)
-            kept = [c.column + end for c in channels.CHANNELS for end in ends]
+            kept = [c.column + end for c in robot.channels for end in ends]
             folder.write_table(
                 "comparison.csv", comparison | {f"simulated_{key}": found.columns[key] for key in kept}
             )
@@ -76,7 +77,7 @@ def compared(
     if not measured.layout.usual and measured.has("surface"):
         table["surface"] = measured["surface"]
     nothing = np.full(len(measured), np.nan)
-    for channel in channels.CHANNELS:
+    for channel in measured.channels:
         table[channel.column] = measured.columns.get(channel.column, nothing)
         table[f"simulated_{channel.column}"] = simulated[channel.column]
         error = residual.relative_error if measured.layout.usual else residual.sized_error
@@ -86,13 +87,13 @@ def compared(
     names = measured["configuration"] if robot is None else measured.configurations_named(robot)
     groups |= {str(c): names == c for c in dict.fromkeys(names)}
     summary = {
-        name: {c.name: _summary(c, {k: v[rows] for k, v in table.items()}) for c in channels.CHANNELS}
+        name: {c.name: _summary(c, {k: v[rows] for k, v in table.items()}) for c in measured.channels}
         for name, rows in groups.items()
     }
     return table, summary
 
 
-def _summary(channel: channels.Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
+def _summary(channel: Channel, table: dict[str, np.ndarray]) -> dict[str, Any]:
     measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
     difference = simulated - measured
     there = difference[np.isfinite(difference)]
@@ -105,9 +106,9 @@ def _summary(channel: channels.Channel, table: dict[str, np.ndarray]) -> dict[st
     }
 
 
-def missing(table: dict[str, np.ndarray]) -> list[str]:
+def missing(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> list[str]:
     """A sentence for each channel of which the table lacks readings."""
-    lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels.CHANNELS}
+    lost = {c.column: int(np.isnan(table[c.column]).sum()) for c in channels}
     rows = len(table["status"])
     return [
         f"{column}: {'all' if count == rows else f'{count} of {rows}'} readings are missing; they weigh nothing"
@@ -116,7 +117,13 @@ def missing(table: dict[str, np.ndarray]) -> list[str]:
     ]
 
 
-def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list[str], sized: bool = False) -> None:
+def print_comparison(
+    table: dict[str, np.ndarray],
+    summary: Summary,
+    channels: Sequence[Channel],
+    notes: list[str],
+    sized: bool = False,
+) -> None:
     """Every row's errors, their summary, and which readings are missing.
 
     Args:
@@ -125,13 +132,13 @@ def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list
     title = "simulated - measured" if sized else "(simulated - measured) / simulated, eq. (35) [%]"
     rows = Table(title=title, title_justify="left")
     stated_here = {c: words for c, words in HEADINGS.items() if c in table and f"simulated_{c}" not in table}
-    for heading in ("", *stated_here.values(), *(_words(c, sized) for c in channels.CHANNELS), "status"):
+    for heading in ("", *stated_here.values(), *(_words(c, sized) for c in channels), "status"):
         rows.add_column(heading, justify="left" if heading in ("", "status") else "right")
     for k in range(len(table["status"])):
         errors = [
             (table[f"simulated_{c.column}"][k] - table[c.column][k], f"+.{c.resolution}f")
             if sized else (table[f"error_{c.name}_percent"][k], "+.1f")
-            for c in channels.CHANNELS
+            for c in channels
         ]  # fmt: skip
         stated = (f"{table[c][k]:g}" for c in stated_here)
         rows.add_row(
@@ -146,7 +153,7 @@ def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list
     for heading in ("rows of", "channel", "rows", *units, f"rms [%{of}]", f"worst [%{of}]", "R²"):
         shown.add_column(heading, justify="left" if heading in ("rows of", "channel") else "right")
     for group, by_channel in summary.items():
-        for channel in channels.CHANNELS:
+        for channel in channels:
             numbers = by_channel[channel.name]
             figures = (numbers["rms_percent"], numbers["max_percent"], numbers["r2"])
             cells = ("-" if v != v else format(v, f) for v, f in zip(figures, (".1f", ".1f", ".3f"), strict=True))
@@ -161,5 +168,5 @@ def print_comparison(table: dict[str, np.ndarray], summary: Summary, notes: list
         say(note)
 
 
-def _words(channel: channels.Channel, with_unit: bool) -> str:
+def _words(channel: Channel, with_unit: bool) -> str:
     return channel.word.replace("_", " ") + (f" [{channel.unit}]" if with_unit else "")

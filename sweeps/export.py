@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mmrjax import outputs
+from mmrjax import channels, outputs
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.variation import STATUS
 from sweeps.zarr_store import STORE, Layout
@@ -46,7 +46,7 @@ def tables(store: Path, layout: Layout) -> Iterator[Any]:
 
     group = zarr.open_group(store, mode="r")
     design, blocks = layout.design, layout.blocks
-    columns = {row.name: row.column for row in outputs.table()}
+    columns = {row.name: row.column for row in outputs.table(channels.EVERY)}
     for chunk in range(len(blocks)):
         box = blocks.box(chunk)
         shape = tuple(b.stop - b.start for b in box)

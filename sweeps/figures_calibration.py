@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,7 +11,7 @@ from matplotlib.figure import Figure
 from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
-from mmrjax import channels
+from mmrjax.channels import Channel
 from sweeps.figures_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure
 
 #: Runs of which histories are drawn.
@@ -95,8 +97,8 @@ def before_after(found: CalibrationResult) -> Figure:
     """rms errors by channel: before, fitted, and with each kind of block held out."""
     lines = {"before": found.errors_before, "fitted": found.errors_after}
     lines |= {f"held out: {blocks.in_words(kind, ' + ')}": held.errors for kind, held in found.held_out.items()}
-    fig, grid = figure(1, len(channels.CHANNELS), 1.1 + 0.36 * len(lines), sharey=True)
-    for axes, channel in zip(grid[0], channels.CHANNELS, strict=True):
+    fig, grid = figure(1, len(found.channels), 1.1 + 0.36 * len(lines), sharey=True)
+    for axes, channel in zip(grid[0], found.channels, strict=True):
         most = int(np.isfinite(found.readings[channel.name].measured).sum())
         for row, (words, by) in enumerate(lines.items()):
             errors = by[channel.name]
@@ -116,14 +118,14 @@ def before_after(found: CalibrationResult) -> Figure:
     return fig
 
 
-def histories(table: dict[str, np.ndarray]) -> Figure:
+def histories(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> Figure:
     """Time histories: measured dots and the fitted line, a row of panels for each run (six at most)."""
     names = list(dict.fromkeys(table["run_id"]))[:HISTORIES] if "run_id" in table else [None]
-    fig, grid = figure(len(names), len(channels.CHANNELS), 2.2 * len(names))
+    fig, grid = figure(len(names), len(channels), 2.2 * len(names))
     for row, name in zip(grid, names, strict=True):
         pick = np.ones(len(table["time_s"]), bool) if name is None else table["run_id"] == name
         order = np.flatnonzero(pick)[np.argsort(table["time_s"][pick])]
-        for axes, channel in zip(row, channels.CHANNELS, strict=True):
+        for axes, channel in zip(row, channels, strict=True):
             axes.plot(table["time_s"][order], table[channel.column][order], "o", ms=3, color=INK)
             axes.plot(table["time_s"][order], table[f"after_{channel.column}"][order], color=BLUE)
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))

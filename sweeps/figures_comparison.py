@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from mmrjax import channels
+from mmrjax.channels import Channel
 from sweeps.figures_style import axis_label, figure, looks, note
 
 
-def parity(table: dict[str, np.ndarray], band: bool = True) -> Figure:
+def parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band: bool = True) -> Figure:
     """Simulated over measured, one panel a channel; a reading that is missing is not drawn.
 
     Args:
         band: whether ±5 % are shaded.
     """
-    fig, grid = figure(1, len(channels.CHANNELS), 3.6)
+    fig, grid = figure(1, len(channels), 3.6)
     look = looks(table["configuration"])
-    for axes, channel in zip(grid[0], channels.CHANNELS, strict=True):
+    for axes, channel in zip(grid[0], channels, strict=True):
         measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
         both = np.isfinite(measured) & np.isfinite(simulated)
         ends = np.concatenate([measured[both], simulated[both]]) if both.any() else np.array([0.0, 1.0])
@@ -55,7 +55,10 @@ def parity(table: dict[str, np.ndarray], band: bool = True) -> Figure:
 
 
 def errors_over(
-    table: dict[str, np.ndarray], in_units: bool = False, beside: Mapping[str, str] | None = None
+    table: dict[str, np.ndarray],
+    channels: Sequence[Channel],
+    in_units: bool = False,
+    beside: Mapping[str, str] | None = None,
 ) -> Figure:
     """Error (35) of each channel over each condition.
 
@@ -73,11 +76,9 @@ def errors_over(
         conditions |= beside or {}
         varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
         conditions = varied or dict(list(conditions.items())[:1])
-    fig, grid = figure(
-        len(channels.CHANNELS), len(conditions), 2.3 * len(channels.CHANNELS), sharex="col", sharey="row"
-    )
+    fig, grid = figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
     look = looks(table["configuration"])
-    for row, channel in zip(grid, channels.CHANNELS, strict=True):
+    for row, channel in zip(grid, channels, strict=True):
         error = table[f"error_{channel.name}_percent"]
         half = 5.0
         if in_units:

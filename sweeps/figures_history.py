@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmrjax import channels
-from mmrjax.channels import MM
+from mmrjax.channels import MM, Channel
+from mmrjax.stages import Stages, ending, numbers, of_histories
 from sweeps import words
 from sweeps.figures_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note
 
@@ -29,10 +30,7 @@ class Start:
     Attributes:
         name: heading; configuration; status.
         time: [s]; current: of all motors [A]; speed, theoretical: V and r_k ω_k [mm/s].
-        sense: in which the shafts turn at the end, 1 or -1; current and speeds are drawn, and kept here, times it.
-        starting: end of stage I [s]: the slide has reached its maximum, the shafts have spun up.
-        slipping: end of stage II [s]: the slide is back within V_s for good; `starting` if it never left.
-        settled: t' [s]: the speed within 1 % of its last value.
+        stages: of the start; current and speeds are drawn, and kept here, times its `sense`. None without numbers.
     """
 
     name: str
@@ -42,15 +40,32 @@ class Start:
     current: np.ndarray
     speed: np.ndarray
     theoretical: np.ndarray
-    sense: float
-    starting: float
-    slipping: float
-    settled: float
+    stages: Stages | None
+
+    @property
+    def sense(self) -> float:
+        """In which the shafts turn at the end, 1 or -1."""
+        return 1.0 if self.stages is None else self.stages.sense
+
+    @property
+    def starting(self) -> float:
+        """End of stage I [s]."""
+        return 0.0 if self.stages is None else self.stages.starting
+
+    @property
+    def slipping(self) -> float:
+        """End of stage II [s]."""
+        return 0.0 if self.stages is None else self.stages.slipping
+
+    @property
+    def settled(self) -> float:
+        """t' [s]."""
+        return 0.0 if self.stages is None else self.stages.settled
 
     @property
     def gets_under_way(self) -> bool:
         """Whether there are stages to tell apart."""
-        return self.status in (*words.SETTLED, "rolls_back", "not_settled")
+        return self.status in words.UNDER_WAY
 
     @property
     def peak(self) -> float:
@@ -60,7 +75,7 @@ class Start:
     @property
     def ended(self) -> tuple[float, float]:
         """Current [A] and speed [mm/s] at the end: the running gear may ripple, so the means over the last 0.15 s."""
-        last = _end(self.time)
+        last = ending(self.time)
         return float(self.current[last].mean()), float(self.speed[last].mean())
 
 
@@ -74,34 +89,17 @@ def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int],
     from mmrjax.signals import STATUSES
 
     answer = []
-    for k, name in enumerate(names):
+    for k, (name, found) in enumerate(zip(names, of_histories(robot, history, which[: len(names)]), strict=True)):
         current = np.asarray(history.signals.total_current[k])
-        finite = np.flatnonzero(np.isfinite(current))
-        upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
-        times, sliding = np.asarray(history.time[k])[upto], np.asarray(history.signals.speed_sliding[k])[upto]
-        speed = np.asarray(history.signals.speed[k])[upto] / MM
-        theoretical = np.asarray(history.signals.speed_theoretical[k])[upto] / MM
-        sense = -1.0 if finite.size and theoretical[-1] < -0.1 else 1.0
-        speed, theoretical, sliding = sense * speed, sense * theoretical, sense * sliding
-        kind = robot.configurations.names[int(which[k])]
-        starting = slipping = settled = 0.0
-        if finite.size:
-            static = float(robot.configurations[kind].ground.friction.speed_static)
-            beyond = np.nonzero(sliding > static)[0]
-            starting = float(times[int(np.argmax(sliding))])
-            slipping = float(times[min(int(beyond[-1]) + 1, len(times) - 1)]) if beyond.size else starting
-            last = speed[_end(times)].mean()
-            late = np.nonzero(np.abs(speed - last) > 0.01 * np.abs(last))[0]
-            settled = float(times[min(int(late[-1]) + 1, len(times) - 1)]) if late.size else 0.0
-        ended = STATUSES[int(status[k])]
-        stages = (starting, max(slipping, starting), settled)
-        answer.append(Start(name, kind, ended, times, sense * current[upto], speed, theoretical, sense, *stages))
+        upto = slice(0, numbers(current))
+        speed, theoretical = (
+            np.asarray(x[k])[upto] for x in (history.signals.speed, history.signals.speed_theoretical)
+        )
+        sense = 1.0 if found is None else found.sense
+        kind, ended, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
+        times = np.asarray(history.time[k])[upto]
+        answer.append(Start(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found))
     return answer
-
-
-def _end(time: np.ndarray) -> np.ndarray:
-    """Samples of the last 0.15 s, some pitches of the running gear, of a short run its last tenth."""
-    return time >= time[-1] - min(0.15, 0.1 * float(time[-1]))
 
 
 def from_standstill(shown: list[Start], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
@@ -160,7 +158,7 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
         middle = float(np.median(start.current[during]))
         at = (start.starting + start.slipping) / 2
         axes.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
-    crest = start.current[_end(start.time)].max()
+    crest = start.current[ending(start.time)].max()
     axes.annotate(
         f"{start.ended[0]:.2f} A", (0.98 * last, crest), xytext=(0, 5), ha="right", textcoords="offset points"
     )
@@ -185,6 +183,70 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
     )  # fmt: skip
     if start.status not in words.SETTLED:
         note(axes, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
+
+
+def slip_over_start(shown: list[Start]) -> Figure:
+    """A row for each run: V_x and V_x_teor until after the start, and beside them the slip (33), its mean over each
+    stage and over t'. Where a run ends backward, backward is drawn positive."""
+    fig, grid = figure(len(shown), 2, 3.1 * len(shown), width_ratios=[1.2, 1.0])
+    look = looks(start.configuration for start in shown)
+    for (speeds, slip), start in zip(grid, shown, strict=True):
+        speeds.set_title(f"{start.name}\nspeeds, Fig. 24{', backward positive' if start.sense < 0 else ''}")
+        slip.set_title("slip, eq. (33)")
+        if start.stages is None:
+            note(speeds, f"no numbers: {words.short(start.status)}", color=VERMILION)
+            continue
+        colour = look[start.configuration][0]
+        last = float(start.time[-1])
+        upto = min(1.6 * max(start.settled, start.slipping, 0.02 * last), last) if start.gets_under_way else last
+        speeds.fill_between(start.time, start.speed, start.theoretical, color=colour, alpha=0.15, lw=0)
+        speeds.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
+        speeds.plot(start.time, start.speed, color=colour)
+        top = max(float(start.theoretical.max()), 1.0)
+        speeds.set(xlim=(0, upto), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
+        speeds.set_ylabel("speed [mm/s]")
+        for words_of, curve, colour_of, place in (
+            (r"2  $V_{x\,teor}$", start.theoretical, INK, (0, 5)), ("1  $V_x$", start.speed, colour, (0, -14)),
+        ):  # fmt: skip
+            at = 0.78 * upto
+            speeds.annotate(
+                words_of, (at, float(np.interp(at, start.time, curve))), xytext=place, textcoords="offset points",
+                color=colour_of, fontsize=9, ha="center",
+            )  # fmt: skip
+        _stages(speeds, start)
+        rolling = np.abs(start.theoretical) > 1e-3 * top
+        share = 100 * (1 - start.speed / np.where(rolling, start.theoretical, np.nan))
+        slip.plot(start.time, share, color=colour)
+        slip.set(xlim=(0, upto), ylim=(min(0.0, *np.clip(share[rolling], -20, 0)) if rolling.any() else 0.0, 125))
+        slip.set(xlabel="time [s]", ylabel="slip s [%]")
+        _stages(slip, start)
+        if start.gets_under_way:
+            _means(speeds, slip, start, upto)
+        if start.status not in words.SETTLED:
+            note(slip, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
+    return fig
+
+
+def _means(speeds: Axes, slip: Axes, start: Start, upto: float) -> None:
+    """Mark t' and draw the mean slip of each stage as a level."""
+    assert start.stages is not None
+    for axes in (speeds, slip):
+        if 0 < start.settled < upto:
+            axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
+    if 0 < start.settled < upto:
+        text = f"t' = {start.settled:.3g} s\ns over t' = {100 * start.stages.over_settling:.1f} %"
+        speeds.annotate(text, (start.settled, 0), xytext=(4, 8), textcoords="offset points", fontsize=8.5)
+    bounds = start.stages.bounds
+    for left, right, mean in zip(bounds[:-1], bounds[1:], start.stages.slip, strict=True):
+        if right <= left or left >= upto or not np.isfinite(mean):
+            continue
+        right = min(right, upto)
+        slip.hlines(100 * mean, left, right, color=INK, lw=1.2, ls="--")
+        if right - left > 0.15 * upto:
+            slip.annotate(
+                f"mean {100 * mean:.1f} %", (right, 100 * mean), xytext=(-3, 4), textcoords="offset points", ha="right",
+                fontsize=8.5,
+            )  # fmt: skip
 
 
 def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
@@ -229,17 +291,18 @@ class Course:
         return float(values[-1]) if values.size else np.nan
 
 
-def courses(history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
+def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
     """Members of a batch of runs as their instruments show them.
 
     Args:
-        history: of the batch; status: codes of how its members ended; names: headings of the members.
+        read: channels of the robot; history: of the batch; status: codes of how its members ended.
+        names: headings of the members.
     """
     from mmrjax.signals import STATUSES
 
-    answer = []
+    answer, shown = [], tuple(c for c in read if c.over_time)
     for k, name in enumerate(names):
-        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in channels.over_time()}
+        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in shown}
         finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
         upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
         of = {channel: values[upto] for channel, values in readings.items()}
@@ -249,10 +312,11 @@ def courses(history: Any, status: np.ndarray, names: Sequence[str]) -> list[Cour
 
 def over_time(shown: list[Course]) -> Figure:
     """A row for each run, a panel for each channel."""
-    fig, grid = figure(len(shown), len(channels.over_time()), 2.6 * len(shown))
+    read = channels.rows(shown[0].readings)
+    fig, grid = figure(len(shown), len(read), 2.6 * len(shown))
     for row, course in zip(grid, shown, strict=True):
         row[0].set_title(course.name)
-        for axes, channel in zip(row, channels.over_time(), strict=True):
+        for axes, channel in zip(row, read, strict=True):
             axes.plot(course.time, course.readings[channel.name], color=BLUE)
             axes.set(xlabel="time [s]", ylabel=axis_label(channel))
         if course.status not in words.SETTLED:

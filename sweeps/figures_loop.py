@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -9,8 +11,7 @@ from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscr
 from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
-from mmrjax import channels
-from mmrjax.channels import MM, RPM
+from mmrjax.channels import MM, RPM, Channel
 from sweeps.figures_style import (
     BLUE,
     FAINT,
@@ -39,18 +40,18 @@ RIG_WORDS = {"track": "torque missing at the output"}
 IMPOSED_WORDS = {"supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]"}
 
 
-def before_after(table: dict[str, np.ndarray], verdict: str) -> Figure:
+def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
     own = imposed(table)
     beside = [c for c in ("payload_kg", "slope_deg") if c in table]
     order = np.lexsort((*(table[c] for c in beside), table[own], table["configuration"]))
-    fig, grid = figure(len(channels.CHANNELS), 1, 1.8 * len(channels.CHANNELS), sharex=True)
+    fig, grid = figure(len(channels), 1, 1.8 * len(channels), sharex=True)
     levels = np.unique(table[own]).size
     few = levels <= 8 or own == "supply_voltage_V"  # else a group by configuration alone
     groups = [f"{table['configuration'][k]}" + (f", {table[own][k]:g} {UNITS[own]}" if few else "") for k in order]
     edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
     x = np.arange(len(order))
-    for axes, channel in zip(grid[:, 0], channels.CHANNELS, strict=True):
+    for axes, channel in zip(grid[:, 0], channels, strict=True):
         before = table[f"residual_before_{channel.name}_sigma"][order]
         after = table[f"residual_after_{channel.name}_sigma"][order]
         axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
@@ -89,18 +90,18 @@ def _range(x: np.ndarray) -> str:
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
+def over_time(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
     """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
     running mean as a line."""
     names = list(dict.fromkeys(table.get("run_id", np.zeros(len(table["row"]), str))))[:RUNS_SHOWN]
-    count = len(channels.CHANNELS)
+    count = len(channels)
     fig, grid = figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
     whens = [("before", ORANGE)] if verdict != "none" else []
     whens += [("after", BLUE)]
     for column, name in enumerate(names):
         mine = np.flatnonzero(table["run_id"] == name) if "run_id" in table else np.arange(len(table["row"]))
         mine = mine[np.argsort(table["time_s"][mine])]
-        for axes, channel in zip(grid[:, column], channels.CHANNELS, strict=True):
+        for axes, channel in zip(grid[:, column], channels, strict=True):
             axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
             axes.axhline(0, color=FAINT, lw=0.8)
             for when, colour in whens:
@@ -123,13 +124,13 @@ def over_time(table: dict[str, np.ndarray], verdict: str) -> Figure:
     return fig
 
 
-def time_statistics(detail: TimeStatistics, verdict: str) -> Figure:
+def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict: str) -> Figure:
     """What only histories tell: memory of the residual, waves in shaft angle, drift in time."""
     sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)]
     sides = sides if verdict != "none" else sides[1:]
-    count = len(channels.CHANNELS)
+    count = len(channels)
     fig, grid = figure(1, count + 1, 2.9, width_ratios=[1] * count + [1.5])
-    for axes, channel in zip(grid[0, :count], channels.CHANNELS, strict=True):
+    for axes, channel in zip(grid[0, :count], channels, strict=True):
         lags = np.arange(1, detail.before.memory.lags + 1)
         limit = 2 / np.sqrt(detail.samples)
         axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
@@ -200,8 +201,8 @@ def errors(found: DiscoveryResult) -> Figure:
     """rms error (35) before and after, fitted and held out by every kind of block."""
     lines = {"fitted": found.errors}
     lines |= {f"held out by\n{blocks.in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
-    fig, grid = figure(1, len(channels.CHANNELS), 2.9, sharey=False)
-    for place, channel in enumerate(channels.CHANNELS):
+    fig, grid = figure(1, len(found.channels), 2.9, sharey=False)
+    for place, channel in enumerate(found.channels):
         axes = grid[0, place]
         for k, (colour, when) in enumerate(((ORANGE, "before"), (BLUE, "after"))):
             values = [v[k][channel.name]["rms_percent"] for v in lines.values()]

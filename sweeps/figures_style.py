@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from mmrjax import channels
+from mmrjax.channels import Channel
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
@@ -32,7 +32,7 @@ def looks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {name: _CYCLE[k % len(_CYCLE)] for k, name in enumerate(dict.fromkeys(map(str, names)))}
 
 
-def axis_label(channel: channels.Channel) -> str:
+def axis_label(channel: Channel) -> str:
     """A channel with its unit."""
     return f"{channel.label} [{channel.unit}]"
 

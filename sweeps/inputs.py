@@ -11,7 +11,6 @@ from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, ON_GROUND, Layout
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
-from mmrjax import channels
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH
 from sweeps import imposed
@@ -30,8 +29,7 @@ VOLTAGE = 33.0
 def load_robot(config: RobotPart) -> Robot:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
 
-    Former names of parameters are taken, and said on stderr. Its channels, and those
-    that a program has added, become those of the command.
+    Former names of parameters are taken, and said on stderr.
 
     Raises:
         BadConfiguration: no such robot, a file or a change that is refused.
@@ -39,7 +37,6 @@ def load_robot(config: RobotPart) -> Robot:
     notes: list[str] = []
     robot = robot_file.load(config.robot, effect_file.library(config.effects), notes)
     robot = robot_file.change(robot, config.set, where="--set", notes=notes)
-    channels.select(robot.rig.channels)
     for note in notes:
         tell(note)
     return robot

@@ -14,7 +14,6 @@ from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks, priors
-from mmrjax import channels
 from sweeps import config as configuration
 from sweeps import words
 from sweeps.console import say, tell
@@ -100,7 +99,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""
         say(f"next: {after.name}: {after.description}{sigma}")
     errors = Table(title=f"rms error [% of the {found.percent_of}]", title_justify="left")
-    for heading in ("", "rows", *(c.label for c in channels.CHANNELS)):
+    for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
     whens = (0,) if found.verdict == "none" else (0, 1)
     when = ("before", "after")
@@ -113,7 +112,11 @@ def print_discovery(found: DiscoveryResult) -> None:
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
     if is_rig(found.robot):
-        say(words.said_rms(rms(found.rows_table(), ("before", "after", "held_out_before", "held_out_after"))))
+        say(
+            words.said_rms(
+                rms(found.rows_table(), found.channels, ("before", "after", "held_out_before", "held_out_after"))
+            )
+        )
     for other in found.sensitivity:
         say(f"with {other.factor:g} times the assumed noise: {other.verdict}: {other.statement}")
     for note in found.notes:

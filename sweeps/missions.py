@@ -15,7 +15,7 @@ from calibration.data import profiles
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
-from mmrjax import balances, channels, missions, outputs
+from mmrjax import balances, channels, ground, missions, outputs
 from mmrjax.conditions import Conditions
 from mmrjax.energy import SINKS
 from mmrjax.fidelities.mission import Mission
@@ -280,6 +280,8 @@ def _course(
     picked = np.flatnonzero(there)[thinned(course.segment[there], signals.current[there], most)]
     course = jax.tree.map(lambda x: x[picked], course)
     signals, reading = course.signals, balances.sensor(robot, course.signals)
+    # What the profile demands acts this much later than its rows say, and all that is written beside it with it.
+    late = float(robot.rig.delay)
     segment = course.segment % source.segments
     length = np.asarray(found.segments.time[k]).ravel()
     elapsed = course.time - (np.cumsum(length) - length)[course.segment]
@@ -296,9 +298,10 @@ def _course(
         }
     return {
         "run_id": np.full(len(picked), name),
-        "time_s": course.time,
-        **{c.column: np.asarray(reading[c.name]) / c.factor for c in channels.CHANNELS},
+        "time_s": course.time + late,
+        **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
         "theoretical_speed_mm_s": signals.speed_theoretical / channels.MM,
+        "slip": np.asarray(ground.slip(signals.speed, signals.speed_theoretical)),
         "distance_m": course.distance,
         "voltage_V": signals.voltage,
         "traction_N": float(robot.sides) * signals.traction,

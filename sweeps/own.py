@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.data import rig_file
 from calibration.data.columns import Layout
-from mmrjax import channels, params
+from mmrjax import params
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
 from mmrjax.robot import Robot
@@ -77,7 +77,7 @@ def idle_columns(robot: Robot) -> set[str]:
 
 def of(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A table without what means nothing for the robot, the columns of its channels aside."""
-    idle = idle_columns(robot) - {c.column for c in channels.CHANNELS}
+    idle = idle_columns(robot) - {c.column for c in robot.channels}
     ends = ("", "_sd", "_lower", "_upper")
     gone = {column + end for column in idle for end in ends}
     return {column: values for column, values in table.items() if column not in gone}

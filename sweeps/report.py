@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ import jinja2
 import numpy as np
 
 from mmrjax import __version__, channels, params
+from mmrjax.channels import Channel
 from sweeps import own, words
 from sweeps.figures_style import style, svg
 
@@ -115,16 +116,16 @@ def label(table: dict[str, np.ndarray], row: int) -> str:
     return ", ".join(parts)
 
 
-def columns() -> dict[str, str]:
+def columns(shown: Iterable[Channel]) -> dict[str, str]:
     """Column of each channel, as in the tables of runs."""
-    return {c.name: c.column for c in channels.CHANNELS}
+    return {c.name: c.column for c in shown}
 
 
-def rms(table: dict[str, np.ndarray], whens: Iterable[str]) -> dict[str, dict[str, float]]:
+def rms(table: dict[str, np.ndarray], shown: Sequence[Channel], whens: Iterable[str]) -> dict[str, dict[str, float]]:
     """rms of simulated less measured in each channel's unit, by when (of columns `WHEN_COLUMN`) and channel."""
     found: dict[str, dict[str, float]] = {}
     for when in whens:
-        for c in channels.CHANNELS:
+        for c in shown:
             if f"{when}_{c.column}" in table:
                 error = np.square(table[f"{when}_{c.column}"] - table[c.column])
                 there = error[np.isfinite(error)]
@@ -167,14 +168,13 @@ def supply(value: Any) -> str:
 
 def reading(value: Any, channel: str) -> str:
     """A reading with the digits that matter beside others of its kind, one less than its resolution."""
-    digits = {c.name: max(c.resolution - 1, 0) for c in channels.CHANNELS}[channel]
+    digits = max(channels.of(channel).resolution - 1, 0)
     return number(value, f"{{:.{digits}f}}")
 
 
 def error(value: Any, channel: str) -> str:
     """A difference of readings, with its sign, with a digit more than they."""
-    digits = {c.name: c.resolution for c in channels.CHANNELS}[channel]
-    return number(value, f"{{:+.{digits}f}}")
+    return number(value, f"{{:+.{channels.of(channel).resolution}f}}")
 
 
 def _grade(value: Any) -> str:
@@ -183,8 +183,12 @@ def _grade(value: Any) -> str:
     return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
 
 
-def render(folder: Path, template: str, album: Album, **known: Any) -> Path:
-    """Write `report.html` from a template, the album's pictures and what the template asks for."""
+def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[Channel] = (), **known: Any) -> Path:
+    """Write `report.html` from a template, the album's pictures and what the template asks for.
+
+    Args:
+        of_channels: that the page is about.
+    """
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(lambda n: (resources.files("sweeps") / "templates" / n).read_text("utf-8")),
         autoescape=True,
@@ -194,7 +198,7 @@ def render(folder: Path, template: str, album: Album, **known: Any) -> Path:
     )
     environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
     environment.globals |= {
-        "channels": {c.name: (c.label, c.unit) for c in channels.CHANNELS},
+        "channels": {c.name: (c.label, c.unit) for c in of_channels},
         "status_words": {name: status.short for name, status in words.STATUSES.items()},
         "settled_words": words.SETTLED,
         "version": __version__,

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
-from mmrjax import channels
 from sweeps import figures_calibration, figures_clusters, figures_comparison, own
 from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
@@ -22,16 +21,16 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         The path of the page.
     """
     table = found.rows()
-    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in channels.CHANNELS}
+    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in found.channels}
     album = Album(folder)
     album.add("parameters", lambda: figures_calibration.parameters(found))
     album.add("before_after", lambda: figures_calibration.before_after(found))
     if found.axis:
-        album.add("histories", lambda: figures_calibration.histories(table))
+        album.add("histories", lambda: figures_calibration.histories(table, found.channels))
     along = {found.axis: "time [s]"} if found.axis else {}
     sized = own.is_rig(found.robot)
-    album.add("parity", lambda: figures_comparison.parity(table, band=not sized))
-    album.add("residuals", lambda: figures_comparison.errors_over(table, sized, along))
+    album.add("parity", lambda: figures_comparison.parity(table, found.channels, band=not sized))
+    album.add("residuals", lambda: figures_comparison.errors_over(table, found.channels, sized, along))
     if found.residual_clusters:
         album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
     if found.profiled:
@@ -41,14 +40,15 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         folder,
         "calibration.html.j2",
         album,
+        of_channels=found.channels,
         title=f"Calibration of {words_shown(Path(robot_name).name)} to {Path(found.source).name}",
         document=found.to_json(),
         rows=first_rows(table),
         conditions=conditions(table),
-        columns=columns(),
+        columns=columns(found.channels),
         sized=sized,
         on_shaft=found.robot.on_shaft,
-        rms=rms(table, ("before", "after", "held_out")),
+        rms=rms(table, found.channels, ("before", "after", "held_out")),
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

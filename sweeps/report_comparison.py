@@ -41,13 +41,14 @@ def write(
     """
     album = Album(folder)
     sized = not Layout.of(robot).usual
-    album.add("parity", lambda: figures_comparison.parity(table, band=not sized))
-    album.add("errors", lambda: figures_comparison.errors_over(table, in_units=sized))
+    album.add("parity", lambda: figures_comparison.parity(table, robot.channels, band=not sized))
+    album.add("errors", lambda: figures_comparison.errors_over(table, robot.channels, in_units=sized))
     known = named(robot, robot_name)
     return render(
         folder,
         "comparison.html.j2",
         album,
+        of_channels=robot.channels,
         title=f"{known['robot']} against {Path(data_name).name}",
         model=model,
         data_name=Path(data_name).name,
@@ -57,7 +58,7 @@ def write(
         statuses=statuses(table),
         summary=summary,
         notes=notes,
-        columns=columns(),
+        columns=columns(robot.channels),
         sized=sized,
         **known,
     )

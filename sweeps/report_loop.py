@@ -26,15 +26,15 @@ def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
 
 def _run_by_run(album: Album, found: DiscoveryResult) -> None:
     table = rows_of(found)
-    album.add("before_after", lambda: figures_loop.before_after(table, found.verdict))
+    album.add("before_after", lambda: figures_loop.before_after(table, found.channels, found.verdict))
     album.add("defects", lambda: figures_loop.defects(table, found.verdict, own.is_rig(found.robot)))
 
 
 def _over_time(album: Album, found: DiscoveryResult) -> None:
     assert isinstance(found.detail, TimeStatistics)
     detail = found.detail
-    album.add("before_after", lambda: figures_loop.over_time(rows_of(found), found.verdict))
-    album.add("series", lambda: figures_loop.time_statistics(detail, found.verdict))
+    album.add("before_after", lambda: figures_loop.over_time(rows_of(found), found.channels, found.verdict))
+    album.add("series", lambda: figures_loop.time_statistics(detail, found.channels, found.verdict))
 
 
 #: What a page shows of one kind of data, by the type of the result's detail.
@@ -75,6 +75,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         Path(folder),
         "loop.html.j2",
         album,
+        of_channels=found.channels,
         title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
         document=found.to_json(),
         p=findings.said_p(found.before.p_value),
@@ -85,10 +86,10 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         worse=preference.said_worse(found.held_out_worse, found.errors_held_out),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
-        columns=columns(),
+        columns=columns(found.channels),
         sized=sized,
         on_shaft=found.robot.on_shaft,
         closed=figures_loop.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
-        rms=rms(table, ("before", "after", "held_out_before", "held_out_after")),
+        rms=rms(table, found.channels, ("before", "after", "held_out_before", "held_out_after")),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
     )

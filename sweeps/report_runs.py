@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax import channels
+from mmrjax.channels import MM, RPM
 from sweeps import figures_power, own, words
 from sweeps.imposed import UNLIMITED
 from sweeps.report import Album, columns, conditions, first_rows, label, named, render, statuses
@@ -63,6 +63,7 @@ def write(
         folder,
         "runs.html.j2",
         album,
+        of_channels=robot.channels,
         title=f"Run of {names[0]}" if single else f"{len(names)} runs",
         model=model,
         total=len(names),
@@ -71,7 +72,7 @@ def write(
         limits=limits(robot, {key: value[0] for key, value in runs.items()}) if single else [],
         chained=len(chain),
         most=CHAINS,
-        columns=columns(),
+        columns=columns(robot.channels),
         about=conditions(runs, mass=True),
         further={c: about for c, about in FURTHER.items() if c in shown},
         heat=own.thermal(robot),
@@ -96,13 +97,14 @@ def _histories(
     history, status = histories.history, np.asarray(histories.result.status)
     assert history is not None  # the fidelity was asked for it
     if robot.on_shaft:
-        if not channels.over_time():
+        if not any(c.over_time for c in robot.channels):
             return {}
-        shown = figures_history.courses(history, status, names[:HISTORIES])
+        shown = figures_history.courses(robot.channels, history, status, names[:HISTORIES])
         album.add("courses", lambda: figures_history.over_time(shown))
         return {"shown": len(shown), "courses": shown, "starts": []}
     starts = figures_history.starts(robot, history, status, which, names[:HISTORIES])
     album.add("history", lambda: figures_history.from_standstill(starts))
+    album.add("slip", lambda: figures_history.slip_over_start(starts))
     known: dict[str, Any] = {"shown": len(starts), "starts": starts}
     if history.reactions is not None:
         from sweeps import figures_gear
@@ -127,8 +129,8 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
     """How much of each limit a run uses: words, its value, the limit, and the share of it [%]."""
     idle = own.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
-    rpm = channels.RPM
-    shaft = float(run["theoretical_speed_mm_s"]) * channels.MM / radius * float(robot.gearbox.ratio) / rpm
+    rpm = RPM
+    shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / rpm
     turning = abs(shaft) > 1e-9
     torque = (
         float(run["power_gear_W"]) / (float(robot.sides) * shaft * rpm) * float(robot.gearbox.ratio)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mmrjax import channels
+from mmrjax.channels import Channel
 from sweeps import figures_sweep, own, words
 from sweeps.report import Album, named, render, statuses
 
@@ -38,21 +39,22 @@ def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Tabl
         The path of the page.
     """
     album = Album(folder)
-    for channel in channels.CHANNELS:
+    for channel in robot.channels:
         album.add(f"sweep_{channel.name}", partial(figures_sweep.sweep, runs, channel))
     return render(
         folder,
         "sweep.html.j2",
         album,
+        of_channels=robot.channels,
         title=f"Sweep of {len(runs['status'])} runs",
         model=model,
-        counts=counts(own.of(robot, runs)),
+        counts=counts(own.of(robot, runs), robot.channels),
         volts_drawn=_drawn(runs),
         **named(robot, robot_name),
     )
 
 
-def counts(runs: Table) -> dict[str, Any]:
+def counts(runs: Table, channels: Sequence[Channel]) -> dict[str, Any]:
     """Counts of a finished sweep per status and limit, its axes in words, and the extremes of the settled runs."""
     status = statuses(runs)
     for s in status:
@@ -67,7 +69,7 @@ def counts(runs: Table) -> dict[str, Any]:
         "status": status,
         "flags": flags,
         "axes": [{"name": name, "values": _levels(runs[c], unit)} for c, (name, unit) in _axes(runs).items()],
-        "extremes": _extremes(runs),
+        "extremes": _extremes(runs, channels),
     }
 
 
@@ -111,10 +113,10 @@ def _where(runs: Table, pick: np.ndarray) -> str:
     return "; ".join(parts)
 
 
-def _extremes(runs: Table) -> list[dict[str, str]]:
+def _extremes(runs: Table, channels: Sequence[Channel]) -> list[dict[str, str]]:
     settled = np.nonzero(np.isin(runs["status"], words.SETTLED))[0]
     asked = [(f"largest {c.label}", c.column, f"{{:.{max(c.resolution - 1, 0)}f}} {c.unit}", 1.0)
-             for c in channels.CHANNELS]  # fmt: skip
+             for c in channels]  # fmt: skip
     asked += [
         ("largest slip", "slip", "{:.1f} %", 100.0),
         ("hottest winding", "temperature_winding_C", "{:.0f} °C", 1.0),

@@ -94,7 +94,7 @@ class RigCheck:
         """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
         theirs = {mine: column for mine, column, _ in self.robot.rig.columns}
         found = []
-        for k, channel in enumerate(channels.CHANNELS):
+        for k, channel in enumerate(self.robot.channels):
             instrument = self.robot.rig.instrument(channel.name)
             usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
             found.append(
@@ -217,7 +217,7 @@ def _use(column: str, robot: Robot) -> str:
     for channel in channels.EVERY:
         if channel.name == robot.rig.imposed and column == channel.column:
             return "imposed"
-        if channel in channels.CHANNELS and column == channel.column:
+        if channel in robot.channels and column == channel.column:
             return f"channel {channel.name}"
         if column == channel.sd_column:
             return f"sd of {channel.name}"

@@ -72,12 +72,13 @@ def simulate(
 
     `progress` is called with the share that is done, by a fidelity that takes long.
     """
-    return ended(fidelities.get(config.model).run(robot, conditions, config.options, progress))
+    return ended(robot, fidelities.get(config.model).run(robot, conditions, config.options, progress))
 
 
-def ended(batch: Run) -> dict[str, np.ndarray]:
+def ended(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     """The columns of how a batch of runs ended, with those of its fidelity alone."""
-    return outputs.columns(*jax.device_get((batch.result, batch.columns)))
+    result, further = jax.device_get((batch.result, batch.columns))
+    return outputs.columns(result, robot.channels, further)
 
 
 def refuse(robot: Robot, conditions: Conditions, config: FidelityPart) -> None:

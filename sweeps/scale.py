@@ -124,7 +124,7 @@ def _program(
     job: Job, surface: tuple[float, ...] | None, mesh: Mesh
 ) -> Callable[[Variation, Conditions, Array], dict[str, Array]]:
     """Outputs as they are stored: in the units of tables, in the stored type, statuses as bytes, flags as two."""
-    factors = {row.name: row.factor for row in outputs.table()}
+    factors = {row.name: row.factor for row in outputs.table(job.robot.channels)}
     names, options = job.outputs, dict(job.options)
 
     def one_device(variation: Variation, conditions: Conditions, values: Array) -> dict[str, Array]:

@@ -165,9 +165,13 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs) -
     else:
         runs = grid(GridPart(surface=config.surface), robot)
         source = "Table 8"
-    words = config.noise or noise.default()
-    stated = {**noise.parse(noise.default()), **(noise.parse(config.noise) if config.noise else {})}
-    return Candidates(Points.of(runs), runs.conditions(robot), source, stated, words, runs.deviations(), config.runs)
+    usual = noise.default(robot.channels)
+    stated = noise.parse(usual, robot.channels)
+    if config.noise:
+        stated |= noise.parse(config.noise, robot.channels)
+    return Candidates(
+        Points.of(runs), runs.conditions(robot), source, stated, config.noise or usual, runs.deviations(), config.runs
+    )
 
 
 def print_sensitivity(found: SensitivityResult) -> None:

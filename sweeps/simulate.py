@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from rich.table import Table
 
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
-from mmrjax import channels, fidelities, outputs
+from mmrjax import channels, fidelities, ground, outputs, stages
+from mmrjax.channels import Channel
 from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result
 from mmrjax.robot import Robot
@@ -25,8 +27,8 @@ from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
-#: Channels that histories of a shaft have in any case.
-OF_SHAFT = ("motor_speed", "output_angle")
+#: Channels that histories of a shaft, and those of a vehicle, have in any case.
+OF_SHAFT, OF_VEHICLE = ("motor_speed", "output_angle"), ("speed",)
 #: Column of the largest current of all motors in a run over time.
 PEAK = "peak_current_A"
 #: Column of the time that a run's current may flow before its windings are at their limit.
@@ -57,7 +59,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             table |= found.columns
-        print_runs({key: value[:_SHOWN] for key, value in own.of(robot, table).items()})
+        print_runs({key: value[:_SHOWN] for key, value in own.of(robot, table).items()}, robot.channels)
         for note in notes:
             say(note)
         if found is not None:
@@ -73,6 +75,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
                 histories=histories,
             )  # fmt: skip
         further: dict[str, Any] = {"notes": notes}
+        if histories is not None and not robot.on_shaft:
+            further["starts"] = starts(robot, histories, runs)
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         return run.leave(folder, config, run.SimulationResult("simulate", config.model, robot, runs, table, further))
@@ -106,7 +110,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     """
     history, status = batch.history, np.asarray(batch.result.status)
     assert history is not None  # the fidelity was asked for it
-    columns = run.ended(batch)
+    columns = run.ended(robot, batch)
     current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
     there = np.isfinite(current)
     last = np.where(there.any(-1), there.shape[-1] - 1 - np.argmax(there[..., ::-1], -1), 0)
@@ -116,7 +120,7 @@ def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     empty = (status == BATTERY_EMPTY) & ~there[rows, -1]
     if empty.any():
         signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
-        at_last = outputs.columns(jax.device_get(result(robot, signals, jnp.asarray(status))))
+        at_last = outputs.columns(jax.device_get(result(robot, signals, jnp.asarray(status))), robot.channels)
         for name, values in at_last.items():
             columns[name] = np.where(empty & there.any(-1), values, columns[name])
         after = time[rows, np.minimum(last + 1, there.shape[-1] - 1)] - time[rows, last]
@@ -193,17 +197,31 @@ def _names(runs: records.Runs) -> np.ndarray:
 def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
-    of_rig = {*channels.names(), *(OF_SHAFT if robot.on_shaft else ())}
-    shown = [c for c in channels.known() if c.over_time and c.name in of_rig]
+    of_rig = {*robot.rig.channels, *(OF_SHAFT if robot.on_shaft else OF_VEHICLE)}
+    shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),
         "time_s": np.ravel(history.time),
         **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
         "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
+        "slip": np.ravel(ground.slip(signals.speed, signals.speed_theoretical)),
         "distance_m": np.ravel(history.distance),
         "voltage_V": np.ravel(signals.voltage),
         "traction_N": float(robot.sides) * np.ravel(signals.traction),
     }
+
+
+def starts(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]:
+    """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
+    get under way."""
+    assert batch.history is not None  # the fidelity was asked for it
+    found = stages.of_histories(robot, batch.history, runs.configurations(robot))
+    nothing = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
+    under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
+    return [
+        {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
+        for name, s, goes in zip(_names(runs), found, under_way, strict=True)
+    ]
 
 
 def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarray]:
@@ -224,13 +242,13 @@ def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarra
     return table
 
 
-def print_runs(table: dict[str, np.ndarray]) -> None:
+def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
     """Operating points, one a column."""
     rows = {
         "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
         **({} if "supply_voltage_V" in table else {"motor_speed_rpm": ("motor speed [rpm]", ".1f")}),
         "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
-        **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in channels.CHANNELS},
+        **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in shown},
         PEAK: ("peak of the total current [A]", ".1f"), "distance_m": ("distance [m]", ".2f"),
         "time_end_s": ("time [s]", ".6g"), "voltage_cell_V": ("voltage of a cell [V]", ".3f"),
         "slip": ("slip", ".4f"),
@@ -240,7 +258,7 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
         PERMISSIBLE: ("permissible at this current for [s]", ".3g"), "adhesion_used": ("adhesion used", ".3f"),
         "status": ("status", ""), "flags": ("limits exceeded", ""),
     }  # fmt: skip
-    shown = Table(show_header=False)
+    printed = Table(show_header=False)
     absent = {"supply_voltage_V": "battery"}
     for key, (heading, form) in rows.items():
         if key not in table or (key == "voltage_cell_V" and not np.nan_to_num(table[key]).any()):
@@ -256,8 +274,8 @@ def print_runs(table: dict[str, np.ndarray]) -> None:
             digits = int(form.strip(".f"))
             pairs = zip(table[key], table[key + uncertainty.SD], strict=True)
             cells = ["-" if v != v else uncertainty.with_sd(v, sd, digits) for v, sd in pairs]
-        shown.add_row(heading, *cells)
-    say(shown)
+        printed.add_row(heading, *cells)
+    say(printed)
     for status in dict.fromkeys(table["status"]):
         if status != STATUSES[0]:
             say(f"{status}: {words.STATUSES[status].why}")

@@ -10,7 +10,8 @@ import numpy as np
 
 from calibration.data.posterior import Posterior
 from calibration.data.runs import Runs
-from mmrjax import channels, fidelities, outputs, params
+from mmrjax import fidelities, outputs, params
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 from mmrjax.signals import done
 from sweeps import run
@@ -32,11 +33,12 @@ class Intervals:
 
     Attributes:
         columns: as `intervals` names them; arrays of shape (runs,).
-        draws: how many.
+        draws: how many; channels: of the robot.
     """
 
     columns: dict[str, np.ndarray]
     draws: int
+    channels: tuple[Channel, ...]
 
     def sd(self, column: str) -> np.ndarray:
         """Standard deviation of a column of the runs."""
@@ -54,7 +56,8 @@ def intervals(robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPa
     """
     values = posterior.draw(draws, SEED)
     fidelity, size = fidelities.get(config.model), min(config.runs_at_once, len(runs))
-    columns = [o.column for o in outputs.table()]
+    rows_of = outputs.table(robot.channels)
+    columns = [o.column for o in rows_of]
     seen = np.full((draws, len(runs), len(columns)), np.nan)
     robot = params.strong(robot)
     with progress(draws, quiet=not (fidelity.facts.slow or draws * len(runs) > 100_000), doing="draws") as advance:
@@ -66,11 +69,11 @@ def intervals(robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPa
                 result = jax.device_get(fidelity.run(drawn, conditions, config.options, None).result)
                 count = min(size, len(runs) - first)
                 there = np.asarray(done(result.status))[:count]
-                for j, output in enumerate(outputs.table()):
+                for j, output in enumerate(rows_of):
                     reading = np.asarray(output.get(result))[:count] / output.factor
                     seen[d, first : first + count, j] = np.where(there, reading, np.nan)
             advance(1)
-    return Intervals(_summary(seen, columns), draws)
+    return Intervals(_summary(seen, columns), draws, robot.channels)
 
 
 def _summary(seen: np.ndarray, columns: list[str]) -> dict[str, np.ndarray]:
@@ -90,10 +93,11 @@ def _summary(seen: np.ndarray, columns: list[str]) -> dict[str, np.ndarray]:
 
 def say_intervals(table: dict[str, np.ndarray], found: Intervals) -> None:
     """The range of every channel over the runs, each end with its sd; and how many draws do not converge."""
-    there = np.isfinite(found.sd(channels.CHANNELS[0].column)) & np.isfinite(table[channels.CHANNELS[0].column])
+    first = found.channels[0].column
+    there = np.isfinite(found.sd(first)) & np.isfinite(table[first])
     if there.any():
         say(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in the table")
-    for c in channels.CHANNELS:
+    for c in found.channels:
         value, sd = table[c.column], found.sd(c.column)
         if there.any():
             rows = np.flatnonzero(there)

@@ -48,6 +48,11 @@ STATUSES: dict[str, Status] = {
         "gravity drives the robot, against its motors or without their voltage",
         "gravity drives the robot, against its motors or without their voltage: it travels downhill steadily",
     ),
+    "cut_off": Status(
+        "cut off",
+        "a cell below its cut-off voltage, where the battery switches itself off",
+        "the cells stayed below their cut-off voltage for longer than they may, with charge left",
+    ),
 }
 
 FLAGS = {
@@ -73,6 +78,8 @@ FOR_EVER = "for ever"
 
 #: Statuses of runs that ended as their conditions ask, with numbers; `signals.DONE` by name.
 SETTLED = ("converged", "reverses")
+#: Those of runs from standstill that get under way, so that there are stages of the start to tell apart.
+UNDER_WAY = (*SETTLED, "rolls_back", "not_settled")
 
 
 def settled(counted: Mapping[str, int]) -> int:
@@ -82,7 +89,6 @@ def settled(counted: Mapping[str, int]) -> int:
 
 #: What a requirement's quantity may come to beside a status of a run: in one line.
 OUTCOMES = {
-    "cut_off": "a cell below its cut-off voltage, where the battery switches itself off",
     "unbounded": "no value: the temperature never settles",
 }
 
@@ -111,7 +117,7 @@ _FITS = {
 
 def said_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
     """rms errors in the units of their channels, in a line; by fit and channel."""
-    units = {c.name: (c.label, c.unit) for c in channels.CHANNELS}
+    units = {c.name: (c.label, c.unit) for c in channels.EVERY}
     parts = [
         f"{_FITS[when]} " + ", ".join(f"{units[name][0]} {value:.3g} {units[name][1]}" for name, value in by.items())
         for when, by in rms.items()

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import dataclasses
 import gc
 import os
@@ -21,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import channels, params, robots
+from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, BY_NAME
 from mmrjax.fidelities.drive import drive, drive_batch
@@ -32,16 +34,71 @@ from sweeps import cli
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.
 MAPPINGS = 12_000
+#: Memory from which they are dropped too [bytes]; one file may add as much again.
+MEMORY = 1.5e9
+#: What a test that is not marked slow may take [s of processor time, on a core that does nothing else].
+LIMIT = 10.0
+STARTED = pytest.StashKey[float]()
+
+
+def _crowded() -> bool:
+    """Whether this process has too many programs to begin another file; where Linux's files are not there: no."""
+    own = Path("/proc/self")
+    if not (own / "statm").exists():
+        return False
+    resident = int((own / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return resident > MEMORY or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _room_for_programs():
-    """Forget compiled programs between files before the process has too many."""
+    """Forget compiled programs between files before the process has too many, and give their memory back."""
     yield
-    mapped = Path("/proc/self/maps")
-    if mapped.exists() and mapped.read_bytes().count(b"\n") > MAPPINGS:
+    if _crowded():
         jax.clear_caches()
         gc.collect()
+        with contextlib.suppress(OSError, AttributeError):  # not every C library has it
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+def _spent() -> float:
+    """Processor time of this process and of those that it has waited for [s]."""
+    at = os.times()
+    return at.user + at.system + at.children_user + at.children_system
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """Note the processor time of each test, its fixtures included."""
+    start = _spent()
+    item.user_properties.append(("slow", item.get_closest_marker("slow") is not None))
+    item.config.stash[STARTED] = start
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    report = yield
+    if call.when == "teardown":
+        report.user_properties.append(("processor_time", _spent() - item.config.stash[STARTED]))
+    return report
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Name the tests that take longer than a test may that is not marked slow.
+
+    It fails nothing: processor time too grows on a loaded machine, and by half from one to another.
+    """
+    long = []
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            told = dict(getattr(report, "user_properties", ()))
+            if told.get("processor_time", 0.0) > LIMIT and not told.get("slow"):
+                long.append((told["processor_time"], report.nodeid))
+    if long:
+        terminalreporter.section(f"not marked slow, and longer than {LIMIT:g} s of processor time")
+        for seconds, name in sorted(long, reverse=True):
+            terminalreporter.write_line(f"{seconds:6.1f} s  {name}")
 
 
 @pytest.fixture(scope="session")
@@ -185,7 +242,6 @@ def mmrjax(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))  # a command may set it, for this process alone
 
-    monkeypatch.setattr(channels, "CHANNELS", channels.CHANNELS)  # a command takes those of its robot
     monkeypatch.setattr(os, "_exit", sys.exit)  # how an interrupted command ends; this process goes on
 
     def command(*arguments):

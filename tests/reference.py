@@ -62,7 +62,7 @@ NOMINAL: dict[str, float] = {
     "6T2A.ground.rolling_resistance": 0.06,
     "6T2A.mass": 13.1,
     "6T2A.radius": PULLEY,
-    "6T2A.inertia": 75e-6 + 140e-6 + (0.040 + 2 * 0.025) * PULLEY**2,
+    "6T2A.inertia": 2 * (75e-6 + 140e-6) + (0.040 + 2 * 0.025) * PULLEY**2,
     # 4W2T
     "4W2T.track.loss_coulomb": 0.070,
     "4W2T.track.loss_viscous": 0.003,
@@ -75,7 +75,7 @@ NOMINAL: dict[str, float] = {
     "4W2T.ground.rolling_resistance": 0.03,
     "4W2T.mass": 11.5,
     "4W2T.radius": WHEEL,
-    "4W2T.inertia": 75e-6 + 140e-6 + 0.040 * PULLEY**2 + 2 * 152e-6,
+    "4W2T.inertia": 2 * (75e-6 + 140e-6) + 0.040 * PULLEY**2 + 2 * 152e-6,
 }
 
 

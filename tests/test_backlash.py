@@ -47,6 +47,7 @@ def test_a_little_backlash_is_a_rigid_gear_once_things_have_settled():
     np.testing.assert_allclose(np.asarray(tight.current)[ends], np.asarray(rigid.current)[ends], rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_steady_travel_knows_no_backlash():
     conditions = Conditions(voltage=np.array([6.0, -6.0]))
     run = drive_batch(bench(0.05), conditions, jnp.asarray([0.0, 3.0])).result
@@ -116,22 +117,21 @@ def test_backlash_is_found_in_a_history_of_reversals(tmp_path):
     path.write_text(FILE)
     robot = robot_file.load(str(path))
     truth = params.replace(robot, {"bench.backlash": 0.06})
-    with channels.panel(robot.rig.channels):
-        seen = driven(truth)
-        at = np.searchsorted(TIMES, SAMPLES)
-        random = np.random.default_rng(3)
-        lines = ["time_s,supply_voltage_V,motor_speed_rpm,motor_speed_sd_rpm,output_angle_deg,output_angle_sd_deg"]
-        for k, t in zip(at, SAMPLES, strict=True):
-            speed = float(seen.speed_motor[k]) / channels.RPM + 5 * random.standard_normal()
-            angle = np.degrees(float(seen.angle[k])) + 0.2 * random.standard_normal()
-            lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
-        table = tmp_path / "table.csv"
-        table.write_text("\n".join(lines))
-        runs = records.read(table, robot=robot)
-        found = calibrate(
-            runs, robot, free=["bench.backlash", "bench.loss_coulomb"], model="drive", starts=2, blocks=False,
-            profiles=False,
-        )  # fmt: skip
+    seen = driven(truth)
+    at = np.searchsorted(TIMES, SAMPLES)
+    random = np.random.default_rng(3)
+    lines = ["time_s,supply_voltage_V,motor_speed_rpm,motor_speed_sd_rpm,output_angle_deg,output_angle_sd_deg"]
+    for k, t in zip(at, SAMPLES, strict=True):
+        speed = float(seen.speed_motor[k]) / channels.RPM + 5 * random.standard_normal()
+        angle = np.degrees(float(seen.angle[k])) + 0.2 * random.standard_normal()
+        lines.append(f"{t:.9g},{VOLTAGE[k]:g},{speed:.6g},5,{angle:.6g},0.2")
+    table = tmp_path / "table.csv"
+    table.write_text("\n".join(lines))
+    runs = records.read(table, robot=robot)
+    found = calibrate(
+        runs, robot, free=["bench.backlash", "bench.loss_coulomb"], model="drive", starts=2, blocks=False,
+        profiles=False,
+    )  # fmt: skip
     backlash = found.parameters["bench.backlash"]
     # Flanks that meet and part make kinks in the misfit: its curvature says less than what it finds is off by.
     assert abs(backlash.value - 0.06) < 0.003 and not backlash.held_by_prior

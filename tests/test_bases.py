@@ -63,7 +63,7 @@ def variables(found):
 
 def test_curves_of_channels_are_over_their_reading_and_what_order_brings():
     for columns, over in ((table(), set()), (shuffled(table()), {"order"})):
-        of = {c: {v for p, v in names(families(columns, COUNTS)) if p == c} for c in channels.names()}
+        of = {c: {v for p, v in names(families(columns, COUNTS)) if p == c} for c in channels.USUAL}
         assert of == {
             "total_current": {"current"} | over, "motor_speed": {"speed_motor"} | over, "speed": {"speed"} | over,
         }  # fmt: skip
@@ -89,7 +89,7 @@ def test_a_window_is_read_from_its_name():
 def test_windows_cover_the_order_and_overlap_by_half():
     basis, shown = windows(shuffled(table()), COUNTS)
     assert [v for _, v in shown.names[:4]] == [v for _, v in basis.names[:4]]
-    assert {n[0] for n in basis.names} == set(bases.BALANCES) and {n[0] for n in shown.names} == set(channels.names())
+    assert {n[0] for n in basis.names} == set(bases.BALANCES) and {n[0] for n in shown.names} == set(channels.USUAL)
     assert basis.columns.shape[2] == 1 and set(np.unique(basis.columns)) == {0.0, 1.0}
     order = shuffled(table())["order"]
     mine = [k for k, n in enumerate(basis.names) if n[0] == "track" and window(n[1]).axis == "order"]

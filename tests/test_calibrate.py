@@ -66,7 +66,7 @@ def test_packaged_data_calibrate_and_the_report_says_what_it_must(found, documen
         assert {"prior", "held_by_prior", "shift_in_prior_sd"} <= set(entry)
     for when in ("before", "after"):
         for what in ("fitted", "held_out"):
-            for channel in channels.names():
+            for channel in channels.USUAL:
                 assert {"rms_percent", "max_percent", "rms_sigma"} <= set(document["errors"][when][what][channel])
     assert set(document["held_out_by"]) == {"slope", "voltage", "payload", "configuration", "voltage_configuration"}
     text = " ".join(document["notes"])
@@ -94,7 +94,7 @@ def test_schema_can_fail(document):
 
 
 def test_estimated_noise_is_that_of_the_misfit(found):
-    leverage = dict(zip(channels.names(), found.identifiability.leverage.sum(0), strict=True))
+    leverage = dict(zip(channels.USUAL, found.identifiability.leverage.sum(0), strict=True))
     for name, readings in found.readings.items():
         assert np.sum(readings.sigma**2) == pytest.approx(len(found) - leverage[name], rel=0.01)
     left = 3 * len(found) - sum(leverage.values())
@@ -153,7 +153,7 @@ def test_stated_noise_comes_before_columns_and_columns_before_estimates(measured
 )
 def test_noise_refuses(text, says):
     with pytest.raises(BadConfiguration, match=says):
-        noise.parse(text)
+        noise.parse(text, channels.usual())
 
 
 def test_too_few_rows_are_refused(measured):
@@ -301,7 +301,7 @@ def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypa
     code, out, _ = mmrjax("compare", "measured", "--robot", "c/robot.toml", "--no-report", "--out", "d")
     assert code == 0
     errors = json.loads((tmp_path / "d" / "result.json").read_text())["errors"]["all"]
-    for channel in channels.names():
+    for channel in channels.USUAL:
         fitted = result["errors"]["after"]["fitted"][channel]["rms_percent"]
         assert errors[channel]["rms_percent"] == pytest.approx(fitted, rel=1e-6)
     code, _, err = mmrjax("calibrate", "measured", "--free", "6T2A.mu")
@@ -403,7 +403,7 @@ def test_a_robot_with_a_configuration_of_its_own_calibrates_from_its_file_alone(
     creep = "rover.ground.friction.speed_static"
     truth = robot_file.change(rover, {creep: 0.05}, where="test")
     shown = steady_batch(truth, conditions.conditions(truth))
-    runs = changed(conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.CHANNELS})
+    runs = changed(conditions, **{c.column: np.asarray(shown.reading[c.name]) / c.factor for c in channels.usual()})
     made = quick(runs, rover, noise="current=1%,motor_speed=0.5%,speed=1%")
     assert set(made.parameters) == {f"rover.{name}" for name in priors.FRICTION}
     low, high = made.parameters[creep].interval
@@ -432,13 +432,15 @@ FOURTH_CHANNEL = """
 import dataclasses, jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from mmrjax import channels, robots
-channels.CHANNELS = (*channels.CHANNELS, channels.Channel(
+from mmrjax import channels
+channels.EVERY += (channels.Channel(
     name="terminal_voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V", factor=1.0,
     label="terminal voltage", word="voltage", range=(0.0, 100.0), sd_largest=10.0,
     read=lambda robot, signals: signals.voltage, sd_share=0.01,
-))
+),)
+channels.USUAL += ("terminal_voltage",)
 import calibration
+from mmrjax import robots
 runs = calibration.read_runs("measured")
 volts = runs["supply_voltage_V"] * 1.001
 runs = dataclasses.replace(runs, columns={**runs.columns, "terminal_voltage_V": volts})

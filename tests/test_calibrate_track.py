@@ -44,7 +44,7 @@ def seen(base):
 def made(seen):
     """The table of those runs."""
     conditions, runs = seen
-    columns = {c.column: np.asarray(runs.result.reading[c.name]) / c.factor for c in channels.CHANNELS}
+    columns = {c.column: np.asarray(runs.result.reading[c.name]) / c.factor for c in channels.usual()}
     return dataclasses.replace(conditions, source="made", columns={**conditions.columns, **columns})
 
 

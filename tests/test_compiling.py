@@ -19,7 +19,7 @@ from calibration.discovery import candidates, discover, scales
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.settings import settings_for
 from calibration.inference import noise, observers
-from mmrjax import channels, effects, params, robots
+from mmrjax import effects, params, robots
 from mmrjax.compiling import compiled, for_equations
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
@@ -30,12 +30,11 @@ def space_of(world, folder):
     """The space of candidates of a clean case, as the loop makes it."""
     gr.case(world).write(folder)
     robot = robot_file.read(folder / "rig.toml")
-    with channels.panel(robot.rig.channels):
-        runs = records.read(folder / "table.csv", robot=robot)
-        observer = observers.kind(runs)
-        library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
-        sd = noise.of(runs, observer.sizes(runs)).sd
-        return discover.pose(runs, robot, sd, settings_for(observer), library=library)
+    runs = records.read(folder / "table.csv", robot=robot)
+    observer = observers.kind(runs)
+    library = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME)
+    sd = noise.of(runs, observer.sizes(runs)).sd
+    return discover.pose(runs, robot, sd, settings_for(observer), library=library)
 
 
 @pytest.mark.parametrize("kind", ["wheeled", "bench", "linear"])

@@ -58,6 +58,43 @@ def motion_of(robot, run, k):
     return Motion(q, v, jnp.asarray(1.5 + draw.random()), jnp.asarray(20.0), memory)
 
 
+def test_slopes_of_the_sums_are_their_derivatives_along_a_direction(recessed):
+    """Of motion, slip and every constant at once, to 1e-9; three motions, one program each for ours and theirs."""
+    run = Conditions(**RUNS["tracked"])
+    setup = system(recessed, run, STEP)
+    gained = 1e-3 * jnp.asarray([0.3, -1.0, 0.5, 20.0, 30.0])
+    constants = contact_sums.inputs(setup.path, setup.chassis, run.adhesion)
+
+    @jax.jit
+    def both(given, moved):
+        ours = contact_sums.linearize(setup.path, setup.chassis, given, gained, tuple(constants))
+        along = jnp.stack([moved[name] for name in ours.names]) @ ours.slopes
+        return along, jax.jvp(lambda given: _summed(setup, given, gained), (given,), (moved,))[1]
+
+    for k in range(3):
+        motion = motion_of(recessed, run, k)
+        given = dict(zip(contact_sums.MOTION, (*motion.q[1:], *motion.v), strict=True)) | constants
+        given = {name: jnp.asarray(value, float) for name, value in given.items()} | {"slip": jnp.asarray(1e-3)}
+        ours, theirs = both(given, _changes(given, k))
+        assert (np.abs(theirs) > 0).any()
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * float(jnp.abs(theirs).max()) + 1e-10)
+
+
+def _summed(setup, given, gained):
+    """The sums over the contacts, as computed, from the inputs of `contact_sums.linearize`."""
+    gear = dataclasses.replace(setup.path.gear, **{n: given[n] for n in contact_sums.GEAR})
+    path, chassis = Path(given["pulley"], gear), setup.chassis
+    laws = {n: given[f"friction_{n}"] for n in contact_sums.FRICTION}
+    ground = dataclasses.replace(chassis.ground, friction=dataclasses.replace(chassis.ground.friction, **laws))
+    own = {n: given[f"chassis_{n}"] for n in contact_sums.CHASSIS}
+    chassis = dataclasses.replace(chassis, ground=ground, **own)
+    q = jnp.stack([jnp.zeros(()), *(given[n] for n in contact_sums.MOTION[:4])])
+    v = jnp.stack([given[n] for n in contact_sums.MOTION[4:]])
+    at = undercarriage.touch(path, chassis, q, v)
+    return contact_sums.shares(path, chassis, at, given["slip"], given["adhesion"], gained).sum(axis=-1)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RUNS))
 @pytest.mark.parametrize("k", range(3))
 def test_slopes_of_the_sums_are_their_derivatives(recessed, name, k):
@@ -73,21 +110,7 @@ def test_slopes_of_the_sums_are_their_derivatives(recessed, name, k):
     def found(given):
         return contact_sums.linearize(setup.path, setup.chassis, given, gained, tuple(constants))
 
-    @jax.jit
-    @jax.jacfwd
-    def slopes(given):
-        gear = dataclasses.replace(setup.path.gear, **{n: given[n] for n in contact_sums.GEAR})
-        path, chassis = Path(given["pulley"], gear), setup.chassis
-        laws = {n: given[f"friction_{n}"] for n in contact_sums.FRICTION}
-        ground = dataclasses.replace(chassis.ground, friction=dataclasses.replace(chassis.ground.friction, **laws))
-        own = {n: given[f"chassis_{n}"] for n in contact_sums.CHASSIS}
-        chassis = dataclasses.replace(chassis, ground=ground, **own)
-        q = jnp.stack([jnp.zeros(()), *(given[n] for n in contact_sums.MOTION[:4])])
-        v = jnp.stack([given[n] for n in contact_sums.MOTION[4:]])
-        at = undercarriage.touch(path, chassis, q, v)
-        return contact_sums.shares(path, chassis, at, given["slip"], given["adhesion"], gained).sum(axis=-1)
-
-    ours, theirs = found(given), slopes(given)
+    ours, theirs = found(given), jax.jit(jax.jacfwd(lambda given: _summed(setup, given, gained)))(given)
     expected = np.stack([np.asarray(theirs[name]) for name in ours.names])
     assert set(ours.names) == set(given)
     assert (np.abs(expected).max(axis=1) > 0).sum() >= {"tracked": 19, "wheeled": 12}[name]
@@ -153,6 +176,7 @@ def backward():
     return eqx.filter_jit(eqx.filter_grad(lambda at: _some(*_stepped(*at, advance))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RUNS))
 @pytest.mark.parametrize("k", range(3))
 def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, backward, name, k):
@@ -166,6 +190,29 @@ def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, 
     assert sum(float(jnp.sum(a * b)) for a, b in pairs) == pytest.approx(float(_some(*ours)), rel=1e-8)
 
 
+def test_derivative_of_a_step_along_a_direction_is_that_of_what_it_computes(recessed):
+    """Of motion and one parameter of each part at once; every parameter, effects and reverse mode: see below."""
+    run = Conditions(**RUNS["tracked"])
+    names = (
+        "running_gear.contact_stiffness", "6T2A.track.guide_friction", "6T2A.ground.friction.static", "6T2A.mass",
+        "motor.resistance", "gearbox.efficiency_load",
+    )  # fmt: skip
+    values = {p.name: jnp.asarray(p.value) for p in params.walk(recessed) if p.name in names}
+    at = values, motion_of(recessed, run, 1)
+
+    @eqx.filter_jit
+    def both(at, moved):
+        def after(values, motion, step):
+            return _stepped(params.replace(recessed, values), run, motion, STEP, step)
+
+        return [eqx.filter_jvp(lambda *a, s=s: after(*a, s), at, moved)[1] for s in (advance, _as_computed)]
+
+    ours, theirs = both(at, _changes(at, 1))
+    _equal(ours, theirs)
+    assert max(float(jnp.abs(x).max()) for x in jax.tree.leaves(theirs[0])) > 0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["running_gear.contact_stiffness", "6T2A.track.guide_friction"])
 def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name):
     """What else is constant has no derivative to begin with."""
@@ -185,6 +232,7 @@ def test_derivative_by_one_parameter_is_that_of_what_is_computed(recessed, name)
     assert max(float(jnp.abs(x).max()) for x in jax.tree.leaves(theirs[0])) > 0
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_what_is_computed(recessed):
     run = Conditions(**RUNS["tracked"])
     motion = motion_of(recessed, run, 1)

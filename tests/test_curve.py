@@ -142,7 +142,7 @@ def test_curves_are_no_part_of_the_library():
 def test_curves_are_those_that_the_trace_looks_for():
     assert tuple(curve.BALANCES) == curves.BALANCES and tuple(curve.VARIABLES) == tuple(curves.VARIABLES)
     assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
-    assert tuple(curve.READINGS) == channels.names()
+    assert tuple(curve.READINGS) == channels.USUAL
 
 
 def test_robot_with_curves_written_and_read_is_the_same(tmp_path):

@@ -81,7 +81,7 @@ def test_steepest_slope_ends_at_the_limit_and_is_missing_where_the_flat_is_not_h
     assert np.isnan(none["steepest_slope"]) and int(none["status"]) == SLIDES
 
 
-@pytest.mark.parametrize(("static", "voltage"), [(0.32, 24.0), (2.5, 2.0)])
+@pytest.mark.parametrize(("static", "voltage"), [pytest.param(0.32, 24.0, marks=pytest.mark.slow), (2.5, 2.0)])
 def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltage):
     tuned = changed(robot, **{"6T2A__ground__friction__static": static})
     theta, f = function(tuned, Conditions(0, voltage, payload=5.0), steepest_slope.compute)
@@ -92,6 +92,7 @@ def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltag
     assert np.abs(exact).max() > 1
 
 
+@pytest.mark.slow
 def test_steepest_slope_of_a_batch_is_that_of_each(robot):
     conditions = Conditions(np.array([0, 1, 0]), np.array([15.0, 24.0, 6.0]), payload=np.array([0.0, 3.0, 8.0]))
     batch = jax.vmap(lambda c: steepest_slope.compute(robot, c))(conditions)
@@ -117,6 +118,7 @@ def test_start_is_that_of_a_run_kept_at_many_instants(robot):
     assert found["energy_start"] == pytest.approx(np.trapezoid(power[rows], times[rows]), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_start_derivatives_are_finite_differences(robot):
     theta, f = function(robot, CONDITIONS, start.compute)
     exact = jax.jacfwd(f)(theta)

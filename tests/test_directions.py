@@ -43,7 +43,7 @@ def table(name: str, amplitude: float, voltages: tuple[float, ...]) -> Runs:
         "supply_voltage_V": voltage,
     }
     rng = np.random.default_rng(1)
-    for channel in channels.CHANNELS:
+    for channel in channels.usual():
         reading = np.asarray(shown[channel.name]) / channel.factor
         sd = channel.sd_share * np.maximum(np.abs(reading), 0.2 * np.abs(reading).max())
         columns |= {channel.column: reading + sd * rng.normal(size=sd.size), channel.sd_column: sd}
@@ -54,7 +54,7 @@ def test_runs_that_go_both_ways_are_known_by_what_drives_them_or_by_a_speed():
     measured = read("measured")
     assert not discover.both_ways(measured)
     columns, rows = dict(measured.columns), len(measured)
-    speeds = [c.column for c in channels.CHANNELS if c.zero_at_rest]
+    speeds = [c.column for c in channels.usual() if c.zero_at_rest]
 
     def changed(**values):
         return dataclasses.replace(measured, columns={**columns, **values})

@@ -25,7 +25,7 @@ from calibration.inference.linearization import PROBED, amplitude_of, scored, sh
 from calibration.inference.observers import SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
 from calibration.inference.optimizers import observation
-from mmrjax import params, robots
+from mmrjax import channels, params, robots
 from mmrjax.effects import BY_NAME
 
 
@@ -263,7 +263,9 @@ def toy():
     basis = bases.Basis.of(columns, (("electrical", "a"), ("track", "b")))
     shown = bases.Basis.of(columns, (("speed", "a"), ("total_current", "b")))
     scale = rng.uniform(0.5, 2.0, (rows, 3))
-    linear = SettledLinearization(*map(jnp.asarray, (e, jacobian, signatures, defects, scale)), None)
+    linear = SettledLinearization(
+        *map(jnp.asarray, (e, jacobian, signatures, defects, scale)), None, channels=channels.USUAL
+    )
     return SimpleNamespace(linear=linear, bases=(basis, shown), scores=score_tests(linear, (basis, shown)))
 
 

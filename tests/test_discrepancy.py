@@ -125,7 +125,7 @@ def test_robot_written_and_read_gives_the_same_readings(found, tmp_path):
         p.name: float(p.value) for p in params.walk(found.what.robot)
     }
     reading = steady_batch(robot, found.runs.conditions(robot)).reading
-    seen = jnp.stack([reading[name] for name in channels.names()], -1)
+    seen = jnp.stack([reading[name] for name in channels.USUAL], -1)
     np.testing.assert_allclose(seen, found.what.reading[: len(found.runs)], rtol=1e-10)
 
 
@@ -184,7 +184,7 @@ def test_formula_reads_as_text():
 
 
 def test_every_balance_of_a_curve_has_a_symbol():
-    assert set(formula.SYMBOL) == {*bases.BALANCES, *channels.names()}
+    assert set(formula.SYMBOL) == {*bases.BALANCES, *channels.USUAL}
 
 
 def test_no_formula_is_proposed_where_nothing_shows(found):
@@ -219,6 +219,7 @@ def test_a_window_is_refined_to_its_rows():
     linear = SettledLinearization(
         *map(jnp.asarray, (residual, jacobian, np.zeros((3 * rows, 1)), defects, np.ones((rows, 3)))),
         SimpleNamespace(order=np.arange(1.0, rows + 1)),
+        channels=channels.USUAL,
     )
     found, explained = refined(linear, "track", "order", np.ones(rows, bool))
     assert (found.low, found.high) == (14, 25) and explained > 60

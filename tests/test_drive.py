@@ -67,7 +67,7 @@ def expected_runs(grid):
     return np.stack(runs)
 
 
-@pytest.mark.parametrize(("tolerance", "error"), [(1e-6, 2e-6), (1e-9, 5e-9)])
+@pytest.mark.parametrize(("tolerance", "error"), [(1e-6, 2e-6), pytest.param(1e-9, 5e-9, marks=pytest.mark.slow)])
 def test_drive_matches_solve_ivp(robot, grid, expected_runs, tolerance, error):
     """To `error` of each state's largest value in the run, at every instant; SciPy's Radau at 1e-10."""
     w, s, p, v = grid[list(ROWS)].T

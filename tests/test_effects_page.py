@@ -31,6 +31,7 @@ def test_effects_page_is_what_the_library_gives(written):
     same((ROOT / "docs" / "effects.md").read_text(encoding="utf-8"), written)
 
 
+@pytest.mark.slow
 def test_effects_page_comparison_can_fail(written):
     with pytest.raises(AssertionError):
         same(written.replace("`windage`", "`windig`", 1), written)

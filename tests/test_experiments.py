@@ -37,7 +37,7 @@ def conditions(made):
 
 
 CLIMBING = params.replace(robots.nominal(), g.CLIMBING)
-REACH = reach(CLIMBING, conditions(g.table8()), channels.names())
+REACH = reach(CLIMBING, conditions(g.table8()), channels.USUAL)
 MENU = menu.menu(REACH)
 SPANS, BY = foreseen.spans(MENU), {e.name: e for e in MENU}
 SETTINGS = SETTLED.settings
@@ -50,7 +50,7 @@ SETTINGS = SETTLED.settings
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
     full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
-    read, batch = eqx.filter_jit(foreseen.readings), foreseen.batch(MENU)
+    read, batch = eqx.filter_jit(foreseen.readings), foreseen.batch(MENU, channels.USUAL)
 
     def of(p, term=None):
         values = dict(p)
@@ -86,7 +86,7 @@ def test_agreement_can_fail(shown):
 
 def test_menu_and_generator_have_the_same_instruments():
     case = g.Case({}, {}, g.conditions(0, 1, 0, 0), g.CLIMBING, (), g.Instruments())
-    sd = foreseen.sds(MENU, case.instruments.stated * [1.0, np.pi / 30, 1e-3])
+    sd = foreseen.sds(MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True)))
     for name, at in SPANS.items():
         np.testing.assert_allclose(case.carry_out(BY[name], 0)["sd"], sd[at], err_msg=name)
 
@@ -323,7 +323,7 @@ def runs_of(table):
 
 
 def test_menu_stays_within_the_reach_of_a_small_robot(rover):
-    made = menu.menu(reach(rover, ROVERS_TABLE, channels.names()))
+    made = menu.menu(reach(rover, ROVERS_TABLE, channels.USUAL))
     runs = runs_of(made)
     assert {r.configuration for r in runs} == {0} and not any("6T2A" in e.description for e in made)
     assert max(max(r.voltage) for r in runs) <= 12.0 and min(min(r.voltage) for r in runs) > 0
@@ -337,14 +337,14 @@ def test_menu_stays_within_the_reach_of_a_small_robot(rover):
 
 def test_configurations_without_rows_are_not_on_the_menu():
     wheels_alone = g.table8(configurations=(1,))
-    made = menu.menu(reach(CLIMBING, conditions(wheels_alone), channels.names()))
+    made = menu.menu(reach(CLIMBING, conditions(wheels_alone), channels.USUAL))
     assert not any("6T2A" in f"{e.name} {e.description}" for e in made)
     assert {r.configuration for r in runs_of(made) if "4W2T" in r.kinds} == {1}
     assert next(e for e in made if e.name == "weigh").at == ((1.0, 0.0), (1.0, 8.0))
 
 
 def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
-    made = menu.menu(reach(rover, grid([12.0], [0.0], [0.0]), channels.names()))
+    made = menu.menu(reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
     runs = runs_of(made)
     assert all(set(r.slope) <= {0.0, -0.0} and set(r.payload) == {0.0} for r in runs)
     assert not {"downhill", "steepest slope", "payload"} & {k for r in runs for k in r.kinds}
@@ -354,7 +354,7 @@ def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
 
 def test_higher_voltage_needs_a_rating_and_is_watched(rover):
     rated = robot_file.change(rover, {"motor.voltage_limit": 18.0}, where="test")
-    within = reach(rated, ROVERS_TABLE, channels.names())
+    within = reach(rated, ROVERS_TABLE, channels.USUAL)
     run = next(r for r in runs_of(menu.menu(within)) if r.name == "other voltages, rover")
     assert max(run.voltage) == 18.0
     shown = menu.carried_out(run, *plain(run), within)
@@ -376,14 +376,14 @@ def test_channels_that_the_bench_lacks_are_not_read(rover):
 
 def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
     one = dataclasses.replace(rover, sides=jnp.asarray(1.0))
-    made = menu.menu(reach(one, ROVERS_TABLE, channels.names()))
+    made = menu.menu(reach(one, ROVERS_TABLE, channels.USUAL))
     assert not any("one motor" in e.kinds for e in made)
     assert "the motor's shaft" in next(e for e in made if e.name == "stall").description
 
 
 def test_voltages_without_load_stay_below_the_permissible_speed():
     slow = robot_file.change(CLIMBING, {"motor.speed_limit": 900.0, "gearbox.speed_limit": 500.0}, where="test")
-    within = reach(slow, conditions(g.table8(voltages=(12.0,))), channels.names())
+    within = reach(slow, conditions(g.table8(voltages=(12.0,))), channels.USUAL)
     runs = {r.name: r for r in runs_of(menu.menu(within))}
     seen = within.motor_speed  # the table went there itself
     assert max(runs["bare motor"].voltage) <= 0.0259 * 900.0
@@ -411,7 +411,7 @@ def test_only_levels_that_the_robot_manages_are_left():
 
 def test_steepest_slope_is_one_that_the_robot_climbs():
     slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
-    found = eqx.filter_jit(foreseen.readings)(slippery, foreseen.batch(MENU))
+    found = eqx.filter_jit(foreseen.readings)(slippery, foreseen.batch(MENU, channels.USUAL))
     first = 0
     for run in runs_of(MENU):
         rows = slice(first, first := first + len(run.voltage))
@@ -476,7 +476,7 @@ def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
 
 
 def test_finer_steps_are_within_the_tables_ranges(rover):
-    within = reach(rover, ROVERS_TABLE, channels.names())
+    within = reach(rover, ROVERS_TABLE, channels.USUAL)
     said = {v: experiments._steps(v, within) for v in ("voltage", "slope", "payload", "current", "time", "humidity")}
     assert "from 6 to 12 V in steps of 0.4 V" in said["voltage"]
     assert "from 0 to 8 deg in steps of 0.6 deg" in said["slope"]
@@ -484,6 +484,6 @@ def test_finer_steps_are_within_the_tables_ranges(rover):
     assert "at 12 V with a payload up to 1 kg and a slope up to 8 deg" in said["current"]
     assert "125 °C is allowed" in said["time"] and "humidity in even small steps" in said["humidity"]
     assert "6, 9 and 12 V" in experiments._steady_speeds("order 2 of the driving shaft", within)
-    level = reach(rover, grid([12.0], [0.0], [0.0]), channels.names())
+    level = reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL)
     assert "a brake or a drawbar pull" in experiments._steps("current", level)
     assert "from 6 to 12 V" in experiments._steps("voltage", level)

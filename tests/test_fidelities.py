@@ -47,10 +47,10 @@ def settles_traceably(fidelity: Fidelity, robot) -> None:
     def readings(resistance):
         result = fidelity.settled(params.replace(robot, {"motor.resistance": resistance}), RUNS)
         assert isinstance(result, Result)
-        return jnp.stack([result.reading[name] for name in channels.names()]), result
+        return jnp.stack([result.reading[name] for name in channels.USUAL]), result
 
     (slopes, result) = jax.eval_shape(jax.jacfwd(readings, has_aux=True), jnp.asarray(0.611))
-    assert slopes.shape == (len(channels.CHANNELS), 2)
+    assert slopes.shape == (len(channels.usual()), 2)
     assert all(x.shape == (2,) for x in jax.tree.leaves(result))
 
 
@@ -59,7 +59,7 @@ def runs_batches(fidelity: Fidelity, robot) -> None:
     assert isinstance(done, Run) and done.history is None
     assert all(x.shape == (2,) for x in jax.tree.leaves(done))
     assert set(np.asarray(done.result.status)) <= set(range(len(STATUSES)))
-    assert set(done.result.reading) == {c.name for c in channels.known()}
+    assert set(done.result.reading) == {c.name for c in channels.EVERY}
 
 
 def keeps_histories(fidelity: Fidelity, robot) -> None:
@@ -71,7 +71,7 @@ def keeps_histories(fidelity: Fidelity, robot) -> None:
     assert isinstance(history, History)
     assert history.time.shape == history.distance.shape and len(history.time) == 2
     assert (np.diff(history.time) > 0).all() and abs(history.time[0, -1] - SHORT) < 1e-9
-    assert set(history.reading) == {c.name for c in channels.known() if c.over_time}
+    assert set(history.reading) == {c.name for c in channels.EVERY if c.over_time}
     for name, reading in history.reading.items():
         assert reading.shape == history.time.shape and np.isfinite(reading).all(), name
     assert (np.abs(history.distance[:, 0]) < 1e-3).all() and (history.reading["total_current"][:, -1] > 0).all()
@@ -115,7 +115,7 @@ def _from_the_middle(robot, conditions, options, progress=None):
         (knows_itself, "steady", {"histories": _from_the_middle}),
         (settles_traceably, "steady", {"settled": _one_row}),
         (runs_batches, "steady", {"run": _no_readings}),
-        (keeps_histories, "drive", {"histories": _from_the_middle}),
+        pytest.param(keeps_histories, "drive", {"histories": _from_the_middle}, marks=pytest.mark.slow),
     ],
     ids=["knows_itself", "settles_traceably", "runs_batches", "keeps_histories"],
 )
@@ -127,7 +127,7 @@ def test_contract_can_be_broken(law, of, change, robot):
 @pytest.mark.slow
 def test_settled_fidelities_agree_where_the_robot_drives(robot):
     steady, drive = (fidelities.get(name).settled(robot, RUNS) for name in ("steady", "drive"))
-    for name in channels.names():
+    for name in channels.USUAL:
         np.testing.assert_allclose(drive.reading[name], steady.reading[name], rtol=1e-3)
 
 
@@ -217,6 +217,7 @@ def test_unknown_fidelity_lists_those_there_are():
             ask("fast")
 
 
+@pytest.mark.slow
 def test_check_refuses_a_step_that_a_run_cannot_bear(robot):
     track = fidelities.get("track")
     stiff = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e9)})

@@ -384,11 +384,12 @@ def test_report_of_histories_shows_what_only_they_tell(started):
 FOURTH = """
 import csv, sys
 from mmrjax import channels
-channels.CHANNELS += (channels.Channel(
+channels.EVERY += (channels.Channel(
     name="terminal_voltage", column="terminal_voltage_V", sd_column="terminal_voltage_sd_V", unit="V", factor=1.0,
     label="terminal voltage", word="voltage", range=(-200.0, 200.0), sd_largest=50.0,
     read=lambda robot, signals: signals.voltage, sd_share=0.01,
 ),)
+channels.USUAL += ("terminal_voltage",)
 source, target, out, *priors = sys.argv[1:]
 rows = list(csv.DictReader(open(source)))
 for row in rows:

@@ -21,7 +21,12 @@ from mmrjax.signals import FLAGS, STATUSES
 
 RPM = np.pi / 30
 ROWS = 8
-run = eqx.filter_jit(mission)
+_run = eqx.filter_jit(mission)
+
+
+def run(*arguments, tolerance=missions.TOLERANCE, **options):
+    """A mission; its tolerance is a number of the program, so that every one shares it."""
+    return _run(*arguments, tolerance=jnp.asarray(tolerance), **options)
 
 
 def rows(time, mode="voltage", **values):
@@ -144,6 +149,7 @@ def test_a_supply_that_takes_nothing_back_lets_the_motors_coast(robot):
     assert abs(float(found.total.unaccounted)) < 1e-4 * float(found.total.of["drawn"] + abs(found.total.of["lift"]))
 
 
+@pytest.mark.slow
 def test_theory_of_the_mesh_gives_less_back(robot):
     mesh = dataclasses.replace(robot, gearbox=dataclasses.replace(robot.gearbox, mesh_theory=True))
     assert float(mesh.gearbox.efficiency_backward) == pytest.approx(2 - 1 / 0.74)
@@ -268,6 +274,39 @@ def test_a_demand_that_cannot_be_met_is_followed_as_far_as_possible_and_flagged(
 BY = ("motor.resistance", "gearbox.efficiency_load", "6T2A.track.loss_coulomb", "6T2A.mass", "motor.torque_constant")
 
 
+def test_derivative_along_a_direction_through_stops_and_reversals_is_that_of_differences(robot):
+    """Of energy and path, along a random direction of parameters, times and values of rows at once, to 1e-3."""
+    time, mode, values = MANY
+    start = rows(time, mode, **values)
+    base = {p.name: float(p.value) for p in params.walk(robot)}
+    draw = np.random.default_rng(6)
+    by_robot, by_time, by_value = draw.normal(size=len(BY)), draw.normal(size=2), draw.normal(size=3)
+
+    def changed(x):
+        moved = {name: base[name] * (1 + x * by_robot[k]) for k, name in enumerate(BY)}
+        p = dataclasses.replace(
+            start,
+            time=start.time.at[3].add(x * by_time[0]).at[5].add(x * by_time[1]),
+            voltage=start.voltage.at[0].multiply(1 + x * by_value[0]).at[3].multiply(1 + x * by_value[1]),
+            demand=start.demand.at[5].multiply(1 + x * by_value[2]),
+        )
+        return params.replace(robot, moved), p
+
+    def outputs(x):
+        made, p = changed(x)
+        total = mission(made, asked(), p, tolerance=jnp.asarray(1e-7)).total
+        return jnp.stack([total.energy, total.of["path"]])
+
+    exact = np.asarray(jax.jit(lambda x: jax.jvp(outputs, (x,), (jnp.ones(()),))[1])(jnp.zeros(())))
+    step, ends = 1e-3, []
+    for x in (step, -step):
+        made, p = changed(jnp.asarray(x))
+        total = run(made, asked(), p, tolerance=1e-7).total  # the program of the other tests
+        ends.append([float(total.energy), float(total.of["path"])])
+    np.testing.assert_allclose(exact, np.subtract(*ends) / (2 * step), rtol=1e-3)
+
+
+@pytest.mark.slow
 def test_derivatives_through_stops_and_reversals_match_differences(robot):
     """Of energy, path, Wh/m and temperature, by parameters and by times and values of rows, to 1e-4."""
     time, mode, values = MANY
@@ -356,6 +395,7 @@ def test_fidelities_agree_on_energy_per_metre(robot):
         assert driven == pytest.approx(per_metre[0], rel=5e-3) and per_metre[1] == pytest.approx(driven, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_endurance_has_the_derivative_of_its_closed_form(robot):
     def endurance(capacity):
         changed = params.replace(robot, {"battery.capacity": capacity})
@@ -364,6 +404,7 @@ def test_endurance_has_the_derivative_of_its_closed_form(robot):
     assert float(jax.jacfwd(endurance)(jnp.asarray(7920.0))) == pytest.approx(1 / 1.5, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop(robot):
     time, mode, values = MANY
     p = rows(time, mode, **values)
@@ -390,6 +431,7 @@ def test_course_is_the_mission_over_time(robot):
     assert current <= float(found.peaks["current"]) * (1 + 1e-12) and current > 0.99 * float(found.peaks["current"])
 
 
+@pytest.mark.slow
 def test_linear_rows_ramp(robot):
     ramp = profile([0, 2, 4], "voltage", voltage=[0.0, 24.0, 24.0], linear=True)
     found = run(robot, asked(), ramp, tolerance=1e-6, keep=2000)

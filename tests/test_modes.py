@@ -98,6 +98,7 @@ def test_modes_of_the_tracked_robot_have_names_and_bands(tracked):
     """Heavier: bounce falls; each holds most of its energy in its own coordinate; the drive is too damped."""
     light, heavy = tracked
     assert [m.name for m in light] == ["pitch", "drive", "bounce"]
+    assert named(light, "pitch").frequency == pytest.approx(66, abs=2)
     assert named(light, "bounce").frequency == pytest.approx(93, abs=2)
     assert named(heavy, "bounce").frequency == pytest.approx(79, abs=2)
     for of in tracked:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
+from calibration.data.columns import Layout
 from calibration.inference import blocks as holdout
 from calibration.inference import identifiability, noise, observers, priors, problem
 from calibration.inference import optimizers as fit
@@ -294,7 +295,7 @@ def history_runs(robot, seed=None, noise_share=0.01):
     }  # fmt: skip
     if seed is not None:
         rng = np.random.default_rng(seed)
-        for column in records.measured_columns():
+        for column in Layout().measured_columns:
             columns[column] = columns[column] * (1 + noise_share * rng.standard_normal(len(columns[column])))
     return records.Runs("made", columns)
 

@@ -40,7 +40,7 @@ def table(masses=MASSES, surface=None) -> records.Runs:
         "total_mass_kg": np.array([masses[n] for n in names]) + payload,
         "payload_kg": payload,
         "slope_deg": np.tile([0.0, 5.0, 12.0], 4)[::-1],
-    } | {c.column: np.linspace(1.0, 2.0, 12) for c in channels.CHANNELS}
+    } | {c.column: np.linspace(1.0, 2.0, 12) for c in channels.usual()}
     return records.Runs("runs.csv", columns | ({} if surface is None else {"surface": np.full(12, surface)}))
 
 
@@ -52,7 +52,7 @@ def unweighed(runs: records.Runs) -> records.Runs:
 @eqx.filter_jit
 def _swept(robot, conditions):
     result = steady_batch(robot, conditions)
-    return jnp.stack([result.reading[c] for c in channels.names()], -1), result.status
+    return jnp.stack([result.reading[c] for c in channels.USUAL], -1), result.status
 
 
 class Written:
@@ -266,7 +266,7 @@ def test_sweep_of_the_loops_robot_is_its_fit(looped):
     swept = {tuple(r[k] for k in keys): r for r in rows(folder / "swept" / "runs.csv")}
     for row in rows(folder / "found" / "rows.csv"):
         same = swept[tuple(row[k] for k in keys)]
-        for c in channels.CHANNELS:
+        for c in channels.usual():
             assert float(same[c.column]) == pytest.approx(float(row[f"after_{c.column}"]), rel=1e-7), (row["row"], c)
 
 

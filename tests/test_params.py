@@ -24,10 +24,11 @@ def test_nominal_values_are_those_of_the_reference(robot):
 def test_running_gear_is_that_of_tables_6_and_7(robot):
     printed = {
         "wheelbase": 0.3, "lever_length": 0.205, "belt_mass": 0.04, "lever_mass": 0.47 + 0.025, "pulley_mass": 0.082,
-        "wheel_mass": 0.086, "inertia_tracked": 0.251, "inertia_wheeled": 0.145,
+        "additional_pulley_mass": 0.104, "wheel_mass": 0.086,
     }  # fmt: skip
     for name, value in printed.items():
         assert float(getattr(robot.running_gear, name)) == pytest.approx(value, rel=1e-12), name
+    assert 10.3 * float(robot.running_gear.body_gyration) ** 2 == pytest.approx(0.119, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", sorted(robots.ROBOTS))

@@ -21,7 +21,7 @@ from mmrjax import channels, robots
 from sweeps import loop as room
 from sweeps import report_loop
 
-NAMES = channels.names()
+NAMES = channels.USUAL
 
 
 def errors(sigma):

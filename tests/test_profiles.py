@@ -97,7 +97,7 @@ def test_units_in_names(read, column, cell, field, value):
 
 
 def test_units_of_a_channel_are_those_of_its_row():
-    for channel in channels.CHANNELS:
+    for channel in channels.usual():
         found = units.of_channel(channel.name)
         assert channel.column == f"{channel.name}_{next(iter(found))}"
         assert len(found) == 1 + len(channel.other_units)
@@ -204,6 +204,11 @@ def test_a_mission_may_begin_in_motion_and_warm(read):
     table = read("# start_speed_mm_s = 400\n# start_winding_C = 60\ntime_s,mode\n0,coast\n1,\n")
     assert table.start is not None and table.begins == {"speed": 0.4, "temperature_winding": 60.0}
     assert read("time_s,mode\n0,coast\n1,\n").start is None
+
+
+@pytest.mark.slow
+def test_a_mission_begins_as_its_profile_says(read):
+    table = read("# start_speed_mm_s = 400\n# start_winding_C = 60\ntime_s,mode\n0,coast\n1,\n")
     found = mission(
         robots.nominal(), Conditions(voltage=24.0), table.profile(robots.nominal(), Conditions([0])), table.start
     )

@@ -132,7 +132,7 @@ def test_every_result_field_and_channel_is_an_attribute(robot):
     one = mm.simulate(robot, mm.Conditions())
     for field in dataclasses.fields(Result):
         assert getattr(one, field.name) is getattr(one.result, field.name)
-    for name in channels.names():
+    for name in channels.USUAL:
         assert getattr(one, name) is one.reading[name]
     with pytest.raises(AttributeError, match="Results has no torque"):
         _ = one.torque
@@ -142,7 +142,12 @@ def test_to_dict_has_the_columns_of_runs_csv(robot):
     runs = mm.Conditions(configuration=["6T2A", "4W2T"], voltage=24.0, payload=2.0)
     columns = mm.simulate(robot, runs).to_dict()
     conditions = ["configuration", "supply_voltage_V", "total_mass_kg", "payload_kg", "slope_deg"]
-    assert list(columns) == [*conditions, *(output.column for output in outputs.table()), "status", "flags"]
+    assert list(columns) == [
+        *conditions,
+        *(output.column for output in outputs.table(channels.usual())),
+        "status",
+        "flags",
+    ]
     assert columns["total_mass_kg"].tolist() == [15.1, 13.5]
     assert columns["status"].tolist() == ["converged", "converged"] and columns["flags"][1] == "gearbox_overspeed"
     result = steady_batch(robot, runs.resolved(robot))
@@ -153,10 +158,10 @@ def test_to_dict_has_the_columns_of_runs_csv(robot):
 
 
 def test_outputs_name_every_number_of_a_result_once():
-    named = [output.name for output in outputs.table()]
+    named = [output.name for output in outputs.table(channels.usual())]
     fields = [field.name for field in dataclasses.fields(Result)]
-    assert sorted(named) == sorted({*channels.names(), *fields} - {"reading", "mass", "status", "flags"})
-    for output in outputs.table():
+    assert sorted(named) == sorted({*channels.USUAL, *fields} - {"reading", "mass", "status", "flags"})
+    for output in outputs.table(channels.usual()):
         assert output.column == output.name or output.column.startswith(f"{output.name}_")
         assert output.label and output.unit
 
@@ -242,6 +247,11 @@ def test_grad_and_forward_mode_go_through(robot):
     central = (current(x + h, robot, run) - current(x - h, robot, run)) / (2 * h)
     np.testing.assert_allclose(jax.grad(current)(x, robot, run), central, rtol=1e-6)
     np.testing.assert_allclose(jax.jacfwd(current)(x, robot, run), central, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_forward_mode_goes_through_a_run_over_time(robot):
+    run, x, h = mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=5.0), jnp.asarray(0.611), 1e-5
     short = dict(model="drive", duration=0.01, history=False)
     driven = (current(x + h, robot, run, **short) - current(x - h, robot, run, **short)) / (2 * h)
     np.testing.assert_allclose(jax.jacfwd(lambda r: current(r, robot, run, **short))(x), driven, rtol=1e-3)

@@ -33,7 +33,7 @@ from sweeps import (
     words,
 )
 
-SWEEP_FIGURES = {f"sweep_{name}" for name in channels.names()}
+SWEEP_FIGURES = {f"sweep_{name}" for name in channels.USUAL}
 
 
 def _asked(configuration, voltage, payload, slope):
@@ -46,7 +46,7 @@ def _asked(configuration, voltage, payload, slope):
 def _table(asked, robot=None):
     """A finished table of runs, as the command line hands it over."""
     robot = ROBOTS["nominal"]() if robot is None else robot
-    outcome = outputs.columns(jax.device_get(steady_batch(robot, asked.conditions(robot))))
+    outcome = outputs.columns(jax.device_get(steady_batch(robot, asked.conditions(robot))), robot.channels)
     return {**run.conditions(robot, asked), **outcome}
 
 
@@ -103,7 +103,7 @@ def test_extremes_are_those_of_the_settled_runs(small):
     _, _, tables, runs = small
     settled = runs["status"] == "converged"
     shown = {row[0]: row[1] for row in tables.tables["extremes"][1:]}
-    for channel in channels.CHANNELS:
+    for channel in channels.usual():
         largest = runs[channel.column][settled].max()
         assert float(shown[f"largest {channel.label}"].split()[0]) == pytest.approx(largest, rel=5e-3)
 
@@ -220,7 +220,7 @@ def driven(robot, tmp_path_factory):
         "configuration": np.array(["6T2A", "6T2A", "4W2T"]), "supply_voltage_V": np.asarray(asked.voltage),
         "payload_kg": np.zeros(3), "slope_deg": np.asarray(asked.slope_deg),
     })  # fmt: skip
-    table = {**run.conditions(robot, runs), **run.ended(batch)}
+    table = {**run.conditions(robot, runs), **run.ended(robot, batch)}
     folder = tmp_path_factory.mktemp("driven")
     report_runs.write(folder, robot=robot, robot_name="nominal", model="drive", runs=table, histories=batch)
     return folder, (folder / "report.html").read_text(), batch

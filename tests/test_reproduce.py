@@ -17,7 +17,7 @@ from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
 from calibration.inference import errors as residual
-from mmrjax import outputs, params
+from mmrjax import channels, outputs, params
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.robots import ROBOTS
@@ -82,6 +82,7 @@ def test_page_has_every_figure_and_refers_to_nothing_outside(paper):
     assert (folder / "report.html").stat().st_size < 5e6
 
 
+@pytest.mark.slow
 def test_robot_of_another_kind_is_shown_and_not_set_against_the_bench(reproduced, tmp_path, capsys):
     (tmp_path / "crawler.toml").write_text('configurations = ["crawler"]\n[crawler]\nlike = "6T2A"\n')
     code, folder = reproduced("--robot", tmp_path / "crawler.toml")
@@ -96,7 +97,7 @@ def test_error_table_equals_equation_35(paper):
     tables = paper[2]
     measured, printed = (data.stacked(records.read(n).columns) for n in ("measured", "simulated_by_paper"))
     points = outputs.columns(
-        steady_batch(ROBOTS["nominal"](), records.read("measured").conditions(ROBOTS["nominal"]()))
+        steady_batch(ROBOTS["nominal"](), records.read("measured").conditions(ROBOTS["nominal"]())), channels.usual()
     )
     ours = residual.relative_error(data.stacked(points), measured)
     kind = records.read("measured")["configuration"]
@@ -121,7 +122,9 @@ def test_error_table_gives_the_papers_own_errors(paper):
 def test_row_table_shows_bench_paper_and_own_numbers(paper):
     tables = paper[2]
     measured = records.read("measured")
-    points = outputs.columns(steady_batch(ROBOTS["nominal"](), measured.conditions(ROBOTS["nominal"]())))
+    points = outputs.columns(
+        steady_batch(ROBOTS["nominal"](), measured.conditions(ROBOTS["nominal"]())), channels.usual()
+    )
     rows = [r for r in tables.tables["rowtable"][2:] if r[0]]
     assert len(rows) == 20
     for k, row in enumerate(rows):

@@ -7,7 +7,6 @@ from calibration.data import robot_file, stated
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import bases, observers
-from mmrjax import channels
 from sweeps import rig_check
 
 BRAKE = """
@@ -28,18 +27,10 @@ loss_coulomb = "0.3 ± 40 %"
 WINCH = BRAKE + "torque_constant = 0.2\n"
 
 
-@pytest.fixture(autouse=True)
-def _channels():
-    with channels.panel(channels.names()):
-        yield
-
-
 def rig_of(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
-    robot = robot_file.read(path)
-    channels.select(robot.rig.channels)
-    return robot
+    return robot_file.read(path)
 
 
 def table(tmp_path, *rows, header="motor_speed_rpm,total_current_A"):

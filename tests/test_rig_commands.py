@@ -71,18 +71,17 @@ def table_of(rig, changed, levels, slopes=None, sd=0.01, seed=5):
     if slopes is not None:
         columns |= {"slope_deg": np.asarray(slopes, float), "payload_kg": np.zeros(len(levels))}
     robot = params.replace(robot, {name: np.asarray(value, float) for name, value in changed.items()})
-    with channels.panel(robot.rig.channels):
-        conditions = Runs("a table", columns, layout=layout).conditions(robot)
-        result = jax.device_get(fidelities.get("steady").run(robot, conditions, {}, lambda share: None).result)
-        drawn = np.random.default_rng(seed)
-        written = {key: value for key, value in columns.items() if key != "configuration"}
-        for c in channels.CHANNELS:
-            reading = np.asarray(result.reading[c.name]) / c.factor
-            size = sd * np.abs(reading).mean()
-            written |= {
-                c.column: reading + size * drawn.normal(size=len(levels)),
-                c.sd_column: np.full(len(levels), size),
-            }
+    conditions = Runs("a table", columns, layout=layout).conditions(robot)
+    result = jax.device_get(fidelities.get("steady").run(robot, conditions, {}, lambda share: None).result)
+    drawn = np.random.default_rng(seed)
+    written = {key: value for key, value in columns.items() if key != "configuration"}
+    for c in robot.channels:
+        reading = np.asarray(result.reading[c.name]) / c.factor
+        size = sd * np.abs(reading).mean()
+        written |= {
+            c.column: reading + size * drawn.normal(size=len(levels)),
+            c.sd_column: np.full(len(levels), size),
+        }
     path = rig.with_suffix(".csv")
     lines = [",".join(written), *(",".join(f"{v[k]:.8g}" for v in written.values()) for k in range(len(levels)))]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

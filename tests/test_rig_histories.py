@@ -54,7 +54,7 @@ def history(tmp_path, robot, truth, columns, sd, seed):
     path = tmp_path / "table.csv"
 
     def write(readings):
-        names = [*columns, *(n for c in channels.CHANNELS for n in (c.column, c.sd_column))]
+        names = [*columns, *(n for c in robot.channels for n in (c.column, c.sd_column))]
         cells = [*columns.values(), *(x for k in range(len(sd)) for x in (readings[:, k], np.full(rows, sd[k])))]
         lines = [",".join(names), *(",".join(str(c[k]) for c in cells) for k in range(rows))]
         path.write_text("\n".join(lines))
@@ -62,7 +62,7 @@ def history(tmp_path, robot, truth, columns, sd, seed):
 
     blank = write(np.zeros((rows, len(sd))))
     shown = np.asarray(observers.kind(blank).of(blank, truth)(truth).reading)
-    factor = np.array([c.factor for c in channels.CHANNELS])
+    factor = np.array([c.factor for c in robot.channels])
     noise = np.array(sd) * np.random.default_rng(seed).standard_normal(shown.shape)
     return write(shown / factor + noise)
 
@@ -75,9 +75,8 @@ def test_a_delay_of_the_imposed_speed_is_found(tmp_path):
     truth = params.replace(robot, {"rig.delay": 0.03, "bench.loss_coulomb": 0.26})
     t = np.arange(0, 4, 0.03)
     speed = (200 * np.sin(1.5 * t) + 50 * np.sin(4 * t)) / channels.RPM
-    with channels.panel(robot.rig.channels):
-        runs = history(tmp_path, robot, truth, {"time_s": t, "motor_speed_rpm": speed}, [0.01], 1)
-        found = calibrate(runs, robot, **OPTIONS)
+    runs = history(tmp_path, robot, truth, {"time_s": t, "motor_speed_rpm": speed}, [0.01], 1)
+    found = calibrate(runs, robot, **OPTIONS)
     delay, friction = found.parameters["rig.delay"], found.parameters["bench.loss_coulomb"]
     assert abs(delay.value - 0.03) < 4 * delay.sd < 4e-3
     assert abs(friction.value - 0.26) < 4 * friction.sd < 0.02
@@ -100,9 +99,8 @@ def test_the_beginning_of_an_arm_in_motion_is_found(tmp_path):
         "time_s": np.tile(t, 2),
         "supply_voltage_V": np.concatenate([voltage, -voltage]),
     }
-    with channels.panel(robot.rig.channels):
-        runs = history(tmp_path, robot, truth, columns, [0.01, 20.0, 0.6], 2)
-        found = calibrate(runs, robot, **OPTIONS)
+    runs = history(tmp_path, robot, truth, columns, [0.01, 20.0, 0.6], 2)
+    found = calibrate(runs, robot, **OPTIONS)
     expected = {
         "arm.torque_gravity": 0.66, "arm.loss_coulomb": 0.08, "rig.begin_a.motor_speed": 30.0,
         "rig.begin_a.angle": 0.3, "rig.begin_b.motor_speed": -20.0, "rig.begin_b.angle": 0.1,
@@ -119,15 +117,14 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
     for start in ("measured", "free"):
         path.write_text(DRIVE.format(imposed="voltage", channels='"output_speed", "output_angle"', start=start) + ARM)
         robot = robot_file.load(str(path))
-        with channels.panel(robot.rig.channels):
-            table = tmp_path / "table.csv"
-            lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
-            lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
-            table.write_text("\n".join(lines))
-            runs = records.read(table, robot=robot)
-            kind = observers.kind(runs)
-            known = noise.of(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
-            begun = kind.begun(robot, runs, known)
+        table = tmp_path / "table.csv"
+        lines = ["time_s,supply_voltage_V,output_speed_rpm,output_angle_deg"]
+        lines += [f"{t},6,{60 + 100 * t},{30 + 360 * t + 300 * t**2}" for t in np.arange(0, 0.2, 0.01)]
+        table.write_text("\n".join(lines))
+        runs = records.read(table, robot=robot)
+        kind = observers.kind(runs)
+        known = noise.of(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
+        begun = kind.begun(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
         assert float(begin.motor_speed) == pytest.approx(60 * channels.RPM * 16, rel=1e-9)

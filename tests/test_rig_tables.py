@@ -33,17 +33,9 @@ DRIVE = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _channels():
-    """Channels as they were, whatever a test selects."""
-    with channels.panel(channels.names()):
-        yield
-
-
 def rig(load, *, sides=1.0, **stated):
-    """A rig from nothing with one load, its channels selected."""
+    """A rig from nothing with one load, with its channels."""
     robot = robots.blank(Configurations({"rig": load}), sides, Rig(**stated))
-    channels.select(robot.rig.channels)
     return params.replace(robot, DRIVE)
 
 
@@ -70,7 +62,7 @@ def measured(tmp_path, robot, conditions, columns, true=None, *, share=0.01, see
     found = steady_batch(params.replace(robot, true or {}), conditions)
     rng = np.random.default_rng(seed)
     columns = dict(columns)
-    for c in channels.CHANNELS:
+    for c in robot.channels:
         x = np.asarray(found.reading[c.name]) / c.factor
         columns[c.column] = [f"{v:.6g}" for v in x * (1 + share * rng.standard_normal(x.shape))]
     lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
@@ -536,7 +528,6 @@ quantum = "free"
     assert robot.rig.instruments == (Instrument("total_current", None, None),)
     robot_file.write(robot, tmp_path / "again.toml", note="of a test")
     assert robot_file.read(tmp_path / "again.toml").rig.instruments == robot.rig.instruments
-    channels.select(robot.rig.channels)
     speeds = np.array([-4000, -3100, -2700, -1900, -1300, -1000, 1000, 1600, 2300, 2900, 3700, 4000.0])
     robot_there = params.replace(robot, {"brake.loss_coulomb": 0.15})
     truth = steady_batch(robot_there, Conditions(motor_speed=speeds * channels.RPM)).reading["total_current"]

@@ -45,7 +45,7 @@ def study(robot):
         np.array(["6T2A", "4W2T", "6T2A", "6T2A"]), np.array([24.0, 15, 33, 24]), np.array([3.0, 0, 8, 0]),
         np.array([0.0, 5, 0, 25]),
     )  # fmt: skip
-    return Study(robot, inputs, points, chosen_outputs(("total_current", "speed")))
+    return Study(robot, inputs, points, chosen_outputs(("total_current", "speed"), robot))
 
 
 def table(path):
@@ -120,7 +120,7 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), covariance), {})
     points = Points(*(x[:1] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("total_current",)))
+    one = Study(robot, inputs, points, chosen_outputs(("total_current",), robot))
     found = analyse(one, "shapley", 20_000)
     z_slopes = local(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
     truth = shapley.linear(z_slopes, covariance)
@@ -129,6 +129,7 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     assert np.all(np.abs(estimate.value - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
 
 
+@pytest.mark.slow
 def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlations(robot, study):
     # The torque constant acts; the inductance does nothing, and the other two act in one configuration each. The
     # guides' share is linked with the inductance through the 4W2T's loss alone.
@@ -136,7 +137,7 @@ def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlatio
     covariance = 0.02 * np.array([[1, 0.6, 0, 0], [0.6, 1, 0.5, 0], [0, 0.5, 1, 0], [0, 0, 0, 1.0]])
     inputs = room.of_posterior(robot, of_coordinates(priors.coordinates(robot, names), np.zeros(4), covariance), {})
     points = Points(*(x[:2] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     found = analyse(one, "shapley", 40_000)
     slopes = local(one).by_score["speed"] @ np.linalg.inv(inputs.parameters.root)
     at = found.outputs["speed"].at_points["shapley"]
@@ -155,7 +156,7 @@ def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance
     coordinates = priors.coordinates(robot, (NAMES[0], NAMES[3]))
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.diag(variances)), {})
     points = Points(*(x[:1] for x in study.points.columns().values()))
-    one = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    one = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     np.testing.assert_array_equal(inert(one, local(one), 0), [False, True])
 
 
@@ -163,7 +164,7 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
     coordinates = priors.coordinates(robot, NAMES[:2])
     inputs = room.of_posterior(robot, of_coordinates(coordinates, np.zeros(2), np.array([[1, 0.5], [0.5, 1.0]])), {})
     points = Points(*(x[[0, 3]] for x in study.points.columns().values()))
-    two = Study(robot, inputs, points, chosen_outputs(("speed",)))
+    two = Study(robot, inputs, points, chosen_outputs(("speed",), robot))
     edge = np.inf
 
     def sample(values, group):
@@ -187,11 +188,13 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
     np.testing.assert_allclose(some.overall["shapley"].value, variance @ at / variance.sum())
 
 
-@pytest.mark.parametrize("method", ["sobol", "morris", "derivative", "shapley"])
+@pytest.mark.parametrize(
+    "method", ["morris", *(pytest.param(m, marks=pytest.mark.slow) for m in ("sobol", "derivative", "shapley"))]
+)
 def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
     inputs = room.of_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
     points = Points(*(x[:2] for x in study.points.columns().values()))
-    found = analyse(Study(robot, inputs, points, chosen_outputs(("speed",))), method, 3000)
+    found = analyse(Study(robot, inputs, points, chosen_outputs(("speed",), robot)), method, 3000)
     assert sum(found.sampled["steady"].values()) == found.evaluations > 0
     if method == "sobol":
         assert found.outputs["speed"].convergence[-1][0] == found.evaluations
@@ -255,6 +258,7 @@ def test_schema_can_fail():
         jsonschema.validate({"schema": "mmrjax.sensitivity/1"}, SCHEMA)
 
 
+@pytest.mark.slow
 def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmrjax, tmp_path, robot):
     coordinates = priors.coordinates(robot, NAMES[:2])
     found = of_coordinates(coordinates, np.zeros(2), 0.01 * np.eye(2))
@@ -337,6 +341,7 @@ def test_candidates_are_read_as_tables_of_runs(mmrjax, tmp_path):
     assert got == 0 and runs["candidates"] == 2 and runs["source"] == "two.csv" and len(runs["runs"]) == 2
 
 
+@pytest.mark.slow
 def test_points_that_are_not_held_are_said_and_end_with_3(mmrjax, tmp_path):
     code, out, _ = mmrjax(
         "sensitivity", "--parameters", NAMES[0], "--voltages", "24", "--payloads", "0", "--slopes", "0,25",
@@ -349,7 +354,7 @@ def test_points_that_are_not_held_are_said_and_end_with_3(mmrjax, tmp_path):
     assert low < 1 < high  # the only input
 
 
-@pytest.mark.parametrize("vary", ["voltage=22:26", "total_mass=12:16"])
+@pytest.mark.parametrize("vary", ["voltage=22:26", pytest.param("total_mass=12:16", marks=pytest.mark.slow)])
 def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(mmrjax, tmp_path, vary):
     code, _, err = mmrjax(
         "sensitivity", "--method", "local", "--parameters", NAMES[0], "--payloads", "3", "--slopes", "0",
@@ -361,6 +366,7 @@ def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(m
     assert vary.partition("=")[0] in document["inputs"] and len(document["next_runs"]["runs"]) == 5
 
 
+@pytest.mark.slow
 def test_start_outputs_are_studied_by_drive(mmrjax, tmp_path):
     code, _, _ = mmrjax(
         "sensitivity", "--method", "local", "--parameters", "motor.resistance,6T2A.ground.friction.dynamic", "--voltages", "24",

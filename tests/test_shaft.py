@@ -127,6 +127,7 @@ def test_an_imposed_history_takes_the_torque_of_its_acceleration():
     np.testing.assert_allclose(np.asarray(seen.angle)[-1], (100 + 40) / 16, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_imposed_history_are_differences():
     conditions = Conditions(voltage=0.0)
     times = jnp.linspace(0, 0.5, 11)

@@ -164,6 +164,7 @@ def test_report_shows_course_energy_and_segments(done):
     assert outside(done) == []
 
 
+@pytest.mark.slow
 def test_runs_of_a_file_follow_the_same_profile(mmrjax, capsys, monkeypatch):
     (mmrjax.folder / "plan.csv").write_text(
         "run_id,configuration,supply_voltage_V,payload_kg,slope_deg\na,6T2A,33,0,0\nb,4W2T,24,4,0\n"
@@ -273,6 +274,7 @@ def test_numbers_are_described_once():
     assert {f"energy_to_{name}" for name in energy.SINKS} < {o.name for o in OUTPUTS}
 
 
+@pytest.mark.slow
 def test_energy_has_forward_derivatives_by_the_robot_and_by_the_profile(robot):
     """Along one direction in both; central differences agree."""
     at = mm.Conditions(configuration="6T2A", voltage=24.0)

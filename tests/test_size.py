@@ -44,9 +44,20 @@ def command(arguments):
     return end.value.code
 
 
+#: The same without what takes a search or an integral at every design.
+FEW = TEXT.replace("payload_kg = 8\n", "", 1).replace('"driving", share = 0.5, slope_deg = 0', '"standing"')
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(FEW, id="few"), pytest.param(TEXT, id="all", marks=pytest.mark.slow)]
+)
+def text(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def asked():
-    return requirements.read(TEXT, "r.toml")
+def asked(text):
+    return requirements.read(text, "r.toml")
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +66,10 @@ def found(robot, asked):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(text, tmp_path_factory):
     """What the command leaves, for a front of two."""
     path = tmp_path_factory.mktemp("runs")
-    (path / "r.toml").write_text(TEXT)
+    (path / "r.toml").write_text(text)
     assert command(["size", path / "r.toml", "--pareto", "mass,energy", "--out", path / "run"]) == 0
     return path / "run"
 
@@ -121,6 +132,7 @@ def test_binding_limits_are_why_it_is_no_lighter(robot, asked, found):
     assert search.measured(of, choice, np.array([row]), x)[1].min() < 0
 
 
+@pytest.mark.slow
 def test_margins_are_differentiable(robot, asked, found):
     of, choice = space(robot, asked, found)
     f = found.best
@@ -206,6 +218,7 @@ def test_chart_has_the_limits_of_the_robot(robot, asked):
     assert payload == pytest.approx(1.6 * 8) and slope == pytest.approx(16)
 
 
+@pytest.mark.slow
 def test_what_no_parts_meet_is_left_out_and_said(robot):
     asked = requirements.read("speed_m_s = 0.5\nslope_deg = 20\n[envelope]\nstate_of_charge = [0.1, 1]", "r.toml")
     found = search.size(robot, asked, ("mass",), starts=32, motors=(MOTOR,))

@@ -24,6 +24,7 @@ from calibration.inference import bases
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers import Histories, SettledRuns
 from calibration.inference.observers.settled import SettledLinearization
+from mmrjax import channels
 from mmrjax.effects import BY_NAME
 
 # --- evidence, on a linear problem ----------------------------------------------------------------------
@@ -45,7 +46,7 @@ def toy():
     jacobian = np.concatenate([slopes, np.zeros((rows, p)), np.eye(p)])
     signals = SimpleNamespace(speed_motor=speed, slope=slope)
     arrays = (jnp.asarray(x) for x in (residual, jacobian, np.zeros((3 * rows, 1)), defects, np.ones((rows, 3))))
-    linear = SettledLinearization(*arrays, signals)
+    linear = SettledLinearization(*arrays, signals, channels=channels.USUAL)
     return SimpleNamespace(linear=linear, readings=readings, slopes=slopes, rows=rows, counts=np.ones(rows, bool))
 
 

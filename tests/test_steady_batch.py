@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import vectorised
 
-from mmrjax import outputs, params
+from mmrjax import channels, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
 from mmrjax.fidelities import steady as room
@@ -16,7 +16,7 @@ from mmrjax.fidelities.steady import steady_batch, steady_derivatives, steady_ou
 from mmrjax.signals import STATUSES
 
 EFFECTS = {"series_resistance": 0.3, "churning": 5e-4, "winding_heating": 1.0, "nonlinear_slip": 0.05}
-ALL = tuple(output.name for output in outputs.table())
+ALL = tuple(output.name for output in outputs.table(channels.usual()))
 #: Driving, sliding, stalled and overhauling in one batch, in both configurations.
 MIXED = dict(
     voltage=[24.0, 33.0, 0.5, 24.0, 15.0, 24.0],
@@ -73,7 +73,7 @@ def test_comparison_with_numpy_can_fail(robot):
 # --- outputs that are asked for ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("effects", [False, True])
+@pytest.mark.parametrize("effects", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_steady_outputs_are_those_of_steady_batch(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
     whole = steady_batch(robot, runs)
@@ -81,7 +81,7 @@ def test_steady_outputs_are_those_of_steady_batch(robot, effects):
         "converged", "slides", "stalled", "converged", "converged", "failed",
     ]  # fmt: skip
     found = steady_outputs(robot, runs, (*ALL, "status", "flags"))
-    for output in outputs.table():
+    for output in outputs.table(channels.usual()):
         np.testing.assert_allclose(found[output.name], output.get(whole), rtol=1e-13, err_msg=output.name)
     np.testing.assert_array_equal(found["status"], whole.status)
     np.testing.assert_array_equal(found["flags"], whole.flags)
@@ -121,7 +121,7 @@ def test_steady_outputs_compile_once_for_other_numbers(robot, compilations):
     assert not compilations
 
 
-@pytest.mark.parametrize("size", [96, 97])
+@pytest.mark.parametrize("size", [96, pytest.param(97, marks=pytest.mark.slow)])
 def test_steady_blocks_change_no_number(robot, monkeypatch, size):
     """97 points have no block that divides them, and go together."""
     runs = Conditions(*points(size))
@@ -144,7 +144,7 @@ PARAMETERS = ("motor.resistance", "6T2A.mass", "gearbox.ratio", "4W2T.ground.fri
 WANTED = ("total_current", "speed", "efficiency_chassis")
 
 
-@pytest.mark.parametrize("effects", [False, True])
+@pytest.mark.parametrize("effects", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_steady_derivatives_are_those_of_jacfwd(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
     at = jnp.asarray([p.value for name in PARAMETERS for p in params.walk(robot) if p.name == name])

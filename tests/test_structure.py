@@ -182,7 +182,7 @@ def channels_are_counted_in_one_place(path: PurePosixPath, tree: ast.Module) -> 
     """No literal outside the table of channels spells two or more of them."""
     if path.parts[0] == "mmrjax" or path.parts[:2] == REPRODUCTION:
         return
-    spelled = {word: c.name for c in channels.CHANNELS for word in (c.name, c.column, c.sd_column)}
+    spelled = {word: c.name for c in channels.usual() for word in (c.name, c.column, c.sd_column)}
     place, inner = places(tree), set()
     for node in ast.walk(tree):
         if id(node) in inner or not isinstance(node, ast.Tuple | ast.List | ast.Set | ast.Dict):
@@ -248,6 +248,115 @@ def front_door_fits_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[B
                 yield line, f"sweeps imports {room}"
 
 
+#: What is kept between calls, with why no answer depends on it.
+KEPT = {
+    ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
+    ("mmrjax/mjcf.py", "_template"): "pure: the topology of the track model",
+    ("mmrjax/params.py", "own_spec"): "pure, of hashable arguments",
+    ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
+    ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",
+    ("calibration/data/parts.py", "motors"): "a packaged table",
+    ("calibration/data/parts.py", "gearboxes"): "a packaged table",
+    ("calibration/data/parts.py", "cells"): "a packaged table",
+    ("calibration/data/requirements.py", "paper"): "a packaged file",
+    ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
+    ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
+    ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/cluster.py", "_compiled"): "a worker's compiled job, by its name; computes the same when compiled again",
+    ("sweeps/cluster.py", "_start"): "prepares jax, once a process",
+    ("sweeps/cluster.py", "jax.config"): "a switch of jax, once a process",
+    ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
+    ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",
+    ("sweeps/design.py", "_directions"): "pure, of hashable arguments",
+    ("sweeps/identity.py", "_code"): "hashes of the files of this program",
+}
+#: Methods that change what they are called on, and decorators that remember what a function returned.
+CHANGES = {
+    "add", "append", "appendleft", "clear", "discard", "extend", "extendleft", "insert", "pop", "popitem", "popleft",
+    "remove", "reverse", "setdefault", "sort", "update",
+}  # fmt: skip
+CACHES = ("cache", "lru_cache")
+CARRIERS = ("ContextVar", "threading.local")
+Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
+
+
+def _stored(tree: ast.AST) -> set[str]:
+    return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+
+
+def _at_the_top(tree: ast.Module) -> tuple[set[str], set[str]]:
+    """Names of a module's own that functions can see, and those that it imports."""
+    own, imported = set(), set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            imported |= {(alias.asname or alias.name).partition(".")[0] for alias in node.names}
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            own.add(node.name)
+        else:
+            own |= _stored(node)
+    return own, imported
+
+
+def _parameters(function: Function) -> set[str]:
+    a = function.args
+    return {x.arg for x in (*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg)))}
+
+
+def _dotted(node: ast.expr) -> str:
+    """`a.b` of what is `a.b[c].d`."""
+    while isinstance(node, ast.Subscript):
+        node = node.value
+    if isinstance(node, ast.Attribute):
+        inner = _dotted(node.value)
+        return f"{inner}.{node.attr}" if inner else ""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _changed(node: ast.AST, inside: bool) -> Iterator[str]:
+    """What a node rebinds, changes or remembers, as a dotted name."""
+    if isinstance(node, ast.Global):
+        yield from node.names
+    elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        made = (d.func if isinstance(d, ast.Call) else d for d in node.decorator_list)
+        yield from (node.name for d in made if ast.unparse(d).rpartition(".")[2] in CACHES)
+    elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(CARRIERS):
+        yield ast.unparse(node.func)
+    elif isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del) and inside:
+        yield "globals" if ast.unparse(node).startswith("globals()[") else _dotted(node)
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and inside:
+        if node.func.attr in CHANGES:
+            yield _dotted(node.func.value)
+    elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("setattr", "delattr") and inside:
+        yield f"{_dotted(node.args[0])}.{ast.unparse(node.func)}"
+
+
+def modules_keep_no_state(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+    """No function changes what belongs to a module, its own or another, but for what is `KEPT`."""
+    own, imported = _at_the_top(tree)
+
+    def walk(node: ast.AST, hidden: set[str], inside: bool) -> Iterator[Breach]:
+        for name in _changed(node, inside):
+            first, _, rest = name.partition(".")
+            called = isinstance(node, ast.Call) and first in imported and (not rest or first in ("np", "jnp"))
+            kept = (path.as_posix(), name) in KEPT
+            always = isinstance(node, ast.Global | Function) or name.endswith(CARRIERS) or name == "globals"
+            if not kept and (always or (first in (own | imported) - hidden and not called)):
+                yield node.lineno, f"keeps state in {name}"
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, Function):
+                mine = (_parameters(child) | _stored(child)) - _rebound(child)
+                yield from walk(child, hidden | mine, True)
+            else:
+                yield from walk(child, hidden, inside)
+
+    yield from walk(tree, set(), False)
+
+
+def _rebound(function: Function) -> set[str]:
+    return {name for n in ast.walk(function) if isinstance(n, ast.Global) for name in n.names}
+
+
 RULES: tuple[Rule, ...] = (
     rooms_have_names_of_their_own,
     layers_import_those_before_them,
@@ -259,6 +368,7 @@ RULES: tuple[Rule, ...] = (
     configurations_are_data,
     discovery_keeps_its_stages,
     front_door_fits_nothing,
+    modules_keep_no_state,
 )
 
 
@@ -330,6 +440,33 @@ BAD = {
         "def f():\n    from calibration.inference.held_out import held_out",
     ),
     "sweeps imports calibration.discovery.candidates": ("sweeps/bad.py", "import calibration.discovery.candidates"),
+    "keeps state in X": ("mmrjax/bad.py", "X = ()\ndef f():\n    global X\n    X = (1,)"),
+    "keeps state in X 2": ("calibration/bad.py", "X = {}\ndef f(k):\n    X[k] = 1"),
+    "keeps state in X 3": ("calibration/bad.py", "X = []\nf = lambda k: X.append(k)"),
+    "keeps state in X 4": ("sweeps/bad.py", "X: dict[str, list[int]] = {}\ndef f(k):\n    X['a'].append(k)"),
+    "keeps state in X 5": ("sweeps/bad.py", "X = {}\ndef f(k):\n    def g():\n        del X[k]\n    return g"),
+    "keeps state in f": (
+        "mmrjax/bad.py",
+        "import functools\n@functools.lru_cache(maxsize=2)\ndef f(k):\n    return k",
+    ),
+    "keeps state in f.seen": ("calibration/bad.py", "def f(k):\n    f.seen = k"),
+    "keeps state in channels.CHANNELS": (
+        "sweeps/bad.py",
+        "from mmrjax import channels\ndef f(rows):\n    channels.CHANNELS = rows",
+    ),
+    "keeps state in channels.CHANNELS 2": (
+        "sweeps/bad.py",
+        "def f(row):\n    from mmrjax import channels\n    channels.CHANNELS.append(row)",
+    ),
+    "keeps state in channels.setattr": (
+        "sweeps/bad.py",
+        "from mmrjax import channels\ndef f(rows):\n    setattr(channels, 'CHANNELS', rows)",
+    ),
+    "keeps state in contextvars.ContextVar": (
+        "mmrjax/bad.py",
+        "import contextvars\nCHANNELS = contextvars.ContextVar('channels')",
+    ),
+    "keeps state in threading.local": ("calibration/bad.py", "import threading\nX = threading.local()"),
 }
 #: What no rule may mind.
 GOOD = {
@@ -343,6 +480,8 @@ GOOD = {
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",
     "calibration/inference/bases.py": "VARIABLES = {'a': 'speed_mm_s', 'b': 'motor_speed_rpm'}\n",
     "sweeps/__init__.py": "",
+    "sweeps/cluster.py": "_compiled = {}\ndef f(k):\n    _compiled[k] = 1\n",
+    "sweeps/local.py": "import numpy as np\nX = {}\nX[1] = 2\ndef f(X, y):\n    X[1] = y\n    z = np.append(y, 1)\n    z[0] = 1\n",
     "sweeps/options.py": "X = option(help='6T2A or 4W2T')\nfrom calibration.discovery.discover import discover\n",
     "sweeps/paper/rows.py": "X = {'6T2A': ('total_current_A', 'speed_mm_s')}\n",
     "sweeps/words.py": "X = ['write 6T2A, or else 4W2T']\n",
@@ -369,6 +508,12 @@ def test_every_rule_is_broken_by_a_bad_module(tmp_path):
     assert broken == {rule.__name__ for rule in RULES}
 
 
+def test_what_is_kept_is_there():
+    assert all((ROOT / path).exists() for path, _ in KEPT)
+    text = {path: (ROOT / path).read_text(encoding="utf-8") for path, _ in KEPT}
+    assert all(name in text[path] for path, name in KEPT)
+
+
 def test_front_door_loads_nothing_heavy():
     if not (ROOT / "sweeps" / "cli.py").exists():
         pytest.skip("no command line yet")
@@ -378,6 +523,79 @@ def test_front_door_loads_nothing_heavy():
         [sys.executable, "-c", code, *heavy], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
     )
     assert answer.stdout.strip() == "[]"
+
+
+#: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
+INNER = {
+    "as_read", "separated", "of_surfaces", "weighed", "begun", "with_begins", "check_start", "assumed", "library_for",
+    "settings_for", "without_copies", "pose", "fit_base", "trace", "discover_at",
+}  # fmt: skip
+#: Campaigns and notebooks that call a part of that all the same, and why.
+CALLED: dict[tuple[str, str], str] = {
+    ("loop_baselines", "pose"): "other ways to select effects, on the loop's own problem after its own preparation",
+    ("loop_baselines", "fit_base"): "the same",
+    ("calibrate", "pose"): "coverage about a known truth: problems without a table of their own",
+    ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
+    ("05_your_rig", "separated"): "an effect of the rig's size, shown by itself before it is calibrated as users do",
+    ("05_your_rig", "library_for"): "the same",
+    ("track_table", "weighed"): "the same rows, searched by members and not by `calibrate`",
+}
+
+
+def inner_calls(source: str) -> Iterator[tuple[int, str]]:
+    """Calls of `INNER` functions in a module, but of methods of what `prepared` gives."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call):
+            whose, _, name = ast.unparse(node.func).rpartition(".")
+            prepared = whose == "given" or whose.startswith("prepared(")
+            if name in INNER and not (name == "trace" and prepared):
+                yield node.lineno, name
+
+
+def test_campaigns_and_notebooks_take_the_way_of_users():
+    """A campaign that prepares a table by itself measures a program that nobody runs."""
+    own = {"fastsim_comparison": {"trace"}, "track_table": {"begun"}}  # a driving trace, searches that have begun
+    found = {
+        (file.stem, name)
+        for folder in ("benchmarks", "notebooks")
+        for file in sorted((ROOT / folder).glob("*.py"))
+        for _, name in inner_calls(file.read_text(encoding="utf-8"))
+        if name not in own.get(file.stem, ())
+    }
+    assert found == set(CALLED)
+    for campaign in ("loop", "loop_series", "loop_baselines", "rigs"):
+        tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
+        assert any(name == "calibration.discovery.discover.prepared" for name, _ in names_imported(tree, "")), (
+            campaign
+        )
+
+
+def test_a_campaign_of_its_own_way_is_found():
+    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.assumed(runs)"
+    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "assumed"]
+    assert not [*inner_calls("given = prepared(runs, robot)\ngiven.trace()\nprepared(runs).trace()\ncalibrate(runs)")]
+
+
+def test_one_preparation_serves_all():
+    """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
+    inner = {"as_read", "separated", "begun", "check_start"}
+    allowed = {
+        "calibration/inference/preparation.py",
+        "sweeps/compare.py",
+        "sweeps/rig_check.py",
+    }  # two that fit nothing
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for layer in ("calibration", "sweeps")
+        for path in (ROOT / layer).rglob("*.py")
+        for _, name in inner_calls(path.read_text(encoding="utf-8"))
+        if name in inner
+    }
+    assert found == allowed
+    for room in ("inference/calibrate", "inference/foresight", "discovery/discover"):
+        tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
+        calls = {ast.unparse(n.func).rpartition(".")[2] for n in ast.walk(tree) if isinstance(n, ast.Call)}
+        assert "prepare" in calls, room
 
 
 def test_reference_implementation_imports_nothing_of_ours():

@@ -219,7 +219,7 @@ def test_resolved_configuration_and_robot_repeat_the_sweep(sweep, whole, tmp_pat
     assert arrays("s") == arrays(whole) == arrays("t")
 
 
-@pytest.mark.parametrize("chunk", [7, 50, 1000])
+@pytest.mark.parametrize("chunk", [7, *(pytest.param(k, marks=pytest.mark.slow) for k in (50, 1000))])
 def test_chunks_change_no_sample_and_results_by_1e_12(sweep, whole, tmp_path, chunk):
     assert sweep("s", "--chunk", chunk)[0] == 3
     compare(tmp_path / "s", whole)
@@ -243,7 +243,10 @@ def test_finished_sweep_is_not_simulated_again(sweep, monkeypatch, tmp_path):
     assert code == 2 and "s holds another sweep, which differs in configuration (samples.seed was 7, is 8)" in err
 
 
-@pytest.mark.parametrize("model, options", [("drive", "duration_s = 0.5"), ("track", "duration_s = 0.01")])
+@pytest.mark.parametrize(
+    "model, options",
+    [("drive", "duration_s = 0.5"), pytest.param("track", "duration_s = 0.01", marks=pytest.mark.slow)],
+)
 def test_every_fidelity_is_swept_over_parameters(sweep, tmp_path, model, options):
     config = (
         f'model = "{model}"\n{options}\nreport = false\nchunk = 2\n[axes]\n"motor.resistance" = [0.6, 0.9, 1.2]\n'
@@ -501,6 +504,7 @@ def test_shares_make_the_same_store_in_any_order(sweep, whole, tmp_path):
     assert sweep("s", "--shard", "1/3")[0] == 3  # a job of the array that comes late
 
 
+@pytest.mark.slow
 def test_shares_started_at_once_finish_one_store(whole, tmp_path):
     (tmp_path / "plan.toml").write_text(CONFIG)
     running = [
@@ -664,6 +668,7 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
 # --- devices --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_four_devices_give_the_same_samples_and_results_to_1e_12(whole, tmp_path):
     (tmp_path / "plan.toml").write_text(CONFIG)
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}

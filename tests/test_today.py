@@ -104,7 +104,13 @@ DOWNHILL = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("model", [(), ("--model", "drive", "--duration", "20")], ids=["steady", "drive"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param((), id="steady"),
+        pytest.param(("--model", "drive", "--duration", "20"), id="drive", marks=pytest.mark.slow),
+    ],
+)
 def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
     code, out, _ = mmrjax(*DOWNHILL, *model, "--out", "a")
     assert code == 0
@@ -275,6 +281,7 @@ def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     assert up.ended[0] > 1.2 * float(flat.total_current)
 
 
+@pytest.mark.slow
 def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     asked = ("simulate", "--battery", "--model", "drive", "--discharge", "2190", "--duration")
     code, out, _ = mmrjax(*asked, "60", "--out", "a")
@@ -373,6 +380,7 @@ def test_rated_limits_stand_in_the_report():
     assert shown["voltage of a cell, charged"]["limit"] == "4.20 V"
 
 
+@pytest.mark.slow
 def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(mmrjax, monkeypatch):
     from sweeps import render
 

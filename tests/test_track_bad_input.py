@@ -10,6 +10,7 @@ import pytest
 from calibration.data.errors import BadConfiguration
 from mmrjax import params
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities import stability
 from mmrjax.fidelities.half_robot import margin, stand, system
 from mmrjax.fidelities.stability import _whole, largest_step
 from mmrjax.fidelities.track import _batch, track_batch
@@ -23,6 +24,7 @@ TWO = Conditions(
 )
 
 
+@pytest.mark.slow
 def test_step_too_large_is_refused_with_the_largest_stable_one(robot):
     robot = params.replace(robot, {"running_gear.contact_stiffness": jnp.asarray(3e9)})
     limit = float(largest_step(robot, TWO).min())
@@ -33,6 +35,17 @@ def test_step_too_large_is_refused_with_the_largest_stable_one(robot):
     assert 5e-4 < limit < 1e-3
 
 
+def test_refusal_names_the_first_run_that_a_step_is_too_large_for_and_one_to_take(robot, monkeypatch):
+    """With limits as if they had been found: how they are is another test's."""
+    monkeypatch.setattr(stability, "largest_step", lambda robot, conditions: np.array([9e-4, 6.5e-4]))
+    with pytest.raises(
+        ValueError, match=r"step: got 0.001 s; .*largest stable step is 0\.00065 s \(run 2 of 2\); take 0.0005 s,"
+    ):
+        stability.refuse(robot, TWO, 1e-3, 1e-3)
+    stability.refuse(robot, TWO, 5e-4, 1e-3)
+
+
+@pytest.mark.slow
 def test_largest_step_falls_with_stiffness(robot):
     stiff = params.replace(robot, {"running_gear.contact_stiffness": 1e6 * robot.running_gear.contact_stiffness})
     soft = largest_step(robot, TWO)
@@ -169,6 +182,7 @@ def changed(robot, values):
     return params.replace(robot, {name: jnp.asarray(value) for name, value in values.items()})
 
 
+@pytest.mark.slow
 def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
     """Set S at 33 V on 15 deg leaves the ground for a twentieth of the time; at 15 V it shakes and stays on it."""
     runs = Conditions(
@@ -182,6 +196,7 @@ def test_gear_that_throws_the_robot_off_the_ground_is_flagged(robot):
     assert np.mean(window[1] < 0.01 * window[1].mean()) > 0.01
 
 
+@pytest.mark.slow
 def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
     """A payload 0.66 m up: gravity alone would not turn it over on 20 deg, its start does; at 15 V it climbs."""
     high = {

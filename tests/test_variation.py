@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import fidelities, outputs, params, robots
+from mmrjax import channels, fidelities, outputs, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
 from mmrjax.fidelities.steady import steady
@@ -57,7 +57,7 @@ def test_evaluate_steady_is_each_point_by_itself(variation):
     assert len(set(map(float, found["total_current"][:2]))) == 2  # the points differ, or the test says nothing
 
 
-@pytest.mark.parametrize("names", [NAMES, ("slope_deg", "voltage")])
+@pytest.mark.parametrize("names", [pytest.param(NAMES, marks=pytest.mark.slow), ("slope_deg", "voltage")])
 def test_evaluate_drive_is_the_run_of_each_robot(names):
     robot, chosen = robots.nominal(), [NAMES.index(n) for n in names]
     values, options = jnp.asarray(VALUES[:2, chosen]), {"duration": 0.5}
@@ -125,7 +125,7 @@ def test_unknown_output_is_refused_with_the_choices(variation, model):
     options = fidelities.facts(model).resolved()
     with pytest.raises(UsageError, match=r"outputs: got total_curent; did you mean total_current.*efficiency_motor"):
         check_outputs(variation, model, Conditions(), options, ("total_curent",))
-    check_outputs(variation, model, Conditions(), options, outputs.names())
+    check_outputs(variation, model, Conditions(), options, outputs.names(channels.usual()))
 
 
 def test_a_fidelitys_own_column_is_an_output(variation):

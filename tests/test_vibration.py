@@ -1,5 +1,8 @@
 """Friction of contacts that shake: the averaged law, and the slip of track-model runs that follows from their ripple."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,8 +13,9 @@ from calibration.discovery.discover import discover
 from mmrjax import channels, params, robots, vibration
 from mmrjax.conditions import Conditions
 from mmrjax.contact import Friction
+from mmrjax.effects.slip import VibrationSlip
 from mmrjax.fidelities.track import track, track_batch
-from mmrjax.signals import CONVERGED, NOT_SETTLED
+from mmrjax.signals import CONVERGED, NOT_SETTLED, Signals
 
 LAW = Friction(static=0.6, dynamic=0.5, speed_static=0.01, speed_dynamic=0.1)
 
@@ -23,6 +27,23 @@ def fig7(speed):
     y = np.clip((size - 0.01) / 0.09, 0, 1)
     rising = 0.6 * x * (3 - x**2) / 2
     return np.sign(speed) * np.where(size < 0.01, rising, 0.6 - 0.1 * y**2 * (3 - 2 * y))
+
+
+@pytest.mark.parametrize("place", ["docs/vibration.md", "docs/effects.md", "mmrjax/effects/slip.py"])
+def test_the_equation_that_is_written_is_the_one_that_runs(place):
+    """The equation of vibration_slip, read off the page and evaluated, up to the limit and beyond."""
+    text = (Path(__file__).parents[1] / place).read_text("utf-8")
+    (said,) = set(re.findall(r"ΔV = a (√.*?0\.05²\))", text))
+    for written, python in (("∣", "|"), ("|u|", "abs(u)"), ("√", "sqrt"), ("²", "**2"), ("^p u", "**p * u")):
+        said = said.replace(written, python)
+    used = np.array([-0.95, -0.3, 0.0, 0.2, 0.5, 0.8, 0.95, 1.2])
+    speed, exponent, first = 0.7, 2.3, 0.9
+    known = {"u": used, "p": exponent, "V_teor": speed, "V_1": first, "sqrt": np.sqrt, "abs": np.abs}
+    expected = 0.03 * eval(said, {"__builtins__": {}}, known)
+    effect = VibrationSlip(amplitude=0.03, exponent=exponent, speed_reference=first)
+    got = effect.term(robots.nominal(), Signals(demand=20.0 * used, adhesion_limit=20.0, speed_theoretical=speed))
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    assert expected[6] / (0.03 * (speed / first) ** exponent * 19) < 0.72  # rounded off
 
 
 def averaged(speed, swing):
@@ -109,6 +130,7 @@ def shaken():
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gear", GEARS)
 def test_slip_of_track_model_runs_follows_from_their_ripple(shaken, gear):
     slip, law, _, normal = shaken[gear]
@@ -116,6 +138,7 @@ def test_slip_of_track_model_runs_follows_from_their_ripple(shaken, gear):
     assert (normal.max() > 0.3) == (gear != "flush")
 
 
+@pytest.mark.slow
 def test_fig_7_alone_misses_the_slip_of_the_gear_that_shakes(shaken):
     slip, law, alone, _ = shaken["recess 0.35 mm, soft"]
     assert np.sqrt(np.mean((law - slip) ** 2)) < 0.5 * np.sqrt(np.mean((alone - slip) ** 2))
@@ -142,7 +165,7 @@ def test_loop_finds_the_effect_in_what_the_track_model_made():
         "configuration": np.where(kind == 0, "6T2A", "4W2T"), "supply_voltage_V": voltage, "payload_kg": payload,
         "slope_deg": slope, "total_mass_kg": np.where(kind == 0, 13.1, 11.5) + payload,
     }  # fmt: skip
-    for channel, sd in zip(channels.CHANNELS, (0.01, 0.003, 0.003), strict=True):
+    for channel, sd in zip(channels.usual(), (0.01, 0.003, 0.003), strict=True):
         noise = 1 + sd * rng.standard_normal(len(kind))
         columns[channel.column] = np.asarray(shown.reading[channel.name]) / channel.factor * noise
     table = Runs("made by the track model", columns).where(goes_on)

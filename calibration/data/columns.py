@@ -55,20 +55,10 @@ _OF_CONDITIONS = {
 }
 
 
-def measured_columns() -> tuple[str, ...]:
-    """Columns of the channels, in the order of arrays."""
-    return tuple(c.column for c in channels.CHANNELS)
-
-
-def deviation_columns() -> tuple[str, ...]:
-    """Columns of the channels' sds, in the order of arrays."""
-    return tuple(c.sd_column for c in channels.CHANNELS)
-
-
 def ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
-    readings = {c.column: c.range for c in channels.known()}
-    deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.known()}
+    readings = {c.column: c.range for c in channels.EVERY}
+    deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.EVERY}
     return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **ORDER}
 
 
@@ -129,6 +119,7 @@ class Layout:
         configurations: its names.
         instruments: of channels, where more is known than that they are there.
         mapped: (column as this program calls it, column of the file, factor from its unit).
+        channels: that its readings are of, in the order of arrays.
     """
 
     imposed: str = "voltage"
@@ -138,6 +129,7 @@ class Layout:
     configurations: tuple[str, ...] = ()
     instruments: tuple[Instrument, ...] = ()
     mapped: tuple[tuple[str, str, float], ...] = ()
+    channels: tuple[Channel, ...] = dataclasses.field(default_factory=channels.usual)
 
     @classmethod
     def of(cls, robot: Robot | None) -> Layout:
@@ -147,7 +139,9 @@ class Layout:
         rig = robot.rig
         weight = robot.on_shaft and any(float(load.torque_constant) != 0 for load in robot.configurations.members)
         names = robot.configurations.names
-        return cls(rig.imposed, robot.on_shaft, weight, rig.blank, names, rig.instruments, rig.columns)
+        return cls(
+            rig.imposed, robot.on_shaft, weight, rig.blank, names, rig.instruments, rig.columns, robot.channels
+        )
 
     @property
     def usual(self) -> bool:
@@ -165,6 +159,16 @@ class Layout:
         on_ground = () if self.on_shaft else ON_GROUND
         return (self.imposed_column, *on_ground)
 
+    @property
+    def measured_columns(self) -> tuple[str, ...]:
+        """Columns of the channels, in the order of arrays."""
+        return tuple(c.column for c in self.channels)
+
+    @property
+    def deviation_columns(self) -> tuple[str, ...]:
+        """Columns of the channels' sds, in the order of arrays."""
+        return tuple(c.sd_column for c in self.channels)
+
     def magnitude(self, channel: str) -> bool:
         """Whether the instrument of a channel shows its magnitude alone."""
         return any(i.channel == channel and i.signed is False for i in self.instruments)
@@ -177,7 +181,7 @@ class Layout:
         """Every column that means something."""
         driven = DRIVING if self.imposed == "voltage" else ()
         of_ground = () if self.on_shaft else ("surface",)
-        named = ("configuration", *self.axes, SUPPLY, *measured_columns(), *deviation_columns())
+        named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns)
         return tuple(dict.fromkeys((*named, *of_ground, "run_id", "time_s", *driven, *ORDER)))
 
     def required(self, *, measured: bool, battery: bool) -> tuple[str, ...]:
@@ -191,8 +195,8 @@ class Layout:
     def quantities(self) -> dict[str, Quantity]:
         """What each number column holds, by its name."""
         found: dict[str, Quantity] = {**_OF_CONDITIONS}
-        for channel in channels.known():
-            if channel in channels.CHANNELS or channel.column == self.imposed_column:
+        for channel in channels.EVERY:
+            if channel in self.channels or channel.column == self.imposed_column:
                 found |= _of_channel(channel)
         known = (*self.known(), *ON_GROUND)
         return {column: quantity for column, quantity in found.items() if column in known}
@@ -252,7 +256,7 @@ class Layout:
 
 def _of_every_channel() -> set[str]:
     """Names of columns of every channel, in any unit."""
-    every = (quantity for channel in channels.known() for quantity in _of_channel(channel).values())
+    every = (quantity for channel in channels.EVERY for quantity in _of_channel(channel).values())
     return {name for quantity in every for name in quantity.columns()}
 
 

@@ -115,12 +115,11 @@ def _check(path: Path, effect: type[Effect]) -> None:
         raise refuse(f", name: got {effect.name!r}; expected lower-case words joined by underscores")
     if effect.balance not in BALANCES:
         raise refuse(f", balance: got {effect.balance}; {choices(effect.balance, BALANCES)}")
+    known = channels.names(channels.EVERY)
     if (effect.balance == "sensor") != bool(effect.channel):
-        raise refuse(
-            f", channel: got {effect.channel!r}; expected one of {', '.join(channels.names())} for sensor, else none"
-        )
-    if effect.channel and effect.channel not in channels.names():
-        raise refuse(f", channel: got {effect.channel}; {choices(effect.channel, channels.names())}")
+        raise refuse(f", channel: got {effect.channel!r}; expected one of {', '.join(known)} for sensor, else none")
+    if effect.channel and effect.channel not in known:
+        raise refuse(f", channel: got {effect.channel}; {choices(effect.channel, known)}")
     if effect.movers and effect.movers not in _MOVERS:
         raise refuse(f", movers: got {effect.movers}; {choices(effect.movers, _MOVERS)}, or none for both")
     size = effect.memory_size

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 #: Profiles that come with the package, in `calibration/data/profiles/`.
 PACKAGED = ("stair", "stop_and_go", "shuttle", "patrol")
 #: Modes in which the driver's controller follows a demand, which is a channel.
-CONTROLLED = tuple(mode for mode in MODES if mode in channels.names())
+CONTROLLED = tuple(mode for mode in MODES if mode in channels.USUAL)
 BETWEEN = ("held", "linear")
 #: Most rows in all, cycles included.
 LONGEST = 1_000_000
@@ -45,7 +45,7 @@ def _range(condition: str) -> tuple[float, float]:
 
 
 def _speed(name: str) -> Quantity:
-    channel = channels.CHANNELS[channels.index(name)]
+    channel = channels.of(name)
     return Quantity(
         name, units.of_channel(name), (channel.range[0] * channel.factor, channel.range[1] * channel.factor)
     )

@@ -9,8 +9,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from calibration.data import runs as records
 from calibration.data import units
+from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax import channels, params
 from mmrjax.rig import IMPOSED, Instrument, Rig
@@ -176,7 +176,7 @@ def _one_of(word: Any, known: Sequence[str], where: str) -> str:
 
 
 def _channels(stated: Any, where: str) -> tuple[str, ...]:
-    every = [c.name for c in channels.known()]
+    every = channels.names(channels.EVERY)
     if not isinstance(stated, list) or not stated or not all(isinstance(name, str) for name in stated):
         raise BadConfiguration(
             f"{where}: got {stated!r}; expected a list of channels, at least one of {', '.join(every)}"
@@ -235,10 +235,9 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
 
 def _known_columns() -> list[str]:
     """Columns of tables by the names of this program, in every unit."""
-    with channels.panel(c.name for c in channels.known()):
-        known = list(records.known_columns())
-        for channel in channels.CHANNELS:
-            known += [f"{channel.name}_{unit}" for unit in units.of_channel(channel.name)]
+    known = list(Layout(channels=channels.EVERY).known())
+    for channel in channels.EVERY:
+        known += [f"{channel.name}_{unit}" for unit in units.of_channel(channel.name)]
     return list(dict.fromkeys(known))
 
 

@@ -28,24 +28,17 @@ from calibration.data.columns import (
     WORDS,
     Layout,
     Meaning,
-    deviation_columns,
-    measured_columns,
 )
 from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number
 from mmrjax import channels
-from mmrjax.channels import MM, RPM
+from mmrjax.channels import MM, RPM, Channel
 from mmrjax.tables import adhesion_ratio
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
     from mmrjax.robot import Robot
 
-__all__ = ["CONDITIONS", "MM", "RPM", "Runs", "known_columns", "measured_columns", "read", "single"]
-
-
-def known_columns() -> tuple[str, ...]:
-    """Every column that means something in a table of the packaged robot's runs."""
-    return Layout().known()
+__all__ = ["CONDITIONS", "MM", "RPM", "Runs", "read", "single"]
 
 
 #: Tables that come with the package.
@@ -66,7 +59,7 @@ class Runs:
         digest: SHA-256 of the file, empty for a table that came from none.
         extras: cells of `unknown` columns, shape (rows,): numbers, NaN where empty, or words; not in `columns`, as
             they have no role, and looked at only for what residuals go with.
-        layout: what its columns mean for the robot that it is of.
+        layout: what its columns mean for the robot that it is of, and its channels.
     """
 
     source: str
@@ -87,6 +80,36 @@ class Runs:
         return column in self.columns
 
     @property
+    def channels(self) -> tuple[Channel, ...]:
+        """That its readings are of, in the order of arrays."""
+        return self.layout.channels
+
+    def of(self, robot: Robot) -> Runs:
+        """The table with the channels of a robot; columns of others have no role then, and are among the unknown.
+
+        Raises:
+            BadData: the table was read for a robot without a channel of this one, so its column was left out.
+        """
+        if self.channels == robot.channels:
+            return self
+        mine = {column for c in robot.channels for column in (c.column, c.sd_column)}
+        if lost := [column for column in self.unknown if column in mine]:
+            raise BadData(
+                f"{self.source}, {lost[0]}: left out as the table was read, but the robot has this channel; read the "
+                "table with robot=, the robot that it is of"
+            )
+        mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0]}
+        others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - mine
+        left = {name: values for name, values in self.columns.items() if name in others}
+        return dataclasses.replace(
+            self,
+            columns={name: values for name, values in self.columns.items() if name not in left},
+            unknown=(*self.unknown, *left),
+            extras={**self.extras, **left},
+            layout=dataclasses.replace(self.layout, channels=robot.channels),
+        )
+
+    @property
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
         duty = () if self.sampled else DUTY
@@ -104,21 +127,21 @@ class Runs:
 
     def measured(self) -> np.ndarray:
         """Measured readings [SI], NaN where one is missing, shape (rows, channels)."""
-        return self._stacked(tuple(c.column for c in channels.CHANNELS))
+        return self._stacked(tuple(c.column for c in self.channels))
 
     def deviations(self) -> np.ndarray:
         """Stated sds of the readings [SI], NaN where none is stated, shape (rows, channels)."""
-        return self._stacked(tuple(c.sd_column for c in channels.CHANNELS))
+        return self._stacked(tuple(c.sd_column for c in self.channels))
 
     def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
         nothing = np.full(len(self), np.nan)
         found = [self.columns.get(column, nothing) for column in columns]
-        return np.stack(found, 1) * np.asarray(channels.factors())
+        return np.stack(found, 1) * np.asarray(channels.factors(self.channels))
 
     def missing(self) -> list[str]:
         """A sentence for each channel of which readings are missing."""
         said = []
-        for k, channel in enumerate(channels.CHANNELS):
+        for k, channel in enumerate(self.channels):
             lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
             if not self.has(channel.column) or lost.size == len(self):
                 said.append(f"{channel.column}: no readings; what they would show is not fitted")
@@ -208,7 +231,8 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
         measured: whether at least one channel is required; without any `total_mass_kg` may be missing too.
         battery: whether the runs are on the on-board battery, whose voltage no table states: its column is left out,
             or empty.
-        robot: that the table is of; it says which columns are needed. None: the packaged one.
+        robot: that the table is of; it says which columns are needed, and which channels it has. None: the packaged
+            one; the table then has every other channel too of which it has a column.
 
     Raises:
         BadData: no such file, nothing in it, no channel, a missing, misspelt or repeated column, a row of another
@@ -218,12 +242,12 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
     layout = Layout.of(robot)
     if str(source) in PACKAGED:
         with resources.as_file(resources.files("calibration") / "data" / PACKAGED[str(source)]) as path:
-            runs = _read(path, str(source), measured, battery, layout)
+            runs = _read(path, str(source), measured, battery, layout, inferred=robot is None)
     else:
         path = Path(source)
         if not path.exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
-        runs = _read(path, path.name or str(source), measured, battery, layout)
+        runs = _read(path, path.name or str(source), measured, battery, layout, inferred=robot is None)
     if robot is not None and not layout.usual:
         from calibration.data import contradictions
 
@@ -231,7 +255,7 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
     return runs
 
 
-def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) -> Runs:
+def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, *, inferred: bool) -> Runs:
     try:
         content = path.read_bytes()
         text = content.decode("utf-8-sig")
@@ -239,7 +263,7 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) 
         raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
     rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
     if not rows:
-        expected = ", ".join((*layout.required(measured=True, battery=False), *measured_columns()))
+        expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
     header = [cell.strip() for cell in rows[0]]
     if len(header) == 1 and ";" in header[0]:
@@ -247,6 +271,8 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) 
     repeated = sorted({c for c in header if header.count(c) > 1})
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
+    if inferred:
+        layout = _with_channels(name, header, layout)
     meanings = layout.meanings(name, header)
     _check_header(name, header, meanings, measured, battery, layout)
     if len(rows) == 1:
@@ -272,7 +298,7 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) 
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
     _check_mass(name, columns)
-    _check_deviations(name, columns)
+    _check_deviations(name, columns, layout.channels)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
     elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
@@ -282,6 +308,14 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout) 
     unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
     extras = {c: _extra([row[header.index(c)].strip() for row in rows[1:]]) for c in unknown}
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout)
+
+
+def _with_channels(name: str, header: list[str], layout: Layout) -> Layout:
+    """`layout` with every other channel too of which a file has a column."""
+    meanings = dataclasses.replace(layout, channels=channels.EVERY).meanings(name, header)
+    stated = {m.column for m in meanings if m is not None}
+    found = tuple(c for c in channels.EVERY if c in layout.channels or c.column in stated)
+    return dataclasses.replace(layout, channels=found)
 
 
 def _extra(cells: list[str]) -> np.ndarray:
@@ -340,7 +374,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
     if (imposed == 0).any():
         row = int(np.flatnonzero(imposed == 0)[0]) + 1
         raise BadData(f"{name} row {row}, {column}: got 0; expected a {what}, in a table of readings")
-    for channel in channels.CHANNELS:
+    for channel in layout.channels:
         if channel.column not in columns or not channel.directed:
             continue
         readings = columns[channel.column]
@@ -378,7 +412,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
             )
 
 
-def _doubt(columns: dict[str, np.ndarray], channel: channels.Channel) -> np.ndarray | float:
+def _doubt(columns: dict[str, np.ndarray], channel: Channel) -> np.ndarray | float:
     """What a reading may lie beyond zero by its noise: SIGN_SDS of its stated sd, or a share of the channel's rms."""
     readings = columns[channel.column]
     share = SIGN_SHARE * float(np.sqrt(np.nanmean(readings**2))) if np.isfinite(readings).any() else 0.0
@@ -391,19 +425,20 @@ def _check_header(
     stated = {m.column for m in meanings if m is not None}
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
     if not layout.usual:  # other channels' columns are not misspelt
-        strange = [c for c in strange if c not in {x for k in channels.known() for x in (k.column, k.sd_column)}]
+        strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
     required = layout.required(measured=measured, battery=battery)
     if not layout.usual and "surface" in stated:  # which says the configuration too, where it has those of one
         required = tuple(c for c in required if c != "configuration")
-    for column in (c for c in (*required, *measured_columns()) if c not in stated):
+    for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
         if column in required or (close and layout.usual):
             got = f"; is {close[0]} meant?" if close else ""
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"
             )
-    if measured and not any(c in stated for c in measured_columns()):
-        raise BadData(f"{name}: no column of a channel; expected at least one of {', '.join(measured_columns())}")
+    if measured and not any(c in stated for c in layout.measured_columns):
+        expected = ", ".join(layout.measured_columns)
+        raise BadData(f"{name}: no column of a channel; expected at least one of {expected}")
     for column in strange:
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
         if close:
@@ -424,8 +459,8 @@ def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[In
         if column == "configuration" and not cell:
             raise refuse("the name of one of the robot's configurations")
         return cell
-    deviations = deviation_columns()
-    if not cell and column != layout.imposed_column and column in (*measured_columns(), *deviations, *DUTY):
+    deviations = layout.deviation_columns
+    if not cell and column != layout.imposed_column and column in (*layout.measured_columns, *deviations, *DUTY):
         return math.nan
     low, high = meaning.limits()
     positive = column in deviations
@@ -461,8 +496,8 @@ def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:
             raise BadData(_too_light(f"{name} row {row}", total, payload))
 
 
-def _check_deviations(name: str, columns: dict[str, np.ndarray]) -> None:
-    for channel in channels.CHANNELS:
+def _check_deviations(name: str, columns: dict[str, np.ndarray], shown: tuple[Channel, ...]) -> None:
+    for channel in shown:
         if channel.column in columns and channel.sd_column in columns:
             lost = np.isfinite(columns[channel.column]) & ~np.isfinite(columns[channel.sd_column])
             if lost.any():

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import instruments, own_mass, robot_file, surfaces
+from calibration.data import own_mass
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
@@ -39,10 +39,9 @@ from calibration.discovery.search import Search, fewest, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import Standing, standing
 from calibration.inference import bases as bases_room
-from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
+from calibration.inference import observers, preparation, priors
 from calibration.inference.bases import Bases, in_words
-from calibration.inference.foreign import foreign_priors
 from calibration.inference.identifiability import said_held
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
@@ -63,7 +62,6 @@ EITHER_WAY = 0.05
 MANY = 0.03
 
 
-@channels.of_the_robot
 def discover(
     runs: Runs,
     robot: Robot,
@@ -94,39 +92,86 @@ def discover(
         BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
             that are not known.
     """
+    ready = prepared(
+        runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
+        forbidden=forbidden,
+    )  # fmt: skip
+    distinct, known = ready.runs, ready.noise
+    for sentence in ready.foreign:
+        progress(sentence)
+    found = finished(ready.trace(progress=progress), distinct, ready.numbers, ready.settings, ready.library, progress)
+    sensitivity, notes = [], ready.notes
+    if "assumed" in known.source:
+        for factor in FACTORS:
+            progress(f"the verdict with {factor:g} times the assumed noise")
+            sds = noise_room.assumed(distinct, observers.kind(distinct).sizes(distinct), noise, factor)
+            sensitivity.append(in_short(factor, ready.trace(sds)))
+        silent = ", ".join(c.name for c, w in zip(known.channels, known.source, strict=True) if w == "assumed")
+        usual = noise_room.default(known.channels)
+        said = f"no sd is stated for {silent}: {usual} is assumed; state yours with --noise"
+        notes = (*notes, said)
+    return dataclasses.replace(found, notes=(*notes, *found.notes), sensitivity=tuple(sensitivity))
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopInput:
+    """What the stages of the loop are given: a table, its robot, and how to look.
+
+    Attributes:
+        runs: without copies; numbers: of the rows, as messages call them.
+        robot: as `preparation.prepare` leaves it; noise: of the readings; stated: priors (mean, sd) [SI].
+        settings: statistical; library: effects to look for.
+        notes: what to say of all that; foreign: those of priors of another robot.
+    """
+
+    runs: Runs
+    numbers: np.ndarray
+    robot: Robot
+    noise: Noise
+    stated: dict[str, tuple[float, float]]
+    settings: Settings
+    library: Library
+    notes: tuple[str, ...]
+    foreign: tuple[str, ...]
+
+    def trace(self, noise: Noise | None = None, progress: Callable[[str], None] = lambda text: None) -> Traced:
+        """The stages up to a verdict, with this noise or another."""
+        sds = self.noise if noise is None else noise
+        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress)
+
+
+def prepared(
+    runs: Runs,
+    robot: Robot,
+    *,
+    noise: str | None = None,
+    stated: Mapping[str, tuple[float, float]] | None = None,
+    library: Library = effects.BY_NAME,
+    replicates: int = 500,
+    seed: int = 0,
+    prefer: str = FIT,
+    forbidden: Sequence[str] = (),
+) -> LoopInput:
+    """What `discover` does before its first fit; arguments and errors as of `discover`.
+
+    A campaign that wants verdicts alone goes on with `LoopInput.trace`, so that it takes the way that users take.
+    """
     menu.check_forbidden(forbidden, robot)
+    runs = runs.of(robot)
     distinct, numbers, notes = without_copies(runs)
-    robot = surfaces.separated(instruments.as_read(robot, distinct), distinct)
-    stated = surfaces.of_surfaces(stated or {}, robot, distinct)
-    stated = robot_file.current_values(stated, robot, "--prior", notes)
     kind = observers.kind(distinct)
     if len(distinct) < kind.fewest:
         raise BadData(
             f"{runs.source}: {len(distinct)} {kind.word} cannot show what a model lacks; at least {kind.fewest} are "
             "needed"
         )
-    known = noise_room.assumed(distinct, kind.sizes(distinct), noise)
-    notes += [*checks.check(distinct, robot, (), known), *kind.check_start(distinct, known, robot)]
-    robot = kind.begun(robot, distinct, known)
-    notes += own_mass.remarks(robot, distinct)
-    foreign = foreign_priors(robot, stated)
-    for sentence in foreign:
-        progress(sentence)
-    notes += foreign
-    library = scales.library_for(robot, distinct.conditions(robot), library)
-    settings = settings_for(kind, replicates, seed, prefer)
-    settings = dataclasses.replace(settings, forbidden=tuple(forbidden))
-
-    found = discover_at(distinct, robot, known, settings, stated, library, numbers, progress)
-    sensitivity = []
-    if "assumed" in known.source:
-        for factor in FACTORS:
-            progress(f"the verdict with {factor:g} times the assumed noise")
-            sds = noise_room.assumed(distinct, kind.sizes(distinct), noise, factor)
-            sensitivity.append(in_short(factor, trace(distinct, robot, sds, settings, stated, library)))
-        silent = ", ".join(c for c, w in zip(channels.names(), known.source, strict=True) if w == "assumed")
-        notes.append(f"no sd is stated for {silent}: {noise_room.default()} is assumed; state yours with --noise")
-    return dataclasses.replace(found, notes=(*notes, *found.notes), sensitivity=tuple(sensitivity))
+    ready = preparation.prepare(distinct, robot, noise, stated)
+    said = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
+    library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library)
+    settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
+    return LoopInput(
+        distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, ready.foreign
+    )
 
 
 def discover_at(
@@ -359,7 +404,7 @@ def visible(
 
 def both_ways(runs: Runs) -> bool:
     """Whether runs go forward as well as backward, by any speed that they state or by what drives them."""
-    moved = [c.column for c in channels.known() if c.zero_at_rest]
+    moved = [c.column for c in channels.EVERY if c.zero_at_rest]
     columns = [runs[name] for name in (*moved, "supply_voltage_V", "duty") if runs.has(name)]
     found = [x[np.isfinite(x)] for x in columns]
     return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in found if x.size)
@@ -379,7 +424,7 @@ def bases_at(runs: Runs, base: BaseFit) -> Bases:
     index, _ = padded(len(runs), problem.observe.sizes_padded)
     columns = dict(runs.where(index).columns)
     reading = np.where(np.isfinite(base.reading), base.reading, np.asarray(problem.data.measured))
-    columns |= {c.column: reading[:, k] for k, c in enumerate(channels.CHANNELS)}
+    columns |= {c.column: reading[:, k] for k, c in enumerate(problem.channels)}
     robot = problem.robot(jnp.asarray(base.candidate.z[: base.space.free]))
     return problem.observe.bases(columns, base.space.included, robot)
 
@@ -564,7 +609,7 @@ def _residuals(
     Args:
         linear: the fit at z, linearised; reading: what it says of every row [SI], shape (rows or more, channels).
     """
-    rows, count = len(runs), len(channels.CHANNELS)
+    rows, count = len(runs), len(runs.channels)
     there = (space.weight[:rows] > 0) & np.isfinite(reading[:rows])
     jacobian = np.asarray(linear.jacobian)[: rows * count, : len(z)]
     whitened = np.where(there, np.asarray(linear.by_row())[:rows], 0.0)
@@ -596,7 +641,7 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
         share = 100 * noise.sd / np.maximum(kind.sizes(runs), 1e-12)
     return {
         name: {"source": noise.source[k], "median_percent": float(np.nanmedian(share[:, k]))}
-        for k, name in enumerate(channels.names())
+        for k, name in enumerate(channels.names(noise.channels))
         if noise.source[k] != "no readings"
     }
 

@@ -34,6 +34,7 @@ from calibration.inference import bases, priors
 from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
+from mmrjax import channels
 from mmrjax.channels import RPM
 from mmrjax.compiling import compiled
 
@@ -241,11 +242,12 @@ def prospect(space: CandidateSpace, candidates: Mapping[str, Candidate], setting
     active = jnp.asarray([space.library.indices(c.active) for c in those])
     z = jnp.asarray(np.stack([c.z for c in those]))
     within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
-    everything = menu.menu(within)
-    found, half = jax.device_get(_foreseen(space.equipped, other, foreseen.batch(everything), active, z))
+    everything, shown = menu.menu(within), channels.names(space.bare.channels)
+    found, half = jax.device_get(_foreseen(space.equipped, other, foreseen.batch(everything, shown), active, z))
     found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
     experiments, kept = _possible(everything, found, within, settings)
-    sd = foreseen.sds(experiments, np.median(np.asarray(space.equipped.data.sd), 0))
+    medians = np.median(np.asarray(space.equipped.data.sd), 0)
+    sd = foreseen.sds(experiments, dict(zip(shown, medians, strict=True)))
     value, half = np.nan_to_num(found.value[:, kept]), np.nan_to_num(half[:, kept])
     return Prospect(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
 
@@ -271,7 +273,7 @@ def _possible(
             if done.any():
                 hot, fast = np.asarray(found.temperature)[0, at], np.asarray(found.speed)[0, at]
                 e = menu.carried_out(e, done, hot, fast, within)
-            rows = np.repeat(done, len(e.read))
+            rows = np.repeat(done, len(e.channels))
         if set(e.kinds) & set(settings.forbidden):
             rows = np.zeros(len(rows), bool)
         if rows.any():

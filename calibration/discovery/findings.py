@@ -373,7 +373,7 @@ def errors(
     percent = problem.observe.percent(simulated, measured)
     sigma = (simulated - measured) / sd
     answer: Errors = {}
-    for k, name in enumerate(channels.names()):
+    for k, name in enumerate(channels.names(problem.channels)):
         there = sigma[np.isfinite(sigma[:, k]), k]
         rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
         answer[name] = {**summary(percent[:, k]), "rms_sigma": rms}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -65,8 +65,8 @@ class Foreseen(eqx.Module):
     speed: Float[Array, " runs"]
 
 
-def batch(experiments: Sequence[Experiment]) -> Batch:
-    """These experiments as one batch."""
+def batch(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
+    """These experiments as one batch, of a robot with these channels."""
     acts = [e for e in experiments if isinstance(e, Act)]
     runs = [e for e in experiments if isinstance(e, Run)]
     set_up = list(dict.fromkeys((r.setup, r.sides) for r in runs))
@@ -79,7 +79,7 @@ def batch(experiments: Sequence[Experiment]) -> Batch:
         brake=jnp.asarray(np.concatenate([np.full(n, r.brake) for r, n in several])),
         set_up=tuple(set_up),
         which=tuple(k for r, n in several for k in [set_up.index((r.setup, r.sides))] * n),
-        read=tuple((r.read, n) for r, n in several),
+        read=tuple((r.read(shown), n) for r, n in several),
         order=tuple(acts.index(e) if isinstance(e, Act) else len(acts) + runs.index(e) for e in experiments),
     )
 
@@ -108,7 +108,7 @@ def readings(robot: Robot, experiments: Batch) -> Foreseen:
     ]
     robots = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(v) for v in x])[which], *set_up)
     result = jax.vmap(lambda r, c: operating_point(r, c)[0])(robots, conditions)
-    every = jnp.stack([result.reading[c] for c in channels.names()], -1)
+    every = jnp.stack([result.reading[c] for c in channels.names(robot.channels)], -1)
     held = np.array([setup is setups.blocked for setup, _ in experiments.set_up])[which]
     does = jnp.where(jnp.asarray(held), result.status == STALLED, done(result.status))
     first = 0
@@ -131,7 +131,7 @@ def size(experiment: Experiment) -> int:
     """How many readings an experiment has, repeats averaged."""
     if isinstance(experiment, Act):
         return len(experiment.at)
-    return len(experiment.voltage) * len(experiment.read)
+    return len(experiment.voltage) * len(experiment.channels)
 
 
 def spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
@@ -140,14 +140,18 @@ def spans(experiments: Sequence[Experiment]) -> dict[str, slice]:
     return {e.name: slice(end - size(e), end) for e, end in zip(experiments, ends, strict=True)}
 
 
-def sds(experiments: Sequence[Experiment], of_channels: np.ndarray) -> np.ndarray:
+def sds(experiments: Sequence[Experiment], of_channels: Mapping[str, float]) -> np.ndarray:
     """Sd of every reading [SI], repeats averaged; runs are read with the instruments of the table.
 
     Args:
-        of_channels: sds of its channels [SI], shape (channels,).
+        of_channels: sds of its channels [SI], by name.
     """
     found = [np.zeros(0)]
     for e in experiments:
-        one = [e.sd] * len(e.at) if isinstance(e, Act) else np.tile(of_channels[list(e.read)], len(e.voltage))
+        one = (
+            [e.sd] * len(e.at)
+            if isinstance(e, Act)
+            else np.tile([of_channels[c] for c in e.channels], len(e.voltage))
+        )
         found.append(np.asarray(one, float) / math.sqrt(e.repeats))
     return np.concatenate(found)

@@ -17,7 +17,7 @@ from mmrjax.signals import Signals
 
 #: What a formula is called, in the symbols of the paper.
 SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV"} | {
-    c.name: f"Δ({c.label})" for c in channels.CHANNELS
+    c.name: f"Δ({c.label})" for c in channels.usual()
 }
 #: Variables over which things fade: symbol, and unit of its constant.
 FADING = {"time": ("t", " s"), "order": ("k", "")}

@@ -96,18 +96,16 @@ class Run:
     watch: str = ""
     imposed: str = "voltage"
 
-    @property
-    def read(self) -> tuple[int, ...]:
-        """Positions of the channels that are read."""
-        return tuple(channels.index(c) for c in self.channels)
+    def read(self, shown: tuple[str, ...]) -> tuple[int, ...]:
+        """Positions of the channels that are read, among all that are shown."""
+        return tuple(shown.index(c) for c in self.channels)
 
     @property
     def description(self) -> str:
         """For an engineer: what to do, what to read, and what to watch."""
         level = self.imposed != "voltage" and not any(self.slope)
         where = "" if self.setup in setups.WEIGHTLESS or level else f" {_slopes(self.slope)}"
-        labels = {c.name: c.label for c in channels.CHANNELS}
-        read = _both([labels[c] for c in self.channels])
+        read = _both([channels.of(c).label for c in self.channels])
         turning = [near(v / RPM) for v in self.voltage]
         at = _amounts(self.voltage, "V") if self.imposed == "voltage" else _amounts(turning, "rpm of the motor")
         text = f"{self.doing}{where} at {at}; read {read}"
@@ -257,7 +255,7 @@ def _runs(
     named, text = ", ".join((name, *of)), ": ".join((*of, doing)) if of else doing
     return Run(
         named, (*(kinds or (name,)), *of), text, setup, voltage, slope, (payload,) * len(each),
-        tuple(c for c in (read or channels.names()) if c in reach.measured), 0 if at is None else at.index, sides,
+        tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
         brake, math.inf if at is None else at.steepest, steepest,
     )  # fmt: skip
 

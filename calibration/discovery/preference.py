@@ -53,11 +53,10 @@ def said_worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Erro
     Args:
         held_out: kind of block → errors before and after, each over the rows that it predicts.
     """
-    labels = {c.name: c.label for c in channels.CHANNELS}
     parts = []
     for kind, (before, after) in held_out.items():
         mine = [w for w in found if w.kind == kind]
-        changes = [f"{labels[w.channel]} {_change(w.before, w.after)} %" for w in mine]
+        changes = [f"{channels.of(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
         predicted = {n: (int(before[n]["rows"]), int(after[n]["rows"])) for n in after}
         if any(w.rows < max(predicted[w.channel]) for w in mine):
             changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"

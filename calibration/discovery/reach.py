@@ -138,5 +138,5 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
 def reach_of(space: CandidateSpace, robot: Robot | None = None) -> Reach:
     """What the robot of a space may be asked for next; the robot fitted where it is given."""
     weight = space.weight
-    measured = tuple(c for k, c in enumerate(channels.names()) if weight[:, k].any())
+    measured = tuple(c for k, c in enumerate(channels.names(space.bare.channels)) if weight[:, k].any())
     return reach(space.bare.base if robot is None else robot, space.bare.observe.driven, measured)

@@ -119,7 +119,7 @@ def resolve(
         readings=int(np.isfinite(rows.measured()).sum()),
         rms_percent={
             c.name: (stated.errors_after[c.name].rms_percent, free.errors_after[c.name].rms_percent)
-            for c in channels.CHANNELS
+            for c in found.channels
         },
         slip_rms=(_slip_rms(stated, robot), _slip_rms(free, robot)),
         notes=tuple(free.notes),
@@ -129,7 +129,7 @@ def resolve(
 def _noise(found: DiscoveryResult, stated: str | None) -> str | None:
     """What the loop took sds to be, in words for `calibrate`."""
     assumed = [name for name, about in found.noise.items() if about["source"] == "assumed"]
-    return ",".join(part for part in (stated, noise_room.default(assumed)) if part) or None
+    return ",".join(part for part in (stated, noise_room.default(channels.rows(assumed))) if part) or None
 
 
 def _slip_rms(fitted: CalibrationResult, robot: Robot) -> float:

@@ -18,7 +18,7 @@ from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
 from calibration.inference.identifiability import said_held
 from calibration.inference.residual_clusters import ResidualCluster
-from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
 SCHEMA = "mmrjax.loop/1"
@@ -488,6 +488,11 @@ class DiscoveryResult:
     resolved: Resolved | None = None
 
     @property
+    def channels(self) -> tuple[Channel, ...]:
+        """That its readings are of, in order."""
+        return self.runs.channels
+
+    @property
     def held_by_prior(self) -> tuple[str, ...]:
         """Names of the parameters of the proposed robot that were fitted and are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
@@ -559,7 +564,7 @@ class DiscoveryResult:
         known = ("run_id", *WHEN, "configuration", *self.runs.axes, *DRIVING)
         table = {"row": self.numbers, **{k: self.runs[k] for k in known if self.runs.has(k)}}
         main = next(iter(seen.held_out.values()), None)
-        for k, channel in enumerate(channels.CHANNELS):
+        for k, channel in enumerate(self.channels):
             column, unit = channel.column, channel.factor
             table[column] = seen.measured[:, k] / unit
             table[f"sd_{column}"] = seen.sd[:, k] / unit

@@ -143,7 +143,7 @@ def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
     alone = dataclasses.replace(robot, effects=(one,))
 
     def share(s: Signals) -> tuple[jax.Array, jax.Array]:
-        shown = next((c.read(robot, s) for c in channels.known() if c.name == effect.channel), None)
+        shown = next((c.read(robot, s) for c in channels.EVERY if c.name == effect.channel), None)
         whole = WHOLE[effect.balance](robot, s) if shown is None else shown
         return jnp.asarray(added(alone, s, effect.balance, effect.channel), float), jnp.asarray(whole, float)
 

@@ -18,6 +18,7 @@ from calibration.data.columns import SPEED, Layout
 from calibration.inference.linearization import PROBED, Linearization
 from mmrjax import channels
 from mmrjax.balances import absent
+from mmrjax.channels import Channel
 from mmrjax.effects import UNNAMED
 from mmrjax.robot import Robot
 
@@ -105,7 +106,7 @@ class Basis(eqx.Module):
     def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
         """Change of the whitened readings by every family's columns."""
         of_channels = in_readings(self.places[0])
-        known, change = (channels.names(), linear.shown) if of_channels else (PROBED, linear.columns)
+        known, change = (linear.channels, linear.shown) if of_channels else (PROBED, linear.columns)
         return jax.vmap(change)(jnp.asarray([known.index(place) for place in self.places]), self.columns)
 
 
@@ -114,7 +115,7 @@ Bases = tuple[Basis, ...]
 
 def in_readings(place: str) -> bool:
     """Whether a place of curves is a channel, whose readings are off; else it is a balance."""
-    return place in channels.names()
+    return place in channels.names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
@@ -130,7 +131,7 @@ def in_words(place: str) -> str:
 def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
     """Change of the readings by terms of a place, shape (readings, terms), of shapes (rows, terms)."""
     if in_readings(place):
-        return np.asarray(linear.shown(channels.index(place), jnp.asarray(shapes)))
+        return np.asarray(linear.shown(linear.channels.index(place), jnp.asarray(shapes)))
     return np.asarray(linear.columns(PROBED.index(place), jnp.asarray(shapes)))
 
 
@@ -146,6 +147,11 @@ def balances_of(robot: Robot | None) -> tuple[str, ...]:
     if robot is None:
         return BALANCES
     return tuple(b for b in BALANCES if b not in absent(robot))
+
+
+def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
+    """Channels of a robot; None: of the packaged one."""
+    return Layout.of(robot).channels
 
 
 def axes_of(robot: Robot | None) -> tuple[str, ...]:
@@ -177,7 +183,7 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot
     bases = [basis for _, basis in over.values() for _ in balances]
     shown = [
         (c.name, v)
-        for c in channels.CHANNELS
+        for c in channels_of(robot)
         for v in over
         if (v in AXES or VARIABLES[v] == c.column) and f"curve_{c.name}_{v}" in UNNAMED
     ]
@@ -266,7 +272,7 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot 
         return ()
     # The first again for those that hold too few or too many rows: tables of one size share what is compiled.
     shapes += shapes[:1] * (len(offered) - len(shapes))
-    read = [c.name for c in channels.CHANNELS if f"curve_{c.name}_order" in UNNAMED]
+    read = [c.name for c in channels_of(robot) if f"curve_{c.name}_order" in UNNAMED]
     return tuple(
         Basis.of(
             np.stack([s for s, _ in shapes] * len(places))[:, :, None],

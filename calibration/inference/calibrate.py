@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import instruments, own_mass, robot_file, surfaces
+from calibration.data import robot_file, surfaces
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import blocks as holdout
@@ -23,20 +23,20 @@ from calibration.inference import (
     observers,
     population,
     priors,
+    scans,
 )
-from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
-from calibration.inference.foreign import foreign_priors
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
 from calibration.inference.population import GENERATIONS, LEAST
 from calibration.inference.posterior import of_coordinates
+from calibration.inference.preparation import Prepared, prepare
 from calibration.inference.problem import Problem
 from calibration.inference.remarks import remarks
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
-from mmrjax import channels, fidelities
+from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 
@@ -48,7 +48,6 @@ FRICTION = "ground.friction."
 _OF_PRODUCT = "its product with the share of the guides, as in the other fidelities"
 
 
-@channels.of_the_robot
 def calibrate(
     runs: Runs,
     robot: Robot,
@@ -95,6 +94,7 @@ def calibrate(
         raise BadConfiguration(
             'calibrate: JAX computes in single precision; set jax.config.update("jax_enable_x64", True) first'
         )
+    runs = runs.of(robot)
     observe = observers.kind(runs)
     facts = observers.facts(model)
     effort = facts.effort
@@ -103,38 +103,33 @@ def calibrate(
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
 
-    robot = surfaces.separated(instruments.as_read(robot, runs), runs)
-    free, fix = (surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix))
-    stated = surfaces.of_surfaces(stated or {}, robot, runs)
     former: list[str] = []
-    free, fix = (robot_file.current_names(names, robot, former) for names in (free, fix))
-    stated = robot_file.current_values(stated or {}, robot, "--prior", former)
-    for sentence in former:
+
+    def chosen(prepared: Prepared) -> tuple[str, ...]:
+        robot = prepared.robot
+        words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
+        words = [robot_file.current_names(names, robot, former) for names in words]
+        present = {robot.configurations.names[k] for k in runs.configurations(robot)}
+        default = priors.default_names(present, robot, computed=facts.computes)
+        default = (*default, *priors.delays(robot, observe.free()[0]))
+        names = priors.choose(robot, default, *words)
+        if unread := fidelities.unread(model, names):
+            reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread))
+            raise BadConfiguration(f"--free {unread[0]}: --model {model} does not read it; allowed: --model {reads}")
+        return names
+
+    ready = prepare(runs, robot, noise, stated, assume=False, choose=chosen)
+    robot, known, stated, names = ready.robot, ready.noise, ready.stated, ready.names
+    for sentence in (*former, *ready.former, *ready.foreign):
         tell(sentence)
-    own_mass.check_priors(stated, robot, runs)
-    weights = own_mass.remarks(robot, runs)
-    robot = own_mass.weighed(robot, runs)
-    present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-    known = noise_room.of(runs, observe.sizes(runs), noise)
-    robot = observe.begun(robot, runs, known)
-    default = priors.default_names(present, robot, computed=facts.computes)
-    default = (*default, *priors.delays(robot, observe.free()[0]))
-    names = priors.choose(robot, default, free, fix)
-    unread = fidelities.unread(model, names)
-    if unread:
-        reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread))
-        raise BadConfiguration(f"--free {unread[0]}: --model {model} does not read it; allowed: --model {reads}")
     base = robot
     of_product: dict[str, tuple[float, float]] = {}
     if priors.GUIDE_SHARE in facts.computes:
+        present = {robot.configurations.names[k] for k in runs.configurations(robot)}
         base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
-    foreign = foreign_priors(robot, stated)
-    for sentence in foreign:
-        tell(sentence)
-    notes = [*foreign, *checks.check(runs, robot, names, known), *weights, *_of_product(of_product)]
+    notes = [*ready.foreign, *ready.checked, *ready.weighed, *_of_product(of_product), *ready.begins]
     posed = observers.pose(runs, base, coordinates, known.sd, model)
-    notes += observe.check_start(runs, known, robot)
 
     if population is None:
         population = POPULATION if fidelities.unread("steady", names) else 0
@@ -163,6 +158,13 @@ def calibrate(
     searched = found.searched
     about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
     notes += searched.statements() if searched is not None else []
+    seen_over = scans.profiles(posed, z)
+    about = scans.with_scanned_sds(about, seen_over)
+    notes += scans.statements(posed, seen_over)
+    elsewhere = scans.apart(seen_over, found.starts.z, found.starts.converged)
+    if elsewhere:
+        over = ", ".join(posed.coordinates.names[k] for k in seen_over)
+        notes.append(f"{elsewhere} of {len(found.starts.cost)} searches converged at other values of {over}")
     if not np.isfinite(about.covariance).all():
         notes.append("the posterior has no finite covariance: values stand, intervals do not")
     jumps = np.flatnonzero(np.asarray(after.flags) >> FLAGS.index("jumps") & 1)
@@ -184,23 +186,24 @@ def calibrate(
     result = CalibrationResult(
         robot=fitted,
         source=runs.source,
+        channels=runs.channels,
         model=model,
         seed=seed,
-        parameters=estimates.parameters(posed, base, z, about, profile, beside, sources),
+        parameters=estimates.parameters(posed, base, z, about, profile, beside, sources, seen_over),
         tied=estimates.tied(posed),
         noise=estimates.noise(posed, known, found.shares, measured),
         percent_of=observe.percent_of,
         axis=observe.axis,
-        errors_before=estimates.errors(observe, seen_before, measured, sd),
-        errors_after=estimates.errors(observe, seen, measured, sd),
+        errors_before=estimates.errors(observe, runs.channels, seen_before, measured, sd),
+        errors_after=estimates.errors(observe, runs.channels, seen, measured, sd),
         held_out={kind: estimates.held_out(posed, h, measured, sd) for kind, h in held.items()},
         conditions=estimates.conditions(observe, runs),
-        readings=estimates.readings(observe, measured, sd, seen_before, seen),
+        readings=estimates.readings(observe, runs.channels, measured, sd, seen_before, seen),
         status_before=np.array(STATUSES)[status_before],
         status=np.array(STATUSES)[status],
         adhesion_used=np.asarray(after.adhesion_used),
         objective=float(found.best.cost),
-        converged=bool(found.best.converged),
+        converged=bool(found.best.converged) and not elsewhere,
         starts=found.starts,
         searched=searched,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),

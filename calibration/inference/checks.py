@@ -14,7 +14,6 @@ from calibration.inference import observers
 from calibration.inference.conduct import conduct
 from calibration.inference.noise import Noise
 from calibration.inference.ranges import check_ranges
-from mmrjax import channels
 from mmrjax.robot import Robot
 from mmrjax.signals import SLIDES, STATUSES
 
@@ -90,7 +89,7 @@ def _stuck(runs: Runs) -> None:
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
     if len(np.unique(np.stack(varied, 1), axis=0)) < 2:
         return
-    for channel in channels.CHANNELS:
+    for channel in runs.channels:
         readings = (
             runs[channel.column][np.isfinite(runs[channel.column])] if runs.has(channel.column) else np.zeros(0)
         )

@@ -20,19 +20,20 @@ SLOW, SLIDING = 0.7, 0.7
 
 def conduct(runs: Runs, robot: Robot) -> list[str]:
     """Say which runs end before they are under way, and which never grip."""
+    runs = runs.of(robot)
     kind = observers.kind(runs)
     ends, shown, lasts = kind.settled(runs)
-    if not kind.axis or not len(ends) or robot.on_shaft or "speed" not in channels.names():
+    if not kind.axis or not len(ends) or robot.on_shaft or "speed" not in robot.rig.channels:
         return []
-    speed = shown[:, channels.index("speed")]
+    speed = shown[:, channels.index("speed", robot.channels)]
     names = ends["run_id"] if ends.has("run_id") else np.array(["(no run_id)"] * len(ends))
     conditions = ends.conditions(robot)
-    if "motor_speed" in channels.names():
-        turning = shown[:, channels.index("motor_speed")]
+    if "motor_speed" in robot.rig.channels:
+        turning = shown[:, channels.index("motor_speed", robot.channels)]
     else:
         imposed = conditions.motor_speed
         turning = np.full(len(ends), np.nan) if imposed is None else np.asarray(imposed)
-    steady = operating_readings(robot, conditions)[:, channels.index("speed")]
+    steady = operating_readings(robot, conditions)[:, channels.index("speed", robot.channels)]
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[np.asarray(conditions.configuration)]
     movers = radius * turning / float(robot.gearbox.ratio)
     known = np.isfinite(speed)

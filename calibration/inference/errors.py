@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from mmrjax import channels
+from mmrjax.channels import Channel
 
 
 def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
@@ -53,11 +55,16 @@ def certainty(measured: np.ndarray, approximated: np.ndarray) -> float:
 
 
 def channel_errors(
-    simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray | None = None
+    shown: Sequence[Channel],
+    simulated: np.ndarray,
+    measured: np.ndarray,
+    sd: np.ndarray,
+    percent: np.ndarray | None = None,
 ) -> dict[str, dict[str, float | int]]:
     """Errors [%] and in sigmas of every channel over the rows that have a simulated and a measured value.
 
     Args:
+        shown: the channels.
         simulated, measured, sd: [SI], NaN where there is none, shape (rows, channels).
         percent: errors of the same shape; None takes eq. (35).
     """
@@ -66,8 +73,8 @@ def channel_errors(
             percent = relative_error(simulated, measured)
     sigma = (simulated - measured) / sd
     answer = {}
-    for k, channel in enumerate(channels.names()):
+    for k, channel in enumerate(shown):
         there = sigma[np.isfinite(sigma[:, k]), k]
         rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
-        answer[channel] = {**summary(percent[:, k]), "rms_sigma": rms}
+        answer[channel.name] = {**summary(percent[:, k]), "rms_sigma": rms}
     return answer

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -28,7 +30,9 @@ from calibration.inference.result import (
     ProfileCurve,
     Tie,
 )
+from calibration.inference.scans import Scan
 from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
 #: How many data sds one prior sd has to move the readings to be measured by them at all.
@@ -45,6 +49,7 @@ def parameters(
     profile: Profile | None,
     beside: np.ndarray | None,
     sources: dict[str, str],
+    scans: Mapping[int, Scan],
 ) -> dict[str, Estimate]:
     """Every free parameter by its name.
 
@@ -52,7 +57,8 @@ def parameters(
         posed, base: the problem, and the robot whose values are the prior means.
         z: the optimum; beside: that of the same problem with `steady`, or None.
         about, profile: the linear analysis there, and the profiles, if any.
-        sources: of the priors that are not the fields'.
+        sources: of the priors that are not the fields'; scans: of the coordinates that are scanned, whose intervals
+            are those of their profiles.
     """
     coordinates = posed.coordinates
     at, sd = jnp.asarray(z), jnp.asarray(about.sd)
@@ -69,6 +75,10 @@ def parameters(
             interval = np.array([profile.low[k], profile.high[k]])
             shift = np.interp(interval, profile.value[k], profile.z[k])
             is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
+        if k in scans:
+            shift, is_open = np.array(scans[k].interval()), scans[k].open()
+            ends = [jnp.where(jnp.arange(len(z)) == k, x, at) for x in shift]
+            interval = np.array([coordinates.value(end)[k] for end in ends])
         found[name] = Estimate(
             value=float(value[k]),
             sd=float(about.sd[k] * slope[k]),
@@ -116,17 +126,21 @@ def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
             100 * float(np.nanmedian(share[:, k])) if np.isfinite(share[:, k]).any() else np.nan,
             100 * float(shares[k]) if known.estimated[k] else None,
         )
-        for k, name in enumerate(channels.names())
+        for k, name in enumerate(channels.names(posed.channels))
     }
 
 
-def errors(observe: type[Observer], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray) -> Errors:
+def errors(
+    observe: type[Observer], shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
+) -> Errors:
     """Errors by channel, in percent of what the observer says and in σ; arrays of shape (rows, channels)."""
-    return _errors(simulated, measured, sd, observe.percent(simulated, measured))
+    return _errors(shown, simulated, measured, sd, observe.percent(simulated, measured))
 
 
-def _errors(simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray) -> Errors:
-    found = channel_errors(simulated, measured, sd, percent)
+def _errors(
+    shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray, percent: np.ndarray
+) -> Errors:
+    found = channel_errors(shown, simulated, measured, sd, percent)
     return {
         name: ChannelErrors(int(e["rows"]), float(e["rms_percent"]), float(e["max_percent"]), float(e["rms_sigma"]))
         for name, e in found.items()
@@ -141,10 +155,12 @@ def held_out(posed: Problem, held: holdout.HeldOut, measured: np.ndarray, sd: np
         inside = held.block == k
         alone = [np.where(inside[:, None], x, np.nan) for x in (held.reading, percent)]
         blocks[label] = Block(
-            _errors(alone[0], measured, sd, alone[1]), _counted(inside & lost), bool(held.converged[k])
+            _errors(posed.channels, alone[0], measured, sd, alone[1]),
+            _counted(inside & lost),
+            bool(held.converged[k]),
         )
-    reading = dict(zip(channels.names(), held.reading.T, strict=True))
-    return HeldOut(_errors(held.reading, measured, sd, percent), _counted(lost), blocks, reading)
+    reading = dict(zip(channels.names(posed.channels), held.reading.T, strict=True))
+    return HeldOut(_errors(posed.channels, held.reading, measured, sd, percent), _counted(lost), blocks, reading)
 
 
 def _counted(rows: np.ndarray) -> tuple[int, ...]:
@@ -153,13 +169,18 @@ def _counted(rows: np.ndarray) -> tuple[int, ...]:
 
 
 def readings(
-    observe: type[Observer], measured: np.ndarray, sd: np.ndarray, before: np.ndarray, after: np.ndarray
+    observe: type[Observer],
+    shown: Sequence[Channel],
+    measured: np.ndarray,
+    sd: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
 ) -> dict[str, ChannelReadings]:
     """Readings by channel; arrays of shape (rows, channels), NaN where there is none."""
     percent, sigma = observe.percent(after, measured), (after - measured) / sd
     return {
         name: ChannelReadings(*(x[:, k] for x in (measured, sd, before, after, percent, sigma)))
-        for k, name in enumerate(channels.names())
+        for k, name in enumerate(channels.names(shown))
     }
 
 

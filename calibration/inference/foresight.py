@@ -7,12 +7,11 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import instruments, own_mass, surfaces
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
 from calibration.inference import identifiability, observers, priors
-from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
+from calibration.inference.preparation import prepare
 from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
@@ -64,11 +63,9 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
         BadData: data that cannot be used.
         BadConfiguration: no parameter of the robot can be freed.
     """
-    observe = observers.kind(runs)
-    robot = surfaces.separated(instruments.as_read(robot, runs), runs)
-    robot = own_mass.weighed(robot, runs)
-    known = noise_room.assumed(runs, observe.sizes(runs), noise)
-    robot = observe.begun(robot, runs, known)
+    runs = runs.of(robot)
+    ready = prepare(runs, robot, noise)
+    observe, robot, known = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.free_names(robot, present, *observe.free())
     names = tuple(n for n in names if n not in fidelities.unread("steady", names)) if not observe.axis else names

@@ -19,7 +19,6 @@ from scipy import stats
 from calibration.data.courses import courses
 from calibration.data.runs import DUTY, Runs
 from calibration.inference.observers import Observer
-from mmrjax import channels
 
 #: Family-wise error of «not adequate».
 LEVEL = 0.05
@@ -180,12 +179,12 @@ def _families(fit: Residuals) -> dict[str, np.ndarray]:
         variables["the order of the runs"] = runs["order"], OVER_TIME
     variables |= {
         f"the fitted {c.label}": (simulated[:, k], TERMS)
-        for k, c in enumerate(channels.CHANNELS)
+        for k, c in enumerate(fit.runs.channels)
         if there[:, k].any()
     }
     which = runs["configuration"]
     families = {}
-    for k, channel in enumerate(channels.CHANNELS):
+    for k, channel in enumerate(fit.runs.channels):
         rows = there[:, k]
         for name, (x, terms) in variables.items():
             if rows.sum() < 2 or not np.isfinite(x[rows]).all() or np.ptp(x[rows]) == 0:
@@ -208,7 +207,7 @@ def _memory(fit: Residuals) -> tuple[float, str] | None:
     order = np.lexsort((runs[observe.axis], run))
     follows = run[order][1:] == run[order][:-1]
     found = []
-    for k, channel in enumerate(channels.CHANNELS):
+    for k, channel in enumerate(fit.runs.channels):
         e, ok = residual[order, k], there[order, k]
         both = follows & ok[1:] & ok[:-1]
         power = float(np.sum(e[ok] ** 2))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mmrjax import channels, params
+from mmrjax import params
 from mmrjax.effects import Effect
 from mmrjax.params import Parameter, Scalar, parameter
 from mmrjax.robot import Robot
@@ -140,6 +140,7 @@ class Linearization(eqx.Module):
         defects: by a defect of each balance of PROBED [its unit]; what further axes are is the observer's.
         scale: of what is added to a reading [1/SI], 0 where it does not count, shape (rows, channels).
         signals: of every row, at the fit.
+        channels: names of those that readings are of, in order.
     """
 
     residual: Float[Array, " residuals"]
@@ -148,11 +149,12 @@ class Linearization(eqx.Module):
     defects: Float[Array, "balances ..."]
     scale: Float[Array, "rows channels"]
     signals: Signals
+    channels: tuple[str, ...] = eqx.field(static=True, kw_only=True)
 
     @property
     def rows(self) -> int:
         """How many rows there are."""
-        return self.signatures.shape[0] // len(channels.CHANNELS)
+        return self.signatures.shape[0] // len(self.channels)
 
     @property
     def readings(self) -> int:

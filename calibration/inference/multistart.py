@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference import identifiability
+from calibration.inference import identifiability, scans
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.noise import Noise
@@ -37,11 +37,13 @@ class Starts:
         cost: objective of each [½σ²], shape (starts,).
         converged: of each.
         infeasible: starts at which some row slides or fails.
+        z: where each ended, shape (starts, parameters); None where that is not kept.
     """
 
     cost: np.ndarray
     converged: np.ndarray
     infeasible: int
+    z: np.ndarray | None = None
 
     @property
     def _at_best(self) -> np.ndarray:
@@ -128,8 +130,12 @@ def search_one_by_one(
         return f"{(time.perf_counter() - begun) / 60:.1f} min"
 
     def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[fit.Optimum, np.ndarray, np.ndarray]:
-        whole = fit.search_long(posed, jnp.asarray(points[0]), data, tell=lambda said: tell(f"  {said}, {clock()}"))
-        found, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], whole)
+        def one(z: np.ndarray) -> tuple[fit.Optimum, Observation, Observation]:
+            return fit.search_long(posed, jnp.asarray(z), data, tell=lambda said: tell(f"  {said}, {clock()}"))
+
+        found, start, end = one(points[0])
+        found, end = scans.searched_on(posed, (found, end), data, lambda z: one(z)[::2], tell)
+        found, start, end = jax.tree.map(lambda x: jnp.asarray(x)[None], (found, start, end))
         return found, start.status, end.status
 
     first = points[0]
@@ -217,7 +223,7 @@ def _member(found: fit.Optimum, k: int) -> fit.Optimum:
 
 def _ended(found: fit.Optimum, feasible: np.ndarray) -> Starts:
     cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
-    return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)))
+    return Starts(cost, np.asarray(found.converged), int(np.sum(~feasible)), np.asarray(found.z))
 
 
 def _settling(posed: Problem, noise: Noise, z: np.ndarray, shares: np.ndarray) -> np.ndarray | None:

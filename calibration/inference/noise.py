@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from calibration.data.errors import BadConfiguration, BadData, choices
 from calibration.data.runs import Runs
 from mmrjax import channels
+from mmrjax.channels import Channel
 
 #: Shares of the reading that the estimate starts from and does not fall below [-].
 START, FLOOR = 0.02, 1e-3
@@ -22,11 +23,13 @@ class Noise:
     """Where the sds come from, and what they are.
 
     Attributes:
+        channels: that the sds are of, in the order of arrays.
         sd: [SI], shape (rows, channels); the first guess where estimated, 1 where there is no reading.
         estimated: whether a channel's sd is to be estimated from the misfit, shape (channels,).
         source: one word a channel: `columns`, `stated`, `estimated`, `assumed`, or `no readings`.
     """
 
+    channels: tuple[Channel, ...]
     sd: np.ndarray
     estimated: np.ndarray
     source: tuple[str, ...]
@@ -38,12 +41,15 @@ class Noise:
 
     def scaled(self, factors: Mapping[str, float]) -> Noise:
         """The same with the sds of channels times a factor, by name."""
-        factor = np.array([factors.get(name, 1.0) for name in channels.names()])
+        factor = np.array([factors.get(name, 1.0) for name in channels.names(self.channels)])
         return dataclasses.replace(self, sd=self.sd * factor)
 
 
-def parse(text: str) -> dict[int, tuple[float, bool]]:
+def parse(text: str, shown: tuple[Channel, ...]) -> dict[int, tuple[float, bool]]:
     """`current=2%,motor_speed=0.5%,speed=1%` (or `current=0.05A,motor_speed=30rpm,speed=5mm/s`).
+
+    Args:
+        shown: the channels that there are.
 
     Returns:
         Position of the channel → (number, whether it is a share of the reading); absolute ones in SI.
@@ -51,15 +57,15 @@ def parse(text: str) -> dict[int, tuple[float, bool]]:
     Raises:
         BadConfiguration: an unknown channel, no positive number, or another unit.
     """
-    words = {c.word: k for k, c in enumerate(channels.CHANNELS)}
-    known = words | {c.name: k for k, c in enumerate(channels.CHANNELS)}
+    words = {c.word: k for k, c in enumerate(shown)}
+    known = words | {c.name: k for k, c in enumerate(shown)}
     found: dict[int, tuple[float, bool]] = {}
     for part in text.split(","):
         name, _, value = part.strip().partition("=")
         if name not in known:
             raise BadConfiguration(f"--noise {part.strip()}: no such channel; {choices(name, words)}")
         k = known[name]
-        channel = channels.CHANNELS[k]
+        channel = shown[k]
         match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(%|[^\d\s.]+)\s*", value)
         form = f"expected a positive number with % or {channel.unit}, e.g. {name}=2% or {name}=0.1{channel.unit}"
         try:
@@ -85,10 +91,10 @@ def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
         BadConfiguration: as `parse`.
         BadData: a channel that reads zero everywhere and has no stated sd.
     """
-    shares = parse(stated) if stated else {}
+    shares = parse(stated, runs.channels) if stated else {}
     measured, columns = runs.measured(), runs.deviations()
     sd, source = np.ones_like(measured), []
-    for k, channel in enumerate(channels.CHANNELS):
+    for k, channel in enumerate(runs.channels):
         there = np.isfinite(measured[:, k])
         if not there.any():
             source.append("no readings")
@@ -104,17 +110,17 @@ def of(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
             )
         sd[:, k] = np.where(there, size * sizes[:, k] if relative else size, 1.0)
         source.append("stated" if k in shares else "estimated")
-    quantum = np.array([runs.layout.variance(name) for name in channels.names()])
+    quantum = np.array([runs.layout.variance(name) for name in channels.names(runs.channels)])
     known = np.array([s in ("columns", "stated") for s in source])  # an estimate has it in it already
     if (known & (quantum > 0)).any():
         sd = np.where(known & np.isfinite(measured), np.sqrt(sd**2 + quantum), sd)
-    return Noise(sd, np.array([s == "estimated" for s in source]), tuple(source))
+    return Noise(runs.channels, sd, np.array([s == "estimated" for s in source]), tuple(source))
 
 
-def default(names: Collection[str] | None = None) -> str:
+def default(shown: Iterable[Channel]) -> str:
     """What the loop takes sds to be where neither the file nor the user says: averages of at least three repeats,
-    printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2. Of some channels by name, or of all."""
-    return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in channels.CHANNELS if names is None or c.name in names)
+    printed to 0.05 A, 10 rpm and 10 mm/s, as in Tables A1 and A2."""
+    return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in shown)
 
 
 def assumed(runs: Runs, sizes: np.ndarray, stated: str | None = None, factor: float = 1.0) -> Noise:
@@ -126,7 +132,7 @@ def assumed(runs: Runs, sizes: np.ndarray, stated: str | None = None, factor: fl
     known = of(runs, sizes, stated)
     if not known.estimated.any():
         return known
-    guess = of(runs, sizes, default())
+    guess = of(runs, sizes, default(runs.channels))
     sd = np.where(known.estimated, factor * guess.sd, known.sd)
     words = tuple("assumed" if e else w for e, w in zip(known.estimated, known.source, strict=True))
-    return Noise(sd, np.zeros(len(words), bool), words)
+    return Noise(runs.channels, sd, np.zeros(len(words), bool), words)

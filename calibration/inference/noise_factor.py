@@ -30,13 +30,13 @@ def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
     if tests and min(p for p, _ in tests) * len(tests) < level:
         return {}
     found = {}
-    for name, chi2, freedom in zip(channels.names(), fit.chi2.tolist(), fit.freedom.tolist(), strict=True):
+    for channel, chi2, freedom in zip(fit.runs.channels, fit.chi2.tolist(), fit.freedom.tolist(), strict=True):
         if freedom < 1 or chi2 <= 0:
             continue
         factor = float(np.sqrt(chi2 / freedom))
         p = stats.chi2.sf(chi2, freedom) if factor > 1 else stats.chi2.cdf(chi2, freedom)
         if max(factor, 1 / factor) > OFF and p < IMPROBABLE:
-            found[name] = factor
+            found[channel.name] = factor
     return found
 
 
@@ -64,8 +64,8 @@ def noise_remarks(fit: Residuals, word: str = "stated") -> list[str]:
         typical = float(np.exp(np.mean(np.log(list(factors.values())))))
         where = "in every channel and everywhere alike"
         return [f"residuals are {typical:.2g} times the {word} sds {where}: are the sds right?"]
-    labels = {c.name: c.label for c in channels.CHANNELS}
+    each = [(channels.of(name).label, factor) for name, factor in factors.items()]
     return [
-        f"residuals of {labels[name]} are {factor:.2g} times the {word} sds, everywhere alike: are these sds right?"
-        for name, factor in factors.items()
+        f"residuals of {label} are {factor:.2g} times the {word} sds, everywhere alike: are these sds right?"
+        for label, factor in each
     ]

@@ -28,7 +28,7 @@ def operating_readings(
 
     Args:
         conditions: shape (runs,).
-        names: of the channels; None: those of the table.
+        names: of the channels; None: the robot's.
     """
     runs = conditions.shape[0]
     index = np.concatenate([np.arange(runs), np.zeros(-runs % PAD, int)])
@@ -38,6 +38,6 @@ def operating_readings(
         mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
     posed = dataclasses.replace(conditions, adhesion=jnp.full(runs, GRIPPING), total_mass=jnp.asarray(mass))
     found = steady_batch(params.strong(robot), jax.tree.map(lambda x: jnp.asarray(x)[index], posed))
-    reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names()], 1)[:runs]
+    reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
     moving = np.asarray(done(found.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)

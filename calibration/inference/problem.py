@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
 if TYPE_CHECKING:
@@ -102,6 +103,11 @@ class Problem(eqx.Module):
     coordinates: Any  # FreeParameters
     observe: Observer
     data: Data
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """That readings are of, in the order of arrays."""
+        return self.base.channels
 
     def observation(self, z: Float[Array, " parameters"]) -> Observation:
         """What the model says of every row at z."""

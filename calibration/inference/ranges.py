@@ -42,6 +42,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
         BadData: a factor beyond `REFUSED`; of histories, which need not get under way, only where a known confusion
             of units explains it.
     """
+    runs = runs.of(robot)
     kind = observers.kind(runs)
     runs, measured, lasts = kind.settled(runs)
     if not len(runs):
@@ -56,7 +57,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
     possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
     if not np.isfinite(possible).any():
         return []
-    factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(channels.CHANNELS)}
+    factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
     said = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
@@ -124,7 +125,7 @@ def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
     """Refuse a gear ratio that is the inverse of what the speeds of motor and output show."""
-    shown = dict(zip(channels.names(), measured.T, strict=True))
+    shown = dict(zip(channels.names(robot.channels), measured.T, strict=True))
     conditions = runs.conditions(robot)
     which = np.asarray(conditions.configuration)
     radius = np.asarray([float(c.radius) for c in robot.configurations.members])[which]
@@ -178,7 +179,7 @@ def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot
     Within runs that differ in their slope alone the current is about linear in it; the coefficient of what is
     measured on what is possible is 1 where slopes are in degrees.
     """
-    k = next((k for k, name in enumerate(channels.names()) if name in ("total_current", "motor_current")), None)
+    k = next((k for k, c in enumerate(robot.channels) if c.name in ("total_current", "motor_current")), None)
     if k is None or robot.on_shaft:
         return
     slope, there = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])

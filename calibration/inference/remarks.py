@@ -9,7 +9,6 @@ from calibration.inference.identifiability import Z95, said_held
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
-from mmrjax import channels
 from mmrjax.signals import DONE, STATUSES
 
 #: Shift from the prior above which the prior or the model is called wrong [prior sd].
@@ -32,7 +31,7 @@ def remarks(found: CalibrationResult) -> list[str]:
 def _noise(found: CalibrationResult) -> list[str]:
     estimated = [
         f"{c.name.replace('_', ' ')} {found.noise[c.name].estimated_percent:.1f} %"
-        for c in channels.CHANNELS
+        for c in found.channels
         if found.noise[c.name].estimated_percent is not None
     ]
     if not estimated:

@@ -99,7 +99,7 @@ class ResidualCluster:
     @property
     def statement(self) -> str:
         """In a sentence."""
-        label = {c.name: c.label for c in channels.CHANNELS}[self.channel]
+        label = channels.of(self.channel).label
         what = f"residuals of {label}"
         within = f" within {self.within}" if self.within else ""
         signs = ", with opposite signs in the two directions of travel" if self.reversing else ""
@@ -277,7 +277,7 @@ def _words(cells: np.ndarray) -> np.ndarray:
 
 def _known(runs: Runs) -> Iterator[np.ndarray]:
     """Columns that have a role, but for readings and their sds, and what labels say together."""
-    readings = {name for c in channels.CHANNELS for name in (c.column, c.sd_column)}
+    readings = {name for c in runs.channels for name in (c.column, c.sd_column)}
     known = {name: v.astype(str) for name, v in runs.columns.items() if name not in readings}
     labels = [known[name] for name in _labels(runs)]
     yield from known.values()
@@ -503,7 +503,7 @@ def _permuted(made: Sequence[tuple[int, _Channel]], seed: int) -> np.ndarray:
 
 def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[str, ...]) -> ResidualCluster:
     """A finding in the units of its channel."""
-    channel, there = channels.CHANNELS[k], whole.there[:, k]
+    channel, there = whole.runs.channels[k], whole.there[:, k]
     cells, residual = whole.runs.extras[test.column][there], whole.residual[there, k] / channel.factor
     signed = residual * np.sign(whole.simulated[there, k]) if test.reversing else residual
     within = whole.runs[test.within][there] if test.within else np.zeros(int(there.sum()), str)

@@ -16,7 +16,7 @@ from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
 from calibration.inference.population import Searched
 from calibration.inference.residual_clusters import ResidualCluster
-from mmrjax import channels
+from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 
@@ -248,7 +248,7 @@ class CalibrationResult:
 
     Attributes:
         robot: calibrated.
-        source: of the runs; model: the fidelity; seed: of the starts.
+        source: of the runs; channels: that its readings are of, in order; model: the fidelity; seed: of the starts.
         parameters: the free ones, by name; tied: those that follow them, by name.
         noise: by channel.
         percent_of: what errors in percent are of; axis: column along which the rows of a run follow one another.
@@ -267,6 +267,7 @@ class CalibrationResult:
 
     robot: Robot
     source: str
+    channels: tuple[Channel, ...]
     model: str
     seed: int
     parameters: dict[str, Estimate]
@@ -373,7 +374,7 @@ class CalibrationResult:
 
     def _readings(self) -> Iterator[tuple[str, np.ndarray]]:
         main = self.main_blocks
-        for channel in channels.CHANNELS:
+        for channel in self.channels:
             r, column = self.readings[channel.name], channel.column
             yield column, r.measured / channel.factor
             yield f"sd_{column}", r.sd / channel.factor

@@ -54,29 +54,29 @@ def counted(codes: np.ndarray) -> dict[str, int]:
     return {STATUSES[k]: int(n) for k, n in enumerate(each) if n}
 
 
-def known_outputs() -> dict[str, OutputRow]:
+def known_outputs(robot: Robot) -> dict[str, OutputRow]:
     """Every output by name: those of a fidelity, then the derived ones."""
-    rows: tuple[OutputRow, ...] = (*table_of_outputs.table(), *derived.TABLE)
+    rows: tuple[OutputRow, ...] = (*table_of_outputs.table(robot.channels), *derived.TABLE)
     return {o.name: o for o in rows}
 
 
-def default_outputs(robot: Robot | None = None) -> tuple[str, ...]:
+def default_outputs(robot: Robot) -> tuple[str, ...]:
     """Names of the outputs that are studied where none are named: every channel, and what the robot's load has."""
     beside: tuple[str, ...] = DEFAULT
-    if robot is not None and robot.on_shaft:
+    if robot.on_shaft:
         beside = ("power_supply",)
-    elif robot is not None and robot.rig.imposed == "motor_speed":  # that stalls on no slope
+    elif robot.rig.imposed == "motor_speed":  # that stalls on no slope
         beside = tuple(name for name in DEFAULT if name != "steepest_slope")
-    return (*channels.names(), *beside)
+    return (*channels.names(robot.channels), *beside)
 
 
-def chosen_outputs(words: tuple[str, ...], robot: Robot | None = None) -> tuple[OutputRow, ...]:
+def chosen_outputs(words: tuple[str, ...], robot: Robot) -> tuple[OutputRow, ...]:
     """The outputs of these names, the usual ones for none; `start` stands for all of the start.
 
     Raises:
         BadConfiguration: an unknown name; lists the choices.
     """
-    known, found = known_outputs(), []
+    known, found = known_outputs(robot), []
     start = tuple(d.name for d in derived.TABLE if d.module.endswith(".start"))
     for word in words or default_outputs(robot):
         for name in start if word == "start" else (word,):

@@ -10,10 +10,9 @@ import numpy as np
 
 from calibration.sensitivity import information
 from calibration.sensitivity.local import Local
-from calibration.sensitivity.model import OutputRow, known_outputs
+from calibration.sensitivity.model import known_outputs
 from calibration.sensitivity.result import NextRuns, Points
 from calibration.sensitivity.study import Study, jacobian_of
-from mmrjax import channels
 from mmrjax.conditions import Conditions
 
 #: Runs proposed.
@@ -58,7 +57,8 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
         None where no candidate travels, or no parameter is uncertain.
     """
     points, conditions = candidates.points, candidates.conditions
-    shown = tuple(_row(c.name) for c in channels.CHANNELS)
+    known = known_outputs(study.robot)
+    shown = tuple(known[c.name] for c in study.robot.channels)
     model = dataclasses.replace(study.model, outputs=shown, fidelity="steady", options={})
     p = len(study.inputs.parameters)
     if not p:
@@ -95,7 +95,3 @@ def next_runs(study: Study, found: Local, candidates: Candidates) -> NextRuns | 
     return NextRuns(
         int(there.sum()), candidates.source, chosen, choice.gain, candidates.words, after / whole, outputs
     )
-
-
-def _row(name: str) -> OutputRow:
-    return known_outputs()[name]

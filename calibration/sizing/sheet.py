@@ -16,9 +16,9 @@ from calibration.data.errors import BadConfiguration, choices
 from calibration.data.requirements import Envelope, Requirement, Requirements
 from mmrjax import params
 from mmrjax.compiling import compiled
-from mmrjax.requirements import AMBIENT, AXES, CHARGE, OUTCOMES, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
+from mmrjax.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED
+from mmrjax.signals import CONVERGED, STATUSES
 from mmrjax.tables import adhesion_ratio
 
 #: Values along each axis of an envelope: its ends, and between them where an output may turn.
@@ -70,7 +70,7 @@ class Outcome:
         requirement: as stated, its rating in place.
         value: of the quantity at the worst corner, in the unit of its name; None where it has none there.
         margin: by how much it is met, negative where it is missed; None where there is no value.
-        status: of the worst corner, of `OUTCOMES`.
+        status: of the worst corner, of `STATUSES`.
         at: the worst corner.
         change: what single change would meet it, the smallest first; empty where it is met or nothing does.
     """
@@ -306,9 +306,9 @@ def _outcome(held: _Held) -> Outcome:
     value, outcome, margin = (x[0] for x in held.over(_now(held)[None]))
     # A point without value is worse than any; the most of those with the same outcome is at its worst corner.
     k = int(np.argmin(margin))
-    status = OUTCOMES[outcome[k]]
+    status = STATUSES[outcome[k]]
     counts = np.isfinite(margin[k])
-    if not counts and status == OUTCOMES[CONVERGED]:  # a value beyond all bounds: a temperature that never settles
+    if not counts and status == STATUSES[CONVERGED]:  # a value beyond all bounds: a temperature that never settles
         status = "unbounded"
     return Outcome(
         r, float(value[k]) if counts else None, float(margin[k]) if counts else None, status, _corner(held, k)

@@ -54,7 +54,7 @@ class Effect(eqx.Module):
         rests_on: dotted names of parameters of the robot in proportion to which its term is, for whoever finds its
             amplitude too large.
         dissipative: whether a positive amplitude may only take power out.
-        channel: for `sensor` alone: the channel that it changes, one of `channels.names()`.
+        channel: for `sensor` alone: the channel that it changes, one of `channels.EVERY`.
         transient: whether settled travel shows nothing of it, so that only histories can.
         settles_to: name of the effect from which settled travel cannot tell it, so that only histories can.
         needs_battery: whether it acts with the on-board battery alone, so that no run on an external supply

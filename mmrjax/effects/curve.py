@@ -23,7 +23,7 @@ BALANCES = {
     "slip": ("m/s", 0.05, "direction"),
 }
 #: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
-READINGS = {c.name: (c.unit_si or c.unit, 0.01 * c.range[1] * c.factor, "direction") for c in channels.CHANNELS}
+READINGS = {c.name: (c.unit_si or c.unit, 0.01 * c.range[1] * c.factor, "direction") for c in channels.usual()}
 PLACES = {**BALANCES, **READINGS}
 #: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the
 #: place of a run in the sequence: unit and ordinary range.

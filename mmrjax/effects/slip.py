@@ -164,15 +164,16 @@ class PulleyEccentricity(Periodic, SlipEffect):
 
 
 class VibrationSlip(SlipEffect):
-    """ΔV = a (V_teor / V_1)^p u / (1 - u), u = demand over the adhesion limit of eq. (6); on tracks alone.
+    """ΔV = a √((V_teor / V_1)² + 0.001²)^p u / √((1 - |u|)² + 0.05²), u = demand over the adhesion limit of eq. (6);
+    on tracks alone.
 
     Contacts that shake slide while they bear little; dry friction turns into an apparent viscous one.
 
     Source: Section 3.2.4 and its ref. [46]; Blekhman, Vibrational Mechanics (2000). The law of Fig. 7 averaged over
     contacts that swing by s (`mmrjax.vibration`), where V_s is small beside s: slip in proportion to s and, with the
-    load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows (docs/vibration.md). The last is
-    rounded off within 0.05 of the limit, beyond which the robot slides anyway. Under a demand that pulls forward the
-    robot runs ahead of its tracks.
+    load's lead, to u; s itself grows as 1 / (1 - u), as the track model shows (docs/vibration.md). That is rounded
+    off within 0.05 of the limit, beyond which the robot slides anyway, and the power of the speed at rest. Under a
+    demand that pulls forward the robot runs ahead of its tracks.
     """
 
     driver = "demand"

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mmrjax import balances, channels, fidelities
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities import Effort, Facts, Option
 from mmrjax.params import Scalar
+from mmrjax.rig import Rig
 from mmrjax.robot import Robot
 from mmrjax.signals import Result, Signals
 from mmrjax.undercarriage import Reactions
+
+T = TypeVar("T")
 
 #: Is called now and then with the share of the work that is done, 0..1.
 Progress = Callable[[float], None]
@@ -25,7 +31,8 @@ class History(eqx.Module):
     """Runs over time; fields have shape (runs, samples).
 
     Attributes:
-        time: [s]; distance: travelled along the slope [m].
+        time: by the clock of tables, on which what is imposed acts the rig's `delay` later than its column says [s].
+        distance: travelled along the slope [m].
         signals: every signal; reading: what the instruments show [SI], by channel, of those that change in a history.
         reactions: loads inside the running gear of one side, where the fidelity resolves them.
     """
@@ -40,10 +47,37 @@ class History(eqx.Module):
     def of(
         robot: Robot, time: Array, distance: Array, signals: Signals, reactions: Reactions | None = None
     ) -> History:
-        """A history with its readings."""
+        """A history with its readings, of runs known at `time` since what is imposed acts."""
         shown = balances.sensor(robot, signals)
-        reading = {c.name: shown[c.name] for c in channels.known() if c.over_time}
-        return History(time, distance, signals, reading, reactions)
+        reading = {c.name: shown[c.name] for c in channels.EVERY if c.over_time}
+        clock, (distance, signals, reading, reactions) = as_tables(
+            robot.rig, time, (distance, signals, reading, reactions)
+        )
+        return History(clock, distance, signals, reading, reactions)
+
+
+def as_tables(rig: Rig, time: Float[Array, "runs samples"], values: T) -> tuple[Float[Array, "runs samples"], T]:
+    """Runs over time by the clock of tables, which the rig's `delay` sets.
+
+    Args:
+        time: since what is imposed acts [s]; values: at those instants, a tree of shape (runs, samples, ...).
+
+    Returns:
+        Instants of the tables' clock and values at those (`Rig.clock`, `Rig.late`).
+    """
+    if rig.prompt:
+        return time, values
+    values = jax.tree.map(lambda x: jnp.broadcast_to(x, time.shape) if jnp.ndim(x) < 2 else jnp.asarray(x), values)
+    clock = rig.clock(time)
+    return clock, _late(rig, time, values, clock)
+
+
+@compiled
+def _late(rig: Rig, time: Array, values: T, clock: Array) -> T:
+    def of_run(times: Array, x: Array, clock: Array) -> Array:
+        return jax.vmap(lambda at: rig.late(times, x, at))(clock)
+
+    return jax.tree.map(lambda x: jax.vmap(of_run)(time, x, clock), values)
 
 
 class Run(eqx.Module):

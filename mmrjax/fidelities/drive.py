@@ -17,17 +17,16 @@ from mmrjax import balances
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.rest import current_at_rest, firmness
-from mmrjax.fidelities.result import result, stands, travels, unless_slipping, withhold
+from mmrjax.fidelities.rest import current_at_rest, firmness, status_moving, voltage_at_rest
+from mmrjax.fidelities.result import result, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
-from mmrjax.fidelities.steady import direction, operating_signals, voltage_at_rest
+from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
     CONVERGED,
     FAILED,
-    NOT_SETTLED,
     STALLED,
     Result,
     Signals,
@@ -206,9 +205,11 @@ def drive(
     signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
     # Friction at rest carries what gravity and the motors ask of a robot that it holds.
     still = jnp.zeros_like(signals.acceleration)
+    held = jnp.clip(signals.demand, -signals.adhesion_limit, signals.adhesion_limit)
     signals = dataclasses.replace(
         signals,
-        traction=jnp.where(parked, signals.demand, signals.traction),
+        demand=jnp.where(parked, held, signals.demand),
+        traction=jnp.where(parked, held, signals.traction),
         acceleration=jnp.where(parked, still, signals.acceleration),
         acceleration_wheel=jnp.where(parked, still, signals.acceleration_wheel),
     )
@@ -236,13 +237,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
-    settling = jnp.abs(end.acceleration) * 0.1 > 1e-3 * jnp.abs(end.speed)
-    status = jnp.where(settling, NOT_SETTLED, travels(end.speed, end.voltage))
-    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
-    still = stands(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
-    status = jnp.where(still & (sense * end.acceleration < 1e-2), STALLED, status)  # not one that is just starting
-    gain = end.acceleration * jnp.sign(end.speed_sliding)
-    status = unless_slipping(status, robot, end, gain, 1e-3, still)
+    status = status_moving(robot, conditions, end, end.voltage)
     status = jnp.where(parked, STALLED, status)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)

@@ -19,6 +19,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.mission_steps import (
     CLOCK,
     DISCHARGE,
+    EVENTS,
     FIRST,
     HOUSING,
     PEAKS,
@@ -31,15 +32,16 @@ from mmrjax.fidelities.mission_steps import (
     instant,
     units,
 )
-from mmrjax.fidelities.result import mask, result, slips, travels, withhold
+from mmrjax.fidelities.rest import status_moving
+from mmrjax.fidelities.result import mask, result, slips, withhold
 from mmrjax.params import Scalar
 from mmrjax.profile import BRAKE, COAST, MOTOR_SPEED, SPEED, Profile
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
     CONVERGED,
+    CUT_OFF,
     FAILED,
-    NOT_SETTLED,
     ROLLS_BACK,
     SLIDES,
     STALLED,
@@ -63,11 +65,13 @@ class Totals(eqx.Module):
         time: that it took [s].
         of: integrals by the names of `TOTALS`; `drawn` and `returned` are the source's, the rest where it went.
         stored: rise of the energy in motion [J].
+        given: by the source on balance [J]: by a battery as its charge at both ends says, by a supply as integrated.
     """
 
     time: Array
     of: dict[str, Array]
     stored: Array
+    given: Array
 
     @property
     def energy(self) -> Scalar:
@@ -76,8 +80,11 @@ class Totals(eqx.Module):
 
     @property
     def unaccounted(self) -> Scalar:
-        """Energy in, less where it went, less what is stored [J]: what the integration is off by."""
-        return self.energy - sum(self.of[name] for name in energy.SINKS) - self.stored
+        """Energy in, less where it went, less what is stored [J]: what the integration is off by.
+
+        That a battery gives follows from its charge alone, so that a charge that is off shows too.
+        """
+        return self.given - sum(self.of[name] for name in energy.SINKS) - self.stored
 
 
 class Start(eqx.Module):
@@ -99,6 +106,7 @@ class Course(eqx.Module):
 
     Attributes:
         time: since the mission began [s]; segment: index of the segment, -1 after the last.
+        event: index into `MARKS` of what a step has landed on, -1 for none.
         distance: along the ground [m]; temperature_winding, temperature_housing: [°C].
         energy: taken from the source on balance [J].
         signals: every signal.
@@ -106,6 +114,7 @@ class Course(eqx.Module):
 
     time: Float[Array, " kept"]
     segment: Int[Array, " kept"]
+    event: Int[Array, " kept"]
     distance: Float[Array, " kept"]
     energy: Float[Array, " kept"]
     temperature_winding: Float[Array, " kept"]
@@ -121,7 +130,7 @@ class Mission(eqx.Module):
         peaks: by the names of `PEAKS` (`cell_low` the lowest voltage of a cell); of the segments too.
         status: of each segment at its end, flags: of each segment; shape (cycles, segments).
         result: the end of the mission, with its status and the flags of all of it. Status is `converged` where the
-            profile was followed to its end; `battery_empty` (also where the cells stay below their cut-off);
+            profile was followed to its end; `battery_empty`; `cut_off` where the cells stayed below their cut-off;
             `stalled`, `slides` or `rolls_back` where some segment that asks for motion ends so, the first one;
             `failed` the integrator gave up.
         end: unknowns at the end; temperature_winding, temperature_housing: [°C]; discharge: [C].
@@ -148,15 +157,12 @@ def _ends(
     robot: Robot, segment: Profile, signals: Signals, asked: Asked, stands: Array, mode: Array
 ) -> tuple[Array, Array]:
     """Status of a segment at its end, and whether the robot has missed what was demanded."""
-    settling = jnp.abs(signals.acceleration) * 0.1 > 1e-3 * jnp.abs(signals.speed)
     driven = signals.duty * signals.voltage_source
+    now = dataclasses.replace(asked.conditions, discharge=signals.discharge)
+    status = jnp.where(stands, STALLED, status_moving(robot, now, signals, driven))
     rests = stands | ((jnp.abs(signals.direction) < 1.0) & (jnp.abs(signals.direction_travel) < 1.0))
     wanted = (mode != BRAKE) & (mode != COAST) & (jnp.abs(driven) > 1e-6)
-    status = jnp.where(settling & ~stands, NOT_SETTLED, travels(signals.speed, driven))
-    slides = jnp.abs(signals.demand) > signals.adhesion_limit
-    status = jnp.where(rests, STALLED, status)
-    status = jnp.where(slides & ~stands, SLIDES, status)
-    status = jnp.where(~wanted & rests & ~slides, CONVERGED, status)  # it stands, as it should
+    status = jnp.where(~wanted & rests & (status == STALLED), CONVERGED, status)  # it stands, as it should
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     per_speed = robot.gearbox.ratio / robot.chassis(signals.configuration).radius
     # A ramp that ends in a stop is measured by where it began.
@@ -165,6 +171,11 @@ def _ends(
     missed = controlled & (jnp.abs(asked.error) > MISSED * jnp.maximum(largest, 10.0))
     status = jnp.where(controlled & rests & ~missed, CONVERGED, status)
     return status, missed
+
+
+def _ending(c: Carry) -> Array:
+    """Status of a mission that has ended before its profile."""
+    return jnp.where(c.failed, FAILED, jnp.where(c.cut_off, CUT_OFF, BATTERY_EMPTY))
 
 
 def mission(
@@ -207,11 +218,11 @@ def mission(
     buffer = None
     if keep:
         blank = jnp.full((keep, 1), jnp.nan, dtype)
-        buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool))
+        buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool), jnp.full(keep, -1))
     carry = Carry(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(begin.speed == 0.0), ended=false,
-        low=jnp.zeros((), dtype), peaks=jnp.full(len(PEAKS), -jnp.inf, dtype), flags=whole,
-        events=jnp.full(3, -1.0, dtype), accepted=whole, rejected=whole, failed=false, kept=whole, buffer=buffer,
+        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=jnp.full(len(PEAKS), -jnp.inf, dtype), flags=whole,
+        events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false, kept=whole, buffer=buffer,
         slope=jnp.zeros((), dtype),
     )  # fmt: skip
 
@@ -222,32 +233,29 @@ def mission(
         c = follow(robot, conditions, segment, fresh, tolerance, most_steps)
         signals, _, _, asked = instant(robot, conditions, segment, c.y, c.stands)
         status, missed = _ends(robot, segment, signals, asked, c.stands, segment.mode[0])
-        empty = c.ended & ~c.failed
-        status = jnp.where(c.failed, FAILED, jnp.where(empty, BATTERY_EMPTY, status))
+        status = jnp.where(c.ended, _ending(c), status)
         flags = c.flags | mask({"demand_missed": missed & ~c.ended, "slips": slips(robot, signals) & ~c.stands})
         rise = energy.stored(robot, signals) - energy.stored(robot, beginning)
+        drawn, returned = (c.q[list(TOTALS).index(name)] for name in ("drawn", "returned"))
+        before, after = (robot.battery.energy(x.y[DISCHARGE] * UNITS[DISCHARGE]) for x in (carry, c))
+        given = jnp.where(conditions.battery > 0.5, after - before, drawn - returned)
         ran = ~carry.ended
-        time = jnp.where(ran, c.y[CLOCK], 0.0)
-        out = (time, jnp.where(ran, c.q, 0.0), jnp.where(ran, rise, 0.0), c.peaks, status, flags, signals, c.kept)
+        time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[CLOCK], rise, given))
+        out = (time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
         carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | flags)
         return carry, out
 
     order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
-    c, (time, q, rise, peaks, status, flags, signals, kept) = jax.lax.scan(one, carry, order)
+    c, (time, q, rise, given, peaks, status, flags, signals, kept) = jax.lax.scan(one, carry, order)
     shape = (profile.cycles, profile.segments)
     names = list(TOTALS)
-    each = Totals(time.reshape(shape), {n: q[:, i].reshape(shape) for i, n in enumerate(names)}, rise.reshape(shape))
+    of = {n: q[:, i].reshape(shape) for i, n in enumerate(names)}
+    each = Totals(time.reshape(shape), of, rise.reshape(shape), given.reshape(shape))
     total = jax.tree.map(jnp.sum, each)
-    bad = (
-        (status == STALLED)
-        | (status == SLIDES)
-        | (status == BATTERY_EMPTY)
-        | (status == FAILED)
-        | (status == ROLLS_BACK)
-    )
+    bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK)
     first = jnp.argmax(bad)
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
-    outcome = jnp.where(c.failed, FAILED, jnp.where(c.ended, BATTERY_EMPTY, outcome))
+    outcome = jnp.where(c.ended, _ending(c), outcome)
     end = jax.tree.map(lambda x: x[-1], signals)
     answer = withhold(result(robot, end, outcome), outcome != FAILED, outcome != FAILED)
     answer = dataclasses.replace(answer, flags=c.flags)
@@ -270,7 +278,7 @@ def mission(
 
 def _course(robot: Robot, conditions: Conditions, profile: Profile, c: Carry, each: Totals, kept: Array) -> Course:
     assert c.buffer is not None
-    ys, qs, stood = c.buffer
+    ys, qs, stood, marks = c.buffer
     at = jnp.arange(len(ys))
     # Of each kept step its segment: the first whose count reaches beyond it.
     of = jnp.minimum(jnp.searchsorted(kept, at, side="right"), len(kept) - 1)
@@ -292,6 +300,7 @@ def _course(robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ea
     return Course(
         time=shown(begun + ys[:, CLOCK]),
         segment=jnp.where(there, of, -1),
+        event=jnp.where(there, marks, -1),
         distance=shown(so_far["distance"]),
         energy=shown(so_far["drawn"] - so_far["returned"]),
         temperature_winding=shown(ys[:, WINDING] * UNITS[WINDING]),

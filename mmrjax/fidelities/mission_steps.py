@@ -41,8 +41,19 @@ PEAKS: dict[str, str] = {
 
 #: The first step of a segment [s], and the shortest.
 FIRST, SHORTEST = 1e-4, 1e-9
+#: What steps land on: standing and breaking away, an empty battery, cells falling below their cut-off and recovering.
+EVENTS = ("stands", "breaks_away", "battery_empty", "below_cut_off", "above_cut_off")
+STANDS, BREAKS_AWAY, EMPTY, FALLS, RECOVERS = range(len(EVENTS))
+#: What a row over time may mark: an event, or that the cells have been below their cut-off for as long as they may,
+#: which is timed from its event.
+MARKS = (*EVENTS, "cut_off")
 #: How near an event a step has to end, of what its function is scaled to; or how short a step is near enough [s].
 EVENT, NEAR = 1e-2, 1e-7
+#: Scales of events: charge, of the capacity [-]; voltage of a cell [V]. From an event at most `EVENT` of its scale
+#: away a Newton step leads to it, along which rates are constant.
+OF_CHARGE, OF_CELL = 1e-3, 1e-3
+#: How far above its cut-off a cell has recovered [V]: beyond the rounding of the crossing.
+RECOVERED = 1e-6
 #: How firmly friction holds a robot before it stands [-].
 FIRMLY = 1e-3
 
@@ -156,7 +167,9 @@ class Carry(NamedTuple):
     step: Array
     stands: Array
     ended: Array  # no more: empty, cut off or failed
-    low: Array  # for how long the cells have been below their cut-off [s]
+    below: Array  # whether the cells are below their cut-off
+    low: Array  # for how long they have been [s]
+    cut_off: Array  # whether they have been for as long as they may
     peaks: Array
     flags: Array
     events: Array
@@ -192,8 +205,18 @@ def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
     return jnp.where(bends, jnp.maximum(top, jnp.maximum(x0, x1)), jnp.maximum(x0, x1))
 
 
-def events_of(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Array:
-    """Three functions that are positive once their event has happened: standing, breaking away, empty [-]."""
+def _cell_above(asked: Asked, state: State) -> Scalar:
+    """By how much a cell is above its cut-off [V]; on an external supply far."""
+    motors = asked.robot.sides * state.current * asked.robot.driver.duty_limited(asked.conditions.duty, state.current)
+    battery = asked.robot.battery
+    cell = battery.voltage_cell(motors, state.discharge)
+    return jnp.where(asked.conditions.battery > 0.5, cell - battery.voltage_cutoff, 10.0)
+
+
+def events_of(
+    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
+) -> Float[Array, " events"]:
+    """Functions that are positive once their event of `EVENTS` has happened [-]."""
     asked = asked_at(robot, otherwise, segment, y, stands)
     state = state_of(robot, y, stands)
     load = robot.chassis(asked.conditions.configuration)
@@ -209,27 +232,48 @@ def events_of(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, s
     firm, stays = rarely(near, _firmly, (robot, otherwise, segment, y, stands), (none, none))
     standing = jnp.minimum(jnp.minimum(slow, grips), stays - FIRMLY)
     battery = asked.robot.battery
-    empty = jnp.where(asked.conditions.battery > 0.5, state.discharge / battery.capacity - 1, -1.0)
-    return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty])
+    empty = jnp.where(asked.conditions.battery > 0.5, (state.discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
+    above = _cell_above(asked, state)
+    falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
+    return jnp.stack(
+        [jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers]
+    )
 
 
 def _onto(
-    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, q: Array, stands: Array, after: Array, h: Array
-) -> tuple[Array, Array, Array]:
-    """Onto an event by a Newton step in time, which carries the derivative of its moment; and what it changes."""
-    which = jnp.argmax(after)
+    robot: Robot,
+    otherwise: Conditions,
+    segment: Profile,
+    y: Array,
+    q: Array,
+    stands: Array,
+    below: Array,
+    after: Array,
+    h: Array,
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Onto the earliest event by a Newton step in time, which carries the derivative of its moment (the implicit
+    function theorem: dt = -dg / (∂g/∂y y')); and what it changes.
+
+    Returns:
+        Unknowns, integrals, whether the robot stands, whether the cells are below their cut-off; the event, and the
+        step in time [s].
+    """
     _, dy, dq, _ = instant(robot, otherwise, segment, y, stands)
-    steep = jax.jvp(lambda y: events_of(robot, otherwise, segment, y, stands), (y,), (dy,))[1][which]
-    back = jnp.where(steep > 1e-9, -after[which] / jnp.where(steep > 1e-9, steep, 1.0), 0.0)
+    steep = jax.jvp(lambda y: events_of(robot, otherwise, segment, y, stands, below), (y,), (dy,))[1]
+    back = jnp.where(steep > 1e-9, -after / jnp.where(steep > 1e-9, steep, 1.0), 0.0)
     back = jnp.where(jnp.abs(back) < h, back, 0.0)
+    which = jnp.argmin(jnp.where(after > 0, back, jnp.inf))
+    back = back[which]
     y, q = y + back * dy, q + back * dq
     # To rest: what is left of the motion is lost where it slid.
     rest = y.at[MOTOR].set(0.0).at[GROUND].set(0.0)
     moved, parked = (instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
-    halts = after[0] > 0
+    halts = which == STANDS
     lost = jnp.where(halts, energy.stored(robot, moved) - energy.stored(robot, parked), 0.0)
     q = q.at[list(TOTALS).index("sliding")].add(lost)
-    return jnp.where(halts, rest, y), q, (stands | halts) & ~(after[1] > 0)
+    stands = (stands | halts) & (which != BREAKS_AWAY)
+    below = (below | (which == FALLS)) & (which != RECOVERS)
+    return jnp.where(halts, rest, y), q, stands, below, which, back
 
 
 def follow(
@@ -249,38 +293,44 @@ def follow(
         _, dy, dq, _ = instant(robot, otherwise, segment, y, stands)
         return dy, dq
 
-    def events(y: Array, stands: Array) -> Array:
-        return events_of(robot, otherwise, segment, y, stands)
+    def left_below(c: Carry) -> Array:
+        """How much longer the cells may stay below their cut-off [s]."""
+        return jnp.where(c.below, robot.battery.delay_cutoff - c.low, jnp.inf)
 
     def going(c: Carry) -> Array:
         return (c.y[CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
 
     def turn(c: Carry) -> Carry:
-        left = length - c.y[CLOCK]
+        to_end, to_trip = length - c.y[CLOCK], left_below(c)
+        left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
         last = c.step >= left * (1 - 1e-9)
         h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
         y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, inverted=True)
-        y = y.at[CLOCK].set(jnp.where(last, length, y[CLOCK]))
+        y = y.at[CLOCK].set(jnp.where(last & ~trips, length, y[CLOCK]))
         scale = tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
         size = optx.rms_norm(u[-1] / scale) * (y.shape[0] / len(UNITS)) ** 0.5
         size = jax.lax.stop_gradient(jnp.where(jnp.isfinite(size), size, 1e6))
         good = size <= 1
         grown = h * jnp.clip(0.9 * jnp.maximum(size, 1e-12) ** -0.25, 0.1, 6.0)
         # Events: steps land on the first of them.
-        after = events(y, c.stands)
+        after = events_of(robot, otherwise, segment, y, c.stands, c.below)
         happened = after > 0
         between = happened & (c.events < 0)
-        share = jnp.where(between, c.events / jnp.where(between, c.events - after, 1.0), 1.0)
+        # The next one is to end a little beyond it.
+        share = jnp.where(between, (c.events - EVENT / 2) / jnp.where(between, c.events - after, 1.0), 1.0)
         far = jnp.any(between & (after > EVENT)) & (h > NEAR)
         taken = good & ~far
         event = taken & jnp.any(happened)
-        here = (robot, otherwise, segment, y, q, c.stands, after, h)
-        y, q, stands = rarely(event, _onto, here, (y, q, c.stands))
+        here = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
+        none = (y, q, c.stands, c.below, jnp.asarray(-1, jnp.argmin(after).dtype), jnp.zeros_like(h))
+        y, q, stands, below, which, back = rarely(event, _onto, here, none)
         y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
         stands = jnp.where(taken, stands, c.stands)
+        low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
+        cut_off = taken & _stayed_below(robot, below, low)
         # After a step cut short by the segment's end or an event, the length from before it.
         step = jnp.where(taken, jnp.where(last, jnp.maximum(grown, c.step), grown), grown)
-        step = jnp.where(good & far, h * jnp.clip(jnp.min(share) * 1.001, 0.02, 0.99), step)
+        step = jnp.where(good & far, h * jnp.clip(jnp.min(share), 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, longest)
         signals, dy, _, _ = instant(robot, otherwise, segment, y, stands)
@@ -288,18 +338,19 @@ def follow(
         peaks = jnp.maximum(c.peaks, _peaks_of(robot, signals))
         within = jnp.where(taken, robot.sides * UNITS[CURRENT] * between_ends, -jnp.inf)
         peaks = peaks.at[list(PEAKS).index("current")].max(within)
-        flags, low = _flags(robot, signals, c.low, jnp.where(taken, h, 0.0))
-        tripped = low > robot.battery.delay_cutoff
+        flags = _flags(robot, signals, cut_off)
         failed = c.failed | (~good & (h <= SHORTEST))
-        ended = c.ended | tripped | (event & happened[2]) | failed
-        now = (robot, otherwise, segment, y, stands)
+        ended = c.ended | cut_off | (which == EMPTY) | failed
+        now = (robot, otherwise, segment, y, stands, below)
         events_now = rarely(event, events_of, now, jnp.where(taken, after, c.events))
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
             at = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
-            buffer = tuple(b.at[at].set(r, mode="drop") for b, r in zip(buffer, (y, q, stands), strict=True))
+            row = (y, q, stands, jnp.where(cut_off, MARKS.index("cut_off"), which))
+            buffer = tuple(b.at[at].set(r, mode="drop") for b, r in zip(buffer, row, strict=True))
         return Carry(
-            y=y, q=q, step=step, stands=stands, ended=ended, low=low, peaks=peaks, flags=c.flags | flags,
+            y=y, q=q, step=step, stands=stands, ended=ended, below=below, low=low, cut_off=cut_off, peaks=peaks,
+            flags=c.flags | flags,
             events=events_now, accepted=c.accepted + taken, rejected=c.rejected + ~taken, failed=failed,
             kept=kept + taken, buffer=buffer, slope=dy[CURRENT],
         )  # fmt: skip
@@ -308,12 +359,26 @@ def follow(
     y = carry.y.at[CLOCK].set(0.0)
     asked = asked_at(robot, otherwise, segment, y, carry.stands)
     stands = carry.stands & (firmness(asked.robot, asked.conditions, state_of(robot, y, carry.stands)) >= 0)
+    # And it may have lifted the cells above their cut-off, or pressed them below.
+    below = _cell_above(asked, state_of(robot, y, stands)) < 0
+    low = jnp.where(below & carry.below, carry.low, 0.0)
     step = jnp.minimum(jnp.asarray(FIRST, y.dtype), longest)
-    begin = carry._replace(y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, events=events(y, stands))
+    events = events_of(robot, otherwise, segment, y, stands, below)
+    cut_off = carry.cut_off | _stayed_below(robot, below, low)
+    begin = carry._replace(
+        y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, below=below, low=low, cut_off=cut_off,
+        ended=carry.ended | cut_off, events=events,
+    )  # fmt: skip
     begin = begin._replace(slope=instant(robot, otherwise, segment, y, stands)[1][CURRENT])
     c = jax.lax.while_loop(going, turn, begin)
     failed = c.failed | ((c.y[CLOCK] < nearly) & ~c.ended)
     return c._replace(failed=failed, ended=c.ended | failed)
+
+
+def _stayed_below(robot: Robot, below: Array, low: Array) -> Array:
+    """Whether the cells have been below their cut-off for as long as they may."""
+    rounding = 8 * jnp.finfo(low.dtype).eps
+    return below & (low >= robot.battery.delay_cutoff * (1 - rounding))
 
 
 def _step_longest(robot: Robot, conditions: Conditions) -> Scalar:
@@ -322,13 +387,12 @@ def _step_longest(robot: Robot, conditions: Conditions) -> Scalar:
     return jax.lax.stop_gradient(jnp.min(jnp.stack([*limits, jnp.asarray(jnp.inf)])))
 
 
-def _flags(robot: Robot, signals: Signals, low: Array, h: Array) -> tuple[Array, Array]:
-    """What an instant exceeds, and for how long its cells have been below their cut-off [s].
+def _flags(robot: Robot, signals: Signals, cut_off: Array) -> Array:
+    """What an instant exceeds.
 
     A start draws more than the cells bear for an instant; only what lasts counts.
     """
     over = exceeded(robot, signals)
     over.pop("slips")  # every start slips for an instant; of a segment it counts at its end
-    low = jnp.where(over["cut_off"], low + h, 0.0)
     hot = jnp.asarray(signals.temperature) > robot.motor.temperature_limit
-    return mask({**over, "cut_off": low > robot.battery.delay_cutoff, "too_hot": hot}), low
+    return mask({**over, "cut_off": cut_off, "too_hot": hot})

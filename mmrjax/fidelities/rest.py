@@ -1,47 +1,171 @@
-"""Rest: whether friction holds a robot that stands, and the current that flows in it then."""
+"""Rest: whether friction holds a robot that stands, the current that flows in it then, and how runs end by that."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from mmrjax import balances
+from mmrjax import balances, ground
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.result import slips, travels
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import State
+from mmrjax.signals import GRAVITY, NOT_SETTLED, SLIDES, STALLED, Signals, State
 
 #: Torque at the driving wheel that counts as much as the whole weight of a side [N·m].
 TORQUE = 1.0
+#: A run has not settled while it would change its speed by more than this share in `TIME` [-], [s].
+SHARE, TIME = 1e-3, 0.1
+#: From which a robot whose movers slide gains or loses speed [m/s²], and from which one that stands is starting.
+GAIN, STARTS = 1e-3, 1e-2
+
+
+def direction(robot: Robot, conditions: Conditions) -> Array:
+    """Direction in which a robot can travel, 1 forward or -1 backward: of the torque on its shafts at rest.
+
+    That of the motors at their stall current less gravity's; friction can hold the robot, not turn it round. That of
+    the motors' speed where it is imposed.
+    """
+    if conditions.motor_speed is not None:
+        return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
+    chassis = robot.chassis(conditions.configuration)
+    mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
+    stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
+    if robot.on_shaft:
+        weight = chassis.torque_load(0.0)
+    else:
+        weight = ground.force_gravity(mass * (1 / robot.sides), conditions.slope, GRAVITY) * chassis.radius
+    return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
+
+
+def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
+    """Voltage that the driver gives motors at rest [V], no current flowing."""
+    if conditions.motor_speed is not None:  # that which makes for the imposed speed
+        return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
+    battery = robot.battery.voltage(0.0, conditions.discharge)
+    source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
+    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, source)
+
+
+def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+    """Signals of shafts that turn in `direction`, or are about to, under a robot that stands: movers carry what the
+    robot asks for, and no more than the ground holds."""
+    signals = balances.settled(robot, conditions, state, direction)[0]
+    if robot.on_shaft:
+        return signals
+    limit = signals.adhesion_limit
+    carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
+    return balances.gearbox(robot, robot.chassis(conditions.configuration), carried)
+
+
+def _still(state: State) -> State:
+    return dataclasses.replace(state, speed_motor=jnp.zeros_like(state.speed), speed=jnp.zeros_like(state.speed))
+
+
+def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
+    """Adhesion less what gravity asks of it beyond rolling resistance [-], negative where a robot slides down."""
+    along = jnp.maximum(backward.demand, -forward.demand)
+    return (forward.adhesion_limit - along) / forward.normal
 
 
 def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """How firmly friction would hold the robot at rest, negative where it cannot [-].
 
-    Its shafts stand where the motors and gravity together can turn them neither way against friction at rest, its
-    movers where gravity along the slope is below the ground's adhesion.
+    Its shafts stand where the motors and gravity together can turn them neither way against friction at rest, be it by
+    moving the robot or by sliding its movers under it; its movers where gravity along the slope less rolling
+    resistance is below the ground's adhesion.
     """
-    at_rest = dataclasses.replace(state, speed_motor=jnp.zeros_like(state.speed), speed=jnp.zeros_like(state.speed))
-    forward, _ = balances.settled(robot, conditions, at_rest, 1.0)
-    backward, _ = balances.settled(robot, conditions, at_rest, -1.0)
+    still = _still(state)
+    forward, backward = (_carried(robot, conditions, still, sense) for sense in (1.0, -1.0))
     shafts = jnp.minimum(-forward.torque_net, backward.torque_net) / TORQUE
-    along = jnp.maximum(backward.demand, -forward.demand)
-    if robot.on_shaft:
-        return shafts
-    ground = (forward.adhesion_limit - along) / forward.normal
-    return jnp.minimum(shafts, ground)
+    return shafts if robot.on_shaft else jnp.minimum(shafts, _ground_margin(forward, backward))
 
 
-def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
-    """Current to which that of a standing robot settles [A], on the line through two of its voltage balance."""
+def slides_in_place(robot: Robot, conditions: Conditions, state: State, sense: Scalar) -> Array:
+    """Whether a robot that cannot travel, as the demand is above what the ground holds, slides; else it stands.
+
+    It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the motors
+    turn the movers faster than V_s, up to which the ground holds more the faster they slide.
+
+    Args:
+        state: of which only what effects remember and the charge are read; sense: in which it would travel, 1 or -1.
+    """
+    chassis = robot.chassis(conditions.configuration)
+    still = _still(state)
+    turning = sense * chassis.ground.friction.speed_static * robot.gearbox.ratio / chassis.radius
+    spun = dataclasses.replace(still, speed_motor=turning * jnp.ones_like(still.speed))
+    if conditions.motor_speed is not None:
+        spins = sense * conditions.motor_speed > sense * turning
+    else:
+        spun = dataclasses.replace(spun, current=current_settled(robot, conditions, spun))
+        spins = sense * _carried(robot, conditions, spun, sense).torque_net > 0
+    forward, backward = (balances.settled(robot, conditions, still, way)[0] for way in (1.0, -1.0))
+    return (_ground_margin(forward, backward) < 0) | spins
+
+
+def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+    """Current to which that of motors at the speed of `state` settles [A], on the line through two of its voltage
+    balance."""
 
     def left(current: Scalar) -> Scalar:
-        still = jnp.zeros_like(state.speed)
-        at_rest = dataclasses.replace(state, current=current, speed_motor=still, speed=still)
-        return balances.settled(robot, conditions, at_rest, 0.0)[0].voltage_left
+        return balances.settled(robot, conditions, dataclasses.replace(state, current=current), 0.0)[0].voltage_left
 
     guess = left(jnp.zeros_like(state.current)) / robot.motor.resistance
     first, second = left(0.5 * guess), left(guess)
     slope = (second - first) / jnp.where(guess == 0, 1.0, 0.5 * guess)
     return guess - jnp.where(guess == 0, 0.0, second / jnp.where(guess == 0, 1.0, slope))
+
+
+def current_at_rest(robot: Robot, conditions: Conditions, state: State) -> Scalar:
+    """Current to which that of a standing robot settles [A]."""
+    return current_settled(robot, conditions, _still(state))
+
+
+def creeps(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
+    """Whether a robot rests, by its numbers: slower than friction at rest is resolved.
+
+    One that its motors drive travels where both shafts and robot move their way, since on a slope the contact's creep
+    takes back what slow shafts win. One that gravity drives travels where either of them does.
+
+    Args:
+        sense: in which it can travel, 1 or -1; voltage: at the motors at rest [V]; theoretical: r_k ω_k [m/s].
+        rest: speed within which friction at rest is not resolved [m/s].
+    """
+    shafts, travel = sense * theoretical, sense * speed
+    driven = sense * voltage > 0
+    return jnp.where(driven, jnp.minimum(shafts, travel), jnp.maximum(shafts, travel)) < rest
+
+
+def status_moving(robot: Robot, conditions: Conditions, end: Signals, voltage: Scalar) -> Array:
+    """Status of a run over time that friction does not hold at its end, by its last instant.
+
+    Args:
+        conditions: that act then; voltage: that the driver gives the motors then [V].
+
+    Returns:
+        `not_settled` while the speed changes, or movers that slide beyond V_s win speed; `slides` where those lose
+        speed or the robot stands; `stalled` where it creeps; else the status of steady travel.
+    """
+    settling = jnp.abs(end.acceleration) * TIME > SHARE * jnp.abs(end.speed)
+    status = jnp.where(settling, NOT_SETTLED, travels(end.speed, voltage))
+    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    still = creeps(sense, voltage_at_rest(robot, conditions), end.speed_theoretical, end.speed, rest)
+    status = jnp.where(still & (sense * end.acceleration < STARTS), STALLED, status)
+    gain = end.acceleration * jnp.sign(end.speed_sliding)
+    return unless_slipping(status, robot, end, gain, GAIN, still)
+
+
+def unless_slipping(
+    status: Array, robot: Robot, signals: Signals, gain: Scalar, least: float, stands: Array | bool
+) -> Array:
+    """The status of a run, of one that slips by what the robot does: `not_settled` while it gains speed, `slides`
+    where it loses speed or stands, else what it is without.
+
+    Args:
+        gain: how fast it gains speed [m/s²]; least: from which that counts; stands: whether it does not travel.
+    """
+    loose = jnp.where(gain > least, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least) | stands, SLIDES, status))
+    return jnp.where(slips(robot, signals), loose, status)

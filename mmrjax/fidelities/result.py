@@ -12,7 +12,7 @@ from jaxtyping import Array, Int
 from mmrjax import balances, ground
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import CONVERGED, FLAGS, NOT_SETTLED, REVERSES, ROLLS_BACK, SLIDES, Result, Signals, quotient
+from mmrjax.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
 
 
 def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
@@ -80,21 +80,6 @@ def travels(speed: Scalar, voltage: Scalar) -> Array:
     return jnp.where(asked, jnp.where(backward, REVERSES, CONVERGED), ROLLS_BACK)
 
 
-def stands(sense: Array, voltage: Scalar, theoretical: Scalar, speed: Scalar, rest: Scalar) -> Array:
-    """Whether a robot rests, by its numbers: slower than friction at rest is resolved.
-
-    One that its motors drive travels where both shafts and robot move their way, since on a slope the contact's creep
-    takes back what slow shafts win. One that gravity drives travels where either of them does.
-
-    Args:
-        sense: in which it can travel, 1 or -1; voltage: at the motors at rest [V]; theoretical: r_k ω_k [m/s].
-        rest: speed within which friction at rest is not resolved [m/s].
-    """
-    shafts, travel = sense * theoretical, sense * speed
-    driven = sense * voltage > 0
-    return jnp.where(driven, jnp.minimum(shafts, travel), jnp.maximum(shafts, travel)) < rest
-
-
 def turned(status: Array) -> Array:
     """Whether a run travels steadily though not forward under its motors' power."""
     return (status == REVERSES) | (status == ROLLS_BACK)
@@ -106,19 +91,6 @@ def slips(robot: Robot, signals: Signals) -> Array:
         return jnp.zeros_like(jnp.asarray(signals.speed), bool)
     friction = robot.chassis(signals.configuration).ground.friction
     return jnp.abs(signals.speed_sliding) > friction.speed_static
-
-
-def unless_slipping(
-    status: Array, robot: Robot, signals: Signals, gain: Scalar, least: float, stands: Array | bool
-) -> Array:
-    """The status of a run, of one that slips by what the robot does: `not_settled` while it gains speed, `slides`
-    where it loses speed or stands, else what it is without.
-
-    Args:
-        gain: how fast it gains speed [m/s²]; least: from which that counts; stands: whether it does not travel.
-    """
-    loose = jnp.where(gain > least, NOT_SETTLED, jnp.where(jnp.asarray(gain < -least) | stands, SLIDES, status))
-    return jnp.where(slips(robot, signals), loose, status)
 
 
 def _efficiency(out: Scalar, into: Scalar) -> Array:

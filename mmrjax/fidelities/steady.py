@@ -11,20 +11,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, channels, ground, outputs, params
+from mmrjax import balances, channels, outputs, params
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
-from mmrjax.fidelities.result import result, stands, travels, turned, withhold
+from mmrjax.fidelities.rarely import rarely
+from mmrjax.fidelities.rest import creeps, direction, slides_in_place, voltage_at_rest
+from mmrjax.fidelities.result import result, travels, turned, withhold
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
     CODES,
     CONVERGED,
     FAILED,
-    GRAVITY,
     SLIDES,
     STALLED,
     Result,
@@ -75,33 +76,6 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
     # No adhesion at all: the robot slides, but a share of nothing has no value.
     return sound, dataclasses.replace(conditions, adhesion=jnp.maximum(conditions.adhesion, 1e-9))
-
-
-def direction(robot: Robot, conditions: Conditions) -> Array:
-    """Direction in which a robot can travel, 1 forward or -1 backward: of the torque on its shafts at rest.
-
-    That of the motors at their stall current less gravity's; friction can hold the robot, not turn it round. That of
-    the motors' speed where it is imposed.
-    """
-    if conditions.motor_speed is not None:
-        return jax.lax.stop_gradient(jnp.where(conditions.motor_speed >= 0, 1.0, -1.0))
-    chassis = robot.chassis(conditions.configuration)
-    mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
-    stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
-    if robot.on_shaft:
-        weight = chassis.torque_load(0.0)
-    else:
-        weight = ground.force_gravity(mass * (1 / robot.sides), conditions.slope, GRAVITY) * chassis.radius
-    return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
-
-
-def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
-    """Voltage that the driver gives motors at rest [V], no current flowing."""
-    if conditions.motor_speed is not None:  # that which makes for the imposed speed
-        return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
-    battery = robot.battery.voltage(0.0, conditions.discharge)
-    source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
-    return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, source)
 
 
 def _start(robot: Robot, conditions: Conditions) -> Vector:
@@ -156,11 +130,16 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
     # What the contact's law gives a robot that stands as creep, friction at rest holds.
     crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
     parked = (point.status == STALLED) & ((jnp.abs(point.theoretical_speed) < 1e-9) | crept)
-    held = {"speed": jnp.where(parked, 0.0, point.speed)}
-    reading = {**point.reading, **held}
+    reading = {**point.reading, "speed": jnp.where(parked, 0.0, point.speed)}
+    # Nor does the ground of a robot that stands carry more than it can.
+    used = jnp.clip(point.adhesion_used, -1.0, 1.0)
+    held = parked & (used != point.adhesion_used)
+    carried = used / jnp.where(held, point.adhesion_used, 1.0)
     point = dataclasses.replace(
         point,
         reading=reading,
+        adhesion_used=jnp.where(held, used, point.adhesion_used),
+        traction=jnp.where(held, carried * point.traction, point.traction),
         power_ground=jnp.where(parked, 0.0, point.power_ground),
         power_lift=jnp.where(parked, 0.0, point.power_lift),
     )
@@ -189,11 +168,15 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
     signals, _ = _balanced(robot, conditions, state, sense)
     rest = robot.chassis(conditions.configuration).speed_still
     voltage = voltage_at_rest(robot, conditions)
-    still = stands(sense, voltage, signals.speed_theoretical, signals.speed, rest)
+    still = creeps(sense, voltage, signals.speed_theoretical, signals.speed, rest)
     still |= sense * signals.speed_theoretical <= 1e-9
     # Ordered by what a person would say first.
     status = jnp.where(still, STALLED, travels(signals.speed, voltage))
-    status = jnp.where(jnp.abs(signals.demand) > signals.adhesion_limit, SLIDES, status)
+    if not robot.on_shaft:
+        beyond = jnp.abs(signals.demand) > signals.adhesion_limit
+        at = jax.lax.stop_gradient((robot, conditions, state, sense))
+        slides = rarely(beyond, slides_in_place, at, jnp.zeros_like(beyond))
+        status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
     status = jnp.where(empty, BATTERY_EMPTY, status)
@@ -241,7 +224,7 @@ def steady_batch(robot: Robot, conditions: Conditions) -> Result:
 
 def _getters() -> dict[str, Callable[[Result], Array]]:
     codes = {name: operator.attrgetter(name) for name in CODES}
-    return {**{output.name: output.get for output in outputs.table(channels.known())}, **codes}
+    return {**{output.name: output.get for output in outputs.table(channels.EVERY)}, **codes}
 
 
 def _check_outputs(names: Iterable[str]) -> None:
@@ -299,7 +282,7 @@ def steady_derivatives(
     _check_outputs(names)
     for name in set(names) & set(CODES):
         raise KeyError(
-            f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table(channels.known()))}"
+            f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table(channels.EVERY))}"
         )
     values = {p.name: p.value for p in params.walk(robot)}
     params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have

@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import contact, fidelities, undercarriage
+from mmrjax import contact, fidelities, mjcf, undercarriage
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
 from mmrjax.fidelities.half_robot import Motion, System, advance, axle_height, instant, margin, roll, stand, system
-from mmrjax.fidelities.result import mask, result, travels, unless_slipping, withhold
+from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, voltage_at_rest
+from mmrjax.fidelities.result import mask, result, travels, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -125,10 +126,10 @@ def _average(run: System, time: Array, travelled: Array, sums: tuple[Signals, Ar
 def _status(run: System, steady: Steady, end: Motion) -> Array:
     robot, conditions, signals = run.robot, run.conditions, steady.signals
     status = jnp.where(steady.change > SETTLED, NOT_SETTLED, travels(signals.speed, signals.voltage))
-    status = jnp.where(jnp.abs(signals.direction) < 0.999, STALLED, status)
-    stands = jnp.sign(signals.direction) * signals.speed < (
-        robot.chassis(conditions.configuration).ground.friction.speed_rest
-    )
+    sense, rest = direction(robot, conditions), robot.chassis(conditions.configuration).speed_still
+    stands = creeps(sense, voltage_at_rest(robot, conditions), signals.speed_theoretical, signals.speed, rest)
+    parked = (jnp.abs(signals.direction) < 0.999) | (stands & (sense * signals.acceleration < STARTS))
+    status = jnp.where(parked, STALLED, status)
     # On average over the window.
     status = unless_slipping(status, robot, signals, signals.acceleration * jnp.sign(signals.direction), 1e-2, stands)
     empty = (conditions.battery > 0.5) & robot.battery.empty(end.discharge)
@@ -215,7 +216,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
     Raises:
         ValueError: `sample` is no whole number of steps or `duration` of samples; a lever reaches below the
             ground; the step is above the largest stable one, which the message states; a load without ground, an
-            imposed motor speed, movers without inertia.
+            imposed motor speed, movers without inertia, parts heavier than the robot or of more inertia than stated.
     """
     if robot.on_shaft:
         raise ValueError("the robot's load is a shaft, which has no running gear; steady and drive take it")
@@ -235,6 +236,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
                 f"{name}.inertia: got 0; expected the inertia of what turns with the movers of one side, which this "
                 "model needs [kg·m^2]"
             )
+    mjcf.check_parts(robot)
     refuse(robot, conditions, step, sample)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from calibration.data import runs as records
 from calibration.inference import errors as residual
-from mmrjax import channels, outputs
-from mmrjax.channels import MM, RPM
+from mmrjax import outputs
+from mmrjax.channels import MM, RPM, Channel
 from mmrjax.conditions import Conditions
 from mmrjax.tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
 from sweeps import figures_history
@@ -63,13 +63,13 @@ def operating_points(robot: Robot, asked: Conditions) -> Columns:
         part = steady_batch(robot, jax.tree.map(lambda x, i=index: x[i], asked))
         parts.append(jax.tree.map(np.asarray, part))
     answer = jax.tree.map(lambda *x: np.concatenate(x)[:rows], *parts)
-    return {**outputs.columns(answer), "total_mass_kg": np.asarray(answer.mass)}
+    return {**outputs.columns(answer, robot.channels), "total_mass_kg": np.asarray(answer.mass)}
 
 
-def channels_of_paper() -> tuple[channels.Channel, ...]:
+def channels_of_paper() -> tuple[Channel, ...]:
     """The channels that the paper's tables have."""
     table = records.read("measured")
-    return tuple(c for c in channels.CHANNELS if table.has(c.column))
+    return tuple(c for c in table.channels if table.has(c.column))
 
 
 def stacked(table: Columns) -> np.ndarray:

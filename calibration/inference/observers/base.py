@@ -218,6 +218,20 @@ class Observer(eqx.Module):
         size = len(problem.coordinates)
         return np.concatenate([np.zeros((1, size)), random.standard_normal((max(count, 1) - 1, size))])
 
+    def scanned(self, problem: Problem) -> tuple[int, ...]:
+        """Coordinates whose misfit is looked at over their prior's range, see `scans`: none where the searches of a
+        kind of data begin at so many draws of the prior that they see every basin."""
+        return ()
+
+    def scan_points(self, problem: Problem, k: int) -> int:
+        """At how many values a coordinate is looked at, a multiple of `scans.CLOSER`."""
+        raise NotImplementedError
+
+    def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
+        """Objective where coordinate k has each of `values` and the others have moved from z to where their
+        linearisation has its minimum, shape (values,), and all coordinates then, (values, coordinates)."""
+        raise NotImplementedError
+
     @abc.abstractmethod
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False

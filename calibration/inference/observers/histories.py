@@ -23,6 +23,7 @@ from calibration.data.courses import names as _names
 from calibration.data.errors import BadConfiguration, BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
+from calibration.inference import scans
 from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
 from calibration.inference.errors import OF_SIZE, sized_error
@@ -33,16 +34,16 @@ from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Optimum, linearised, searches_long
 from calibration.inference.priors import DELAY
-from calibration.inference.problem import Data, Observation, Problem
+from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
-from mmrjax.channels import RPM
+from mmrjax.channels import RPM, Channel
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.drive import rates, state_of
 from mmrjax.fidelities.histories import GROWTH, LONGEST, STEPS, grid, growth, histories, respond, states
 from mmrjax.params import Scalar
-from mmrjax.rig import Begin, Begins
+from mmrjax.rig import Begin, Begins, Rig
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FAILED, Signals, State
 
@@ -53,6 +54,8 @@ if TYPE_CHECKING:
 KNOTS, KNOT_STEPS = 256, 1e7
 #: Lags of a run's residual that are looked at, at most a quarter of its samples.
 LAGS = 12
+#: Values of a delay at which the misfit is looked at, fewest and most; and of what else is scanned, a run each.
+DELAYS, SCANNED = (256, 2048), 32
 #: Of a chassis' friction law what only sliding shows.
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
@@ -86,7 +89,7 @@ class HistoriesLinearization(Linearization):
     def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
         moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
         there = jnp.where(self.rows_of < 0, self.rows, self.rows_of)  # beyond the last row: dropped
-        out = jnp.zeros((self.rows, len(channels.CHANNELS), shapes.shape[1])).at[there].set(moved, mode="drop")
+        out = jnp.zeros((self.rows, len(self.channels), shapes.shape[1])).at[there].set(moved, mode="drop")
         return out.reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
@@ -177,7 +180,9 @@ class Histories(Observer):
             order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
         index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
-        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=robot.rig.blank)
+        rig = robot.rig
+        delayed = rig.blank or DELAY in rig.stated or not rig.prompt
+        return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=delayed)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -217,8 +222,8 @@ class Histories(Observer):
         names, measured = _names(runs), runs.measured()
         # Current rises within a millisecond; what moves does not.
         resting = robot.rig.start == "rest" and robot.rig.imposed == "voltage"
-        moving = [k for k, c in enumerate(channels.CHANNELS) if c.zero_at_rest and resting]
-        for channel in (c for c in channels.CHANNELS if not c.over_time and runs.has(c.column)):
+        moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
+        for channel in (c for c in runs.channels if not c.over_time and runs.has(c.column)):
             raise BadData(
                 f"{runs.source}, {channel.column}: histories do not follow it; remove the column, or give settled "
                 "runs without time_s"
@@ -236,7 +241,7 @@ class Histories(Observer):
                 size = np.max(np.nan_to_num(np.abs(measured[mine, k])))
                 limit = max(RESTING * size, RESTING_SD * noise.sd[first, k])
                 if runs["time_s"][first] < EARLY and abs(measured[first, k]) > limit:
-                    column, unit = channels.CHANNELS[k].column, channels.CHANNELS[k].unit
+                    column, unit = runs.channels[k].column, runs.channels[k].unit
                     raise BadData(
                         f"{runs.source} row {first + 1}, time_s: run {name or '(no run_id)'} is moving at "
                         f"{number(runs['time_s'][first])} s ({number(runs[column][first])} {unit}); a history "
@@ -404,24 +409,15 @@ class Histories(Observer):
         cases = some[np.unique(which, axis=0, return_index=True)[1]]
         return jax.tree.map(lambda x: jnp.asarray(x[cases]), turned)
 
-    def _delayed(self, robot: Robot, whole: Signals) -> Float[Array, "rows channels"]:
-        """Readings of every row, between the instants before and after it less the delay."""
-        every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(whole)  # runs, instants, channels
-        wanted = self.time - robot.rig.delay
-
-        def between(run: Array, t: Array) -> Array:
-            times = self.times[run]
-            k = jnp.clip(jnp.searchsorted(times, t, side="right") - 1, 0, times.shape[0] - 2)
-            gap = times[k + 1] - times[k]
-            share = jnp.where(gap > 0, (t - times[k]) / jnp.where(gap > 0, gap, 1.0), 0.0)
-            return every[run, k] + jnp.clip(share, 0.0, 1.0) * (every[run, k + 1] - every[run, k])
-
-        return jax.vmap(between)(self.run, wanted)
+    def late(self, every: Float[Array, "runs instants ..."], rig: Rig) -> Float[Array, "rows ..."]:
+        """Of every row, what is there between the instants before and after it less the rig's delay."""
+        return jax.vmap(lambda run, at: rig.late(self.times[run], every[run], at))(self.run, self.time)
 
     def __call__(self, robot: Robot) -> Observation:
         whole = self.whole(robot)
         if self.delayed:
-            reading = self._delayed(robot, whole)
+            every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(whole)
+            reading = self.late(every, robot.rig)
         else:
             reading = jax.vmap(lambda s: _readings(robot, s))(self.at_rows(whole))
         followed = jnp.all(jnp.isfinite(reading), 1)
@@ -488,6 +484,7 @@ class Histories(Observer):
             self.knots,
             self.time,
             self.angle(runs),
+            channels=channels.names(problem.channels),
         )
 
     def replicate(
@@ -519,22 +516,60 @@ class Histories(Observer):
             return jax.tree.map(lambda *x: np.concatenate(x), *jax.device_get(parts))
 
         if problem.base.on_shaft or problem.base.rig.imposed != "voltage":  # no ground whose grip makes for valleys
-            return super().starts(problem, random, count)
+            return scans.placed(problem, super().starts(problem, random, count))
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
-        return settled_ends.starts(problem, draws, search)[:count]
+        return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])
+
+    def scanned(self, problem: Problem) -> tuple[int, ...]:
+        return scans.beyond_a_basin(problem)
+
+    def scan_points(self, problem: Problem, k: int) -> int:
+        """Of a delay so many that none is further from the next than half of the rise of a current L/R or an eighth
+        of a sample, as far as `DELAYS` go."""
+        if problem.coordinates.names[k] != DELAY:
+            return SCANNED
+        motor, time = problem.base.motor, np.unique(np.round(np.asarray(self.time), 9))
+        rise = float(motor.inductance) / float(motor.resistance)
+        fine = min(0.125 * float(np.median(np.diff(time))), max(0.5 * rise, 1e-6)) if len(time) > 1 else 1.0
+        wanted = 2 * scans.RANGE * float(problem.coordinates.spread[k]) / fine
+        return int(2 ** np.clip(np.ceil(np.log2(wanted)), *np.log2(DELAYS)))
+
+    def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
+        """As the protocol says. A delay shifts what a run shows and does not change it: one run and its derivatives
+        serve for all."""
+        if problem.coordinates.names[k] == DELAY:
+            return _over_delays(problem, z, data, jnp.arange(len(z)) == k, values)
+        found = [
+            _moved(*linearised(problem, z.at[k].set(v), data)[:2], z.at[k].set(v), jnp.arange(len(z)) == k)
+            for v in values
+        ]
+        return jnp.stack([cost for cost, _ in found]), jnp.stack([at for _, at in found])
 
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
     ) -> tuple[Optimum, Observation]:
         """As the protocol says; the runs are compiled once for all steps."""
-        return searches_long(
-            lambda z: _evaluate(problem, z, weights, active),
-            starts,
-            problem.data,
-            weights,
-            self.policy.steps,
-            rivals=rivals,
+
+        def batch(starts: Array) -> tuple[Optimum, Observation]:
+            return searches_long(
+                lambda z: _evaluate(problem, z, weights, active),
+                starts,
+                problem.data,
+                weights,
+                self.policy.steps,
+                rivals=rivals,
+            )
+
+        found = batch(starts)
+        if not rivals or not scans.scanned(problem):
+            return found
+        k = int(np.nanargmin(found[0].cost))
+        one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
+        data = dataclasses.replace(problem.data, weight=weights[k])
+        best = scans.searched_on(
+            problem, one(found), data, lambda z: one(batch(jnp.tile(z, (len(starts), 1)))), lambda _: None
         )
+        return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         """Curves and windows as of settled runs, over time too, and waves in the angle of a shaft. Over the voltage
@@ -585,7 +620,7 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
     x = np.asarray(linear.series())
     power = np.maximum(np.sum(x**2, (0, 1)), 1e-12)
     of = [np.sum(x[:, k:] * x[:, :-k], (0, 1)) / power for k in range(1, lags + 1)]
-    return {name: [float(lag[k]) for lag in of] for k, name in enumerate(channels.names())}
+    return {name: [float(lag[k]) for lag in of] for k, name in enumerate(linear.channels)}
 
 
 def _changes(runs: Runs, each: list[np.ndarray]) -> list[np.ndarray]:
@@ -655,7 +690,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
         mine = mine[np.argsort(runs["time_s"][mine], kind="stable")]
         key = begin_name(str(name))
         at: dict[str, tuple[float, float]] = {}
-        for k, channel in enumerate(channels.CHANNELS):
+        for k, channel in enumerate(runs.channels):
             field = "angle" if channel.unit_si == "rad" else "motor_speed"
             there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
             if channel.zero_at_rest and field not in at and len(there):
@@ -669,7 +704,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
     return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, begins=Begins(found), priors=priors))
 
 
-def _shown_of_unit(robot: Robot, configuration: int, channel: channels.Channel) -> float:
+def _shown_of_unit(robot: Robot, configuration: int, channel: Channel) -> float:
     """What a channel shows while the motor shafts turn by 1 rad/s, the load rolls with them and the output's angle is
     1 rad [SI]."""
     radius = float(robot.configurations.members[configuration].radius)
@@ -703,7 +738,7 @@ def _check_signs(runs: Runs) -> None:
     for run in stretches(runs):
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
-            for k, channel in enumerate(channels.CHANNELS):
+            for k, channel in enumerate(runs.channels):
                 shown = measured[rows, k][np.isfinite(measured[rows, k])]
                 size = np.nanmax(np.abs(measured[:, k]), initial=0.0)
                 if channel.zero_at_rest and channel.directed and shown.size and np.median(shown) > RESTING * size:
@@ -734,12 +769,47 @@ def _knots(rows: np.ndarray, most: int) -> np.ndarray:
 
 def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:
     shown = balances.sensor(robot, signals)
-    return jnp.stack([shown[name] for name in channels.names()], -1)
+    return jnp.stack([shown[name] for name in channels.names(robot.channels)], -1)
 
 
 @compiled
 def _angle(observe: Histories, robot: Robot) -> Array:
     return observe.angle(observe.whole(robot))
+
+
+@compiled
+def _over_delays(problem: Problem, z: Array, data: Data, scanned: Array, values: Array) -> tuple[Array, Array]:
+    observe: Histories = problem.observe  # type: ignore[assignment]
+
+    def shown(z: Array) -> tuple[Array, Array]:
+        robot = problem.robot(z)
+        every = jax.vmap(jax.vmap(lambda s: _readings(robot, s)))(observe.whole(robot))
+        return every, every
+
+    slope, every = jax.jacfwd(shown, has_aux=True)(z)
+    both = jnp.concatenate([every[..., None], slope], -1)
+
+    def one(value: Array) -> tuple[Array, Array]:
+        at = jnp.where(scanned, value, z)
+        late = observe.late(both, problem.robot(at).rig)
+        error = data.weight * (late[..., 0] - data.measured) / data.sd
+        there = jnp.all(jnp.isfinite(late), -1)
+        error = jnp.where(there, error, MISSING * data.weight)
+        jacobian = jnp.where(there[..., None], (data.weight / data.sd)[..., None] * late[..., 1:], 0.0)
+        residual = jnp.concatenate([error.ravel(), at - data.centre])
+        whole = jnp.concatenate([jacobian.reshape(-1, z.size), jnp.eye(z.size)])
+        return _moved(residual, whole, at, scanned)
+
+    return jax.lax.map(one, values, batch_size=16)
+
+
+@compiled
+def _moved(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Array, Array]:
+    """Objective at the minimum of a linearisation in which one coordinate is held, and the coordinates there."""
+    free = jnp.where(held, 0.0, jacobian)
+    lower = cholesky(free.T @ free + jnp.diag(held.astype(float)))
+    step = -backward(lower, forward(lower, free.T @ residual))
+    return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
 
 
 @compiled

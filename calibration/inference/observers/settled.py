@@ -109,7 +109,7 @@ class SettledRuns(Observer):
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             for at in np.argwhere(apart > allowed)[:1]:
                 (one, other, k), at = at.tolist(), tuple(at)
-                first, second, column = rows[one], rows[other], channels.CHANNELS[k].column
+                first, second, column = rows[one], rows[other], runs.channels[k].column
                 known = f"{apart[at] / sd[at]:.0f} sd" if not noise.estimated[k] else f"{apart[at] / mean[at]:.0%}"
                 raise BadData(
                     f"{runs.source} rows {first + 1} and {second + 1}, {column}: the same conditions gave "
@@ -120,7 +120,7 @@ class SettledRuns(Observer):
 
     @classmethod
     def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[str]:
-        for channel in (c for c in channels.CHANNELS if not c.settled and runs.has(c.column)):
+        for channel in (c for c in runs.channels if not c.settled and runs.has(c.column)):
             raise BadData(f"{runs.source}, {channel.column}: settled runs have none; remove the column")
         return []
 
@@ -151,7 +151,7 @@ class SettledRuns(Observer):
 
     def __call__(self, robot: Robot) -> Observation:
         result = fidelities.get(self.fidelity).settled(robot, self.conditions)
-        reading = jnp.stack([result.reading[name] for name in channels.names()], -1)
+        reading = jnp.stack([result.reading[name] for name in channels.names(robot.channels)], -1)
         return Observation(reading, jnp.asarray(result.adhesion_used), result.status, jnp.asarray(result.flags))
 
     @property
@@ -177,7 +177,7 @@ class SettledRuns(Observer):
         """As the protocol says. A signature is the sensitivity of the readings to a defect of the effect's balance,
         times its term: exact, as an effect enters one balance and is linear in its amplitude."""
         probes = tuple(probe(b) for b in PROBED)
-        robot, size = problem.robot(z), z.size
+        robot, size, shown = problem.robot(z), z.size, channels.names(problem.channels)
 
         def whitened(x: Array) -> Array:
             z, delta = x[:size], x[size:]
@@ -199,7 +199,7 @@ class SettledRuns(Observer):
             term = jax.vmap(lambda s: balances.added(alone, s, effect.balance, effect.channel))(signals)
             term = jnp.broadcast_to(term, (rows,))
             if effect.balance == "sensor":
-                moved = term[:, None] * (jnp.arange(count) == channels.index(effect.channel)) * scale
+                moved = term[:, None] * (jnp.arange(count) == shown.index(effect.channel)) * scale
             elif effect.balance in PROBED:
                 moved = term[:, None] * defects[PROBED.index(effect.balance)]
             else:
@@ -207,7 +207,9 @@ class SettledRuns(Observer):
             return moved.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
-        return SettledLinearization(residual, jacobian[:, :size], finite(signatures), defects, scale, signals)
+        return SettledLinearization(
+            residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown
+        )
 
     def replicate(
         self,

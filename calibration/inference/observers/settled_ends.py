@@ -190,9 +190,9 @@ def _at_ends(problem: Problem) -> Float[np.ndarray, "starts parameters"]:
 
 def _sliding(problem: Problem, ends: Ends) -> np.ndarray:
     """Whether a run's movers spin at its end, shape (runs,): also while it still gains speed, forwards or back."""
-    if not {"motor_speed", "speed"} <= set(channels.names()):
+    if not {"motor_speed", "speed"} <= set(problem.base.rig.channels):
         return np.zeros(len(ends.mean), bool)
-    turning, travelling = (ends.shown[:, channels.index(c)] for c in ("motor_speed", "speed"))
+    turning, travelling = (ends.shown[:, channels.index(c, problem.channels)] for c in ("motor_speed", "speed"))
     robot = problem.base
     radius = np.array([float(c.radius) for c in robot.configurations.members])
     circumference = radius[np.asarray(ends.conditions.configuration)] * turning

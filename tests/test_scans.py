@@ -1,0 +1,118 @@
+"""Parameters whose misfit is a staircase are scanned: a delay of coarse samples is found, and its interval is honest."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from test_rig_histories import BENCH, DRIVE, history
+
+from calibration.data import robot_file
+from calibration.inference import multistart, noise, observers, priors, scans
+from calibration.inference.calibrate import calibrate
+from calibration.inference.optimizers import evaluated
+from calibration.inference.scans import Scan
+from mmrjax import params
+
+OPTIONS = {"model": "drive", "starts": 1, "blocks": False, "profiles": False}
+TRUTH = 0.0312
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory):
+    """A bench whose current rises within a millisecond and is read every 20 ms, 31 ms late."""
+    folder = tmp_path_factory.mktemp("coarse")
+    text = DRIVE.format(imposed="voltage", channels='"total_current"', start="rest") + BENCH
+    text = text.replace("resistance = 3.0", "resistance = 3.0\ninductance = 1e-3").replace("0 ± 0.05", "0 ± 0.02")
+    (folder / "rig.toml").write_text(text)
+    robot = robot_file.load(str(folder / "rig.toml"))
+    truth = params.replace(robot, {"rig.delay": TRUTH, "bench.loss_coulomb": 0.24})
+    t = np.arange(0, 0.32, 0.02)
+    columns = {"time_s": t, "supply_voltage_V": np.where(t < 0.16, 12.0, 6.0)}
+    runs = history(folder, robot, truth, columns, [0.02], 1)
+    return robot, runs
+
+
+def posed(robot, runs):
+    kind = observers.kind(runs)
+    names = ("bench.loss_coulomb", "rig.delay")
+    return observers.pose(runs, robot, priors.coordinates(robot, names), noise.of(runs, kind.sizes(runs)).sd)
+
+
+def test_a_search_finds_a_delay_between_coarse_samples(coarse):
+    """From the prior mean, 1.5 prior sds away and behind two cliffs."""
+    robot, runs = coarse
+    problem, kind = posed(robot, runs), observers.kind(runs)
+    known = noise.of(runs, kind.sizes(runs))
+    starts = problem.observe.starts(problem, np.random.default_rng(0), 1)
+    found = multistart.search_one_by_one(problem, known, starts, multistart.first_shares(known), lambda said: None)
+    low, high = (0.02 * z for z in scans.profiles(problem, found.best.z)[1].interval())
+    assert found.best.converged
+    assert low <= TRUTH <= high and 0.02 < low < high < 0.04
+    assert abs(0.02 * found.best.z[1] - TRUTH) < 4 * 0.02 * found.best.sd[1] < 0.01
+
+
+@pytest.mark.slow
+def test_a_calibration_states_the_delay_that_its_profile_shows(coarse):
+    robot, runs = coarse
+    found = calibrate(runs, robot, free=("bench.loss_coulomb", "rig.delay"), **OPTIONS)
+    delay = found.parameters["rig.delay"]
+    low, high = delay.interval
+    assert found.converged
+    assert low <= TRUTH <= high and 0.02 < low < high < 0.04
+    assert abs(delay.value - TRUTH) < 4 * delay.sd < 0.01
+    assert high - low == pytest.approx(4 * delay.sd, rel=0.35)
+
+
+def test_a_scan_sees_the_misfit_of_runs_at_each_delay(coarse):
+    """A delay shifts one run: where the others are held, the scan's objective is that of a run of its own."""
+    robot, runs = coarse
+    problem = posed(robot, runs)
+    only = dataclasses.replace(problem, coordinates=priors.coordinates(robot, ("rig.delay",)))
+    only = dataclasses.replace(only, data=dataclasses.replace(only.data, centre=only.data.centre[:1]))
+    at = np.array([-0.5, 0.3, 1.1, 1.6])
+    cost, others = only.observe.scan(only, np.zeros(1), only.data, 0, at)
+    alone = [0.5 * np.sum(np.asarray(evaluated(only, z, only.data)) ** 2) for z in at[:, None]]
+    np.testing.assert_allclose(cost, alone, rtol=1e-9)
+    np.testing.assert_array_equal(np.asarray(others)[:, 0], at)
+
+
+def test_a_scan_is_as_fine_as_the_rise_of_a_current(coarse):
+    robot, runs = coarse
+    problem = posed(robot, runs)
+    assert scans.scanned(problem) == (1,)
+    count = problem.observe.scan_points(problem, 1)
+    assert 2 * scans.RANGE * 0.02 / count <= 0.5 * 1e-3 / 3.0
+
+
+def test_the_interval_of_a_scan_holds_every_basin_that_may_be():
+    """Two basins that differ by 1 σ² and a wall between them; a third one, 6 σ² higher, is out."""
+    at = np.linspace(-4, 4, 801)
+    rise = np.minimum(np.minimum(((at - 1) / 0.1) ** 2, ((at + 1) / 0.1) ** 2 + 1), ((at - 3) / 0.1) ** 2 + 6)
+    seen = Scan(at, 0.5 * rise, at[:, None])
+    low, high = seen.interval()
+    assert low == pytest.approx(-1 - 0.1 * (1.96**2 - 1) ** 0.5, abs=0.01)
+    assert high == pytest.approx(1 + 0.1 * 1.96, abs=0.01)
+    assert seen.parts() == 2 and seen.open() == (False, False)
+    assert [round(at[k], 2) for k in seen.basins()] == [1.0, -1.0, 3.0]
+    weights = np.array([1.0, np.exp(-0.5), np.exp(-3.0)])
+    places = np.array([1.0, -1.0, 3.0])
+    middle = weights @ places / weights.sum()
+    spread = (weights @ (places - middle) ** 2 / weights.sum() + 0.01) ** 0.5
+    assert seen.sd() == pytest.approx(spread, rel=0.01)
+
+
+def test_a_scan_of_one_smooth_basin_is_the_curvature():
+    at = np.linspace(-4, 4, 801)
+    seen = Scan(at, 0.5 * ((at - 0.5) / 0.2) ** 2, at[:, None])
+    assert seen.sd() == pytest.approx(0.2, rel=1e-3)
+    assert seen.interval() == pytest.approx((0.5 - 0.392, 0.5 + 0.392), abs=1e-3)
+    assert seen.parts() == 1
+
+
+def test_searches_that_converged_elsewhere_are_counted():
+    at = np.linspace(-4, 4, 801)
+    seen = {1: Scan(at, 0.5 * ((at - 0.5) / 0.1) ** 2, at[:, None])}
+    ends = np.array([[0.0, 0.5], [9.0, 0.55], [0.0, -1.0], [0.0, -1.0]])
+    converged = np.array([True, True, True, False])
+    assert scans.apart(seen, ends, converged) == 1
+    assert scans.apart({}, ends, converged) == scans.apart(seen, None, converged) == 0
