@@ -87,12 +87,15 @@ class Conditions(eqx.Module):
             said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
         self.configuration = (np if which.dtype.kind == "U" else jnp).broadcast_to(which, shape)
-        # what is stated by the same number for all shares one array: most fields of a large batch are 0 or 1
-        shared = {v: jnp.broadcast_to(x, shape) for v, x in zip(given, numbers, strict=True) if isinstance(v, float)}
-        numbers = [
-            shared[v] if isinstance(v, float) else jnp.broadcast_to(x, shape)
-            for v, x in zip(given, numbers, strict=True)
-        ]
+        # the same number for all is one array: most fields of a large batch are 0 or 1
+        shared: dict[float, Array] = {}
+        for k, value in enumerate(given):
+            if not isinstance(value, float):
+                numbers[k] = jnp.broadcast_to(numbers[k], shape)
+                continue
+            if value not in shared:
+                shared[value] = jnp.broadcast_to(numbers[k], shape)
+            numbers[k] = shared[value]
         self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
         self.order, self.duty, self.open = numbers[6:]
         held = {name: jnp.broadcast_to(x, shape) for name, x in optional.items()}
