@@ -14,6 +14,8 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 
+from mmrjax.programs import Programs
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -28,12 +30,16 @@ def for_equations(x: T) -> T:
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """`eqx.filter_jit` of a function; one that returns a robot returns it as `for_equations` leaves it."""
-    inner = eqx.filter_jit(function)
+    """`eqx.filter_jit` of a function; one that returns a robot returns it as `for_equations` leaves it.
+
+    Where a folder for them is stated its programs are kept there (`mmrjax.programs`).
+    """
+    inner, kept = eqx.filter_jit(function), Programs(function)
 
     @functools.wraps(function)
     def call(*args: P.args, **named: P.kwargs) -> T:
         args, named = for_equations((args, named))
-        return inner(*args, **named)
+        program = kept.of((args, named))
+        return inner(*args, **named) if program is None else program((args, named))
 
     return call

@@ -17,6 +17,8 @@ import warnings
 from pathlib import Path
 
 VARIABLE = "MMRJAX_CACHE"
+#: The same of `mmrjax.programs`, which finds programs that were kept whole there; empty to keep none so.
+PROGRAMS = "MMRJAX_PROGRAMS"
 OFF = ("off", "0", "no", "false")
 #: Size beyond which the oldest entries are dropped when the cache is enabled, down to half of it [bytes].
 LIMIT = 4 * 2**30
@@ -92,6 +94,7 @@ def enable(path: Path | None = None) -> Path | None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     jax.config.update("jax_raise_persistent_cache_errors", False)
+    os.environ.setdefault(PROGRAMS, str(folder))
     return folder
 
 

@@ -11,6 +11,7 @@ import os
 import sys
 from pathlib import Path
 
+os.environ["MMRJAX_PROGRAMS"] = ""  # what tests put in the place of a function is traced, not read
 from sweeps import compilation_cache
 
 compilation_cache.enable()  # one for all workers, and for the next time

@@ -11,7 +11,6 @@ import itertools
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -27,11 +26,9 @@ from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import search_in_batches
 from calibration.inference.linearization import Linearization
-from calibration.inference.optimizers import informing
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax import params
-from mmrjax.compiling import compiled
 from mmrjax.effects import UNNAMED
 from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import PLACES
@@ -208,18 +205,6 @@ class Shaped(eqx.Module):
         return params.replace(there, {n: y[k] for k, n in enumerate(self.names)})
 
 
-@compiled
-def _curvature(problem: Problem, z: Array) -> Array:
-    """JᵀJ over readings and priors."""
-
-    def informed(z: Array) -> Array:
-        residual = jnp.concatenate([problem.misfit(z, problem.data), z - problem.data.centre])
-        return residual[informing(problem.data)]
-
-    jacobian = jax.jacfwd(informed)(z)
-    return jacobian.T @ jacobian
-
-
 @dataclasses.dataclass(frozen=True)
 class Discrepancy:
     """A discrepancy that was located, as a smooth curve fitted together with the base.
@@ -277,7 +262,7 @@ def fit_discrepancy(
     found, seen = search_in_batches(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
     z = np.asarray(found.z[k])
-    covariance = np.linalg.inv(np.asarray(_curvature(problem, jnp.asarray(z))))
+    covariance = np.asarray(found.covariance[k])
     grid = np.linspace(at_base.low, at_base.high, POINTS)
     shape = at_base.scale * at_base.basis(grid) @ at_base.root
     ordinates = covariance[inner:, inner:]

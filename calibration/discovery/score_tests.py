@@ -30,7 +30,7 @@ UNSETTLED = 0.05
 #: Prior sd of a curve's columns where they are fitted with the free parameters [σ]: wide, and keeps their rank.
 WIDE = 30.0
 #: Further columns are filled up to a multiple of this.
-FILLED = 12
+FILLED = 36
 #: Replicates in one batch of the bootstrap.
 CHUNK = 64
 
@@ -252,16 +252,26 @@ def bootstrap(
         seed: random seed.
     """
     count = -(-replicates // CHUNK)
-    keys = jax.random.split(jax.random.key(seed), (count, CHUNK))
-    parts = [jax.device_get(_replicates(problem, jnp.asarray(z), linear, effects, bases, k)) for k in keys]
+    given = problem, z, linear, effects, bases, np.asarray(seed)
+    parts = [jax.device_get(_replicates(*given, np.asarray(k), count)) for k in range(count)]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)
 
 
 @compiled
 def _replicates(
-    problem: Problem, z: Array, linear: Linearization, effects: tuple[ScoredEffect, ...], bases: Bases, keys: Array
+    problem: Problem,
+    z: Array,
+    linear: Linearization,
+    effects: tuple[ScoredEffect, ...],
+    bases: Bases,
+    seed: Array,
+    chunk: Array,
+    count: int,
 ) -> Statistics:
+    """One of `count` chunks of a bootstrap."""
+    keys = jax.random.split(jax.random.key(seed), (count, CHUNK))[chunk]
+
     def one(key: Array) -> Statistics:
         drawn = problem.observe.replicate(problem, z, problem.data, effects, linear, key)
         return strongest(score_tests(drawn, bases), drawn)

@@ -54,7 +54,8 @@ class Optimum(eqx.Module):
 
     Attributes:
         z: coordinates, shape (parameters,).
-        sd: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,).
+        covariance: of z, from the Gauss-Newton curvature (JᵀJ)⁻¹ of readings and priors, shape (parameters,
+            parameters); sd: root of its diagonal.
         cost: objective, half the sum of squares of misfit and prior [-].
         decrement: decrease that the Gauss-Newton step from here still predicts [-].
         converged: whether the decrement is small (see `DECREMENT`); holds whatever the solver said.
@@ -63,6 +64,7 @@ class Optimum(eqx.Module):
 
     z: Z
     sd: Z
+    covariance: Float[Array, "parameters parameters"]
     cost: Float[Array, ""]
     decrement: Float[Array, ""]
     converged: Bool[Array, ""]
@@ -107,28 +109,47 @@ def informing(data: Data) -> np.ndarray:
     return np.r_[:readings, readings + rows : readings + rows + data.centre.size]
 
 
-def _finish(problem: Problem, z: Z, data: Data, pin: Pin, steps: Array) -> tuple[Optimum, Observation]:
-    """The optimum at z, and what the model says of every row there: one evaluation serves both."""
+def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Array, Array, Observation]]:
+    """Residuals (misfit, then prior), their Jacobian, and what the model says of every row, as a function of z: one
+    evaluation serves all three."""
 
-    def evaluated(x: Z) -> tuple[Array, tuple[Array, Observation]]:
+    def function(x: Z) -> tuple[Array, tuple[Array, Observation]]:
         seen = problem.observation(pin.apply(x))
         prior = jnp.where(pin.held, x - pin.at, x - data.centre)
         r = jnp.concatenate([problem.whitened(seen, data), prior])
         return r, (r, seen)
 
-    jacobian, (r, seen) = jax.jacfwd(evaluated, has_aux=True)(z)
-    return _optimum(jacobian, r, z, data, pin, steps), seen
+    def at(z: Z) -> tuple[Array, Array, Observation]:
+        jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
+        return r, jacobian, seen
+
+    return at
+
+
+def _known(r: Array, jacobian: Array) -> Callable[[Z, None], tuple[Array, None]]:
+    """What a step asks of the residuals at the one place where it asks, where they and their Jacobian are known."""
+
+    @jax.custom_jvp
+    def value(z: Z) -> Array:
+        return r
+
+    @value.defjvp
+    def derivative(primals: tuple[Z], tangents: tuple[Z]) -> tuple[Array, Array]:
+        return r, jacobian @ tangents[0]
+
+    return lambda z, _: (value(z), None)
 
 
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
     informed = jacobian[informing(data)]
     lower = cholesky(informed.T @ informed)
-    sd = jnp.linalg.norm(forward(lower, jnp.eye(z.shape[0])), axis=0)
+    half = forward(lower, jnp.eye(z.shape[0]))
+    sd = jnp.linalg.norm(half, axis=0)
     lower = cholesky(jacobian.T @ jacobian)
     decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
     cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))
-    return Optimum(pin.apply(z), sd, cost, decrement, _small(decrement, cost), steps)
+    return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _small(decrement, cost), steps)
 
 
 def _small(decrement: Any, cost: Array) -> Array:
@@ -162,18 +183,38 @@ def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
     """One search by `optimistix.LevenbergMarquardt`, and what the model says where it ended. To be vmapped over
-    starts, data and pins."""
+    starts, data and pins.
+
+    The model is evaluated in one place of the program, at the start of a step: what was accepted there is what the
+    search returns, with its residuals, Jacobian and observation.
+    """
     pin = no_pin(start.shape[0]) if pin is None else pin
-    function = residuals(problem, data, pin)
-    tolerance = TOLERANCE_LONG if problem.observe.long else TOLERANCE
-    solution: optx.Solution = optx.least_squares(
-        lambda z, _: function(z),
-        Search(tolerance),
-        pin.apply(start),
-        max_steps=max_steps,
-        throw=False,
-    )
-    return _finish(problem, solution.value, data, pin, solution.stats["num_steps"])
+    evaluate, start = _evaluated(problem, data, pin), pin.apply(start)
+    solver = Search(TOLERANCE_LONG if problem.observe.long else TOLERANCE)
+    shapes = jax.eval_shape(evaluate, start)
+    nowhere = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    state = solver.init(_known(*nowhere[:2]), start, None, {}, shapes[0], None, frozenset())
+    searching, fixed = eqx.partition(state, eqx.is_array)
+
+    def going(carry: tuple) -> Array:
+        y, searching, _, done = carry
+        return ~done & (eqx.combine(searching, fixed).num_steps < max_steps) & jnp.all(jnp.isfinite(y))
+
+    def step(carry: tuple) -> tuple:
+        y, searching, best, _ = carry
+        state = eqx.combine(searching, fixed)
+        found = evaluate(state.y_eval)
+        function = _known(*found[:2])
+        y, state, _ = solver.step(function, y, None, {}, state, frozenset())
+        done, _ = solver.terminate(function, y, None, {}, state, frozenset())
+        accepted = state.num_steps_since_acceptance == 0
+        best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), found, best)
+        return y, eqx.filter(state, eqx.is_array), best, done
+
+    carry = (start, searching, nowhere, jnp.asarray(False))
+    z, searching, (r, jacobian, seen), _ = jax.lax.while_loop(going, step, carry)
+    steps = eqx.combine(searching, fixed).num_steps
+    return _optimum(jacobian, r, z, data, pin, steps), seen
 
 
 def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
@@ -405,7 +446,8 @@ def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) 
 
     carry = (start, solver.init(start), jnp.asarray(0), jnp.asarray(jnp.inf))
     z, _, k, _ = jax.lax.while_loop(go_on, step, carry)
-    return _finish(problem, z, data, pin, k)[0]
+    r, jacobian, _ = _evaluated(problem, data, pin)(z)
+    return _optimum(jacobian, r, z, data, pin, k)
 
 
 @compiled

@@ -1,0 +1,280 @@
+"""Programs on disk: what was compiled for a function and arguments of one structure, kept whole.
+
+JAX's own cache is asked for a program once it has been traced and lowered, which is most of the time of a process
+that compiles nothing. Here a program is found by a name, a hash of all that its tracing reads: the source of our
+packages, the versions of the libraries, JAX's settings, and the arguments with shapes in the place of their arrays.
+What has no such name (a class of a user's own file, an array of keys) goes the usual way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import io
+import os
+import pickle
+import sys
+import threading
+import types
+import zlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.monitoring
+import jax.numpy as jnp
+from jax.experimental import serialize_executable
+
+#: Names the folder in which programs are kept; where it is not set, or empty, none are.
+VARIABLE = "MMRJAX_PROGRAMS"
+#: Packages whose source is part of a name, and distributions whose version is.
+OWN = ("mmrjax", "calibration", "sweeps")
+LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "optax", "numpy", "scipy", "mujoco-mjx")
+_KNOWN = {*OWN, "jax", "jaxlib", "equinox", "optimistix", "lineax", "diffrax", "optax", "numpy", "mujoco"}
+_KNOWN |= {"builtins", "functools", "operator", "math", "collections", "copyreg", "types"}
+#: Settings of JAX and variables of the environment that say where and what is logged or kept, not what is computed.
+_ASIDE = ("jax_compilation_cache", "jax_persistent_cache", "jax_log", "jax_logging", "jax_dump")
+_HEEDED = ("XLA_", "EQX_")
+
+
+class Unnamed(Exception):
+    """Arguments by which no other process could find a program again."""
+
+
+class _Place:
+    """Where an array belongs in a result."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """One compiled program.
+
+    Attributes:
+        executable: of the arrays among the arguments, in turn, to those among the results.
+        result: as the function returns it, with a `_Place` for every array.
+    """
+
+    executable: Callable[..., list[Any]]
+    result: Any
+
+    def __call__(self, arguments: Any) -> Any:
+        """The function of such arguments."""
+        found = iter(self.executable(*_arrays(jax.tree.leaves(arguments))))
+        return jax.tree.map(lambda x: next(found) if isinstance(x, _Place) else x, self.result)
+
+
+class Programs:
+    """The programs of a function by the structure of its arguments: those of this process, and those on disk."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        self._found: dict[Any, Future[Program | None]] = {}
+        self._lock = threading.Lock()
+
+    def of(self, arguments: tuple[tuple, dict[str, Any]]) -> Program | None:
+        """The program for positional and named arguments; None where none may be kept."""
+        folder = os.environ.get(VARIABLE, "")
+        if not folder or not _keeps():
+            return None
+        leaves, tree = jax.tree.flatten(arguments)
+        if any(isinstance(x, jax.core.Tracer) for x in leaves):
+            return None
+        try:
+            structure = tree, tuple(_shape(x) for x in leaves)
+            with self._lock:
+                first = structure not in self._found
+                found = self._found.setdefault(structure, Future())
+        except (TypeError, Unnamed):  # what cannot be hashed
+            return None
+        if first:
+            try:
+                found.set_result(self._obtained(Path(folder), leaves, tree))
+            except BaseException as error:
+                found.set_exception(error)
+                with self._lock:
+                    del self._found[structure]
+        return found.result()
+
+    def _obtained(self, folder: Path, leaves: list[Any], tree: Any) -> Program | None:
+        """From the folder, or made and kept there."""
+        try:
+            name = _name(self.function, tree.unflatten([_shape(x) for x in leaves]))
+        except (Unnamed, pickle.PicklingError, AttributeError, TypeError, RecursionError):
+            return None
+        place, known = folder / f"{name}.program", None
+        with contextlib.suppress(Exception):  # an entry that cannot be read, for whatever reason, is made again
+            known = pickle.loads(place.read_bytes())
+        arrays = _arrays(leaves)
+        if known is not None:
+            result, compiled = known
+            executable = _loaded(folder, compiled, len(arrays), result)
+            if executable is not None:
+                return Program(executable, result)
+        result, lowered = self._lowered(leaves, tree)
+        compiled = hashlib.sha256(lowered.as_text().encode()).hexdigest()
+        executable = _loaded(folder, compiled, len(arrays), result)
+        if executable is None:
+            with _read_from_cache() as read:
+                executable = lowered.compile()
+            # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU).
+            if not read:
+                with contextlib.suppress(NotImplementedError, ValueError):
+                    written = serialize_executable.serialize(executable)[0]
+                    _write(_executable(folder, compiled), zlib.compress(written, 1))
+        with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
+            _write(place, pickle.dumps((result, compiled)))
+        return Program(executable, result)
+
+    def _lowered(self, leaves: list[Any], tree: Any) -> tuple[Any, Any]:
+        """What the function returns of such arguments, and itself lowered for them."""
+        returned: list[Any] = []
+
+        def flat(*arrays: Any) -> list[Any]:
+            given = iter(arrays)
+            args, named = tree.unflatten([next(given) if eqx.is_array(x) else x for x in leaves])
+            out, shape = jax.tree.flatten(self.function(*args, **named))
+            returned.append(shape.unflatten([_Place() if eqx.is_array(x) else x for x in out]))
+            return _arrays(out)
+
+        flat.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
+        lowered = jax.jit(flat).lower(*_arrays(leaves))
+        return returned[0], lowered
+
+
+def _arrays(leaves: list[Any]) -> list[Any]:
+    return [x for x in leaves if eqx.is_array(x)]
+
+
+def _keeps() -> bool:
+    """Whether programs of this process may be kept: double precision, on the one device of a CPU."""
+    return bool(jax.config.jax_enable_x64) and jax.default_backend() == "cpu" and jax.device_count() == 1
+
+
+def _shape(leaf: Any) -> Any:
+    """What a program knows of a leaf: shape and kind of an array, and anything else itself.
+
+    Raises:
+        Unnamed: an array of keys, or another whose kind NumPy does not have.
+    """
+    if not eqx.is_array(leaf):
+        return type(leaf), leaf
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.extended):
+        raise Unnamed
+    return leaf.shape, str(leaf.dtype), bool(getattr(leaf, "weak_type", False))
+
+
+class _Describer(pickle.Pickler):
+    """Pickles what is of known packages alone, equal things to equal bytes."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=5)
+        self.fast = True  # no references to what came before: these depend on which of two equal things was meant
+
+    def reducer_override(self, thing: Any) -> Any:
+        by_name = isinstance(thing, type | types.FunctionType | types.BuiltinFunctionType)
+        if by_name and (thing.__module__ or "").partition(".")[0] not in _KNOWN:
+            raise Unnamed
+        if isinstance(thing, type) and _found(thing) is not thing:  # made by a function, such as the curves
+            facts = sorted((k, v) for k, v in vars(thing).items() if isinstance(v, str | int | float | tuple))
+            return tuple, ((thing.__module__, thing.__qualname__, thing.__bases__, *facts),)
+        return NotImplemented
+
+
+def _found(thing: type) -> Any:
+    """What a module has by the name of a class."""
+    at: Any = sys.modules.get(thing.__module__)
+    for name in thing.__qualname__.split("."):
+        at = getattr(at, name, None)
+    return at
+
+
+def _name(function: Callable[..., Any], arguments: Any) -> str:
+    """The name of a program: a hash of all that its tracing reads.
+
+    Args:
+        arguments: with shapes in the place of arrays.
+
+    Raises:
+        Unnamed: something is of a package that is not known.
+    """
+    named = function.__module__, function.__qualname__
+    if named[0].partition(".")[0] not in OWN or "<" in named[1]:
+        raise Unnamed
+    file = io.BytesIO()
+    _Describer(file).dump((named, _settings(), arguments))
+    return hashlib.sha256(_sources().encode() + file.getvalue()).hexdigest()
+
+
+def _settings() -> tuple[tuple[str, str], ...]:
+    """JAX's settings and the variables of the environment that change what is compiled."""
+    chosen = {k: str(v) for k, v in jax.config.values.items() if not k.startswith(_ASIDE)}
+    chosen |= {k: v for k, v in os.environ.items() if k.startswith(_HEEDED)}
+    return tuple(sorted(chosen.items()))
+
+
+@functools.cache
+def _sources() -> str:
+    """A hash of the source of our packages, of the versions of the libraries and of Python."""
+    digest = hashlib.sha256(sys.version.encode())
+    for library in LIBRARIES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            digest.update(f"{library} {importlib.metadata.version(library)}\n".encode())
+    root = Path(__file__).resolve().parents[1]
+    for package in OWN:
+        for path in sorted((root / package).rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}\n".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _executable(folder: Path, name: str) -> Path:
+    return folder / f"{name}.executable"
+
+
+def _loaded(folder: Path, name: str, arrays: int, result: Any) -> Callable[..., list[Any]] | None:
+    """The executable of that name for so many arrays; None where there is none that can be read."""
+    out = sum(isinstance(x, _Place) for x in jax.tree.leaves(result))
+    try:
+        written = zlib.decompress(_executable(folder, name).read_bytes())
+        _linear_algebra()
+        return serialize_executable.deserialize_and_load(
+            written, jax.tree.structure(((0,) * arrays, {})), jax.tree.structure([0] * out)
+        )
+    except Exception:  # an entry that cannot be read, for whatever reason, is made again
+        return None
+
+
+@functools.cache
+def _linear_algebra() -> None:
+    """Let JAX find LAPACK, which it does where it lowers a call of it: a program that was read calls it too."""
+    jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), float))
+
+
+@contextlib.contextmanager
+def _read_from_cache() -> Iterator[list[str]]:
+    """Fills a list if JAX reads a program from its own cache in this thread meanwhile."""
+    mine, read = threading.get_ident(), list[str]()
+
+    def listen(event: str, **_: Any) -> None:
+        if event.endswith("/cache_hits") and threading.get_ident() == mine:
+            read.append(event)
+
+    jax.monitoring.register_event_listener(listen)
+    try:
+        yield read
+    finally:
+        jax.monitoring.unregister_event_listener(listen)
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all; a folder that cannot be written to is no error."""
+    partial = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}")
+    with contextlib.suppress(OSError):
+        partial.write_bytes(content)
+        partial.replace(path)
