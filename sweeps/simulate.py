@@ -27,8 +27,10 @@ from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
 _SHOWN = 6  # runs on the console
-#: Channels that histories of a shaft, and those of a vehicle, have in any case.
-OF_SHAFT, OF_VEHICLE = ("motor_speed", "output_angle"), ("speed",)
+#: Channels that histories of a shaft have in any case.
+OF_SHAFT = ("motor_speed", "output_angle")
+#: The same of a vehicle.
+OF_VEHICLE = ("speed",)
 #: Column of the largest current of all motors together in a run over time (not of the supply, which gives the duty's
 #: share of it).
 PEAK = "peak_current_A"
