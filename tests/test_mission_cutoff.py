@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 import mmrjax as mm
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
-from mmrjax import missions, params, robots
+from mmrjax import channels, derived, missions, outputs, params, robots
 from mmrjax.fidelities.mission import mission
 from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.profile import profile
@@ -266,6 +266,47 @@ def test_a_name_is_one_quantity_in_every_file_of_a_mission(run_folder):
             assert float(run[name]) == pytest.approx(result[name], rel=1e-6, abs=1e-9), name
     for name in ("distance_m", "displacement_m", "energy_Wh", "state_of_charge"):
         assert float(history[-1][name]) == pytest.approx(float(run[name]), rel=1e-6), name
+
+
+def test_a_column_of_several_registries_has_one_unit_and_one_meaning():
+    """Outputs of runs (with every channel), of missions and of what is derived: what shares a name is listed here."""
+    several: dict[str, list[tuple[str, float, str]]] = {}
+    for output in (*outputs.table(channels.EVERY), *missions.OUTPUTS, *derived.TABLE):
+        several.setdefault(output.column, []).append((output.unit, output.factor, output.label))
+    shared = {column: said for column, said in several.items() if len(said) > 1}
+    assert set(shared) == {"peak_current_A"}
+    assert all(said[:2] == ("A", 1.0) and "all motors" in said[2] for said in shared["peak_current_A"])
+
+
+@pytest.mark.slow
+def test_names_shared_by_a_run_and_a_mission_are_the_same_quantities(folder, capsys, monkeypatch):
+    """The same three seconds by both, at a current limit, so that current of motors and of the supply differ, and
+    backward, so that the two distances do; a mission heats up by some degrees, of which 2 % are allowed for."""
+    (folder / "three.csv").write_text("time_s,supply_voltage_V\n0,-24\n3,-24\n")
+    asked = ("simulate", "--configuration", "4W2T", "--set", "driver.current_limit=1.5", "--no-report")
+    by_run = ("--model", "drive", "--voltage", "-24", "--duration", "3", "--out", "run")
+    for words in (by_run, ("--profile", "three.csv", "--out", "mission")):
+        command(capsys, monkeypatch, folder, *asked, *words)
+    compared = set()
+    for name in ("runs.csv", "history.csv"):
+        one, other = (rows(folder / out / name)[-1] for out in ("run", "mission"))
+        for column in set(one) & set(other):
+            try:
+                values = float(one[column]), float(other[column])
+            except ValueError:
+                continue
+            assert values[1] == pytest.approx(values[0], rel=0.02, abs=1e-3), (name, column)
+            compared.add(column)
+    assert compared >= {
+        "peak_current_A",
+        "total_current_A",
+        "displacement_m",
+        "traction_N",
+        "voltage_V",
+        "speed_mm_s",
+    }
+    last = rows(folder / "mission" / "history.csv")[-1]
+    assert float(last["distance_m"]) == pytest.approx(-float(last["displacement_m"]), rel=1e-6)
 
 
 def test_a_cut_off_above_a_full_cell_is_refused_in_a_file(tmp_path):
