@@ -364,7 +364,7 @@ def follow(
     asked = asked_at(robot, otherwise, segment, y, carry.stands)
     stands = carry.stands & (firmness(asked.robot, asked.conditions, state_of(robot, y, carry.stands)) >= 0)
     # And it may have lifted the cells above their cut-off, or pressed them below.
-    below = _cell_above(asked, state_of(robot, y, stands)) < 0
+    below = jnp.asarray(_cell_above(asked, state_of(robot, y, stands)) < 0)
     low = jnp.where(below & carry.below, carry.low, 0.0)
     step = jnp.minimum(jnp.asarray(FIRST, y.dtype), longest)
     events = events_of(robot, otherwise, segment, y, stands, below)
