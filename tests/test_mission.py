@@ -253,7 +253,7 @@ def test_battery_standing_still_lasts_its_capacity_over_the_other_consumers_curr
 def test_cells_that_stay_below_their_cut_off_end_the_mission(robot):
     weak = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=3.9))
     found = run(weak, asked(battery=1.0, discharge=2500.0), rows([0, 3600]))
-    assert "cut_off" in flagged(found.result.flags) and STATUSES[int(found.result.status)] == "battery_empty"
+    assert "cut_off" in flagged(found.result.flags) and STATUSES[int(found.result.status)] == "cut_off"
     assert float(found.total.time) < 1000.0
     started = run(robot, asked(battery=1.0), rows([0, 5]))  # the inrush alone does not count
     assert float(started.peaks["cell_low"]) < 3.0 and "cut_off" not in flagged(started.result.flags)

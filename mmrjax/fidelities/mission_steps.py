@@ -332,15 +332,17 @@ def follow(
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, longest)
         signals, dy, _, _ = instant(robot, otherwise, segment, y, stands)
-        # What is itself an unknown may be largest within the step.
-        tops = _top(c.y, y, h * c.slope, h * dy) * units(robot).astype(y.dtype)
+        # Current and heat may be largest within the step. Not so speeds: at the end of a long step their slopes are
+        # those of what is stiff in them, and a cubic would swing.
+        tops = _top(c.y, y, h * c.slope, h * dy)
         within = {
-            "current": robot.sides * tops[CURRENT], "motor_speed": tops[MOTOR], "speed": tops[GROUND],
-            "temperature": jnp.where(y[WINDING] > 0, tops[WINDING], -jnp.inf),
-        }  # fmt: skip
+            "current": robot.sides * UNITS[CURRENT] * tops[CURRENT],
+            "temperature": jnp.where(y[WINDING] > 0, UNITS[WINDING] * tops[WINDING], -jnp.inf),
+        }
         highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in PEAKS])
         peaks = jnp.maximum(jnp.maximum(c.peaks, _peaks_of(robot, signals)), highest)
-        flags = _flags(robot, signals, cut_off) | jnp.where(taken, _flags_within(robot, tops), 0)
+        hot = taken & (within["temperature"] > robot.motor.temperature_limit)
+        flags = _flags(robot, signals, cut_off) | mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
         ended = c.ended | cut_off | (which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
@@ -362,7 +364,7 @@ def follow(
     asked = asked_at(robot, otherwise, segment, y, carry.stands)
     stands = carry.stands & (firmness(asked.robot, asked.conditions, state_of(robot, y, carry.stands)) >= 0)
     # And it may have lifted the cells above their cut-off, or pressed them below.
-    below = _cell_above(asked, state_of(robot, y, stands)) < 0
+    below = jnp.asarray(_cell_above(asked, state_of(robot, y, stands)) < 0)
     low = jnp.where(below & carry.below, carry.low, 0.0)
     step = jnp.minimum(jnp.asarray(FIRST, y.dtype), longest)
     events = events_of(robot, otherwise, segment, y, stands, below)
@@ -387,18 +389,6 @@ def _step_longest(robot: Robot, conditions: Conditions) -> Scalar:
     """The longest step that still resolves every effect with a memory [s]."""
     limits = [jnp.asarray(effect.step_longest(robot, conditions)) for effect in robot.remembering]
     return jax.lax.stop_gradient(jnp.min(jnp.stack([*limits, jnp.asarray(jnp.inf)])))
-
-
-def _flags_within(robot: Robot, tops: Array) -> Array:
-    """What the largest sizes of unknowns within a step exceed."""
-    return mask(
-        {
-            "motor_overspeed": tops[MOTOR] > robot.motor.speed_limit,
-            "gearbox_overspeed": tops[MOTOR] > robot.gearbox.speed_limit,
-            "current_limited": robot.driver.limits(tops[CURRENT]),
-            "too_hot": tops[WINDING] > robot.motor.temperature_limit,
-        }
-    )
 
 
 def _flags(robot: Robot, signals: Signals, cut_off: Array) -> Array:
