@@ -100,8 +100,7 @@ LUMPED = (
     "effects.vibration_slip.amplitude",
     "effects.vibration_slip.exponent",
 )
-#: Sets of docs/vibration.md: S found on the paper's simulated slip, which no measured row made; N on the measured
-#: slip.
+#: Sets of docs/vibration.md: S found on the simulated slip, which no measured row made; N on the measured slip.
 SET_S = (0.6093, 0.5331, 0.00961, 3.648e-4, 0.01066, 3.816e7, 649.2, 0.00011, 0.0595)
 SET_N = (0.5353, 0.4847, 0.00766, 3.841e-4, 0.01465, 1.969e7, 347.5, 0.00536, 0.0912)
 NEAR = 0.25  # spread of the first generation about a set [prior sd]

@@ -170,11 +170,11 @@ def test_step_that_a_later_chunk_cannot_bear_is_refused_before_the_first(robot):
 
 #: Set S of docs/vibration.md.
 SHAKING = {
-    "6T2A.ground.friction.static": 0.5735, "6T2A.ground.friction.dynamic": 0.5524,
-    "6T2A.ground.friction.speed_static": 0.01777, "6T2A.ground.friction.speed_dynamic": 0.1777,
-    "6T2A.track.guide_friction": 0.06, "running_gear.guide_recess": 3.327e-4, "running_gear.guide_gap": 0.01029,
-    "running_gear.contact_stiffness": 4.261e7, "running_gear.contact_damping": 806.9,
-    "running_gear.centre_offset": -0.00154, "running_gear.payload_height": 0.0675,
+    "6T2A.ground.friction.static": 0.6093, "6T2A.ground.friction.dynamic": 0.5331,
+    "6T2A.ground.friction.speed_static": 0.00961, "6T2A.ground.friction.speed_dynamic": 0.0961,
+    "6T2A.track.guide_friction": 0.06, "running_gear.guide_recess": 3.648e-4, "running_gear.guide_gap": 0.01066,
+    "running_gear.contact_stiffness": 3.816e7, "running_gear.contact_damping": 649.2,
+    "running_gear.centre_offset": 0.00011, "running_gear.payload_height": 0.0595,
 }  # fmt: skip
 
 
