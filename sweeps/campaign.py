@@ -46,12 +46,18 @@ NOTHING_SPECIAL = How()
 
 
 def campaign(
-    config: Campaign | Sweep, where: str, out: Path | None, force: bool, options: How = NOTHING_SPECIAL
+    config: Campaign | Sweep,
+    where: str,
+    out: Path | None,
+    force: bool,
+    options: How = NOTHING_SPECIAL,
+    wanted: tuple[str, ...] = (),
 ) -> int:
     """Simulate a design and leave a run folder with its store; returns the exit code.
 
     Args:
         config: the configuration; where: its file, for messages; out: the run folder; force: replace one.
+        wanted: outputs, in place of those of the configuration.
     """
     robot = load_robot(config)
     if isinstance(config, Sweep):
@@ -74,7 +80,8 @@ def campaign(
         config = config.model_copy(
             update={
                 "chunk": config.chunk or scale.default_chunk(config.model, accelerator, devices),
-                "outputs": config.outputs
+                "outputs": wanted
+                or config.outputs
                 or (channels.names(robot.channels) if config.profile is None else missions.USUAL),
             }
         )

@@ -225,6 +225,12 @@ def sweep(
     zarr: Annotated[
         bool, typer.Option("--zarr", help="Write a Zarr store, also of a small grid of options.")
     ] = False,
+    outputs: Annotated[
+        str | None,
+        typer.Option(
+            help="Comma-separated, what a store holds of each point.  \\[default: what its instruments show]"
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say points, chunks, bytes and time; write nothing.")
     ] = False,
@@ -276,11 +282,12 @@ def sweep(
     file = config_file if file is None else file
     how = config_campaign.how(shard, scheduler, export, dry_run)
     where = file.name if file is not None else "options"
-    if zarr or how != config_campaign.How() or config_campaign.is_campaign(file):
+    wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))
+    if zarr or wanted or how != config_campaign.How() or config_campaign.is_campaign(file):
         stored = _prepared(config_campaign.resolve_campaign(file, options), no_cache)
         from sweeps import campaign
 
-        return campaign.campaign(stored, where, out, force, how)
+        return campaign.campaign(stored, where, out, force, how, wanted)
     resolved = _prepared(config.resolve(config.Sweep, file, options), no_cache)
     from sweeps import sweep as room
 

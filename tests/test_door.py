@@ -46,7 +46,7 @@ def test_what_instruments_show_is_that_of_the_whole(robot, whole):
     assert shown_first.statuses.tolist() == ["converged", "slides", "stalled", "converged", "converged", "reverses"]
     for name in ("total_current", "motor_speed", "speed"):
         np.testing.assert_allclose(getattr(shown_first, name), whole.reading[name], rtol=1e-13, err_msg=name)
-    for output in outputs.table():
+    for output in outputs.table(robot.channels):
         np.testing.assert_array_equal(output.get(whole_first.result), output.get(whole), err_msg=output.name)
         np.testing.assert_allclose(output.get(shown_first.result), output.get(whole), rtol=1e-13, err_msg=output.name)
     np.testing.assert_array_equal(whole_first.flags, whole.flags)

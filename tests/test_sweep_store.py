@@ -163,6 +163,17 @@ def test_large_grid_of_a_file_leaves_a_store_too(mmrjax, tmp_path, monkeypatch):
     assert code == 0 and "4 points: results.zarr" in said and (tmp_path / "s" / zarr_store.STORE).is_dir()
 
 
+def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
+    grid = ["sweep", "--slopes", "0,5", "--payloads", "0", "--voltages", "24", "--no-report"]
+    assert mmrjax(*grid, "--outputs", "slip, flags", "--out", "s")[0] == 0
+    found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
+    assert set(found.data_vars) == {"slip", "flags", "status"}
+    alone = steady(robots.nominal(), Conditions(0, 24.0, 5.0, 0.0))
+    np.testing.assert_allclose(found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12)
+    code, _, said = mmrjax(*grid, "--outputs", "slipp", "--out", "t")
+    assert code == 2 and "outputs: got slipp; did you mean slip" in said
+
+
 def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
     monkeypatch.setattr("sweeps.sweep.TABLE", 3)
     monkeypatch.setattr(campaign, "MARGIN", 10**18)
