@@ -219,13 +219,12 @@ def _settings() -> tuple[tuple[str, str], ...]:
 
 
 @functools.cache
-def _sources() -> str:
-    """A hash of the source of our packages, of the versions of the libraries and of Python."""
+def _sources(root: Path = Path(__file__).resolve().parents[1]) -> str:  # noqa: B008 (a constant)
+    """A hash of the source of our packages, which lie in a folder, of the versions of the libraries and of Python."""
     digest = hashlib.sha256(sys.version.encode())
     for library in LIBRARIES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             digest.update(f"{library} {importlib.metadata.version(library)}\n".encode())
-    root = Path(__file__).resolve().parents[1]
     for package in OWN:
         for path in sorted((root / package).rglob("*.py")):
             digest.update(f"{path.relative_to(root)}\n".encode())

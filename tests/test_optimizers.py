@@ -72,6 +72,22 @@ def test_normal_equations_solve():
     np.testing.assert_allclose(x, np.linalg.lstsq(a, b)[0], rtol=1e-9)
 
 
+def test_search_has_its_model_in_one_place_of_its_program(posed):
+    """What a search costs to compile is one evaluation of the model with its Jacobian, not one for each use of it."""
+
+    def loops(jaxpr) -> int:
+        """Searches for the operating point, loops inside of the search's own."""
+        inner = [v for e in jaxpr.eqns for x in e.params.values() for v in (x if isinstance(x, tuple) else (x,))]
+        inner = [getattr(v, "jaxpr", v) for v in inner if hasattr(getattr(v, "jaxpr", v), "eqns")]
+        own = sum(e.primitive.name == "while" and "int8" in str(e.outvars[0].aval) for e in jaxpr.eqns)
+        return own + sum(map(loops, inner))
+
+    start = jnp.zeros(len(posed.coordinates))
+    one = jax.make_jaxpr(jax.jacfwd(lambda z: posed.misfit(z, posed.data)))(start)
+    search = jax.make_jaxpr(lambda z: fit.levenberg_marquardt(posed, z, posed.data)[0].cost)(start)
+    assert loops(search.jaxpr) == loops(one.jaxpr) == 1
+
+
 def test_jacobian_of_steady_is_the_finite_difference(posed, truth):
     function = jax.jit(lambda z: posed.misfit(z, posed.data))
     jacobian = np.asarray(jax.jit(jax.jacfwd(function))(truth))

@@ -1,0 +1,160 @@
+"""Programs on disk: found again without tracing, and never those of other arguments, settings or source."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from calibration.inference.normal_equations import cholesky, forward
+from mmrjax import effects, programs, robots
+from mmrjax.compiling import for_equations
+from mmrjax.effects import UNNAMED
+
+MATRIX = np.array([[4.0, 1.0], [1.0, 3.0]])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """An empty one in which programs are kept; JAX's own cache, which other tests fill, is not asked."""
+    monkeypatch.setenv(programs.VARIABLE, str(tmp_path))
+    monkeypatch.setattr(jax, "device_count", lambda: 1)
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()
+    yield tmp_path
+    jax.config.update("jax_enable_compilation_cache", True)
+    compilation_cache.reset_cache()
+
+
+def untraceable(function):
+    """The function by its name, which fails where it is traced."""
+
+    @functools.wraps(function)
+    def fails(*args, **named):
+        raise AssertionError("traced")
+
+    return fails
+
+
+def named(function, *args):
+    return programs._name(function, jax.tree.map(programs._shape, (args, {})))
+
+
+def test_a_second_process_finds_a_program_without_tracing(folder, compilations):
+    first = programs.Programs(cholesky).of(((MATRIX,), {}))
+    answer = first(((MATRIX,), {}))
+    np.testing.assert_allclose(answer, np.linalg.cholesky(MATRIX), rtol=1e-12, atol=1e-15)
+    made = len(compilations)
+    again = programs.Programs(untraceable(cholesky)).of(((2 * MATRIX,), {}))  # as a new process, with other numbers
+    np.testing.assert_allclose(again(((2 * MATRIX,), {})), np.linalg.cholesky(2 * MATRIX), rtol=1e-12, atol=1e-15)
+    np.testing.assert_array_equal(again(((MATRIX,), {})), answer)
+    assert len(compilations) == made
+
+
+def test_a_program_of_this_process_is_not_read_again(folder):
+    kept = programs.Programs(cholesky)
+    first = kept.of(((MATRIX,), {}))
+    for path in folder.iterdir():
+        path.unlink()
+    assert kept.of(((3 * MATRIX,), {})) is first
+
+
+def test_results_come_back_with_what_is_no_array(folder):
+    robot = robots.nominal()
+    for function in (for_equations, untraceable(for_equations)):
+        found = programs.Programs(function).of(((robot,), {}))(((robot,), {}))
+        assert found.configurations.names == robot.configurations.names and found.rig == robot.rig
+        assert jax.tree.structure(found) == jax.tree.structure(robot)
+        np.testing.assert_array_equal(found.motor.resistance, robot.motor.resistance)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        (np.eye(3),),
+        (np.eye(2, dtype=np.float32),),
+        (np.eye(2, dtype=int),),
+        (jnp.asarray(2.0),),
+        (2.0,),
+        (2,),
+        (np.eye(2), np.eye(2)),
+        ([np.eye(2)],),
+        ("6T2A",),
+    ],
+)
+def test_other_arguments_have_another_program(other):
+    assert named(cholesky, *other) == named(cholesky, *other) != named(cholesky, np.eye(2))
+
+
+def test_whole_numbers_floats_and_truths_are_told_apart(folder):
+    assert len({named(cholesky, x) for x in (1, 1.0, True)}) == 3
+    kept = programs.Programs(for_equations)
+    found = [kept.of((((x, MATRIX),), {})).result[0] for x in (1, 1.0, True)]
+    assert [type(x) for x in found] == [int, float, bool]
+
+
+def test_another_function_class_or_curve_has_another_program():
+    robot, plain = robots.nominal(), np.eye(2)
+    assert named(cholesky, plain) != named(forward, plain)
+    some = [effects.BY_NAME["churning"](), effects.BY_NAME["windage"](), *(curve() for curve in UNNAMED.values())]
+    names = {named(cholesky, dataclasses.replace(robot, effects=(e,))) for e in some}
+    assert len(names) == len(some)
+
+
+def test_settings_and_source_are_part_of_a_name(monkeypatch, tmp_path):
+    before = named(cholesky, MATRIX)
+    with monkeypatch.context() as patch:
+        patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+        assert named(cholesky, MATRIX) != before
+    with monkeypatch.context() as patch:
+        patch.setattr(programs, "_sources", lambda: "other")
+        assert named(cholesky, MATRIX) != before
+    assert named(cholesky, MATRIX) == before
+    found = set()
+    for package in programs.OWN:
+        (tmp_path / package / "room").mkdir(parents=True)
+        for content in ("x = 1\n", "x = 2\n"):
+            (tmp_path / package / "room" / "module.py").write_text(content)
+            found.add(programs._sources.__wrapped__(tmp_path))
+    assert len(found) == 2 * len(programs.OWN)
+
+
+class Own(eqx.Module):
+    """Of no package whose source is part of a name."""
+
+    x: jax.Array
+
+
+@pytest.mark.parametrize("what", [Own(jnp.zeros(2)), jax.random.key(0), untraceable, lambda x: x], ids=type)
+def test_what_has_no_name_goes_the_usual_way(what, folder):
+    assert programs.Programs(for_equations).of(((what, MATRIX), {})) is None
+    assert not list(folder.iterdir())
+
+
+def test_tracers_go_the_usual_way(folder):
+    kept = programs.Programs(cholesky)
+    jax.eval_shape(lambda x: [x, kept.of(((x,), {}))][0], MATRIX)
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("ending", ["program", "executable"])
+def test_broken_files_are_made_again(folder, ending):
+    made = programs.Programs(cholesky).of(((MATRIX,), {}))(((MATRIX,), {}))
+    (broken,) = folder.glob(f"*.{ending}")
+    broken.write_bytes(b"nonsense")
+    again = programs.Programs(cholesky).of(((MATRIX,), {}))(((MATRIX,), {}))
+    np.testing.assert_array_equal(made, again)
+
+
+def test_nothing_is_kept_unless_a_folder_is_stated(folder, monkeypatch):
+    monkeypatch.setenv(programs.VARIABLE, "")
+    assert programs.Programs(cholesky).of(((MATRIX,), {})) is None
+    monkeypatch.setenv(programs.VARIABLE, str(folder / "is not there"))
+    found = programs.Programs(cholesky).of(((MATRIX,), {}))  # cannot be written to: the program is used all the same
+    np.testing.assert_allclose(found(((MATRIX,), {})), np.linalg.cholesky(MATRIX), rtol=1e-12, atol=1e-15)
