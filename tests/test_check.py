@@ -47,8 +47,8 @@ def some_of_the_papers(*kept: str) -> str:
     text = (Path(requirements.__file__).parent / "aims" / "paper.toml").read_text("utf-8")
     head, envelope, tail = text.partition("[envelope]")
     lines = [line for line in head.splitlines() if line.partition(" ")[0] in ("schema", *kept)]
-    (standing,) = (line.strip() for line in head.splitlines() if 'duty = "standing"' in line)
-    lines += [f"endurance_min = [{standing}]"] if "endurance_min" in kept else []
+    if "standing" in kept:
+        lines += ["endurance_min = [", *(line for line in head.splitlines() if 'duty = "standing"' in line), "]"]
     return "\n".join([*lines, envelope + tail])
 
 
@@ -68,7 +68,7 @@ def values(folder):
     if "winding_C" in {r["name"] for r in found["requirements"]}:
         return found
     path = folder.with_name("values")
-    aims = some_of_the_papers("speed_m_s", "speed_end_of_charge_m_s", "mass_kg", "endurance_min", "winding_C")
+    aims = some_of_the_papers("speed_m_s", "speed_end_of_charge_m_s", "mass_kg", "winding_C", "standing")
     path.with_suffix(".toml").write_text(aims, encoding="utf-8")
     assert command(["check", path.with_suffix(".toml"), "--no-changes", "--no-report", "--out", path]) == 3
     return json.loads((path / "result.json").read_text())
