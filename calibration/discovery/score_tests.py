@@ -178,10 +178,10 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     Args:
         chosen: index of the family, in the order of `ScoreTable.curve`.
     """
-    linear = jax.tree.map(jnp.asarray, linear)
+    linear = jax.tree.map(np.asarray, linear)
     for basis in bases:
         if chosen < len(basis.places):
-            columns = signature(linear, basis.places[chosen], np.asarray(basis.columns[chosen]))
+            columns = signature(linear, basis.places[chosen], np.asarray(basis.columns)[chosen])
             norm = np.linalg.norm(columns, axis=0)
             return columns[:, norm > 0] / norm[norm > 0] * WIDE
         chosen -= len(basis.places)
@@ -213,8 +213,8 @@ def beside_columns(
         extra: columns over the readings, shape (readings, columns); of: their places.
     """
     filled = np.pad(extra, ((0, 0), (0, -extra.shape[1] % FILLED)))  # to few sizes: each is compiled
-    jacobian, residual = map(jnp.asarray, widened(linear, filled))
-    linear = jax.tree.map(jnp.asarray, linear)
+    jacobian, residual = widened(linear, filled)
+    linear = jax.tree.map(np.asarray, linear)
     padded = dataclasses.replace(linear, jacobian=jacobian, residual=residual)
     scores = _score_tests(padded, bases)
     balances = np.array([n[0] for b in bases for n in b.names])

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.params import Parameter, Scalar, parameter
 from mmrjax.robot import Robot
@@ -123,7 +124,11 @@ def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     if shape is None:
         return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))
     grid = TURN if _phase(shape) else grid
-    return ScoredEffect(unit, shape.name, tuple(grid), shaped(shape_scales(shape), jnp.asarray(grid)))
+    scales = [np.asarray(x) for x in shape_scales(shape)]
+    return ScoredEffect(unit, shape.name, tuple(grid), _shaped(tuple(scales), np.asarray(grid)))
+
+
+_shaped = compiled(shaped)
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
@@ -183,7 +188,7 @@ class Linearization(eqx.Module):
         Args:
             channel: position in the table of channels.
         """
-        mine = jnp.where(jnp.arange(self.scale.shape[1]) == channel, self.scale, 0.0)
+        mine = self.scale * (np.arange(self.scale.shape[1]) == channel)
         return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
