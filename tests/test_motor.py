@@ -79,7 +79,9 @@ def test_temperatures_in_closed_form_match_scipy(current):
 
 def test_permissible_time_is_when_the_limit_is_reached():
     motor = Motor()
-    permissible = jax.jit(lambda current: motor.time_permissible(current))
+    permissible = jax.jit(
+        lambda current, winding=25.0, housing=25.0: motor.time_permissible(current, winding, housing)
+    )
     slope = jax.jit(jax.grad(lambda current: motor.time_permissible(current)))
     for current in (4.5, 8.0, 30.0):
         time = float(permissible(current))
@@ -88,5 +90,5 @@ def test_permissible_time_is_when_the_limit_is_reached():
         apart = float(permissible(current + step)) - float(permissible(current - step))
         assert float(slope(current)) == pytest.approx(apart / (2 * step), rel=1e-5)
     assert float(permissible(3.9)) == np.inf  # below the continuous current
-    assert float(motor.time_permissible(8.0, winding=130.0)) == 0.0
-    assert float(motor.time_permissible(8.0, 100.0, 80.0)) < float(motor.time_permissible(8.0))
+    assert float(permissible(8.0, 130.0)) == 0.0
+    assert float(permissible(8.0, 100.0, 80.0)) < float(permissible(8.0)) == float(motor.time_permissible(8.0))

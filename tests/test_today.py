@@ -305,6 +305,7 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     assert code == 3 and "battery_empty: empty before the start" in out
 
 
+@pytest.mark.slow
 def test_a_run_may_last_a_day(mmrjax):
     found = api.simulate(robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"
