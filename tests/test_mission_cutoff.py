@@ -243,7 +243,7 @@ def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):
     out, err = ((run_folder.parent / f"{name}.txt").read_text() for name in ("out", "err"))
     result = json.loads((run_folder / "result.json").read_text())
     left = 100 * result["state_of_charge"]
-    assert result["status"] == "cut_off" and result["flags_raised"] == ["cut_off"]
+    assert result["status"] == "cut_off" and "cut_off" in result["flags_raised"]
     assert "no charge left" not in out and f"ended with {left:.1f} % of the charge left" in " ".join(out.split())
     assert "3.3 V is below the 3.41 V of an empty cell without load: it acts only beyond 2.22 A" in " ".join(
         err.split()
