@@ -95,7 +95,7 @@ def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
 
 
 def test_modes_of_the_tracked_robot_have_names_and_bands(tracked):
-    """Heavier: bounce falls; each holds most of its energy in its own coordinate; the drive is too damped."""
+    """Heavier: bounce falls towards pitch; each holds most of its energy in its own coordinate; the drive is too damped."""
     light, heavy = tracked
     assert [m.name for m in light] == ["pitch", "drive", "bounce"]
     assert named(light, "pitch").frequency == pytest.approx(66, abs=2)
@@ -103,9 +103,11 @@ def test_modes_of_the_tracked_robot_have_names_and_bands(tracked):
     assert named(heavy, "bounce").frequency == pytest.approx(79, abs=2)
     for of in tracked:
         pitch, drive, bounce = (named(of, name) for name in ("pitch", "drive", "bounce"))
-        assert pitch.share > 0.75 and bounce.share > 0.85
         assert pitch.resonant and bounce.resonant and not drive.resonant
-        assert pitch.low < pitch.frequency < pitch.high < bounce.low
+        assert pitch.low < pitch.frequency < pitch.high and pitch.frequency < bounce.low
+    assert named(light, "pitch").share > 0.8 and named(light, "bounce").share > 0.8
+    # with 8 kg bounce comes near to pitch, and they share more of their energy
+    assert named(heavy, "pitch").share > 0.6 and named(heavy, "bounce").share > 0.7
 
 
 def test_mode_over_an_octave_is_no_frequency_to_meet():
