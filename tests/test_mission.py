@@ -190,10 +190,11 @@ def test_standing_and_breaking_away_agree_with_steady(robot):
     volts, slopes = np.meshgrid([-6.0, -1.0, 0.0, 1.0, 6.0], [-15.0, -4.0, 0.0, 4.0, 15.0])
     conditions = asked(np.ones(volts.size, int), voltage=volts.ravel(), slope_deg=slopes.ravel(), adhesion=2.0)
     steady = steady_batch(robot, conditions)
-    p = rows([0, 6])
-    p = dataclasses.replace(p, voltage=None, slope_deg=None, duty=None, payload=None, current_other=None)
-    found = jax.jit(jax.vmap(lambda c: mission(robot, c, p)))(conditions)
-    speed = np.asarray(found.result.reading["speed"])
+    each = [
+        run(robot, asked(1, adhesion=2.0), rows([0, 6], voltage=v, slope_deg=s))
+        for v, s in zip(volts.ravel(), slopes.ravel(), strict=True)
+    ]
+    speed = np.array([float(found.result.reading["speed"]) for found in each])
     settled = np.asarray(steady.reading["speed"])
     stalled = np.asarray(steady.status) == STATUSES.index("stalled")
     assert stalled.any() and (~stalled).any()
