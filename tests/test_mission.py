@@ -254,6 +254,7 @@ def test_battery_standing_still_lasts_its_capacity_over_the_other_consumers_curr
     assert float(found.total.time) == pytest.approx(7920.0 / 1.5, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_cells_that_stay_below_their_cut_off_end_the_mission(robot):
     weak = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, voltage_cutoff=3.9))
     found = run(weak, asked(battery=1.0, discharge=2500.0), rows([0, 3600]))
