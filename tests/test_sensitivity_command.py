@@ -108,13 +108,16 @@ def test_default_inputs_are_what_has_a_prior_and_acts_here(robot):
 
 
 def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
-    shares = {method: analyse(study, method, 40_000).outputs["speed"] for method in ("local", "sobol")}
+    found = {method: analyse(study, method, 40_000) for method in ("local", "sobol")}
+    assert sum(found["sobol"].sampled["steady"].values()) == found["sobol"].evaluations > 0
+    shares = {method: of.outputs["speed"] for method, of in found.items()}
     linear, sampled = shares["local"].share[:2], shares["sobol"].at_points["total"]
     np.testing.assert_allclose(sampled.value[:2], linear, atol=0.03)
     assert np.all(sampled.low[:2] <= linear + 0.01) and np.all(linear - 0.01 <= sampled.high[:2])
     assert not shares["sobol"].studied[3] and np.isnan(sampled.value[3]).all()
 
 
+@pytest.mark.slow
 def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, study):
     coordinates = priors.coordinates(robot, NAMES[:2])
     covariance = np.array([[0.02, 0.012], [0.012, 0.02]])

@@ -258,6 +258,7 @@ def two(robot):
     return mm.simulate(robot, at, profile=SHORT, history=False)
 
 
+@pytest.mark.slow
 def test_simulate_over_a_profile_has_the_columns_of_the_table(two):
     assert two.model == "drive" and two.shape == (2,) and list(two.statuses) == ["converged"] * 2
     table = two.to_dict()

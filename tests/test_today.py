@@ -267,6 +267,7 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     assert json.loads((tmp_path / "a" / "result.json").read_text())[PEAK] == pytest.approx(float(row[PEAK]))
 
 
+@pytest.mark.slow
 def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     robot, found = climb
     heading = report_runs.labels(found.to_dict())
