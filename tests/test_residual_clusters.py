@@ -261,6 +261,7 @@ def shifted():
     return calibrate(measured_table(0, 8.0), robots.nominal(), starts=2, profiles=False, blocks=())
 
 
+@pytest.mark.slow
 def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     (found,) = shifted.residual_clusters
     assert (found.column, found.channel, found.within) == ("idle_wheel", "speed", "")
@@ -272,6 +273,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     assert Tables(page).tables
 
 
+@pytest.mark.slow
 def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
     clean = calibrate(measured_table(1, 0.0), robots.nominal(), starts=2, profiles=False, blocks=())
     assert clean.residual_clusters == () and "without a role" not in " ".join(clean.notes)
@@ -279,6 +281,7 @@ def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
     assert 'id="clusters"' not in page
 
 
+@pytest.mark.slow
 def test_the_loop_says_what_its_last_fit_leaves_clustered():
     runs = measured_table(0, 8.0)
     found = discover.discover_at(runs, robots.nominal(), known(runs), SETTLED.settings, {}, SETTLED.library)
