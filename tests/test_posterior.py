@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import calibrated
 
 from calibration.data import posterior as room
 from calibration.data import robot_file
@@ -218,10 +218,7 @@ def test_a_value_is_said_to_two_digits_of_its_sd(value, sd, most, said):
 
 
 def test_saved_calibration_has_its_posterior(tmp_path):
-    import calibration
-
-    runs = calibration.read_runs("measured")
-    found = calibration.calibrate(runs, calibration.read_robot("nominal"), starts=4, profiles=False, blocks=False)
+    found = calibrated()
     found.save(tmp_path)
     again = room.read(tmp_path / room.FILE)
     again.check(robot_file.load(str(tmp_path / "robot.toml")), "saved")

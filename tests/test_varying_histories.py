@@ -213,7 +213,9 @@ def test_derivative_of_a_varying_run_along_one_direction_is_a_difference(observe
     along = theta * np.random.default_rng(6).uniform(0.3, 1.0, len(names)) * np.array([1, -1, 1, -1, 1, 1])
 
     def readings(share):
-        return observer(params.replace(robots.nominal(), dict(zip(names, theta + share * along, strict=True)))).reading
+        return observer(
+            params.replace(robots.nominal(), dict(zip(names, theta + share * along, strict=True)))
+        ).reading
 
     slope = np.asarray(jax.jit(lambda t: jax.jvp(readings, (t,), (jnp.ones(()),))[1])(jnp.asarray(0.0)))
     at = jax.jit(readings)
