@@ -117,16 +117,19 @@ class Programs:
             if executable is not None:
                 return Program(executable, result)
         result, lowered = self._lowered(leaves, tree)
-        compiled = hashlib.sha256(lowered.as_text().encode()).hexdigest()
+        text = lowered.as_text()
+        compiled = hashlib.sha256(text.encode()).hexdigest()
         executable = _loaded(folder, compiled, len(arrays), result)
         if executable is None:
             with _read_from_cache() as read:
                 executable = lowered.compile()
-            # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU).
-            if not read:
-                with contextlib.suppress(NotImplementedError, ValueError):
-                    written = serialize_executable.serialize(executable)[0]
-                    _write(_executable(folder, compiled), zlib.compress(written, 1))
+            # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU), and one
+            # that calls back into Python holds addresses of this process.
+            if read or "callback" in text:
+                return Program(executable, result)
+            with contextlib.suppress(Exception):  # what cannot be written, for whatever reason, is not kept
+                written = serialize_executable.serialize(executable)[0]
+                _write(_executable(folder, compiled), zlib.compress(written, 1))
         with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
             _write(place, pickle.dumps((result, compiled)))
         return Program(executable, result)
