@@ -142,7 +142,7 @@ class Programs:
             given = iter(arrays)
             args, named = tree.unflatten([next(given) if eqx.is_array(x) else x for x in leaves])
             out, shape = jax.tree.flatten(self.function(*args, **named))
-            returned.append(shape.unflatten([_Place() if eqx.is_array(x) else x for x in out]))
+            returned.append(jax.tree.unflatten(shape, [_Place() if eqx.is_array(x) else x for x in out]))
             return _arrays(out)
 
         flat.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
@@ -156,7 +156,7 @@ def _arrays(leaves: list[Any]) -> list[Any]:
 
 def _keeps() -> bool:
     """Whether programs of this process may be kept: double precision, on the one device of a CPU."""
-    return bool(jax.config.jax_enable_x64) and jax.default_backend() == "cpu" and jax.device_count() == 1
+    return bool(jnp.result_type(float) == jnp.float64) and jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
 def _shape(leaf: Any) -> Any:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Array
 from numpy.polynomial import legendre
 
 from calibration.discovery.projection import Projection
@@ -82,7 +84,7 @@ def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.asarray(_weights(np.asarray(x), np.asarray(low), np.asarray(high)))
 
 
-_weights = compiled(weights)
+_weights: Callable[..., Array] = compiled(weights)
 
 
 def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:

@@ -128,7 +128,7 @@ def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     return ScoredEffect(unit, shape.name, tuple(grid), _shaped(tuple(scales), np.asarray(grid)))
 
 
-_shaped = compiled(shaped)
+_shaped: Callable[..., Array] = compiled(shaped)
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
@@ -174,19 +174,19 @@ class Linearization(eqx.Module):
         """The same at other residuals."""
         return dataclasses.replace(self, residual=residual)
 
-    def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+    def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         """Change of the whitened readings by defects of a balance, each a column over the rows.
 
         Args:
-            balance: index into PROBED.
+            balance: index into PROBED; shapes: shape (rows, terms).
         """
         raise NotImplementedError
 
-    def shown(self, channel: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+    def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         """Change of the whitened readings by what is added to those of a channel [SI], each a column over the rows.
 
         Args:
-            channel: position in the table of channels.
+            channel: position in the table of channels; shapes: shape (rows, terms).
         """
         mine = self.scale * (np.arange(self.scale.shape[1]) == channel)
         return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
