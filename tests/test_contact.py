@@ -96,3 +96,17 @@ def test_force_contact_derivative_is_finite_through_contact(gap, exponent):
 def test_force_contact_static_is_a_spring_and_never_pulls():
     np.testing.assert_allclose(contact.force_contact(0.008, 0.0, 0.01, 1e4, 1.0, 50.0, 1e-3), 20.0)
     assert float(contact.force_contact(0.008, 100.0, 0.01, 1e4, 1.0, 50.0, 1e-3)) == 0.0
+
+
+def test_friction_rise_is_the_derivative_of_the_coefficient():
+    law = Friction(**LAW)
+    for speed in (-0.5, -0.15, -0.01, 0.0, 0.007, 0.05, 0.11, 0.19, 0.4):
+        difference = (law.coefficient(speed + 1e-7) - law.coefficient(speed - 1e-7)) / 2e-7
+        np.testing.assert_allclose(law.rise(speed), difference, rtol=1e-5, atol=1e-5)
+
+
+def test_damping_contact_is_how_the_force_falls_with_the_rate_of_the_gap():
+    for gap in (0.0085, 0.0095, 0.011):  # deeper than d, within d, without contact
+        forces = [contact.force_contact(gap, rate, 0.01, 1e4, 1.0, 20.0, 1e-3) for rate in (-0.01, 0.01)]
+        damping = contact.damping_contact(forces[0], gap, 0.01, 20.0, 1e-3)
+        np.testing.assert_allclose(damping, (forces[0] - forces[1]) / 0.02, atol=1e-9)

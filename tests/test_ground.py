@@ -68,3 +68,10 @@ def test_adhesion_ratio_restores_table5(robot, surface, tracked, wheeled):
     ):
         ratio = robots.adhesion_ratio(surface, on_tracks)
         np.testing.assert_allclose(body.ground.force_adhesion(1.0, ratio), phi, rtol=1e-12)
+
+
+def test_traction_rise_is_the_derivative_of_traction():
+    surface = robots.nominal().configurations["6T2A"].ground
+    for speed in (-0.05, 0.003, 0.1):
+        difference = (surface.traction(speed + 1e-7, 60.0, 1.3) - surface.traction(speed - 1e-7, 60.0, 1.3)) / 2e-7
+        np.testing.assert_allclose(surface.traction_rise(speed, 60.0, 1.3), difference, rtol=1e-5)

@@ -56,3 +56,10 @@ def test_voltage_source_selects_as_reference(mode, on_battery):
 def test_voltage_source_external_has_no_battery_gradient():
     gradient = jax.grad(lambda b: voltage_source(b, jnp.asarray(24.0), 0.0, 2.0, 100.0))(Battery())
     assert all(float(g) == 0.0 for g in jax.tree.leaves(gradient))
+
+
+def test_battery_energy_is_the_integral_of_its_voltage_over_the_charge():
+    battery = Battery()
+    charge = np.linspace(0.0, 6000.0, 3001)
+    volts = 8 * np.asarray(battery.voltage_no_load(charge))
+    np.testing.assert_allclose(battery.energy(6000.0), np.sum((volts[1:] + volts[:-1]) / 2) * 2.0, rtol=1e-7)

@@ -11,7 +11,7 @@ from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from mmrjax import channels, params
-from mmrjax.rig import Begin, Begins
+from mmrjax.rig import Begin, Begins, Rig
 
 DRIVE = """
 schema = "mmrjax.robot/2"
@@ -137,3 +137,11 @@ def test_a_robot_at_rest_has_no_beginnings(tmp_path):
     path.write_text(DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + ARM)
     robot = robot_file.load(str(path))
     assert robot.rig.begins is None and jnp.asarray(robot.rig.delay) == 0
+
+
+def test_what_is_imposed_acts_later_by_the_delay():
+    rig = Rig(delay=0.2)
+    times, values = jnp.asarray([0.0, 1.0, 2.0]), jnp.asarray([3.0, 5.0, 4.0])
+    shown = [float(rig.late(times, values, at)) for at in (-1.0, 0.1, 0.7, 1.2, 1.7, 9.0)]
+    assert shown == pytest.approx([3.0, 3.0, 4.0, 5.0, 4.5, 4.0])
+    assert rig.clock(jnp.asarray([-0.5, 0.0, 0.3])).tolist() == pytest.approx([-0.5, 0.0, 0.5])

@@ -1,0 +1,202 @@
+"""Whether the quick tests notice plausible mistakes: each mutant of tests/mutants.toml has to die by its tests.
+
+Each mutant replaces one piece of text in a copy of the tree and runs the tests that it names, in a process of its
+own. Before that the same tests have to pass without any mutant, and to be among those of `make test`.
+
+    python benchmarks/mutants.py                          # all of them, one at a time
+    python benchmarks/mutants.py --jobs 2
+    python benchmarks/mutants.py --only track_drops_guide --only gravity_takes_cosine
+
+Ends with 1 where a mutant survives, its tests can't run, or its text does not stand exactly once in its file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.util
+import multiprocessing
+import os
+import queue
+import shutil
+import sys
+import tempfile
+import time
+import tomllib
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+LIST = ROOT / "tests" / "mutants.toml"
+#: What takes most of a test's start is imported once, before processes are forked; nothing of ours.
+PRELOADED = ("numpy", "scipy.stats", "jax", "jax.numpy", "equinox", "optimistix", "optax", "mujoco")
+#: A module that is imported before pytest sees it has no asserts to rewrite here.
+RELAXED = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
+#: How long the tests of a mutant may run [s]: a mutant may loop for ever.
+PATIENCE = 900.0
+LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", "*.egg-info", ".hypothesis")
+
+
+@dataclasses.dataclass(frozen=True)
+class Mutant:
+    """A plausible mistake.
+
+    Attributes:
+        kind: what it is in; file: from the root of the tree.
+        text: replaced, once in the file; by: its replacement.
+        killed_by: node ids of quick tests, of which at least one has to fail.
+    """
+
+    name: str
+    kind: str
+    file: str
+    text: str
+    by: str
+    killed_by: tuple[str, ...]
+
+    def applied(self, source: str) -> str:
+        """The file's text with the mistake in it.
+
+        Raises:
+            ValueError: the text does not stand there exactly once.
+        """
+        found = source.count(self.text)
+        if found != 1:
+            raise ValueError(f"{self.name}: its text stands {found} times in {self.file}; expected once")
+        return source.replace(self.text, self.by)
+
+
+def mutants() -> list[Mutant]:
+    """The list of tests/mutants.toml."""
+    with LIST.open("rb") as file:
+        tables: dict[str, dict[str, Any]] = tomllib.load(file)
+    return [Mutant(name, **{**of, "killed_by": tuple(of["killed_by"])}) for name, of in tables.items()]
+
+
+class _Passed:
+    """Node ids of tests that pass, for pytest."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        if report.when == "call" and report.passed:
+            self.names.append(report.nodeid)
+
+
+def _run(tree: str, tests: list[str], log: str, told: Any) -> None:
+    """Run quick tests of a tree in this process and put (exit code of pytest, tests that passed) into `told`."""
+    os.chdir(tree)
+    os.environ["PYTHONPATH"] = tree  # for processes that tests start
+    sys.path.insert(0, tree)
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    import pytest
+
+    passed = _Passed()
+    code = int(pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *RELAXED, *tests], plugins=[passed]))
+    for name in ("mmrjax", "calibration", "sweeps"):
+        module = sys.modules.get(name)
+        if module is not None and not str(module.__file__).startswith(tree):
+            code = -1  # another installation was tested
+    told.put((code, passed.names))
+    sys.stdout.flush()
+
+
+def run(tree: Path, tests: list[str], log: Path) -> tuple[int | None, list[str]]:
+    """Exit code of pytest over quick tests in a process of its own, None where it hangs or dies, and what passed."""
+    context = multiprocessing.get_context("forkserver")
+    told = context.SimpleQueue()
+    process = context.Process(target=_run, args=(str(tree), tests, str(log), told))
+    process.start()
+    process.join(PATIENCE)
+    if process.is_alive():
+        process.kill()
+        process.join()
+    return (None, []) if told.empty() else told.get()
+
+
+def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:
+    """Outcome of a mutant in a copy of the tree, seconds, and the end of what pytest printed."""
+    path, log = tree / mutant.file, tree / "mutant.log"
+    original, times = path.read_text(encoding="utf-8"), path.stat()
+    begin = time.perf_counter()
+    try:
+        path.write_text(mutant.applied(original), encoding="utf-8")
+        os.utime(path, (stamp, stamp))  # so that no compiled module is taken for that of another text
+        code, _ = run(tree, list(mutant.killed_by), log)
+    except ValueError as error:
+        return "error", 0.0, str(error)
+    finally:
+        path.write_text(original, encoding="utf-8")
+        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    outcome = {0: "survived", 1: "killed"}.get(-1 if code is None else code, "error")
+    said = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    failed = [line for line in said.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return outcome, time.perf_counter() - begin, failed[0] if failed and outcome == "killed" else said[-1500:]
+
+
+def unmutated(chosen: list[Mutant], tree: Path) -> str | None:
+    """Why the killing tests can't serve, None where all pass and are quick."""
+    tests = list(dict.fromkeys(test for mutant in chosen for test in mutant.killed_by))
+    code, passed = run(tree, tests, tree / "mutant.log")
+    if code != 0:
+        return "the tests don't pass without a mutant:\n" + (tree / "mutant.log").read_text(errors="replace")[-3000:]
+    none = [t for t in tests if not any(p == t or p.startswith((f"{t}[", f"{t}::")) for p in passed)]
+    return f"no test of `make test`: {', '.join(none)}" if none else None
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", action="append", metavar="NAME", help="this mutant alone; may be repeated")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="mutants at a time (default 1)")
+    options = parser.parse_args()
+    every = mutants()
+    names = [m.name for m in every]
+    if unknown := [name for name in options.only or [] if name not in names]:
+        parser.error(f"--only: no mutant {unknown[0]}; there are {', '.join(names)}")
+    if options.jobs < 1:
+        parser.error(f"--jobs: got {options.jobs}; expected at least 1")
+    chosen = [m for m in every if not options.only or m.name in options.only]
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([name for name in PRELOADED if importlib.util.find_spec(name.split(".")[0])])
+
+    with tempfile.TemporaryDirectory(prefix="mmrjax-mutants-") as folder:
+        trees: queue.SimpleQueue[Path] = queue.SimpleQueue()
+        for k in range(options.jobs):
+            shutil.copytree(ROOT, Path(folder) / str(k), ignore=LEFT_OUT)
+            trees.put(Path(folder).resolve() / str(k))
+        tree = trees.get()
+        if wrong := unmutated(chosen, tree):
+            print(wrong)
+            return 1
+        trees.put(tree)
+        print(f"{len(chosen)} mutants; their tests pass without them and belong to `make test`", flush=True)
+
+        def one(k: int) -> tuple[str, float]:
+            tree = trees.get()
+            outcome, seconds, said = tested(chosen[k], tree, k + 1)
+            trees.put(tree)
+            mutant = chosen[k]
+            print(f"{outcome:9} {seconds:6.1f} s  {mutant.kind:12} {mutant.name:40} {mutant.file}", flush=True)
+            print(f"          {said.strip()}" if outcome != "killed" else f"          {said[:150]}", flush=True)
+            return outcome, seconds
+
+        with ThreadPoolExecutor(options.jobs) as pool:
+            outcomes = list(pool.map(one, range(len(chosen))))
+
+    print()
+    by_kind = Counter((m.kind, outcome) for m, (outcome, _) in zip(chosen, outcomes, strict=True))
+    print(f"{'kind':14}{'killed':>8}{'survived':>10}{'error':>7}")
+    for kind in dict.fromkeys(m.kind for m in chosen):
+        print(f"{kind:14}{by_kind[kind, 'killed']:8}{by_kind[kind, 'survived']:10}{by_kind[kind, 'error']:7}")
+    left = [m.name for m, (outcome, _) in zip(chosen, outcomes, strict=True) if outcome != "killed"]
+    print(f"{len(chosen) - len(left)} of {len(chosen)} killed" + (f"; not: {', '.join(left)}" if left else ""))
+    return 1 if left else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
