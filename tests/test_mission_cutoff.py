@@ -190,7 +190,7 @@ def test_moment_of_the_cut_off_has_the_derivative_of_differences(robot):
     for k in range(4):
         apart = (both(zero.at[k].add(h))[0] - both(zero.at[k].add(-h))[0]) / (2 * h)
         np.testing.assert_allclose(exact[:, k], apart, rtol=2e-3, atol=1e-3, err_msg=names[k])
-        assert abs(float(apart[0])) > 10.0  # s: the moment moves
+        assert abs(float(apart[0])) > 1.0  # s: the moment moves
 
 
 def test_charge_that_is_off_shows_in_what_is_unaccounted_for(cut):
