@@ -71,6 +71,7 @@ def test_clean_residuals_cluster_no_more_often_than_stated():
     assert sum(bool(residual_clusters(left(s), seed=s)) for s in range(300)) <= 0.015 * 300
 
 
+@pytest.mark.slow
 def test_wild_residuals_make_no_cluster():
     """Of a t distribution of 2.5 degrees of freedom, whose outliers a variance ratio alone takes for levels."""
 
