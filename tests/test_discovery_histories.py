@@ -58,8 +58,8 @@ def clean(runs):
     return parts(runs, ANALYST.trace(runs))
 
 
-#: Two effects of which one remembers, for what needs no fit.
-TWO = dataclasses.replace(ANALYST, library={n: BY_NAME[n] for n in ("churning", "pulley_eccentricity")})
+#: One effect, which remembers and has a shape, for what needs no fit.
+ONE = dataclasses.replace(ANALYST, library={"pulley_eccentricity": BY_NAME["pulley_eccentricity"]})
 
 
 @pytest.fixture(scope="module", params=["prior", pytest.param("fitted", marks=pytest.mark.slow)])
@@ -69,7 +69,7 @@ def seen(request, runs):
         clean = request.getfixturevalue("clean")
         z, linear, space = clean.base.z[: clean.space.free], clean.left.linear, clean.space
     else:
-        space = TWO.space(runs)
+        space = ONE.space(runs)
         z = np.zeros(space.free)
         posed, scored_ = space.bare, space.library.scored
         linear = jax.jit(lambda z: posed.observe.linearise(posed, z, posed.data, scored_))(jnp.asarray(z))

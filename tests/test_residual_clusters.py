@@ -88,7 +88,7 @@ def by_wheel(size):
     return lambda runs, columns: size * np.array([1.2, -0.3, -0.9])[columns["idle_wheel"].astype(int) - 1]
 
 
-@pytest.mark.parametrize("channel", [CURRENT, MOTOR, SPEED])
+@pytest.mark.parametrize("channel", [*(pytest.param(c, marks=pytest.mark.slow) for c in (CURRENT, MOTOR)), SPEED])
 def test_a_hidden_column_is_found_in_its_channel(channel):
     name = ("total_current", "motor_speed", "speed")[channel]
     hits = [residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(40)]
