@@ -230,7 +230,7 @@ def test_held_out_readings_are_those_of_a_refit_without_the_block(clean, looks):
     for row in np.flatnonzero(block):  # so far off that whoever has seen the block shows it
         runs = changed(runs, "speed_mm_s", row, 15 * runs["speed_sd_mm_s"][row])
     fitted, brute = looks.analyst.base(runs), looks.analyst.base(runs.where(~block))
-    out = held_out(fitted.space.equipped, fitted.candidate.z, [block], (-1, -1))
+    out = held_out(fitted.space.equipped, fitted.candidate.z, [block], (-1,) * looks.analyst.settings.slots)
     seen = observation(fitted.space.bare, jnp.asarray(brute.candidate.z[: brute.space.free]))
     expected = np.asarray(seen.reading)[: len(runs)]
     assert out.converged.all() and block.sum() in (4, 6) and np.isnan(out.reading[~block]).all()

@@ -107,7 +107,7 @@ def commanded(every=False) -> SimpleNamespace:
 
 @pytest.fixture(scope="module", params=["few", pytest.param("every", marks=pytest.mark.slow)])
 def done(request):
-    return commanded(every=request.param == "every")
+    return commanded(every=True) if request.param == "every" else commanded()
 
 
 @pytest.fixture(scope="module")

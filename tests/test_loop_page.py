@@ -10,8 +10,8 @@ import jsonschema
 import numpy as np
 import pytest
 from pages import Tables, drawn
-from synthetic import FEW, SETTLED, small, table
-from test_implausible import heated
+from synthetic import SETTLED, table
+from test_implausible import heated, unnamed
 from test_loop_command import commanded
 from test_stated_values import made as leads
 
@@ -40,7 +40,7 @@ def happening():
 #: A case → its result. The first two are of 24 runs and share their programs; the command has made the first.
 MADE = {
     "churning": lambda: commanded().found,
-    "hot": lambda: FEW.discover(heated(3.0, small)),
+    "hot": unnamed,
     "leads": lambda: SETTLED.discover(leads(lead=0.8)),
     "heated": lambda: SETTLED.discover(heated(3.0)),
     "happening": lambda: SETTLED.discover(happening()),

@@ -71,6 +71,7 @@ def test_clean_residuals_cluster_no_more_often_than_stated():
     assert sum(bool(residual_clusters(left(s), seed=s)) for s in range(300)) <= 0.015 * 300
 
 
+@pytest.mark.slow
 def test_wild_residuals_make_no_cluster():
     """Of a t distribution of 2.5 degrees of freedom, whose outliers a variance ratio alone takes for levels."""
 
@@ -87,7 +88,7 @@ def by_wheel(size):
     return lambda runs, columns: size * np.array([1.2, -0.3, -0.9])[columns["idle_wheel"].astype(int) - 1]
 
 
-@pytest.mark.parametrize("channel", [CURRENT, MOTOR, SPEED])
+@pytest.mark.parametrize("channel", [*(pytest.param(c, marks=pytest.mark.slow) for c in (CURRENT, MOTOR)), SPEED])
 def test_a_hidden_column_is_found_in_its_channel(channel):
     name = ("total_current", "motor_speed", "speed")[channel]
     hits = [residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(40)]
