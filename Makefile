@@ -6,7 +6,7 @@ READY := $(VENV)/ready
 # A command that ends with 3 is done, with some runs that did not converge; their status says why.
 DONE := || [ $$? -eq 3 ]
 
-.PHONY: demo test test-all slow lint campaign bench clean
+.PHONY: demo test test-all slow lint mutants campaign bench clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force $(DONE)
@@ -31,6 +31,10 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m mypy
+
+# Whether `make test` notices plausible mistakes; a quarter of an hour on two cores.
+mutants: $(READY)
+	$(QUICK) $(BIN)/python benchmarks/mutants.py --jobs 2
 
 campaign: $(READY)
 	$(BIN)/python benchmarks/loop.py --clean-wide 1000 --noise 100 --library 500 --variants 300 --outside 300 --pairs 200 --triples 150 --drift 100 --cluster 120 --coverage 600

@@ -32,8 +32,8 @@ ROOT = Path(__file__).parents[1]
 LIST = ROOT / "tests" / "mutants.toml"
 #: What takes most of a test's start is imported once, before processes are forked; nothing of ours.
 PRELOADED = ("numpy", "scipy.stats", "jax", "jax.numpy", "equinox", "optimistix", "optax", "mujoco")
-#: A module that is imported before pytest sees it has no asserts to rewrite here.
-RELAXED = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
+#: A module that is imported before pytest sees it, which it warns of, has no asserts to rewrite here.
+OPTIONS = ("-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
 #: How long the tests of a mutant may run [s]: a mutant may loop for ever.
 PATIENCE = 900.0
 LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", "*.egg-info", ".hypothesis")
@@ -97,7 +97,7 @@ def _run(tree: str, tests: list[str], log: str, told: Any) -> None:
     import pytest
 
     passed = _Passed()
-    code = int(pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", *RELAXED, *tests], plugins=[passed]))
+    code = int(pytest.main([*OPTIONS, *tests], plugins=[passed]))
     for name in ("mmrjax", "calibration", "sweeps"):
         module = sys.modules.get(name)
         if module is not None and not str(module.__file__).startswith(tree):

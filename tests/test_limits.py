@@ -57,7 +57,9 @@ def test_travel_is_named_by_what_drives_it():
 
 def test_a_driven_robot_creeps_where_either_lags_and_one_that_gravity_drives_where_both_do():
     rest, fast, slow = 0.002, 0.01, 0.001
-    driven = [bool(creeps(1.0, 24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))]
+    driven = [
+        bool(creeps(1.0, 24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
+    ]
     rolling = [
         bool(creeps(1.0, -24.0, a, b, rest)) for a, b in ((fast, fast), (fast, slow), (slow, fast), (slow, slow))
     ]

@@ -17,7 +17,12 @@ def test_numbers_keep_nine_digits_and_what_is_not_finite_is_left_empty(tmp_path)
 
 
 def test_what_is_not_finite_is_null(tmp_path):
-    content = {"a": np.array([1.5, np.nan]), "b": {"c": np.float64(np.inf)}, "d": (np.int64(3), True), "e": float("nan")}
+    content = {
+        "a": np.array([1.5, np.nan]),
+        "b": {"c": np.float64(np.inf)},
+        "d": (np.int64(3), True),
+        "e": float("nan"),
+    }
     writing.write_json(tmp_path / "r.json", content)
     found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
     assert found == {"a": [1.5, None], "b": {"c": None}, "d": [3, True], "e": None}
