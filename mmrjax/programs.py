@@ -117,16 +117,19 @@ class Programs:
             if executable is not None:
                 return Program(executable, result)
         result, lowered = self._lowered(leaves, tree)
-        compiled = hashlib.sha256(lowered.as_text().encode()).hexdigest()
+        text = lowered.as_text()
+        compiled = hashlib.sha256(text.encode()).hexdigest()
         executable = _loaded(folder, compiled, len(arrays), result)
         if executable is None:
             with _read_from_cache() as read:
                 executable = lowered.compile()
-            # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU).
-            if not read:
-                with contextlib.suppress(NotImplementedError, ValueError):
-                    written = serialize_executable.serialize(executable)[0]
-                    _write(_executable(folder, compiled), zlib.compress(written, 1))
+            # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU), and one
+            # that calls back into Python holds addresses of this process.
+            if read or "callback" in text:
+                return Program(executable, result)
+            with contextlib.suppress(Exception):  # what cannot be written, for whatever reason, is not kept
+                written = serialize_executable.serialize(executable)[0]
+                _write(_executable(folder, compiled), zlib.compress(written, 1))
         with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
             _write(place, pickle.dumps((result, compiled)))
         return Program(executable, result)
@@ -139,7 +142,7 @@ class Programs:
             given = iter(arrays)
             args, named = tree.unflatten([next(given) if eqx.is_array(x) else x for x in leaves])
             out, shape = jax.tree.flatten(self.function(*args, **named))
-            returned.append(shape.unflatten([_Place() if eqx.is_array(x) else x for x in out]))
+            returned.append(jax.tree.unflatten(shape, [_Place() if eqx.is_array(x) else x for x in out]))
             return _arrays(out)
 
         flat.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
@@ -153,7 +156,7 @@ def _arrays(leaves: list[Any]) -> list[Any]:
 
 def _keeps() -> bool:
     """Whether programs of this process may be kept: double precision, on the one device of a CPU."""
-    return bool(jax.config.jax_enable_x64) and jax.default_backend() == "cpu" and jax.device_count() == 1
+    return bool(jnp.result_type(float) == jnp.float64) and jax.default_backend() == "cpu" and jax.device_count() == 1
 
 
 def _shape(leaf: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import generator as g
 import numpy as np
 
 from calibration.data.runs import Runs
+from calibration.data.runs import read as read_runs
 from calibration.discovery import discover
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, fit_base
@@ -18,8 +20,10 @@ from calibration.discovery.outliers import Screening, screen
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import Settings, settings_for
 from calibration.inference import noise, observers
+from calibration.inference.calibrate import calibrate
 from calibration.inference.noise import Noise
 from calibration.inference.observers import SettledRuns
+from calibration.inference.result import CalibrationResult
 from mmrjax import robots
 from mmrjax.effects import BY_NAME, Effect
 
@@ -76,6 +80,25 @@ def parts(runs: Runs, traced: Traced) -> SimpleNamespace:
     return SimpleNamespace(
         runs=runs, traced=traced, left=traced.left, space=base.space, base=base.candidate, bases=traced.screened.bases
     )
+
+
+#: The smallest search, which ordinary tests share with the command of tests/test_loop_command.py: tables of 24 runs, and
+#: seven effects, of which settled runs do not show the last.
+FEWEST = (
+    "churning", "series_resistance", "load_slip", "winding_heating", "mass_offset", "supply_sag", "cogging",
+)  # fmt: skip
+FEW = Analyst(settings_for(SettledRuns, 250), {name: BY_NAME[name] for name in FEWEST})
+
+
+def small(p: Mapping[str, float] = g.CLIMBING) -> g.Conditions:
+    """24 runs: two slopes, two payloads, three voltages, both configurations."""
+    return g.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 10.0))
+
+
+@functools.cache
+def calibrated() -> CalibrationResult:
+    """The packaged table from four starts, without profiles and without what is left out; made once for all files."""
+    return calibrate(read_runs("measured"), robots.nominal(), starts=4, profiles=False, blocks=())
 
 
 #: What tables of settled runs are searched for; the whole library is what the command and the campaign search.

@@ -203,6 +203,7 @@ def test_cells_as_a_number_are_the_batterys_cells(robot):
         )
 
 
+@pytest.mark.slow
 def test_endurance_is_the_integral_over_the_charge(robot):
     """Against the trapezoidal rule over 2000 operating points."""
     at = point(share=0.5)

@@ -58,6 +58,7 @@ def motion_of(robot, run, k):
     return Motion(q, v, jnp.asarray(1.5 + draw.random()), jnp.asarray(20.0), memory)
 
 
+@pytest.mark.slow
 def test_slopes_of_the_sums_are_their_derivatives_along_a_direction(recessed):
     """Of motion, slip and every constant at once, to 1e-9; three motions, one program each for ours and theirs."""
     run = Conditions(**RUNS["tracked"])
@@ -118,18 +119,29 @@ def test_slopes_of_the_sums_are_their_derivatives(recessed, name, k):
         np.testing.assert_allclose(row, want, rtol=1e-9, atol=1e-9 * np.abs(want).max() + 1e-10)
 
 
+@pytest.fixture(scope="module")
+def pushed():
+    """Generalized force of an instant, and the impulse that MJX's step with it takes."""
+
+    @eqx.filter_jit
+    def both(robot, run, motion):
+        setup = system(robot, run, STEP)
+        signals, _, pulled = instant(setup, motion)
+        force, armature = generalized(setup, signals, pulled)
+        model = setup.model.replace(dof_armature=armature)
+        data = mjx.step(model, setup.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force))
+        gained, wheelbase = data.qvel - motion.v, setup.path.gear.wheelbase
+        return force, mjcf.impulse(setup.half, wheelbase, run, motion.q[2], motion.v[2], armature[3], gained, STEP)
+
+    return both
+
+
 @pytest.mark.parametrize("name", sorted(RUNS))
-def test_impulse_is_that_of_mjx(recessed, name):
+def test_impulse_is_that_of_mjx(recessed, pushed, name):
     run = Conditions(**RUNS[name])
-    setup, motion = system(recessed, run, STEP), motion_of(recessed, run, 1)
+    motion = motion_of(recessed, run, 1)
     motion = dataclasses.replace(motion, q=motion.q.at[2].set(0.3), v=motion.v.at[2].set(2.0))
-    signals, _, pulled = instant(setup, motion)
-    force, armature = generalized(setup, signals, pulled)
-    model = setup.model.replace(dof_armature=armature)
-    data = mjx.step(model, setup.data.replace(qpos=motion.q, qvel=motion.v, qfrc_applied=force))
-    spent = mjcf.impulse(
-        setup.half, setup.path.gear.wheelbase, run, motion.q[2], motion.v[2], armature[3], data.qvel - motion.v, STEP
-    )
+    force, spent = pushed(recessed, run, motion)
     np.testing.assert_allclose(spent / STEP, force, rtol=1e-9, atol=1e-9 * float(jnp.abs(force).max()))
 
 

@@ -17,7 +17,7 @@ from calibration.data.runs import Runs
 from calibration.discovery import discover
 from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.discrepancy import fit_discrepancy, locate
-from calibration.discovery.score_tests import diagnosed
+from calibration.discovery.score_tests import bootstrap, diagnosed
 from calibration.discovery.search import search
 from calibration.discovery.settings import settings_for
 from calibration.discovery.standing import standing
@@ -47,10 +47,33 @@ def case(*names, sigmas=12.0, seed=1):
 
 
 @pytest.fixture(scope="module")
-def clean():
-    """Histories in which nothing is missing, through the stages of the loop."""
-    runs = case(seed=1)[0]
+def runs():
+    """Histories in which nothing is missing."""
+    return case(seed=1)[0]
+
+
+@pytest.fixture(scope="module")
+def clean(runs):
+    """The same through the stages of the loop."""
     return parts(runs, ANALYST.trace(runs))
+
+
+#: One effect, which remembers and has a shape, for what needs no fit.
+ONE = dataclasses.replace(ANALYST, library={"pulley_eccentricity": BY_NAME["pulley_eccentricity"]})
+
+
+@pytest.fixture(scope="module", params=["prior", pytest.param("fitted", marks=pytest.mark.slow)])
+def seen(request, runs):
+    """Runs, space, coordinates and the linear model there: at the prior's mean, and where the loop's fit ends."""
+    if request.param == "fitted":
+        clean = request.getfixturevalue("clean")
+        z, linear, space = clean.base.z[: clean.space.free], clean.left.linear, clean.space
+    else:
+        space = ONE.space(runs)
+        z = np.zeros(space.free)
+        posed, scored_ = space.bare, space.library.scored
+        linear = jax.jit(lambda z: posed.observe.linearise(posed, z, posed.data, scored_))(jnp.asarray(z))
+    return SimpleNamespace(runs=runs, space=space, problem=space.bare, z=jnp.asarray(z), linear=linear)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +92,7 @@ def oval():
 # --- verdicts ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_clean_histories_lack_nothing(clean):
     found = clean.traced
     assert found.verdict == "none" and found.screened.outliers == found.screened.base.unusable == ()
@@ -77,6 +101,7 @@ def test_clean_histories_lack_nothing(clean):
     assert abs(2 * clean.base.cost - readings) < 4 * np.sqrt(2 * readings)
 
 
+@pytest.mark.slow
 def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
     runs, label = case("pulley_eccentricity", seed=2)
     found = ANALYST.discover(runs)
@@ -91,6 +116,7 @@ def test_eccentric_pulley_is_named_with_its_amplitude_and_phase():
     assert [e.name for e in found.robot.effects] == ["pulley_eccentricity"]
 
 
+@pytest.mark.slow
 def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
     space, left, searched = oval.space, oval.left, oval.searched
     assert left.test.rejected
@@ -144,15 +170,10 @@ def test_sample_that_stands_alone_is_an_outlier(clean):
 # --- linear algebra ----------------------------------------------------------------------------------
 
 
-def at_base(clean):
-    problem = clean.space.bare
-    return problem, jnp.asarray(clean.base.z[: clean.space.free])
-
-
-def test_signatures_are_differences_of_runs(clean):
+def test_signatures_are_differences_of_runs(seen):
     """At the first and the last point of each shape's grid, through everything that an effect remembers."""
-    problem, z = at_base(clean)
-    robot, linear, library = problem.robot(z), clean.left.linear, clean.space.library
+    problem, linear, library = seen.problem, seen.linear, seen.space.library
+    robot = problem.robot(seen.z)
     read = jax.jit(lambda r: problem.whitened(problem.observe(r), problem.data)[: problem.data.measured.size])
     for k, instances in enumerate(library.scored):
         mine = np.flatnonzero(library.of == k)
@@ -171,11 +192,12 @@ def test_signatures_are_differences_of_runs(clean):
             assert np.linalg.norm(got - expected) < 5e-3 * np.linalg.norm(expected), (effect.name, point)
 
 
-@pytest.mark.parametrize("balance", bases.BALANCES)
-def test_columns_are_differences_of_runs_with_a_curve(clean, balance):
+@pytest.mark.parametrize(
+    "balance", [b if b == "track" else pytest.param(b, marks=pytest.mark.slow) for b in bases.BALANCES]
+)
+def test_columns_are_differences_of_runs_with_a_curve(seen, balance):
     """A defect over time, laid through the samples, against the curve effect that is the same over time."""
-    problem, z = at_base(clean)
-    linear = clean.left.linear
+    problem, z, linear = seen.problem, seen.z, seen.linear
     effect = UNNAMED[f"curve_{balance}_time"]
     shape = {"low": 0.0, "high": 0.8, "y0": 0.5, "y1": 0.7, "y2": 0.9, "y3": 1.0, "y4": 1.2, "y5": 0.8}
     size = 1e-3 * effect().amplitude + 1e-3 * {"electrical": 1.0, "track": 0.2, "ground": 4.0, "slip": 0.05}[balance]
@@ -195,10 +217,23 @@ def test_columns_are_differences_of_runs_with_a_curve(clean, balance):
     assert np.linalg.norm(expected) > 0
 
 
+def test_bootstrap_leaves_what_noise_leaves(seen):
+    """χ² of tables drawn from the fit and fitted again linearly."""
+    share = np.asarray(seen.linear.time) / 0.8
+    over_time = bases.Basis.of(np.stack([share, share**2], -1)[None], (("track", "time"),))
+    effects = seen.space.library.scored
+    null = bootstrap(seen.problem, np.asarray(seen.z), seen.linear, effects, (over_time,), 100, 0)
+    readings = 3 * len(seen.runs)
+    assert len(null.chi2) > 90 and abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
+    assert stats.kstest(null.chi2, stats.chi2(readings).cdf).pvalue > 0.01
+    assert stats.kstest(1.1 * null.chi2, stats.chi2(readings).cdf).pvalue < 0.01  # the test can fail
+
+
+@pytest.mark.slow
 def test_linear_bootstrap_is_that_of_refits(clean):
     """Statistics of replicates by the linear refit, against a few histories drawn and fitted again in full."""
     null = clean.left.test.null
-    problem, z = at_base(clean)
+    problem, z = clean.space.bare, jnp.asarray(clean.base.z[: clean.space.free])
     key = jax.random.key(3)
     draw = jax.random.normal(key, (6, *problem.data.measured.shape))
     clean_reading = problem.observation(z).reading
@@ -217,8 +252,8 @@ def test_linear_bootstrap_is_that_of_refits(clean):
     assert stats.kstest(null.chi2, stats.chi2(readings).cdf).pvalue > 0.01
 
 
-def test_memory_tells_noise_from_what_remembers(clean):
-    linear = clean.left.linear
+def test_memory_tells_noise_from_what_remembers(seen):
+    linear = seen.linear
     rng = np.random.default_rng(0)
     rows = np.asarray(linear.rows_of)
     whole = np.asarray(linear.residual).size
@@ -237,8 +272,7 @@ def test_memory_tells_noise_from_what_remembers(clean):
     assert of(slow) > 2 * np.max(white) > 0
 
 
-def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(clean):
-    runs = clean.runs
+def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(runs):
     short = runs.where((runs["run_id"] != "start2") | (runs["time_s"] < 0.5))
     mixed = short.where(np.random.default_rng(0).permutation(len(short)))
     observer = Histories.of(mixed, robots.nominal())
@@ -254,8 +288,7 @@ def test_knots_of_a_short_run_in_any_order_end_with_its_last_sample(clean):
 # --- input checks ----------------------------------------------------------------------------------------
 
 
-def test_histories_that_do_not_start_from_rest_are_refused(clean):
-    runs = clean.runs
+def test_histories_that_do_not_start_from_rest_are_refused(runs):
     late = runs.where(runs["time_s"] > 0.3)
     late.columns["time_s"] = late["time_s"] - 0.32
     with pytest.raises(BadData, match=r"run start0 is moving at 0 s .* starts from rest"):
@@ -263,10 +296,10 @@ def test_histories_that_do_not_start_from_rest_are_refused(clean):
     Histories.check_start(runs, known(runs), robots.nominal())
 
 
-def test_assumed_noise_of_histories_does_not_vanish_at_the_start(clean):
-    bare = {k: v for k, v in clean.runs.columns.items() if "_sd_" not in k}
-    runs = Runs("bare", bare)
-    sd = noise.assumed(runs, Histories.sizes(runs)).sd
+def test_assumed_noise_of_histories_does_not_vanish_at_the_start(runs):
+    bare = {k: v for k, v in runs.columns.items() if "_sd_" not in k}
+    made = Runs("bare", bare)
+    sd = noise.assumed(made, Histories.sizes(made)).sd
     assert (np.ptp(sd, axis=0) == 0).all()
     current = bare["total_current_A"]
     np.testing.assert_allclose(sd[0, 0], 0.02 * np.sqrt(np.mean(current**2)))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import SETTLED, table
+from test_implausible import unnamed
 
 from calibration.data import robot_file
 from calibration.discovery import discover, formula
@@ -30,9 +31,7 @@ from mmrjax.fidelities.steady import steady_batch
 CASES = {"commutation_step": ("electrical", "voltage"), "guide_binding": ("track", "payload")}
 
 
-@pytest.fixture(
-    scope="module", params=[pytest.param(c, marks=pytest.mark.slow) if k else c for k, c in enumerate(CASES)]
-)
+@pytest.fixture(scope="module", params=[pytest.param(c, marks=pytest.mark.slow) for c in CASES])
 def found(request):
     """A case of 12 sigmas, its base fit, and the discrepancy that is fitted to what that leaves."""
     case = g.case([request.param], 12.0, seed=1)
@@ -153,6 +152,21 @@ def test_formula_finds_the_variable(found):
     unit = found.what.unit
     assert proposal.formula.startswith(formula.SYMBOL[found.what.balance] + " = ")
     assert proposal.formula.count(f" {unit} (") == len(proposal.terms)
+
+
+def test_curve_of_a_result_is_in_its_robot_and_takes_the_discrepancy_out(tmp_path):
+    found = unnamed()
+    what, path = found.unnamed, tmp_path / "robot.toml"
+    assert found.chi2[0] - found.chi2[1] == pytest.approx(what.score) and what.score > 50
+    assert found.after.adequate and not found.before.adequate
+    assert what.at.shape == what.value.shape == what.sd.shape and (what.sd > 0).all()
+    assert np.abs(what.value / what.sd).max() > 5
+    robot_file.write(found.robot, path, note="a discrepancy without a name")
+    robot = robot_file.load(str(path))
+    assert [e.name for e in robot.effects] == [what.effect]
+    reading = steady_batch(robot, found.runs.conditions(robot)).reading
+    seen = np.stack([np.asarray(reading[name]) for name in channels.USUAL], -1)
+    np.testing.assert_allclose(seen, found.readings_of_rows.after, rtol=1e-9)
 
 
 # --- the dictionary -------------------------------------------------------------------------------------

@@ -152,6 +152,7 @@ def test_a_seam_gives_back_what_it_takes():
     assert abs(np.trapezoid(force, r * theta / 48)) < 1e-3 * np.trapezoid(abs(force), r * theta / 48)
 
 
+@pytest.mark.slow
 def test_histories():
     """All laws, known ones too, as one batch of starts, each alone in its six runs at ordinary size: finite and new."""
     laws = f.FOREIGN_SERIES | gs.FORMS

@@ -79,10 +79,13 @@ def test_generator_imports_nothing_of_the_package():
         assert not [m for m in found if m.partition(".")[0] in ("mmrjax", "calibration", "sweeps", "jax")]
 
 
-def test_readings_are_those_of_the_simulator(worlds):
-    """180 rigs of five kinds: voltage, duty or speed imposed, forward and backward, loads that drive the motor."""
+@pytest.mark.parametrize("kind", [k if k == "bench" else pytest.param(k, marks=pytest.mark.slow) for k in gr.KINDS])
+def test_readings_are_those_of_the_simulator(worlds, kind):
+    """Rigs of every kind: voltage, duty or speed imposed, forward and backward, loads that drive the motor."""
+    mine = [w for w in worlds if w.rig.kind == kind]
+    assert len(mine) == 12 * len(gr.IMPOSED)
     with jax.enable_x64(True):
-        for w in worlds:
+        for w in mine:
             found, names = steady(w)
             s, sound = gr.solve(w.rig, w.conditions, w.constants)
             assert sound.all()
@@ -265,13 +268,17 @@ def test_library_is_of_effects_that_mmrjax_has():
         assert form.balance == (effect.channel if effect.balance == "sensor" else effect.balance)
 
 
-def test_laws_are_those_of_the_library(worlds):
+@pytest.mark.parametrize(
+    "names", [("churning",), pytest.param(tuple(laws.LIBRARY), marks=pytest.mark.slow)], ids=["one", "every"]
+)
+def test_laws_are_those_of_the_library(worlds, names):
     """A library law in mmrjax shows what the generator shows, to a thousandth of a rig's largest reading."""
     from mmrjax.effects import BY_NAME
 
     rng = np.random.default_rng(7)
     with jax.enable_x64(True):
-        for name, form in laws.LIBRARY.items():
+        for name in names:
+            form = laws.LIBRARY[name]
             fits = [w for w in worlds if name in w.applicable(laws.LIBRARY)]
             w = next((w for w in fits if not w.rig.wide), fits[0])
             term = dataclasses.replace(laws.draw(name, rng, w.scale()), amplitude=0.2 * form.size(w.scale()))

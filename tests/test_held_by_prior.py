@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
 from pages import Tables
+from synthetic import calibrated
 
 from calibration.data import runs as records
 from calibration.inference import identifiability
@@ -92,6 +93,8 @@ def found():
     made = {}
 
     def of(case):
+        if case == "packaged":
+            return calibrated()
         if case not in made:
             runs = records.read("measured")
             made[case] = calibrate(runs, robots.nominal(), starts=2, profiles=False, blocks=(), **CALIBRATIONS[case])
@@ -100,7 +103,9 @@ def found():
     return of
 
 
-@pytest.mark.parametrize("case", CALIBRATIONS)
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=[pytest.mark.slow] * (c != "packaged")) for c in CALIBRATIONS]
+)
 def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, tmp_path):
     made = found(case)
     held = {name for name, p in made.parameters.items() if np.sqrt(p.variance_ratio) > HELD}
@@ -127,6 +132,7 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
     assert all(name in first.split("held by")[-1] for name in held)
 
 
+@pytest.mark.slow
 def test_calibrations_have_what_the_rule_is_for(found):
     unmeasured, bound, noisy = (found(c).parameters for c in ("unmeasured", "at a bound", "noisy"))
     assert unmeasured["motor.inductance"].held_by_prior and unmeasured["6T2A.mass"].held_by_prior

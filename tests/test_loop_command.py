@@ -2,12 +2,14 @@
 
 import contextlib
 import csv
+import functools
 import io
 import json
 import os
 import re
 import subprocess
 import sys
+import tempfile
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +19,7 @@ import generator_series as gs
 import jsonschema
 import numpy as np
 import pytest
+from synthetic import FEW, small
 
 from calibration.data import effect_file
 from calibration.inference import bases as curves
@@ -71,23 +74,40 @@ def written(path, table) -> None:
         out.writerows(zip(*table.values(), strict=True))
 
 
-def small(p):
-    return g.table8(p, payloads=(0.0, 8.0), slopes=(0.0, 10.0))
-
-
 def loaded(p):
     return g.table8(p, payloads=(0.0, 3.0, 5.0, 8.0), slopes=(0.0, 10.0), voltages=(24.0, 33.0))
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory):
-    """The whole command on 24 runs of a robot whose track churns, one of them twice."""
-    folder = tmp_path_factory.mktemp("done")
+@functools.cache
+def commanded(every=False) -> SimpleNamespace:
+    """The whole command on 24 runs of a robot whose track churns, one of them twice; made once for all files.
+
+    It looks for the effects of `FEW` alone, or for `every` one of the library.
+    """
+    room_for_it = tempfile.TemporaryDirectory()  # which is there as long as the answer
+    folder, kept = Path(room_for_it.name), []
     case = g.case(["churning"], 15.0, seed=3, grid=small)
     written(folder / "runs.csv", {k: np.append(v, v[4]) for k, v in case.table.items()})
-    answer = mmrjax(folder, "loop", "runs.csv", "--replicates", 250, "--out", "found", *PRIORS)
+
+    def discover(*arguments, **options):
+        kept.append(discovering(*arguments, **options))
+        return kept[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        discovering = room.discover
+        patch.setattr(room, "discover", discover)
+        if not every:
+            patch.setattr(room, "effect_file", SimpleNamespace(library=lambda paths: FEW.library))
+        answer = mmrjax(folder, "loop", "runs.csv", "--replicates", 250, "--out", "found", *PRIORS)
     result = json.loads((folder / "found" / "result.json").read_text())
-    return SimpleNamespace(folder=folder, case=case, answer=answer, result=result)
+    return SimpleNamespace(
+        folder=folder, case=case, answer=answer, result=result, found=kept[0], room_for_it=room_for_it
+    )
+
+
+@pytest.fixture(scope="module", params=["few", pytest.param("every", marks=pytest.mark.slow)])
+def done(request):
+    return commanded(every=True) if request.param == "every" else commanded()
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,7 @@ def test_bounce_on_tracks_is_that_of_a_mass_on_its_grousers(robot):
     assert found.natural == pytest.approx(np.sqrt(stiffness / (13.1 / 2)) / (2 * np.pi), rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
     """4W2T rolls; 2 µm up, and its height against that of the same run undisturbed."""
     run = system(robot, jax.tree.map(lambda x: x[0], conditions(robot, "4W2T")), 1e-4)
@@ -95,7 +96,7 @@ def test_a_small_vibration_rings_at_the_damped_frequency(robot, wheeled):
 
 
 def test_modes_of_the_tracked_robot_have_names_and_bands(tracked):
-    """Heavier: bounce falls; each holds most of its energy in its own coordinate; the drive is too damped."""
+    """Heavier: bounce falls towards pitch; each holds most of its energy in its own coordinate; the drive is too damped."""
     light, heavy = tracked
     assert [m.name for m in light] == ["pitch", "drive", "bounce"]
     assert named(light, "pitch").frequency == pytest.approx(66, abs=2)
@@ -103,9 +104,11 @@ def test_modes_of_the_tracked_robot_have_names_and_bands(tracked):
     assert named(heavy, "bounce").frequency == pytest.approx(79, abs=2)
     for of in tracked:
         pitch, drive, bounce = (named(of, name) for name in ("pitch", "drive", "bounce"))
-        assert pitch.share > 0.75 and bounce.share > 0.85
         assert pitch.resonant and bounce.resonant and not drive.resonant
-        assert pitch.low < pitch.frequency < pitch.high < bounce.low
+        assert pitch.low < pitch.frequency < pitch.high and pitch.frequency < bounce.low
+    assert named(light, "pitch").share > 0.8 and named(light, "bounce").share > 0.8
+    # with 8 kg bounce comes near to pitch, and they share more of their energy
+    assert named(heavy, "pitch").share > 0.6 and named(heavy, "bounce").share > 0.7
 
 
 def test_mode_over_an_octave_is_no_frequency_to_meet():
@@ -114,7 +117,7 @@ def test_mode_over_an_octave_is_no_frequency_to_meet():
     assert mode._replace(low=60.0).resonant
 
 
-@pytest.mark.parametrize("recess", [0.0, 3.5e-4, 3e-3])
+@pytest.mark.parametrize("recess", [3.5e-4, *(pytest.param(x, marks=pytest.mark.slow) for x in (0.0, 3e-3))])
 def test_standing_robot_is_in_balance_wherever_its_belt_stands(robot, recess):
     """Normal force to the weight; with a recess some grousers bear alone."""
     gear = params.replace(robot, {"running_gear.guide_recess": jnp.asarray(recess)})

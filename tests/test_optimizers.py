@@ -147,6 +147,7 @@ def test_step_ahead_is_the_optimum_beyond_and_along_the_edges_of_penalties():
     assert crossed > 5  # where the Gauss-Newton step leads to a higher place
 
 
+@pytest.mark.slow
 def test_search_of_rollouts_ends_at_the_limit_of_adhesion_from_inside(measured):
     """With the noise that is estimated of them the rows pull static friction down to the margin; from just inside of
     it nothing shows the penalty."""
@@ -169,6 +170,7 @@ def test_truth_is_recovered_from_clean_readings(clean, truth):
     np.testing.assert_allclose(found.z, np.broadcast_to(truth, found.z.shape), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_64_starts_on_the_packaged_data_agree(posed):
     found, _, _ = fit.searches(posed, starts(len(posed.coordinates), 64), posed.data)
     assert np.all(found.converged)
@@ -195,6 +197,7 @@ def test_intervals_cover_the_truth(posed, truth):
     assert np.all((found.profile > 0.92) & (found.profile < 0.98)), found.profile
 
 
+@pytest.mark.slow
 def test_coverage_can_fail(posed, truth):
     """Intervals made with half the noise that the readings have do not cover."""
     reading = posed.observation(truth).reading
@@ -214,6 +217,7 @@ def test_coverage_can_fail(posed, truth):
     assert inside.min() < 0.85
 
 
+@pytest.mark.slow
 def test_what_only_its_prior_holds_is_said(measured):
     robot = robots.nominal()
     names = (
@@ -248,6 +252,7 @@ def test_profile_of_a_linear_problem_is_its_interval(clean, truth):
     np.testing.assert_allclose(profile.high[sure], high[sure], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
     posed = pose(measured, robots.nominal(), stated="current=9%,motor_speed=6%,speed=4%")
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data)
@@ -259,6 +264,7 @@ def test_profile_of_a_parameter_held_by_the_limit_is_one_sided(measured):
     assert profile.better < 1e-3
 
 
+@pytest.mark.slow
 def test_blocks_left_out_are_not_seen(posed, measured):
     masks = {"slope": holdout.blocks(measured, "slope")}
     best = solve(posed, jnp.zeros(len(posed.coordinates)), posed.data).z

@@ -264,6 +264,7 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     assert np.isfinite(found.posterior.covariance).all()
 
 
+@pytest.mark.slow
 def test_population_of_which_no_member_can_be_run_is_refused(runs, monkeypatch):
     true = population._observed
 

@@ -143,6 +143,20 @@ def test_tracers_go_the_usual_way(folder):
     assert not list(folder.iterdir())
 
 
+def test_programs_that_call_back_into_python_are_used_and_not_kept(folder):
+    seen = []
+
+    @functools.wraps(cholesky)
+    def watched(matrix):
+        jax.debug.callback(seen.append, matrix[0, 0])
+        return cholesky(matrix)
+
+    found = programs.Programs(watched).of(((MATRIX,), {}))(((MATRIX,), {}))
+    jax.effects_barrier()
+    np.testing.assert_allclose(found, np.linalg.cholesky(MATRIX), rtol=1e-12, atol=1e-15)
+    assert seen == [4.0] and not list(folder.iterdir())
+
+
 @pytest.mark.parametrize("ending", ["program", "executable"])
 def test_broken_files_are_made_again(folder, ending):
     made = programs.Programs(cholesky).of(((MATRIX,), {}))(((MATRIX,), {}))

@@ -365,10 +365,14 @@ def test_other_wrong_use_is_said(robot):
     assert refused(robot, {"voltage": 3.0}) == "conditions: got dict; expected mmrjax.Conditions(...)"
     said = refused(robot, mm.Conditions(voltage=np.full(1001, 24.0)), model="drive")
     assert said == "history: got 1001 runs; at most 1000 are kept over time; expected history=False"
+    with pytest.raises(ValueError, match="shapes do not broadcast"):
+        mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])
+
+
+@pytest.mark.slow
+def test_step_that_contacts_cannot_bear_is_said(robot):
     stiff = params.replace(robot, {"running_gear.contact_stiffness": np.asarray(3e9)})
     assert re.match(
         r"model track, step: got 0\.001 s; .* the largest stable step is",
         refused(stiff, mm.Conditions(), model="track", step=1e-3),
     )
-    with pytest.raises(ValueError, match="shapes do not broadcast"):
-        mm.Conditions(voltage=[1.0, 2.0], payload=[1.0, 2.0, 3.0])

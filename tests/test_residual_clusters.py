@@ -9,8 +9,9 @@ import jsonschema
 import numpy as np
 import pytest
 from pages import Tables
-from synthetic import SETTLED, known
+from synthetic import SETTLED, calibrated, known
 from test_lack_of_fit import SIGMA, toy
+from test_loop_command import commanded
 
 from calibration.data import runs as records
 from calibration.data.runs import Runs
@@ -70,6 +71,7 @@ def test_clean_residuals_cluster_no_more_often_than_stated():
     assert sum(bool(residual_clusters(left(s), seed=s)) for s in range(300)) <= 0.015 * 300
 
 
+@pytest.mark.slow
 def test_wild_residuals_make_no_cluster():
     """Of a t distribution of 2.5 degrees of freedom, whose outliers a variance ratio alone takes for levels."""
 
@@ -86,7 +88,7 @@ def by_wheel(size):
     return lambda runs, columns: size * np.array([1.2, -0.3, -0.9])[columns["idle_wheel"].astype(int) - 1]
 
 
-@pytest.mark.parametrize("channel", [CURRENT, MOTOR, SPEED])
+@pytest.mark.parametrize("channel", [*(pytest.param(c, marks=pytest.mark.slow) for c in (CURRENT, MOTOR)), SPEED])
 def test_a_hidden_column_is_found_in_its_channel(channel):
     name = ("total_current", "motor_speed", "speed")[channel]
     hits = [residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(40)]
@@ -261,6 +263,7 @@ def shifted():
     return calibrate(measured_table(0, 8.0), robots.nominal(), starts=2, profiles=False, blocks=())
 
 
+@pytest.mark.slow
 def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     (found,) = shifted.residual_clusters
     assert (found.column, found.channel, found.within) == ("idle_wheel", "speed", "")
@@ -272,6 +275,7 @@ def test_calibration_says_what_its_residuals_cluster_by(shifted, tmp_path):
     assert Tables(page).tables
 
 
+@pytest.mark.slow
 def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
     clean = calibrate(measured_table(1, 0.0), robots.nominal(), starts=2, profiles=False, blocks=())
     assert clean.residual_clusters == () and "without a role" not in " ".join(clean.notes)
@@ -279,6 +283,7 @@ def test_clean_table_says_nothing_of_columns_without_a_role(tmp_path):
     assert 'id="clusters"' not in page
 
 
+@pytest.mark.slow
 def test_the_loop_says_what_its_last_fit_leaves_clustered():
     runs = measured_table(0, 8.0)
     found = discover.discover_at(runs, robots.nominal(), known(runs), SETTLED.settings, {}, SETTLED.library)
@@ -286,6 +291,35 @@ def test_the_loop_says_what_its_last_fit_leaves_clustered():
     assert [(c.column, c.channel) for c in found.residual_clusters] == [("idle_wheel", "speed")]
     assert any("cluster by idle_wheel" in note for note in found.notes)
     assert document["residual_clusters"][0]["p"] < LEVEL
+
+
+def clustered():
+    """What residuals cluster by where one wheel in three idles, of a linear fit."""
+    (found,) = residual_clusters(left(0, shift=by_wheel(2.0)))
+    return found
+
+
+def test_clusters_are_in_the_document_and_on_the_page_of_a_calibration(tmp_path):
+    found, plain = clustered(), calibrated()
+    made = dataclasses.replace(plain, residual_clusters=(found,))
+    document = json.loads(json.dumps(made.to_json()))
+    jsonschema.validate(document, json.loads((SCHEMAS / "calibrate.schema.json").read_text("utf-8")))
+    assert document["residual_clusters"][0]["statement"] == found.statement
+    page = report_calibration.write(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
+    assert "cluster by idle_wheel" in page and (tmp_path / "with" / "figures" / "clusters.svg").exists()
+    bare = dataclasses.replace(plain, residual_clusters=())
+    assert 'id="clusters"' not in report_calibration.write(tmp_path / "bare", bare, robot_name="nominal").read_text(
+        "utf-8"
+    )
+
+
+def test_the_loop_gives_its_document_what_its_last_fit_leaves_clustered():
+    """A clean column without a role is not told; one by which residuals cluster is in the document."""
+    plain, found = commanded().found, clustered()
+    assert plain.residual_clusters == () and plain.to_json()["residual_clusters"] == []
+    document = dataclasses.replace(plain, residual_clusters=(found,)).to_json()
+    assert document["residual_clusters"][0]["p"] < LEVEL
+    assert document["residual_clusters"][0]["statement"] == found.statement
 
 
 # --- reading --------------------------------------------------------------------------------------------

@@ -130,7 +130,7 @@ def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_pa
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
-@pytest.mark.parametrize("kind", ["bench", "pendulum", "wheeled"])
+@pytest.mark.parametrize("kind", ["bench", "pendulum", pytest.param("wheeled", marks=pytest.mark.slow)])
 def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind)
     code, out, err = mmrjax(
@@ -144,6 +144,7 @@ def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
+@pytest.mark.slow
 def test_a_profile_turns_a_bench(mmrjax, tmp_path):
     (tmp_path / "turn.csv").write_text("time_s,motor_speed_rpm,supply_voltage_V\n0,0,24\n1,2000,24\n2,2000,24\n")
     code, out, err = mmrjax(
@@ -282,6 +283,7 @@ def test_a_sweep_into_a_store_knows_what_is_imposed(mmrjax, tmp_path):
     assert code == 2 and "the robot's file imposes the motor speed" in err
 
 
+@pytest.mark.slow
 def test_a_vehicle_is_drawn(mmrjax, tmp_path):
     rig = of_kind(tmp_path, "wheeled")
     code, out, err = mmrjax(
@@ -295,7 +297,7 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
 # --- measured tables ----------------------------------------------------------------------------------------------
 
 
-def test_compare_calibrate_and_loop_take_one_channel_both_ways(mmrjax, tmp_path, bench):
+def test_compare_and_calibrate_take_one_channel_both_ways(mmrjax, tmp_path, bench):
     rig, data = bench
     code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
     assert code == 0, err
@@ -305,31 +307,45 @@ def test_compare_calibrate_and_loop_take_one_channel_both_ways(mmrjax, tmp_path,
     assert code == 0 and "rms error: before total current" in said and "motor and speed" not in said, err
     fitted = robot_file.read(tmp_path / "fitted" / "robot.toml")
     assert float(fitted.configurations["bench"].loss_coulomb) == pytest.approx(0.07, rel=0.05)
+    priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
+    assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
+    for folder in ("compared", "fitted"):
+        assert words_of_others(*left_in(tmp_path / folder)) == [], folder
+    assert words_of_others(out, said, err) == []
+
+
+@pytest.mark.slow
+def test_loop_takes_one_channel_both_ways(mmrjax, tmp_path, bench):
+    rig, data = bench
     code, told, err = mmrjax("loop", data, "--robot", rig, "--replicates", "250", "--out", "found")
     assert code == 0 and "rms error: before total current" in told, err
     defects = (tmp_path / "found" / "figures" / "defects.svg").read_text()
     assert "torque missing at the output" in defects and "voltage missing" not in defects and "slip" not in defects
     page = (tmp_path / "found" / "report.html").read_text()
     assert "The channels close one equation: torque." in page
-    for folder in ("compared", "fitted", "found"):
-        assert words_of_others(*left_in(tmp_path / folder)) == [], folder
-    assert words_of_others(out, said, told, err) == []
+    assert words_of_others(*left_in(tmp_path / "found"), told, err) == []
 
 
-def test_compare_and_calibrate_show_a_vehicles_conditions(mmrjax, tmp_path, rover):
+def test_compare_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
     rig, data = rover
     code, out, err = mmrjax("compare", data, "--robot", rig, "--out", "compared")
     assert code == 0, err
     shown = (tmp_path / "compared" / "figures" / "errors.svg").read_text()
     assert "motor speed [rpm]" in shown and "slope" in shown and "supply voltage" not in shown
+    assert words_of_others(out, err, *left_in(tmp_path / "compared")) == []
+
+
+@pytest.mark.slow
+def test_calibrate_shows_a_vehicles_conditions(mmrjax, tmp_path, rover):
+    rig, data = rover
     code, said, err = mmrjax("calibrate", data, "--robot", rig, "--starts", "2", "--no-profiles", "--out", "fitted")
     assert code == 0, err
     priors = json.loads((tmp_path / "fitted" / "result.json").read_text())["parameters"]
     assert {p["prior"]["source"] for p in priors.values()} <= {params.STATED, params.DEFAULT}
-    assert words_of_others(out, said, err, *left_in(tmp_path / "compared"), *left_in(tmp_path / "fitted")) == []
+    assert words_of_others(said, err, *left_in(tmp_path / "fitted")) == []
 
 
-@pytest.mark.parametrize("kind", ["linear", "tracked"])
+@pytest.mark.parametrize("kind", ["linear", pytest.param("tracked", marks=pytest.mark.slow)])
 def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind)
     levels = [8, 12, 18, 24, 8, 12, 18, 24]
@@ -342,7 +358,7 @@ def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
 # --- sensitivity --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["bench", "wheeled"])
+@pytest.mark.parametrize("kind", ["bench", pytest.param("wheeled", marks=pytest.mark.slow)])
 def test_sensitivity_takes_what_a_rig_has(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind, speed=kind == "bench")
     where = ["--motor-speeds", "1000,3000"] if kind == "bench" else ["--voltages", "12,24", "--slopes", "0,5"]

@@ -381,6 +381,7 @@ def inside(found, true):
     return {n: abs(p.value - true[n]) / p.sd for n, p in found.parameters.items() if n in true}
 
 
+@pytest.mark.slow
 def test_a_bench_with_imposed_speed_and_current_alone_is_calibrated(tmp_path):
     robot, speed = bench(), np.repeat(np.linspace(500, 4000, 6), 3)
     true = {"rig.loss_coulomb": 0.07, "rig.loss_viscous": 0.006}
@@ -392,6 +393,7 @@ def test_a_bench_with_imposed_speed_and_current_alone_is_calibrated(tmp_path):
     assert list(found.held_out) == ["speed"] and "supply_voltage_V" not in found.rows()
 
 
+@pytest.mark.slow
 def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
     robot = bench("voltage", ("total_current", "motor_speed"), sides=3.0)
     volts = np.array([-24.0, -18, -12, -6, 6, 12, 18, 24] * 2)
@@ -404,6 +406,7 @@ def test_three_motors_forward_and_reverse_are_calibrated(tmp_path):
     assert set(found.status) == {"converged", "reverses"}
 
 
+@pytest.mark.slow
 def test_a_vehicle_on_two_surfaces_is_calibrated(tmp_path):
     robot = vehicle(sides=2.0)
     speed = np.tile([1000.0, 2000, 3000, -1000, -2000, -3000], 4)
@@ -445,6 +448,7 @@ loss_viscous = 0.004
 """
 
 
+@pytest.mark.slow
 def test_a_bench_is_compared_and_calibrated_from_two_files(mmrjax, tmp_path):
     (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
     rows = "".join(f"{n},{0.16 + n * 2.4e-5 + 1e-3 * (k % 3)}\n" for k, n in enumerate(range(500, 4500, 500)))
@@ -503,6 +507,7 @@ def test_an_instrument_left_free_is_what_its_table_shows(tmp_path):
     assert records.read(path, robot=free).layout.instruments[0].signed is True
 
 
+@pytest.mark.slow
 def test_a_calibration_of_a_free_instrument_leaves_what_it_found(tmp_path):
     text = """
 base = "none"

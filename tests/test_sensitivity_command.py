@@ -108,13 +108,16 @@ def test_default_inputs_are_what_has_a_prior_and_acts_here(robot):
 
 
 def test_sobol_of_a_nearly_linear_study_is_its_linear_share(study):
-    shares = {method: analyse(study, method, 40_000).outputs["speed"] for method in ("local", "sobol")}
+    found = {method: analyse(study, method, 40_000) for method in ("local", "sobol")}
+    assert sum(found["sobol"].sampled["steady"].values()) == found["sobol"].evaluations > 0
+    shares = {method: of.outputs["speed"] for method, of in found.items()}
     linear, sampled = shares["local"].share[:2], shares["sobol"].at_points["total"]
     np.testing.assert_allclose(sampled.value[:2], linear, atol=0.03)
     assert np.all(sampled.low[:2] <= linear + 0.01) and np.all(linear - 0.01 <= sampled.high[:2])
     assert not shares["sobol"].studied[3] and np.isnan(sampled.value[3]).all()
 
 
+@pytest.mark.slow
 def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, study):
     coordinates = priors.coordinates(robot, NAMES[:2])
     covariance = np.array([[0.02, 0.012], [0.012, 0.02]])
@@ -122,6 +125,7 @@ def test_shapley_effects_of_a_posterior_are_those_of_its_linear_model(robot, stu
     points = Points(*(x[:1] for x in study.points.columns().values()))
     one = Study(robot, inputs, points, chosen_outputs(("total_current",), robot))
     found = analyse(one, "shapley", 20_000)
+    assert sum(found.sampled["steady"].values()) == found.evaluations > 0
     z_slopes = local(one).by_score["total_current"][0] @ np.linalg.inv(inputs.parameters.root)
     truth = shapley.linear(z_slopes, covariance)
     estimate = found.outputs["total_current"].overall["shapley"]
@@ -188,9 +192,8 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
     np.testing.assert_allclose(some.overall["shapley"].value, variance @ at / variance.sum())
 
 
-@pytest.mark.parametrize(
-    "method", ["morris", *(pytest.param(m, marks=pytest.mark.slow) for m in ("sobol", "derivative", "shapley"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["sobol", "morris", "derivative", "shapley"])
 def test_evaluations_are_those_whose_statuses_are_counted(robot, study, method):
     inputs = room.of_priors(robot, (*NAMES[:3], "6T2A.ground.friction.static"), {})  # a size of design each
     points = Points(*(x[:2] for x in study.points.columns().values()))
@@ -360,7 +363,8 @@ def test_points_that_are_not_held_are_said_and_end_with_3(mmrjax, tmp_path):
     assert low < 1 < high  # the only input
 
 
-@pytest.mark.parametrize("vary", ["voltage=22:26", pytest.param("total_mass=12:16", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("vary", ["voltage=22:26", "total_mass=12:16"])
 def test_conditions_that_vary_are_those_of_each_candidate_where_it_states_them(mmrjax, tmp_path, vary):
     code, _, err = mmrjax(
         "sensitivity", "--method", "local", "--parameters", NAMES[0], "--payloads", "3", "--slopes", "0",

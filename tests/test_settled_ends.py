@@ -53,6 +53,7 @@ def is_global(monkeypatch, adhesion, creep, seed=3):
     assert abs(2 * fitted.candidate.cost - readings) < 5 * np.sqrt(2 * readings), (adhesion, creep)
 
 
+@pytest.mark.slow
 def test_clean_starts_on_a_ground_that_is_not_nominal_are_fitted(monkeypatch):
     is_global(monkeypatch, (0.55, 0.54), 0.012)
 
@@ -87,6 +88,7 @@ def test_ends_of_runs_that_grip_are_those_of_settled_travel(monkeypatch):
     assert (ends.sd[there] >= settled_ends.FLOOR * np.abs(ends.mean[there]) - 1e-12).all()
 
 
+@pytest.mark.slow
 def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
     """On a slope beyond its adhesion a robot spins its movers, and its steady state is none."""
     _, slides, _, sound = ends_of(monkeypatch, (0.12, 0.6))

@@ -140,7 +140,8 @@ def test_history_follows_the_demand_and_holds_each_segments_peak(done):
     for cycle, segment, peak in zip(segments["cycle"], segments["segment"], segments["peak_current_A"], strict=True):
         own = (history["cycle"] == cycle) & (history["segment"] == segment)
         # the peak of a segment counts the instant that it begins in too
-        assert 2 * np.abs(history["motor_current_A"][own]).max() <= peak * (1 + 1e-9)
+        # (half of it has nine digits in the file, of which the last is rounded)
+        assert 2 * np.abs(history["motor_current_A"][own]).max() <= peak * (1 + 1e-8)
     assert 2 * np.abs(history["motor_current_A"]).max() == pytest.approx(segments["peak_current_A"].max())
     assert history["energy_Wh"][-1] == pytest.approx(segments["energy_Wh"].sum(), rel=1e-6)
 
@@ -258,6 +259,7 @@ def two(robot):
     return mm.simulate(robot, at, profile=SHORT, history=False)
 
 
+@pytest.mark.slow
 def test_simulate_over_a_profile_has_the_columns_of_the_table(two):
     assert two.model == "drive" and two.shape == (2,) and list(two.statuses) == ["converged"] * 2
     table = two.to_dict()

@@ -188,6 +188,7 @@ def stood(analyst, runs, effects):
     return standing(space, base, Search((best,), best, after), left, bases, analyst.settings), best, after
 
 
+@pytest.mark.slow
 def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
     got, best, _ = stood(SETTLED, growing(monkeypatch, 20.0, 1), ("rolling_radius", "load_slip"))
     assert not got.stands and ("smooth" in got.reason or "not adequate" in got.reason)
@@ -195,6 +196,7 @@ def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
     assert true.stands and true.reason == "" and same.key == best.key and not after.test.rejected_with_margin
 
 
+@pytest.mark.slow
 def test_sliding_speed_that_grows_gets_no_name(monkeypatch):
     for sigmas, seed in ((12.0, 1), (30.0, 2)):
         found = SETTLED.trace(growing(monkeypatch, sigmas, seed))
@@ -220,6 +222,7 @@ def test_three_slips_do_not_stand_for_a_sliding_speed_that_grows(monkeypatch):
         assert len(found.best.effects) < 3 and set(found.families) == {"slip that changes with speed"}, (sigmas, seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pair", [("rolling_radius", "load_slip"), ("series_resistance", "brush_drop"), ("churning", "stribeck_track")]
 )

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import generator as g
 import numpy as np
 import pytest
-from synthetic import SETTLED, table
+from synthetic import FEW, SETTLED, small, table
 
 from calibration.discovery import discover, findings
 from calibration.discovery.stated_values import scores, shifts
@@ -59,20 +59,28 @@ def test_a_coordinate_that_nothing_shows_cannot_be_the_wrong_one(toy):
 # --- a robot whose sheet is wrong -----------------------------------------------------------------------
 
 
-def made(resistance=NOMINAL, lead=0.0):
+def made(resistance=NOMINAL, lead=0.0, grid=g.table8):
     """A table of a robot with this winding, and leads beside it, all else at its sheets."""
     p = dict(g.CLIMBING) | {"motor.resistance": resistance}
     terms = (g.Term("series_resistance", lead),) * (lead > 0)
-    c, instruments = g.table8(p), g.Instruments()
+    c, instruments = grid(p), g.Instruments()
     return table(g._table(c, *g.readings(c, p, terms), instruments, np.random.default_rng(1)))
 
 
+@pytest.fixture(scope="module", params=["few", pytest.param("many", marks=pytest.mark.slow)])
+def looks(request):
+    """Who looks, and at which runs."""
+    return {"few": (FEW, small), "many": (SETTLED, g.table8)}[request.param]
+
+
 @pytest.mark.parametrize(
-    ("runs", "truth"), [(made(lead=0.8), NOMINAL + 0.8), (made(resistance=1.3), 1.3)], ids=["leads", "winding"]
+    ("wrong", "truth"), [({"lead": 0.8}, NOMINAL + 0.8), ({"resistance": 1.3}, 1.3)], ids=["leads", "winding"]
 )
-def test_resistance_freed_of_its_prior_is_the_right_one(runs, truth):
-    fitted = SETTLED.base(runs)
-    found = {s.name: s for s in shifts(fitted.space, fitted.candidate, NEEDED, SETTLED.settings)}
+def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
+    analyst, grid = looks
+    runs = made(**wrong, grid=grid)
+    fitted = analyst.base(runs)
+    found = {s.name: s for s in shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings)}
     assert "motor.resistance" in found
     shift = found["motor.resistance"]
     said = findings._stated(fitted.space, fitted.candidate, shift)
@@ -86,15 +94,16 @@ def test_resistance_freed_of_its_prior_is_the_right_one(runs, truth):
     assert findings.stated_in_words(fitted.space, [shift]) == [f"motor.resistance is {said.value:.3g} ohm"]
 
 
-def test_nothing_is_shifted_where_the_sheet_is_right():
-    fitted = SETTLED.base(made())
-    assert shifts(fitted.space, fitted.candidate, NEEDED, SETTLED.settings) == []
+def test_nothing_is_shifted_where_the_sheet_is_right(looks):
+    analyst, grid = looks
+    fitted = analyst.base(made(grid=grid))
+    assert shifts(fitted.space, fitted.candidate, NEEDED, analyst.settings) == []
 
 
-def test_verdict_lists_the_resistance_that_may_be_wrong():
+def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
     """Beside the leads, so that no single name is given; its prior is one fifteenth of the shift."""
-    runs = made(lead=0.8)
-    found = SETTLED.trace(runs)
+    analyst, grid = looks
+    found = analyst.trace(made(lead=0.8, grid=grid))
     assert found.verdict == "class"
     (members,), (stated,) = found.alike.members, found.alike.stated
     assert "series_resistance" in members and [s.name for s in stated] == ["motor.resistance"]

@@ -273,6 +273,7 @@ def test_every_fidelity_is_swept_over_parameters(sweep, tmp_path, model, options
         assert ((found.guide_share > 0) & (found.guide_share < 1)).all()
 
 
+@pytest.mark.slow
 def test_track_step_that_a_corner_cannot_bear_is_refused_before_the_first_run(sweep, tmp_path):
     config = (
         'model = "track"\nduration_s = 0.01\nstep_s = 1e-3\n[axes]\n"running_gear.contact_stiffness" = [3e7, 3e9]\n'

@@ -267,6 +267,7 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
     assert json.loads((tmp_path / "a" / "result.json").read_text())[PEAK] == pytest.approx(float(row[PEAK]))
 
 
+@pytest.mark.slow
 def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     robot, found = climb
     heading = report_runs.labels(found.to_dict())
@@ -305,6 +306,7 @@ def test_what_was_reached_is_shown_when_the_battery_ends(mmrjax, tmp_path):
     assert code == 3 and "battery_empty: empty before the start" in out
 
 
+@pytest.mark.slow
 def test_a_run_may_last_a_day(mmrjax):
     found = api.simulate(robots.nominal(), api.Conditions(0, 33.0), "drive", duration=86_400.0, history=False)
     assert found.statuses == "converged"

@@ -65,7 +65,8 @@ def step_both(robot):
     return forces
 
 
-@pytest.mark.parametrize("name", [pytest.param("tracked", marks=pytest.mark.slow), "wheeled"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(RUNS))
 def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
     """10 000 steps, each engine on its own trajectory; to 1e-6 of every coordinate's and rate's size.
 

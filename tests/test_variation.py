@@ -57,7 +57,8 @@ def test_evaluate_steady_is_each_point_by_itself(variation):
     assert len(set(map(float, found["total_current"][:2]))) == 2  # the points differ, or the test says nothing
 
 
-@pytest.mark.parametrize("names", [pytest.param(NAMES, marks=pytest.mark.slow), ("slope_deg", "voltage")])
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [NAMES, ("slope_deg", "voltage")])
 def test_evaluate_drive_is_the_run_of_each_robot(names):
     robot, chosen = robots.nominal(), [NAMES.index(n) for n in names]
     values, options = jnp.asarray(VALUES[:2, chosen]), {"duration": 0.5}

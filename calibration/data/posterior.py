@@ -78,6 +78,12 @@ class Posterior:
         followers = [ratio * theta[..., k] for _, k, ratio in self.tied]
         return jnp.concatenate([theta, jnp.stack(followers, -1)], -1) if followers else theta
 
+    def numbers(self, z: np.ndarray) -> np.ndarray:
+        """The same of an array, in one program."""
+        import jax
+
+        return np.asarray(jax.jit(self.at)(z))
+
     def values(self, normal_scores: Any) -> Any:
         """Parameters [SI] of draws.
 
@@ -91,7 +97,8 @@ class Posterior:
 
     def draw(self, draws: int, seed: int) -> np.ndarray:
         """Parameters [SI] of so many random draws, shape (draws, names)."""
-        return np.asarray(self.values(np.random.default_rng(seed).standard_normal((draws, len(self)))))
+        scores = np.random.default_rng(seed).standard_normal((draws, len(self)))
+        return self.numbers(np.asarray(self.mean) + scores @ self.root.T)
 
     def check(self, robot: Robot, where: str) -> None:
         """Refuse a posterior that is not this robot's.
@@ -111,7 +118,7 @@ class Posterior:
                     f"{where}: a posterior of {name}, which this robot does not have, so it is of another robot; "
                     f"{choices(name, [n for n in known if n.rpartition('.')[2] == name.rpartition('.')[2]] or known)}"
                 )
-        at = np.asarray(self.at(np.asarray(self.mean)))
+        at = self.numbers(np.asarray(self.mean))
         sd = np.asarray(self.sd)
         for name, value, width in zip(self.names, at, sd, strict=True):
             if not abs(known[name] - value) <= APART * width + 1e-6 * abs(value):  # also where one is NaN
@@ -125,7 +132,7 @@ class Posterior:
         """Standard deviation of each parameter of `names` to first order [SI]."""
         import jax
 
-        slopes = np.asarray(jax.jacfwd(self.at)(np.asarray(self.mean)))
+        slopes = np.asarray(jax.jit(jax.jacfwd(self.at))(np.asarray(self.mean)))
         return np.sqrt(np.einsum("ij,jk,ik->i", slopes, self.covariance, slopes))
 
 
@@ -142,7 +149,7 @@ def write(posterior: Posterior, path: Path | str) -> None:
         "low": (p.low, "least u"),
         "high": (p.high, "greatest u"),
         "softness": (p.softness, "width over which bounds are rounded off, as a share of the spread"),
-        "value": (np.asarray(p.at(p.mean))[: len(p)], "parameter at the mean [SI]"),
+        "value": (p.numbers(p.mean)[: len(p)], "parameter at the mean [SI]"),
         "sd": (p.sd[: len(p)], "standard deviation of the parameter, to first order [SI]"),
     }
     data: dict[str, Any] = {

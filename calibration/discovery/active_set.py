@@ -22,6 +22,7 @@ from calibration.inference.linearization import (
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
 
@@ -66,10 +67,7 @@ class ActiveSet(eqx.Module):
 
     def robot(self, robot: Robot, z: Float[Array, " coordinates"]) -> Robot:
         """`robot`, which has every effect of `names`, at coordinates z."""
-        base, amplitude, shape = self.parts(z)
-        held = self.held()
-        amplitudes = self.sd * (amplitude @ held)
-        shapes = shaped(self.scales, shape @ held)
+        base, amplitudes, shapes = _parts(self, z)
         values = {f"effects.{name}.amplitude": amplitudes[k] for k, name in enumerate(self.names)}
         pairs = enumerate(zip(self.names, self.shapes, strict=True))
         values |= {f"effects.{n}.{s}": shapes[k] for k, (n, s) in pairs if s}
@@ -78,6 +76,16 @@ class ActiveSet(eqx.Module):
     def with_effects(self, active: Sequence[int] | Array) -> ActiveSet:
         """The same with these effects in the slots."""
         return dataclasses.replace(self, active=jnp.asarray(active, int))
+
+
+@compiled
+def _parts(space: ActiveSet, z: Array) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
+    """Coordinates of the base, and amplitude and shape of every effect."""
+    base, amplitude, shape = space.parts(z)
+    held, effects = space.held(), range(len(space.names))
+    amplitudes = space.sd * (amplitude @ held)
+    shapes = shaped(space.scales, shape @ held)
+    return base, tuple(amplitudes[k] for k in effects), tuple(shapes[k] for k in effects)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,6 +29,7 @@ from calibration.inference.linearization import Linearization
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.effects import UNNAMED
 from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import PLACES
@@ -200,9 +201,15 @@ class Shaped(eqx.Module):
 
     def robot(self, robot: Robot, z: Float[Array, " coordinates"]) -> Robot:
         """`robot`, which has the curve, at coordinates z."""
-        there = self.base.robot(robot, z[: len(self.base)])
-        y = self.root @ z[len(self.base) :]
-        return params.replace(there, {n: y[k] for k, n in enumerate(self.names)})
+        base, ordinates = _ordinates(self, z)
+        return params.replace(self.base.robot(robot, base), dict(zip(self.names, ordinates, strict=True)))
+
+
+@compiled
+def _ordinates(shaped: Shaped, z: Array) -> tuple[Array, tuple[Array, ...]]:
+    """Coordinates of the base, and the ordinates of the curve."""
+    y = shaped.root @ z[len(shaped.base) :]
+    return z[: len(shaped.base)], tuple(y[k] for k in range(len(shaped.names)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -178,10 +179,10 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     Args:
         chosen: index of the family, in the order of `ScoreTable.curve`.
     """
-    linear = jax.tree.map(jnp.asarray, linear)
+    linear = jax.tree.map(np.asarray, linear)
     for basis in bases:
         if chosen < len(basis.places):
-            columns = signature(linear, basis.places[chosen], np.asarray(basis.columns[chosen]))
+            columns = signature(linear, basis.places[chosen], np.asarray(basis.columns)[chosen])
             norm = np.linalg.norm(columns, axis=0)
             return columns[:, norm > 0] / norm[norm > 0] * WIDE
         chosen -= len(basis.places)
@@ -213,9 +214,9 @@ def beside_columns(
         extra: columns over the readings, shape (readings, columns); of: their places.
     """
     filled = np.pad(extra, ((0, 0), (0, -extra.shape[1] % FILLED)))  # to few sizes: each is compiled
-    jacobian, residual = map(jnp.asarray, widened(linear, filled))
-    linear = jax.tree.map(jnp.asarray, linear)
-    padded = dataclasses.replace(linear, jacobian=jacobian, residual=residual)
+    wide: tuple[Any, Any] = widened(linear, filled)
+    linear = jax.tree.map(np.asarray, linear)
+    padded = dataclasses.replace(linear, jacobian=wide[0], residual=wide[1])
     scores = _score_tests(padded, bases)
     balances = np.array([n[0] for b in bases for n in b.names])
     deviate = np.where(np.isin(balances, list(of)), -np.inf, np.asarray(scores.curve))
@@ -252,8 +253,10 @@ def bootstrap(
         seed: random seed.
     """
     count = -(-replicates // CHUNK)
-    given = problem, z, linear, effects, bases, np.asarray(seed)
-    parts = [jax.device_get(_replicates(*given, np.asarray(k), count)) for k in range(count)]
+    parts = [
+        jax.device_get(_replicates(problem, z, linear, effects, bases, np.asarray(seed), np.asarray(k), count))
+        for k in range(count)
+    ]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)
 
@@ -261,19 +264,19 @@ def bootstrap(
 @compiled
 def _replicates(
     problem: Problem,
-    z: Array,
+    z: np.ndarray,
     linear: Linearization,
     effects: tuple[ScoredEffect, ...],
     bases: Bases,
-    seed: Array,
-    chunk: Array,
+    seed: np.ndarray,
+    chunk: np.ndarray,
     count: int,
 ) -> Statistics:
     """One of `count` chunks of a bootstrap."""
     keys = jax.random.split(jax.random.key(seed), (count, CHUNK))[chunk]
 
     def one(key: Array) -> Statistics:
-        drawn = problem.observe.replicate(problem, z, problem.data, effects, linear, key)
+        drawn = problem.observe.replicate(problem, jnp.asarray(z), problem.data, effects, linear, key)
         return strongest(score_tests(drawn, bases), drawn)
 
     return jax.vmap(one)(keys)

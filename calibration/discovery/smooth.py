@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.polynomial import legendre
 
 from calibration.discovery.projection import Projection
 from calibration.inference.bases import ORDERS, scaled, signature, window
 from calibration.inference.linearization import Linearization
+from mmrjax.compiling import compiled
 from mmrjax.effects.curve import ORDINATES, weights
 
 #: Priors that are tried for the ordinates: correlation lengths [spacings], sizes [σ that an ordinate makes].
@@ -79,7 +81,10 @@ class Smooth:
 def _basis(variable: str, x: np.ndarray, low: float, high: float) -> np.ndarray:
     if variable in ORDERS:
         return np.stack([np.sin(x), np.cos(x)], 1)
-    return np.asarray(weights(jnp.asarray(x), low, high))
+    return np.asarray(_weights(np.asarray(x), np.asarray(low), np.asarray(high)))
+
+
+_weights: Callable[..., Array] = compiled(weights)
 
 
 def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarray) -> Smooth:

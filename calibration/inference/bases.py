@@ -131,8 +131,8 @@ def in_words(place: str) -> str:
 def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:
     """Change of the readings by terms of a place, shape (readings, terms), of shapes (rows, terms)."""
     if in_readings(place):
-        return np.asarray(linear.shown(linear.channels.index(place), jnp.asarray(shapes)))
-    return np.asarray(linear.columns(PROBED.index(place), jnp.asarray(shapes)))
+        return np.asarray(linear.shown(linear.channels.index(place), shapes))
+    return np.asarray(linear.columns(PROBED.index(place), shapes))
 
 
 def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:

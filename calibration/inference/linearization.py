@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
 from mmrjax.params import Parameter, Scalar, parameter
 from mmrjax.robot import Robot
@@ -123,7 +124,11 @@ def scored(effect: Effect, grid: Sequence[float] = GRID) -> ScoredEffect:
     if shape is None:
         return ScoredEffect(unit, "", (0.0,), jnp.zeros(0))
     grid = TURN if _phase(shape) else grid
-    return ScoredEffect(unit, shape.name, tuple(grid), shaped(shape_scales(shape), jnp.asarray(grid)))
+    scales = [np.asarray(x) for x in shape_scales(shape)]
+    return ScoredEffect(unit, shape.name, tuple(grid), _shaped(tuple(scales), np.asarray(grid)))
+
+
+_shaped: Callable[..., Array] = compiled(shaped)
 
 
 # --- the fit ------------------------------------------------------------------------------------------------
@@ -169,21 +174,21 @@ class Linearization(eqx.Module):
         """The same at other residuals."""
         return dataclasses.replace(self, residual=residual)
 
-    def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+    def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         """Change of the whitened readings by defects of a balance, each a column over the rows.
 
         Args:
-            balance: index into PROBED.
+            balance: index into PROBED; shapes: shape (rows, terms).
         """
         raise NotImplementedError
 
-    def shown(self, channel: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+    def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         """Change of the whitened readings by what is added to those of a channel [SI], each a column over the rows.
 
         Args:
-            channel: position in the table of channels.
+            channel: position in the table of channels; shapes: shape (rows, terms).
         """
-        mine = jnp.where(jnp.arange(self.scale.shape[1]) == channel, self.scale, 0.0)
+        mine = self.scale * (np.arange(self.scale.shape[1]) == channel)
         return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from calibration.data.errors import BadConfiguration, choices, number
 from calibration.data.surfaces import GROUND
 from mmrjax import params
+from mmrjax.compiling import compiled
 from mmrjax.params import Parameter
 from mmrjax.robot import Robot
 
@@ -119,15 +120,21 @@ class Coordinates(eqx.Module):
 
     def robot(self, base: Robot, z: Float[Array, " parameters"]) -> Robot:
         """`base` with the free parameters, and those tied to them, at coordinates z."""
-        theta = self.value(z)
-        values = {name: theta[k] for k, name in enumerate(self.names)}
-        values |= {follower: self.ratios[n] * theta[k] for n, (follower, k) in enumerate(self.followers)}
-        return params.replace(base, values)
+        names = (*self.names, *(follower for follower, _ in self.followers))
+        return params.replace(base, dict(zip(names, _numbers(self, z), strict=True)))
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
         """-1 or 1 where z lies on or beyond its lower or upper bound, else 0; shape (parameters,)."""
         u = np.asarray(self.location + self.spread * z)
         return np.where(u <= self.low, -1, np.where(u >= self.high, 1, 0))
+
+
+@compiled
+def _numbers(coordinates: Coordinates, z: Float[Array, " parameters"]) -> tuple[Array, ...]:
+    """Parameters at coordinates z and those tied to them, one by one [SI]."""
+    theta = coordinates.value(z)
+    tied = (coordinates.ratios[n] * theta[k] for n, (_, k) in enumerate(coordinates.followers))
+    return (*(theta[k] for k in range(len(coordinates))), *tied)
 
 
 def known(robot: Robot) -> dict[str, Parameter]:

@@ -86,7 +86,7 @@ class HistoriesLinearization(Linearization):
     time: Float[Array, " rows"]
     angle: Float[Array, " rows"]
 
-    def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+    def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         moved = jnp.einsum("rksc,rkt->rsct", self.defects[balance], shapes[self.knots])
         there = jnp.where(self.rows_of < 0, self.rows, self.rows_of)  # beyond the last row: dropped
         out = jnp.zeros((self.rows, len(self.channels), shapes.shape[1])).at[there].set(moved, mode="drop")

@@ -46,7 +46,7 @@ EQUATIONS = ("electrical", "track", "slip")
 class SettledLinearization(Linearization):
     """Of settled rows: `defects` has shape (balances, rows, channels), a defect of each row of its own."""
 
-    def columns(self, balance: Scalar | int, shapes: Float[Array, "rows terms"]) -> Float[Array, "readings terms"]:
+    def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         return (self.defects[balance][:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
 
     def places(self) -> np.ndarray:
