@@ -68,6 +68,24 @@ def _spent() -> float:
     return at.user + at.system + at.children_user + at.children_system
 
 
+#: Files that share results, which a process makes once: one worker runs them, and first, since they take longest.
+SHARING = {
+    "loop": (
+        "test_loop_command", "test_loop_page", "test_discovery", "test_implausible", "test_stated_values",
+        "test_discrepancy", "test_residual_clusters",
+    ),
+    "calibrated": ("test_calibrate", "test_posterior", "test_held_by_prior"),
+}  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    """A worker takes a file at a time, or the files of a group (`--dist loadgroup`)."""
+    group = {file: name for name, files in SHARING.items() for file in files}
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group(group.get(item.path.stem, item.path.stem)))
+    items.sort(key=lambda item: list(SHARING).index(g) if (g := group.get(item.path.stem)) else len(SHARING))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item, nextitem):
     """Note the processor time of each test, its fixtures included."""
