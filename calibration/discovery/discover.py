@@ -5,6 +5,7 @@ Each stage is a function of what the stages before it found; none changes anythi
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -99,13 +100,18 @@ def discover(
     distinct, known = ready.runs, ready.noise
     for sentence in ready.foreign:
         progress(sentence)
-    found = finished(ready.trace(progress=progress), distinct, ready.numbers, ready.settings, ready.library, progress)
-    sensitivity, notes = [], ready.notes
+    traced, notes = ready.trace(progress=progress), ready.notes
+    # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
+    with concurrent.futures.ThreadPoolExecutor(len(FACTORS)) as others:
+        verdicts = {}
+        if "assumed" in known.source:
+            progress(f"the verdict with {' and '.join(f'{f:g}' for f in FACTORS)} times the assumed noise, beside:")
+            sizes = observers.kind(distinct).sizes(distinct)
+            sds = {f: noise_room.assumed(distinct, sizes, noise, f) for f in FACTORS}
+            verdicts = {f: others.submit(ready.trace, sds[f]) for f in FACTORS}
+        found = finished(traced, distinct, ready.numbers, ready.settings, ready.library, progress)
+        sensitivity = [in_short(f, verdict.result()) for f, verdict in verdicts.items()]
     if "assumed" in known.source:
-        for factor in FACTORS:
-            progress(f"the verdict with {factor:g} times the assumed noise")
-            sds = noise_room.assumed(distinct, observers.kind(distinct).sizes(distinct), noise, factor)
-            sensitivity.append(in_short(factor, ready.trace(sds)))
         silent = ", ".join(c.name for c, w in zip(known.channels, known.source, strict=True) if w == "assumed")
         usual = noise_room.default(known.channels)
         said = f"no sd is stated for {silent}: {usual} is assumed; state yours with --noise"

@@ -8,7 +8,9 @@ with one degree of freedom where nothing is missing (Rao 1948).
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -34,6 +36,8 @@ WIDE = 30.0
 FILLED = 36
 #: Replicates in one batch of the bootstrap.
 CHUNK = 64
+#: Batches that run side by side, at most as many as there are cores.
+BATCHES = min(4, os.cpu_count() or 1)
 
 
 class ScoreTable(eqx.Module):
@@ -253,10 +257,13 @@ def bootstrap(
         seed: random seed.
     """
     count = -(-replicates // CHUNK)
-    parts = [
-        jax.device_get(_replicates(problem, z, linear, effects, bases, np.asarray(seed), np.asarray(k), count))
-        for k in range(count)
-    ]
+
+    def part(k: int) -> Statistics:
+        return jax.device_get(_replicates(problem, z, linear, effects, bases, np.asarray(seed), np.asarray(k), count))
+
+    # The first batch compiles what the others run; a batch keeps one core busy.
+    with concurrent.futures.ThreadPoolExecutor(BATCHES) as cores:
+        parts = [part(0), *cores.map(part, range(1, count))]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)
 
