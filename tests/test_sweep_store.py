@@ -169,7 +169,9 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
     found = xr.open_zarr(tmp_path / "s" / zarr_store.STORE).load()
     assert set(found.data_vars) == {"slip", "flags", "status"}
     alone = steady(robots.nominal(), Conditions(0, 24.0, 5.0, 0.0))
-    np.testing.assert_allclose(found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12)
+    np.testing.assert_allclose(
+        found.slip.sel(configuration="6T2A", slope_deg=5).values.ravel(), alone.slip, rtol=1e-12
+    )
     code, _, said = mmrjax(*grid, "--outputs", "slipp", "--out", "t")
     assert code == 2 and "outputs: got slipp; did you mean slip" in said
 
