@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import importlib.util
+import json
 import multiprocessing
 import os
 import queue
@@ -86,8 +87,8 @@ class _Passed:
             self.names.append(report.nodeid)
 
 
-def _run(tree: str, tests: list[str], log: str, told: Any) -> None:
-    """Run quick tests of a tree in this process and put (exit code of pytest, tests that passed) into `told`."""
+def _run(tree: str, tests: list[str], log: str, answer: str) -> None:
+    """Run quick tests of a tree in this process; leaves exit code of pytest and tests that passed in a file."""
     os.chdir(tree)
     os.environ["PYTHONPATH"] = tree  # for processes that tests start
     sys.path.insert(0, tree)
@@ -102,21 +103,24 @@ def _run(tree: str, tests: list[str], log: str, told: Any) -> None:
         module = sys.modules.get(name)
         if module is not None and not str(module.__file__).startswith(tree):
             code = -1  # another installation was tested
-    told.put((code, passed.names))
-    sys.stdout.flush()
+    Path(answer).write_text(json.dumps([code, passed.names]), encoding="utf-8")
 
 
 def run(tree: Path, tests: list[str], log: Path) -> tuple[int | None, list[str]]:
     """Exit code of pytest over quick tests in a process of its own, None where it hangs or dies, and what passed."""
     context = multiprocessing.get_context("forkserver")
-    told = context.SimpleQueue()
-    process = context.Process(target=_run, args=(str(tree), tests, str(log), told))
+    answer = tree / "mutant.json"
+    answer.unlink(missing_ok=True)
+    process = context.Process(target=_run, args=(str(tree), tests, str(log), str(answer)))
     process.start()
     process.join(PATIENCE)
     if process.is_alive():
         process.kill()
         process.join()
-    return (None, []) if told.empty() else told.get()
+    if not answer.exists():
+        return None, []
+    code, passed = json.loads(answer.read_text(encoding="utf-8"))
+    return code, passed
 
 
 def tested(mutant: Mutant, tree: Path, stamp: int) -> tuple[str, float, str]:

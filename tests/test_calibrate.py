@@ -238,9 +238,11 @@ def test_histories_need_drive(measured):
     with pytest.raises(
         BadConfiguration, match="--model steady: measured holds time histories; they need --model drive"
     ):
+        later = np.arange(20) > 0  # it starts from rest
         quick(changed(measured, time_s=np.arange(20.0), configuration=np.full(20, "6T2A"),
                       supply_voltage_V=np.full(20, 15.0), slope_deg=np.zeros(20), total_mass_kg=np.full(20, 13.1),
-                      payload_kg=np.zeros(20)))  # fmt: skip
+                      payload_kg=np.zeros(20), motor_speed_rpm=measured["motor_speed_rpm"] * later,
+                      speed_mm_s=measured["speed_mm_s"] * later))  # fmt: skip
 
 
 def test_unknown_fidelity_lists_the_choices(measured):

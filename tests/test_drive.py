@@ -242,7 +242,17 @@ def small(robot):
 
 @pytest.mark.parametrize(
     ("gain", "sliding", "status"),
-    [(0.0, 0.03, "converged"), (-0.1, 0.03, "slides"), (0.1, 0.03, "not_settled"), (0.0, 0.01, "converged")],
+    [
+        (0.0, 0.03, "converged"),
+        (-0.1, 0.03, "slides"),
+        (0.1, 0.03, "not_settled"),
+        (0.0, 0.01, "converged"),
+        # gaining 0.5 % of its speed in a second: settled if it gripped
+        (0.0035, 0.01, "converged"),
+        (0.0035, 0.03, "not_settled"),
+        (-0.0035, 0.03, "slides"),
+        (0.0005, 0.03, "converged"),
+    ],
 )
 def test_status_follows_from_what_the_robot_does(robot, gain, sliding, status):
     """One that slips beyond V_s on average and holds its speed has settled, with a flag that it slips."""

@@ -18,7 +18,7 @@ from test_stated_values import made as leads
 from calibration.data.writing import finite
 from calibration.discovery import findings
 from calibration.discovery.clusters import Cluster
-from calibration.discovery.result import Estimate, HiddenEffect, Resolved, StatedValue
+from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.inference.identifiability import HELD
 from sweeps import loop as room
 from sweeps import report_loop
@@ -133,9 +133,25 @@ def test_class_with_a_stated_value_is_listed_and_said(shown, capsys, tmp_path):
     assert "motor.resistance is 1.41 ohm" in " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.parametrize("name", ["hot", pytest.param("heated", marks=pytest.mark.slow)])
-def test_what_is_too_large_is_said_beside_the_verdict(shown, capsys, name):
-    got = shown(name, capsys)
+def test_what_is_ruled_out_by_its_size_is_on_the_page(shown, capsys, tmp_path):
+    why = "winding_heating at 2.9 times its largest plausible size; check motor.resistance_thermal_housing"
+    alone = {"winding_heating": 0.9}
+    found = shown("hot", capsys).found
+    found = dataclasses.replace(found, implausible=(Alternative(alone, alone, {"winding_heating": 2.9}, 1.0, why),))
+    jsonschema.validate(finite(found.to_json()), SCHEMA)
+    said = f"winding_heating would explain as much as the curve, but is ruled out by size or sign alone: {why}."
+    text = report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    page = Tables(text)
+    assert said in page.text and page.tables["implausible"][1][-1] == why
+    assert text.index('id="ruled_out"') < text.index('id="effects"')
+    capsys.readouterr()
+    room.print_discovery(found)
+    assert said in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.slow
+def test_what_is_too_large_is_said_beside_the_verdict(shown, capsys):
+    got = shown("heated", capsys)
     (ruled_out,) = (a for a in got.document["implausible"] if list(a["effects"]) == ["winding_heating"])
     times = f"{ruled_out['sizes']['winding_heating']:.2g}"
     assert got.document["verdict"] == "unnamed" and 2.7 < float(times) < 3.3

@@ -149,12 +149,15 @@ def test_to_dict_has_the_columns_of_runs_csv(robot):
         "flags",
     ]
     assert columns["total_mass_kg"].tolist() == [15.1, 13.5]
+    assert columns["supply_voltage_V"].tolist() == [24.0, 24.0]
     assert columns["status"].tolist() == ["converged", "converged"] and columns["flags"][1] == "gearbox_overspeed"
     result = steady_batch(robot, runs.resolved(robot))
     np.testing.assert_allclose(columns["motor_speed_rpm"], result.motor_speed * 30 / np.pi, rtol=1e-12)
     np.testing.assert_allclose(columns["theoretical_speed_mm_s"], result.theoretical_speed * 1e3, rtol=1e-12)
     weighed = mm.simulate(robot, dataclasses.replace(runs, total_mass=jnp.asarray([16.0, 17.0])))
     assert weighed.to_dict()["total_mass_kg"].tolist() == [16.0, 17.0] == weighed.mass.tolist()
+    on_battery = mm.simulate(robot, dataclasses.replace(runs, battery=jnp.asarray([0.0, 1.0])))
+    np.testing.assert_array_equal(on_battery.to_dict()["supply_voltage_V"], [24.0, np.nan])
 
 
 def test_outputs_name_every_number_of_a_result_once():

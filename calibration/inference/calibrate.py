@@ -109,6 +109,8 @@ def calibrate(
         robot = prepared.robot
         words = [surfaces.names_of_surfaces(names, robot, runs) for names in (free, fix)]
         words = [robot_file.current_names(names, robot, former) for names in words]
+        for sentence in former:  # before a name is refused that nobody has typed
+            tell(sentence)
         present = {robot.configurations.names[k] for k in runs.configurations(robot)}
         default = priors.default_names(present, robot, computed=facts.computes)
         default = (*default, *priors.delays(robot, observe.free()[0]))
@@ -120,7 +122,7 @@ def calibrate(
 
     ready = prepare(runs, robot, noise, stated, assume=False, choose=chosen)
     robot, known, stated, names = ready.robot, ready.noise, ready.stated, ready.names
-    for sentence in (*former, *ready.former, *ready.foreign):
+    for sentence in (*ready.former, *ready.foreign):
         tell(sentence)
     base = robot
     of_product: dict[str, tuple[float, float]] = {}
