@@ -15,8 +15,8 @@ from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.variation import STATUS
 from sweeps.zarr_store import STORE, Layout
 
-#: Columns of conditions, as tables of runs and options have them, and the SI value of a unit of each; what has no such
-#: column keeps its name.
+#: Columns of conditions, as tables of runs and options have them, and the value of a unit of each in that of the
+#: store; what has no such column keeps its name.
 COLUMNS = {
     "voltage": ("supply_voltage_V", 1.0),
     "slope_deg": ("slope_deg", 1.0),

@@ -241,7 +241,9 @@ class ResonanceResult:
             "restless_m_s": self.restless,
             "table8": [
                 {
-                    **{key: self.table[key][k].item() for key in ("supply_voltage_V", "payload_kg", "speed_mean_mm_s")},
+                    "supply_voltage_V": self.table["supply_voltage_V"][k].item(),
+                    "payload_kg": self.table["payload_kg"][k].item(),
+                    "speed_mean_mm_s": self.table["speed_mean_mm_s"][k].item(),
                     "status": str(self.table["status"][k]),
                     "in_a_peak": self.shaken(k),
                 }
