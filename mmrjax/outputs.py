@@ -61,8 +61,8 @@ FURTHER: tuple[Output, ...] = (
         lambda r: r.efficiency_chassis,
     ),
     Output(
-        "temperature_winding", "winding_settled_C", "°C", 1.0, "winding, long running",
-        lambda r: r.temperature_winding, 1,
+        "winding_settled", "winding_settled_C", "°C", 1.0, "winding, long running",
+        lambda r: r.winding_settled, 1,
     ),
     Output("voltage_cell", "voltage_cell_V", "V", 1.0, "cell voltage", lambda r: r.voltage_cell, 3),
 )  # fmt: skip

@@ -317,7 +317,7 @@ def test_a_store_and_its_export_hold_the_numbers_of_a_table(made, swept):
 
     stored = made(
         "store", "sweep", *POINTS, "--zarr", "--export", "csv", "--outputs",
-        "total_current,motor_speed,speed,slip,power_supply,temperature_winding,traction,flags",
+        "total_current,motor_speed,speed,slip,power_supply,winding_settled,traction,flags",
     )  # fmt: skip
     sound(stored)
     one, other = (numbers(table(f / "runs.csv")) for f in (swept, stored))
