@@ -59,6 +59,11 @@ class Channel:
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
 
+    @property
+    def unit_shown(self) -> str:
+        """Unit of the columns as people write it: C is a coulomb, °C a temperature."""
+        return self.unit_si if self.unit_si and self.factor == 1.0 else self.unit
+
     def __reduce__(self) -> tuple[Callable[[str], Channel], tuple[str]]:
         """Pickled by its name, so that tables and results go to other processes and back."""
         return of, (self.name,)

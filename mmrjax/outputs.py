@@ -46,7 +46,7 @@ FURTHER: tuple[Output, ...] = (
         lambda r: r.theoretical_speed, 1,
     ),
     Output("slip", "slip", "-", 1.0, "slip", lambda r: r.slip, 4),
-    Output("voltage", "voltage_V", "V", 1.0, "motor voltage", lambda r: r.voltage, 2),
+    Output("voltage", "voltage_V", "V", 1.0, "voltage at the motors", lambda r: r.voltage, 2),
     Output("adhesion_used", "adhesion_used", "-", 1.0, "adhesion used", lambda r: r.adhesion_used),
     Output("traction", "traction_N", "N", 1.0, "traction", lambda r: r.traction, 1),
     Output("power_supply", "power_supply_W", "W", 1.0, "supply power", lambda r: r.power_supply, 1),
@@ -61,8 +61,8 @@ FURTHER: tuple[Output, ...] = (
         lambda r: r.efficiency_chassis,
     ),
     Output(
-        "temperature_winding", "temperature_winding_C", "°C", 1.0, "winding temperature",
-        lambda r: r.temperature_winding, 1,
+        "winding_settled", "winding_settled_C", "°C", 1.0, "winding, long running",
+        lambda r: r.winding_settled, 1,
     ),
     Output("voltage_cell", "voltage_cell_V", "V", 1.0, "cell voltage", lambda r: r.voltage_cell, 3),
 )  # fmt: skip
@@ -74,7 +74,9 @@ def _reading(channel: str) -> Callable[[Result], Any]:
 
 def table(shown: Iterable[Channel]) -> tuple[Output, ...]:
     """Every output, the channels that are shown first, in the order of columns."""
-    read = tuple(Output(c.name, c.column, c.unit, c.factor, c.label, _reading(c.name), c.resolution) for c in shown)
+    read = tuple(
+        Output(c.name, c.column, c.unit_shown, c.factor, c.label, _reading(c.name), c.resolution) for c in shown
+    )
     return read + FURTHER
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mmrjax.simulation import Pending
 
 #: Columns of a printed table beside conditions and channels.
-_SHOWN = ("slip", "adhesion_used", "power_supply_W", "temperature_winding_C")
+_SHOWN = ("slip", "adhesion_used", "power_supply_W", "winding_settled_C")
 #: Columns of conditions: heading, unit and digits after the point.
 _CONDITIONS = {
     "configuration": ("configuration", "", 0),

@@ -150,7 +150,7 @@ class Result(eqx.Module):
         power_lift: against gravity [W].
         efficiency_motor, efficiency_gear, efficiency_chassis: N_d/P_e, N_r/N_d, N_t/N_r [-]; 0 at rest
             and where power does not flow that way.
-        temperature_winding: after long running at this current [°C]; inf where none settles.
+        winding_settled: after long running at this current [°C]; inf where none settles.
         voltage_cell: of one cell of the battery [V]; 0 on the external supply.
         status: code into `STATUSES`.
         flags: bit mask over `FLAGS`.
@@ -171,7 +171,7 @@ class Result(eqx.Module):
     efficiency_motor: Scalar
     efficiency_gear: Scalar
     efficiency_chassis: Scalar
-    temperature_winding: Scalar
+    winding_settled: Scalar
     voltage_cell: Scalar
     status: Int[Array, "..."]
     flags: Int[Array, "..."]

@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 
 from mmrjax import channels, outputs
+from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.variation import STATUS
 from sweeps.zarr_store import STORE, Layout
 
-#: Columns of conditions, as tables of runs have them; what has no such column keeps its name.
+#: Columns of conditions, as tables of runs and options have them, and the value of a unit of each in that of the
+#: store; what has no such column keeps its name.
 COLUMNS = {
-    "voltage": "supply_voltage_V",
-    "slope_deg": "slope_deg",
-    "payload": "payload_kg",
-    "total_mass": "total_mass_kg",
-    "discharge": "discharge_C",
+    "voltage": ("supply_voltage_V", 1.0),
+    "slope_deg": ("slope_deg", 1.0),
+    "payload": ("payload_kg", 1.0),
+    "total_mass": ("total_mass_kg", 1.0),
+    "motor_speed": ("motor_speed_rpm", channels.RPM),
+    "discharge": ("discharge_mAh", COULOMB_PER_MAH),
 }
 
 
@@ -55,14 +58,16 @@ def tables(store: Path, layout: Layout) -> Iterator[Any]:
             along = values[box[k]][(slice(None),) + (None,) * (len(shape) - k - 1)]
             flat = np.broadcast_to(along, shape).ravel()
             words = layout.labels.get(name)
-            found[COLUMNS.get(name, name)] = (
-                pa.array(flat)
+            column, unit = COLUMNS.get(name, (name, 1.0))
+            found[column] = (
+                pa.array(flat / unit)
                 if words is None
                 else pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(words))
             )
         for name in design.samples.names if design.samples is not None else ():
             drawn: Any = group[name]
-            found[COLUMNS.get(name, name)] = pa.array(np.broadcast_to(drawn[box[-1]], shape).ravel())
+            column, unit = COLUMNS.get(name, (name, 1.0))
+            found[column] = pa.array(np.broadcast_to(drawn[box[-1]], shape).ravel() / unit)
         for variable in layout.variables:
             array: Any = group[variable.name]
             flat = array[box].ravel()

@@ -83,7 +83,7 @@ def errors_over(
         half = 5.0
         if in_units:
             error = table[f"simulated_{channel.column}"] - table[channel.column]
-            sd = table.get(f"sd_{channel.column}", np.array([np.nan]))
+            sd = table.get(channel.sd_column, np.array([np.nan]))
             half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
         for axes, (condition, words) in zip(row, conditions.items(), strict=True):
             axes.axhspan(-half, half, color="#eef3ee", zorder=0)

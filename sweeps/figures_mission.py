@@ -46,7 +46,7 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, li
         _speed(axes[0], time, shown, linear, legend=first)
         axes[1].set_title("current of all motors, and duty of the driver")
         _current(axes[1], time, shown, sides, legend=first)
-        unlimited = limit >= UNLIMITED or "winding_C" not in rows
+        unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
         beyond = (
             "" if unlimited or _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
         )
@@ -113,17 +113,17 @@ def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], sides
 
 def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
     """Whether the limit is near enough to be drawn; far above it would flatten what is to be seen."""
-    return "winding_C" in rows and bool(np.max(rows["winding_C"]) > 0.6 * limit)
+    return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
 
 
 def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], limit: float, legend: bool) -> None:
-    if "winding_C" not in rows:
+    if "housing_temperature_C" not in rows:
         note(axes, "the robot's file does not state how heat leaves the windings (motor.resistance_thermal_...)")
         axes.set_yticks([])
         return
-    axes.plot(time, rows["winding_C"], color=VERMILION, lw=1.4, label="winding")
-    axes.plot(time, rows["housing_C"], color=ORANGE, lw=1.4, label="housing")
-    top, bottom = float(np.max(rows["winding_C"])), float(np.min(rows["housing_C"]))
+    axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")
+    axes.plot(time, rows["housing_temperature_C"], color=ORANGE, lw=1.4, label="housing")
+    top, bottom = float(np.max(rows["winding_temperature_C"])), float(np.min(rows["housing_temperature_C"]))
     if _near(rows, limit):
         axes.axhline(limit, color=INK, lw=1.0, ls="--", label=f"limit {limit:.0f} °C")
         axes.set_ylim(bottom - 2, 1.1 * max(top, limit))

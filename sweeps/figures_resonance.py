@@ -36,7 +36,7 @@ def resonance_map(found: ResonanceResult) -> Figure:
     for axes, name in zip(grid[1:, 0], MAPS, strict=True):
         ripple_map(axes, found, name)
     grid[-1, 0].set_xlabel("speed of the robot [mm/s]")
-    fastest = np.nanmax(found.table["travel_mm_s"])
+    fastest = np.nanmax(found.table["speed_mean_mm_s"])
     grid[0, 0].set_xlim(0, 1.06 * fastest)
     return fig
 
@@ -56,7 +56,7 @@ def _top(found: ResonanceResult) -> float:
 def campbell(axes: Axes, found: ResonanceResult) -> None:
     """Lines n × V / S, bands of natural frequencies, and the strongest line of each run, larger for more ripple."""
     table, what, top = found.table, found.passing, _top(found)
-    fastest = float(np.nanmax(table["travel_mm_s"]))
+    fastest = float(np.nanmax(table["speed_mean_mm_s"]))
     place = np.inf
     for order in range(1, ORDERS + 1):
         at_end = order * fastest * MM / what.travel
@@ -74,7 +74,7 @@ def campbell(axes: Axes, found: ResonanceResult) -> None:
     for name, (colour, marker) in _MARKS.items():
         ripple = table[f"{name}_ripple_percent"][found.read]
         axes.scatter(
-            table["travel_mm_s"][found.read], table[f"{name}_frequency_Hz"][found.read],
+            table["speed_mean_mm_s"][found.read], table[f"{name}_frequency_Hz"][found.read],
             s=4 + 60 * (ripple / max(float(np.nanmax(ripple)), 1e-9)) ** 2, marker=marker, color=colour, alpha=0.55,
             lw=0, zorder=3, label=f"{SIGNALS[name].label}, up to {percent(float(np.nanmax(ripple)))}",
         )  # fmt: skip
@@ -86,7 +86,7 @@ def campbell(axes: Axes, found: ResonanceResult) -> None:
     )  # fmt: skip
     points = table["table8"] & found.read
     for voltage in np.unique(table["supply_voltage_V"][points]):
-        speed = float(np.median(table["travel_mm_s"][points & (table["supply_voltage_V"] == voltage)]))
+        speed = float(np.median(table["speed_mean_mm_s"][points & (table["supply_voltage_V"] == voltage)]))
         axes.axvline(speed, color=INK, lw=0.9, ls=":", zorder=2)
         axes.annotate(
             f"{voltage:g} V", (speed, top), xytext=(0, 2), textcoords="offset points", va="bottom", ha="center",
@@ -157,7 +157,7 @@ def ripple_map(axes: Axes, found: ResonanceResult, name: str) -> None:
     loads = table["payload_kg"][points]
     inside = (loads >= payloads[0]) & (loads <= payloads[-1])
     axes.scatter(
-        table["travel_mm_s"][points[inside]], np.interp(loads[inside], payloads, range(len(payloads))), s=22,
+        table["speed_mean_mm_s"][points[inside]], np.interp(loads[inside], payloads, range(len(payloads))), s=22,
         facecolor="white", edgecolor=INK, lw=0.9, zorder=5,
     )  # fmt: skip
     axes.set(ylim=(-0.5, len(payloads) - 0.5), ylabel="payload [kg]")

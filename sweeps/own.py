@@ -26,7 +26,8 @@ OF_TRAVEL = (
 )  # fmt: skip
 #: Those of the heat of a winding, which a rig has where its file states how heat leaves it.
 OF_HEAT = (
-    "temperature_winding_C", "permissible_time_s", "winding_C", "housing_C", "winding_peak_C", "housing_end_C",
+    "winding_settled_C", "permissible_time_s", "winding_temperature_C", "housing_temperature_C", "winding_peak_C",
+    "winding_end_C", "housing_end_C",
 )  # fmt: skip
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
 

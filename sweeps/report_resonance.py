@@ -83,7 +83,7 @@ def _points(found: ResonanceResult) -> list[dict[str, Any]]:
         {
             "voltage": f"{table['supply_voltage_V'][k]:g}",
             "payload": f"{table['payload_kg'][k]:g}",
-            "speed": table["travel_mm_s"][k],
+            "speed": table["speed_mean_mm_s"][k],
             "ripple": [table[f"{name}_ripple_percent"][k] for name in SIGNALS],
             "status": words.short(str(table["status"][k])),
             "shaken": found.shaken(k),

@@ -143,7 +143,7 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
         ("motor speed", shaft, float(robot.motor.speed_limit) / rpm, "{:.0f}", " rpm"),
         ("gearbox input speed", shaft, float(robot.gearbox.speed_limit) / rpm, "{:.0f}", " rpm"),
-        ("winding, long running", float(run["temperature_winding_C"]), float(robot.motor.temperature_limit), "{:.0f}",
+        ("winding, long running", float(run["winding_settled_C"]), float(robot.motor.temperature_limit), "{:.0f}",
          " °C"),
         (gear, torque, robot.gearbox.torque_limit or math.nan, "{:.2f}", " N·m"),
         ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f}", " V"),

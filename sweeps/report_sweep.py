@@ -119,7 +119,7 @@ def _extremes(runs: Table, channels: Sequence[Channel]) -> list[dict[str, str]]:
              for c in channels]  # fmt: skip
     asked += [
         ("largest slip", "slip", "{:.1f} %", 100.0),
-        ("hottest winding", "temperature_winding_C", "{:.0f} °C", 1.0),
+        ("hottest winding", "winding_settled_C", "{:.0f} °C", 1.0),
     ]
     answer = []
     for name, column, form, scale in asked:

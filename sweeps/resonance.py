@@ -86,7 +86,7 @@ class ResonanceResult:
     @property
     def speeds(self) -> tuple[float, float]:
         """Least and greatest speed read [m/s]; NaN where none is."""
-        speed = self.table["travel_mm_s"][self.read] * MM
+        speed = self.table["speed_mean_mm_s"][self.read] * MM
         return (float(speed.min()), float(speed.max())) if len(speed) else (float("nan"), float("nan"))
 
     @property
@@ -120,7 +120,7 @@ class ResonanceResult:
     @property
     def travel(self) -> np.ndarray:
         """Speed of every run [mm/s]; where it has none, as its voltage has it in the others (NaN: in none)."""
-        speed, voltage = self.table["travel_mm_s"], self.table["supply_voltage_V"]
+        speed, voltage = self.table["speed_mean_mm_s"], self.table["supply_voltage_V"]
         if self.read.sum() < 2:
             return speed
         line = np.polyfit(voltage[self.read], speed[self.read], 1)
@@ -204,7 +204,7 @@ class ResonanceResult:
 
     def shaken(self, row: int | np.integer[Any]) -> bool:
         """Whether a run is within one of the strongest peaks of its own payload."""
-        speed, payload = self.table["travel_mm_s"][row] * MM, self.table["payload_kg"][row]
+        speed, payload = self.table["speed_mean_mm_s"][row] * MM, self.table["payload_kg"][row]
         strong = {(r.mode, r.order, r.signal) for r in strongest(self.resonances)}
         return any(
             p.low <= speed <= p.high
@@ -241,7 +241,9 @@ class ResonanceResult:
             "restless_m_s": self.restless,
             "table8": [
                 {
-                    **{key: self.table[key][k].item() for key in ("supply_voltage_V", "payload_kg", "travel_mm_s")},
+                    "supply_voltage_V": self.table["supply_voltage_V"][k].item(),
+                    "payload_kg": self.table["payload_kg"][k].item(),
+                    "speed_mean_mm_s": self.table["speed_mean_mm_s"][k].item(),
                     "status": str(self.table["status"][k]),
                     "in_a_peak": self.shaken(k),
                 }
@@ -390,7 +392,6 @@ def _columns(robot: Robot, ended: Any, what: Passing) -> dict[str, np.ndarray]:
     slow = ~found.read & np.isin(status, ("converged", "not_settled"))
     columns = {
         "status": np.where(slow, SLOW, status),
-        "travel_mm_s": found.speed / MM,
         "passing_Hz": found.passing,
     }
     for name, signal in SIGNALS.items():
@@ -416,10 +417,10 @@ def _found(
     for payload, of in by_payload.items():
         gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
         rows = np.flatnonzero(gridded & (table["status"] == "converged"))
-        rows = rows[np.argsort(table["travel_mm_s"][rows])]
+        rows = rows[np.argsort(table["speed_mean_mm_s"][rows])]
         if not len(rows):
             continue
-        speed = table["travel_mm_s"][rows] * MM
+        speed = table["speed_mean_mm_s"][rows] * MM
         here = [
             peak
             for name in SIGNALS

@@ -177,7 +177,7 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
                 f"{name}winding_hot: {limit:g} °C are reached after {float(times[k]):.3g} s at this "
                 f"current, from {ambient:g} °C"
             )
-        if np.isinf(table["temperature_winding_C"][k]) and own.thermal(robot):
+        if np.isinf(table["winding_settled_C"][k]) and own.thermal(robot):
             current = float(amperes(robot, table)[k])
             said.append(
                 f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "
@@ -258,7 +258,7 @@ def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
         "slip": ("slip", ".4f"),
         "power_supply_W": ("power from supply P_e [W]", ".2f"), "power_motor_W": ("at motor shafts N_d [W]", ".2f"),
         "power_gear_W": ("at gearbox outputs N_r [W]", ".2f"), "power_ground_W": ("to the ground N_t [W]", ".2f"),
-        "temperature_winding_C": ("winding, long running [°C]", ".0f"),
+        "winding_settled_C": ("winding, long running [°C]", ".0f"),
         PERMISSIBLE: ("permissible at this current for [s]", ".3g"), "adhesion_used": ("adhesion used", ".3f"),
         "status": ("status", ""), "flags": ("limits exceeded", ""),
     }  # fmt: skip

@@ -128,7 +128,7 @@ def test_a_reading_keeps_its_column_and_size_from_file_to_result(tmp_path, bench
         for k, c in enumerate(bench.channels):
             for column in (c.column, f"before_{c.column}", f"after_{c.column}"):
                 np.testing.assert_allclose(table[column], FIRST + k + np.arange(12.0), rtol=1e-12)
-            np.testing.assert_allclose(table[f"sd_{c.column}"], 0.01 * (k + 1), rtol=1e-12)
+            np.testing.assert_allclose(table[c.sd_column], 0.01 * (k + 1), rtol=1e-12)
 
 
 def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):

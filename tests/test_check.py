@@ -119,7 +119,7 @@ def test_worst_corner_is_the_worst_of_a_finer_grid(values, robot):
     axes = np.linspace(0, 8, 9), np.linspace(0, 10, 17), np.linspace(0, capacity * (1 - 1e-9), 17)
     payload, slope, discharge = (x.ravel() for x in np.meshgrid(*axes))
     runs = steady_batch(robot, Conditions(0, battery=1.0, payload=payload, slope_deg=slope, discharge=discharge))
-    assert found["value"] == pytest.approx(float(np.max(runs.temperature_winding)), rel=1e-7)
+    assert found["value"] == pytest.approx(float(np.max(runs.winding_settled)), rel=1e-7)
     assert found["at"]["payload_kg"] == 8 and found["at"]["slope_deg"] == 10
 
 

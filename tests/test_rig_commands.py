@@ -126,7 +126,7 @@ def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_pa
     assert columns <= set(row) and row["status"] in ("converged", "reverses")
     on_ground = {"slip", "adhesion_used", "slope_deg", "total_mass_kg", "power_ground_W"}
     assert on_ground <= set(row) if kind in ("wheeled", "tracked") else on_ground.isdisjoint(row)
-    assert "temperature_winding_C" not in row  # nobody has stated how heat leaves the windings
+    assert "winding_settled_C" not in row  # nobody has stated how heat leaves the windings
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
@@ -152,7 +152,11 @@ def test_a_profile_turns_a_bench(mmrjax, tmp_path):
     )  # fmt: skip
     assert code in (0, 3), err
     course = rows_of(tmp_path / "run" / "history.csv")
-    assert "demanded_motor_speed_rpm" in course[0] and "slope_deg" not in course[0] and "winding_C" not in course[0]
+    assert (
+        "demanded_motor_speed_rpm" in course[0]
+        and "slope_deg" not in course[0]
+        and "winding_temperature_C" not in course[0]
+    )
     assert "distance" not in out and "winding" not in out
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 

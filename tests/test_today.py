@@ -144,7 +144,7 @@ def test_a_winding_that_no_temperature_settles_says_so(mmrjax, tmp_path):
     motor = robots.nominal().motor
     assert time == pytest.approx(float(motor.time_permissible(float(row["total_current_A"]) / 2)), rel=1e-4)
     assert notes[0].startswith(f"winding_hot: 125 °C are reached after {time:.3g} s at this current")
-    assert row["temperature_winding_C"] == "" and "winding_hot" in row["flags"]
+    assert row["winding_settled_C"] == "" and "winding_hot" in row["flags"]
     page = (tmp_path / "a" / "report.html").read_text()
     assert "none settles" in page and ">inf" not in page and "nan %" not in page
 

@@ -87,7 +87,7 @@ def closed_form_all(wheeled, voltage, slope_deg, payload, p=NOMINAL):
         **dict(zip(("power_supply", "power_motor", "power_gear", "power_ground"), powers, strict=True)),
         "power_lift": SIDES * load.gravity * V,
         **dict(zip(("efficiency_motor", "efficiency_gear", "efficiency_chassis"), efficiencies, strict=True)),
-        "temperature_winding": _settled(p, R * I * I),
+        "winding_settled": _settled(p, R * I * I),
         "voltage_cell": np.zeros_like(V),
     }
 

@@ -120,7 +120,7 @@ def readings(robot: Robot, experiments: Batch) -> Foreseen:
     speed = jnp.where(jnp.asarray(held), 0.0, result.reading["motor_speed"])
     return Foreseen(
         jnp.concatenate(values), jnp.concatenate(exists), does, jnp.asarray(result.adhesion_used),
-        jnp.asarray(result.temperature_winding), speed,
+        jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
 
 

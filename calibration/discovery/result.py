@@ -567,7 +567,7 @@ class DiscoveryResult:
         for k, channel in enumerate(self.channels):
             column, unit = channel.column, channel.factor
             table[column] = seen.measured[:, k] / unit
-            table[f"sd_{column}"] = seen.sd[:, k] / unit
+            table[channel.sd_column] = seen.sd[:, k] / unit
             table[f"before_{column}"], table[f"after_{column}"] = seen.before[:, k] / unit, seen.after[:, k] / unit
             if main is not None:
                 table[f"held_out_before_{column}"] = main[0][:, k] / unit

@@ -377,7 +377,7 @@ class CalibrationResult:
         for channel in self.channels:
             r, column = self.readings[channel.name], channel.column
             yield column, r.measured / channel.factor
-            yield f"sd_{column}", r.sd / channel.factor
+            yield channel.sd_column, r.sd / channel.factor
             yield f"before_{column}", r.before / channel.factor
             yield f"after_{column}", r.after / channel.factor
             if main is not None:

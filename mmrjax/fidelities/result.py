@@ -41,7 +41,7 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         efficiency_motor=_efficiency(power_motor, power_supply),
         efficiency_gear=_efficiency(power_gear, power_motor),
         efficiency_chassis=_efficiency(power_ground, power_gear),
-        temperature_winding=temperature,
+        winding_settled=temperature,
         voltage_cell=jnp.where(signals.battery > 0.5, signals.voltage_source / robot.battery.cells, 0.0),
         status=status,
         flags=flags,

@@ -13,6 +13,7 @@ from calibration.inference import errors as residual
 from mmrjax import outputs
 from mmrjax.channels import MM, RPM, Channel
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities.base import History
 from mmrjax.tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
 from sweeps import figures_history
 from sweeps.figures_history import Start
@@ -226,15 +227,18 @@ def starts(robot: Robot, voltage: float = 33.0, seconds: float = 1.5) -> list[St
     from mmrjax.fidelities.drive import drive_batch
 
     times = np.concatenate([np.linspace(0, 0.04, 161), np.linspace(0.04, seconds, 440)[1:]])
-    return starts_of(robot, drive_batch(robot, conditions(robot, kinds(robot), voltage=voltage), jnp.asarray(times)))
+    run = drive_batch(robot, conditions(robot, kinds(robot), voltage=voltage), jnp.asarray(times))
+    return starts_of(robot, History(run.time, run.distance, run.signals, {}), run.result.status)
 
 
-def starts_of(robot: Robot, run: Any) -> list[Start]:
-    """Runs of the paper's configurations from standstill, of any fidelity that has histories."""
+def starts_of(robot: Robot, history: Any, status: Any) -> list[Start]:
+    """Runs of the paper's configurations from standstill, of any fidelity that has histories.
+
+    Args:
+        history: time, signals and reactions (None where contacts are not resolved); status: codes of how runs ended.
+    """
     names = kinds(robot)
-    return figures_history.starts(
-        robot, run, run.result.status, [robot.configurations.index(c) for c in names], names
-    )
+    return figures_history.starts(robot, history, status, [robot.configurations.index(c) for c in names], names)
 
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:

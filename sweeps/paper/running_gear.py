@@ -48,7 +48,7 @@ def draw(album: Album, robot: Robot) -> dict[str, Any]:
     gears = figures_gear.gears(robot, run, status, share, which, names)
     if not all(gear.rolls for gear in gears):
         return {"left_out": ", ".join(f"{g.name}: {words.short(g.status)}" for g in gears)}
-    starts = data.starts_of(robot, run)
+    starts = data.starts_of(robot, run, run.result.status)
     album.add(
         "track_fig23_24_from_standstill",
         lambda: figures_history.from_standstill(starts, data.FIG_23, data.FIG_24),

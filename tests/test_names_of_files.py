@@ -1,0 +1,426 @@
+"""One name is one quantity in every file that a command writes: tables of names, and the files of every command."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import inspect
+import io
+import itertools
+import json
+import os
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibration.data import columns
+from mmrjax import channels, derived, missions, outputs, requirements
+from mmrjax.fidelities.resonance import SIGNALS
+from sweeps import cli, config, export, own
+
+#: Ends of names, and the unit of each.
+UNITS = {
+    "mm_s": "mm/s", "m_s": "m/s", "A": "A", "mAh": "mAh", "V": "V", "W": "W", "Wh": "Wh", "J": "J", "N": "N",
+    "Nm": "N·m", "kg": "kg", "rpm": "rpm", "deg": "deg", "C": "°C", "Hz": "Hz", "s": "s", "ms": "ms", "min": "min",
+    "h": "h", "m": "m", "mm": "mm", "percent": "%", "EUR": "EUR", "mNm": "mN·m", "mV": "mV", "mA": "mA", "g": "g",
+}  # fmt: skip
+#: An end that is a unit, the longest that fits.
+END = re.compile(rf"_({'|'.join(sorted(UNITS, key=len, reverse=True))})$")
+#: What is put before or after a name that is known: the same quantity of another robot, or its spread.
+BEFORE = re.compile(r"^(simulated|before|after|held_out_before|held_out_after|held_out|paper|plain|raised|weighed)_")
+AFTER = re.compile(r"_(sd|lower|upper)$")
+#: Loads on each grouser and in each span of the belt.
+NUMBERED = re.compile(r"(grouser|tension)_\d\d_N")
+
+#: Names that no table has, and what they mean.
+MORE = {
+    # conditions and options
+    "time_s": "time since the run began; of a segment when it begins",
+    "ambient_C": "ambient temperature",
+    "discharge_mAh": "charge already taken from the battery",
+    "voltages_V": "axis of supply_voltage_V", "payloads_kg": "axis of payload_kg",
+    "slopes_deg": "axis of slope_deg", "motor_speeds_rpm": "axis of motor_speed_rpm",
+    "step_s": "integration step",
+    # runs over time
+    "time_end_s": "when a run ends", "permissible_time_s": "how long a current may flow from ambient temperature",
+    "source_voltage_V": "terminals of battery or supply", "demanded_speed_mm_s": "speed that a profile demands",
+    "demanded_motor_speed_rpm": "motor speed that a profile demands",
+    "housing_temperature_C": "housing, at that time", "from_s": "begin of a stage", "until_s": "end of a stage",
+    "acceleration_time_s": "t' of a start: within 1 % of its last speed",
+    "guide_N": "load on the guides", "front_N": "load on the front pulley", "rear_N": "load on the rear pulley",
+    "centrifugal_tension_N": "tension of the belt by its own speed",
+    # maps of ripple
+    "passing_Hz": "frequency at which grousers or teeth pass", "frequency_Hz": "natural frequency of a mode, or line",
+    "natural_Hz": "natural frequency without damping", "low_Hz": "least over the belt's position",
+    "high_Hz": "most over the belt's position", "low_m_s": "speed from which a peak is high",
+    "high_m_s": "speed up to which a peak is high", "speeds_m_s": "range of speed", "quiet_m_s": "ranges of speed",
+    "restless_m_s": "ranges of speed", "pitch_m": "of the belt", "travel_m": "from one passing to the next",
+    # errors
+    "rms_percent": "rms of errors", "max_percent": "largest error", "median_percent": "median sd of readings",
+    "estimated_percent": "sd of readings as the fit has them",
+    # missions
+    "energy_by_where_Wh": "energy that goes to each sink",
+    # robots that are found
+    "radius_m": "of the driving wheel",
+}  # fmt: skip
+#: Names of several tables on purpose: one quantity of a run, of a mission, or a limit on it.
+SHARED = {"peak_current_A", "speed_m_s", "slope_deg", "payload_kg", "motor_speed_rpm", "energy_per_metre_Wh"}
+#: Keys of files below which keys are no names of ours: of parameters, users' settings, packages and hashes.
+FOREIGN = {"parameters", "set", "versions", "hashes", "prior", "blocks", "statuses", "tied"}
+
+
+def registries() -> dict[str, list[tuple[str, str]]]:
+    """Unit and meaning of every name of the tables that writers use; of each table in which it is."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    for row in (*outputs.table(channels.EVERY), *missions.OUTPUTS, *derived.TABLE):
+        found.setdefault(row.column, []).append((row.unit, row.label))
+    for c in channels.EVERY:
+        found.setdefault(c.sd_column, []).append((c.unit_shown, f"sd of a reading: {c.label}"))
+    for name in columns.CONDITIONS:
+        found.setdefault(name, []).append((UNITS[END.search(name)[1]], f"condition {name}"))
+    for q in requirements.QUANTITIES.values():
+        found.setdefault(q.name, []).append((q.unit, f"required: {q.label}"))
+    return found
+
+
+def options() -> set[str]:
+    """Names of all options of all commands, as `config.resolved.toml` has them."""
+    parts = [c for _, c in inspect.getmembers(config, inspect.isclass) if issubclass(c, config.Part)]
+    return {name for part in parts for name in part.model_fields}
+
+
+def known(name: str, names: set[str]) -> bool:
+    """Whether a name is in a table, or is one that is, of something else."""
+    if name in names or NUMBERED.fullmatch(name):
+        return True
+    if match := re.fullmatch(r"error_(.+)_percent", name):
+        return match[1] in {c.name for c in channels.EVERY}
+    if match := re.fullmatch(r"(.+?)_(mean_.+|ripple_percent|frequency_Hz)", name):
+        kind = SIGNALS.get(match[1])
+        return kind is not None and match[2] in (f"mean_{kind.unit}", "ripple_percent", "frequency_Hz")
+    if AFTER.search(name):
+        return known(AFTER.sub("", name), names)
+    return bool(BEFORE.match(name)) and known(BEFORE.sub("", name), names)
+
+
+def keys(content: Any, before: str = "") -> Iterator[tuple[str, str]]:
+    """Every key of JSON or TOML, and the path of keys to it."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield key, f"{before}.{key}"
+            if key not in FOREIGN:
+                yield from keys(value, f"{before}.{key}")
+    elif isinstance(content, list):
+        for value in content:
+            yield from keys(value, f"{before}[]")
+
+
+def table(path: Path) -> dict[str, list[str]]:
+    with path.open(newline="") as stream:
+        rows = list(csv.reader(stream))
+    return {name: [row[k] for row in rows[1:]] for k, name in enumerate(rows[0])}
+
+
+def walk(folder: Path) -> dict[str, str]:
+    """Every name in every file of a folder, with one place where it is."""
+    found: dict[str, str] = {}
+    for path in sorted(folder.rglob("*"), key=lambda path: (path.suffix == ".csv", path)):
+        if path.suffix == ".csv":
+            found |= {name: str(path) for name in table(path)}
+        elif path.suffix == ".json" and path.name not in ("zarr.json", "identity.json"):
+            found |= {name: f"{path}{where}" for name, where in keys(json.loads(path.read_text()))}
+        elif path.suffix == ".toml" and path.name != "robot.toml":  # names of parameters, in SI units
+            found |= {name: f"{path}{where}" for name, where in keys(tomllib.loads(path.read_text()))}
+    return found
+
+
+def unknown(folder: Path) -> dict[str, str]:
+    """Names that end in a unit and are in no table, with a place of each."""
+    names, asked = {*registries(), *MORE}, {*requirements.QUANTITIES} - SHARED
+    return {
+        name: where
+        for name, where in walk(folder).items()
+        if END.search(name)
+        and not known(name, names - asked if ".csv" in where else names)  # of what is asked for there are no columns
+    }
+
+
+def numbers(found: dict[str, list[str]]) -> dict[str, np.ndarray]:
+    """Columns of numbers; an empty cell is NaN."""
+    kept = {}
+    for name, cells in found.items():
+        with contextlib.suppress(ValueError):
+            kept[name] = np.array([float(x) if x else np.nan for x in cells])
+    return kept
+
+
+#: Columns with the same numbers where nothing tells them apart, and why.
+ALIKE = {
+    frozenset(pair)
+    for pair in (
+        ("supply_voltage_V", "voltage_V"),  # at full duty, of an external supply
+        ("source_voltage_V", "voltage_V"), ("source_voltage_V", "supply_voltage_V"),
+        ("displacement_m", "distance_m"),  # forward
+        ("energy_Wh", "energy_drawn_Wh"),  # nothing is returned
+        ("duration_s", "time_end_s"), ("payload_kg", "slope_deg"),
+    )
+}  # fmt: skip
+
+
+def twins(path: Path) -> list[tuple[str, str]]:
+    """Columns with one unit and the same numbers in at least two rows that differ: one quantity under two names."""
+    found = {n: x for n, x in numbers(table(path)).items() if END.search(n) and not NUMBERED.fullmatch(n)}
+    pairs = itertools.combinations(found, 2)
+    return [
+        (a, b)
+        for a, b in pairs
+        if END.search(a)[1] == END.search(b)[1] != "Hz"  # of the strongest lines of two signals
+        and frozenset((a, b)) not in ALIKE
+        and np.unique(found[a][np.isfinite(found[a])]).size > 1
+        and np.allclose(found[a], found[b], rtol=1e-6, atol=0.0, equal_nan=True)
+    ]
+
+
+def command(folder: Path, *arguments: Any) -> SimpleNamespace:
+    """Run a command in this process and in a folder."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.chdir(folder)
+        patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
+        patch.setattr(os, "_exit", sys.exit)
+        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+    assert end.value.code in (0, None, 3), err.getvalue()
+    return SimpleNamespace(code=end.value.code, out=out.getvalue(), err=err.getvalue())
+
+
+def sound(folder: Path) -> None:
+    """No name without a meaning, no quantity under two names, in all files of a folder."""
+    assert unknown(folder) == {}
+    assert {str(path): twins(path) for path in folder.rglob("*.csv") if twins(path)} == {}
+
+
+def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray], *, but: tuple[str, ...] = ()) -> set[str]:
+    """Names that two tables of the same rows share; their numbers are the same."""
+    shared = (set(one) & set(other)) - set(but)
+    for name in sorted(shared):
+        np.testing.assert_allclose(one[name], other[name], rtol=1e-6, atol=1e-12, err_msg=name)
+    return shared
+
+
+# --- tables of names ------------------------------------------------------------------------------------------------
+
+
+def test_a_name_has_one_unit_in_all_tables_and_one_meaning():
+    for name, said in registries().items():
+        assert len({unit for unit, _ in said}) == 1, (name, said)
+        meanings = {meaning for _, meaning in said}
+        assert len(meanings) == 1 or name in SHARED, (name, said)
+    assert set(registries()) & set(MORE) == set()
+
+
+def test_a_meaning_has_one_name():
+    """Words of reports too: no two columns have one label."""
+    names: dict[str, set[str]] = {}
+    for name, said in registries().items():
+        for _, meaning in said:
+            names.setdefault(meaning, set()).add(name)
+    assert {meaning: of for meaning, of in names.items() if len(of) > 1} == {}
+
+
+def test_the_end_of_a_name_is_its_unit():
+    """C is a degree, never a coulomb; energy per metre alone leaves its metre to the words before its unit."""
+    for name, said in registries().items():
+        end = END.search(name)
+        for unit, _ in said:
+            if unit == "-":
+                assert end is None, name
+            elif "_per_metre_" in name:
+                assert unit == f"{end[1]}/m", name
+            else:
+                assert end is not None and unit == UNITS[end[1]], (name, unit)
+
+
+def test_options_are_called_as_what_they_state():
+    of = {name for name in options() if END.search(name)}
+    assert {"discharge_mAh", "duration_s", "voltages_V"} <= of
+    assert {name for name in of if not known(name, {*registries(), *MORE})} == set()
+
+
+def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
+    lists = {*own.OF_GROUND, *own.OF_TRAVEL, *own.OF_HEAT, *(column for column, _ in export.COLUMNS.values())}
+    assert {n for n in lists if END.search(n) and not known(n, {*registries(), *MORE})} == set()
+    of_heat = {
+        n
+        for n in registries()
+        if re.match(r"(winding|housing)_", n) and n in (*missions.names(), "winding_settled_C")
+    }
+    assert of_heat <= set(own.OF_HEAT)
+
+
+def test_an_unknown_name_a_coulomb_and_a_twin_are_found(tmp_path):
+    (tmp_path / "a.csv").write_text("discharge_C,travel_mm_s,speed_mm_s\n1,2,2\n2,3,3\n")
+    (tmp_path / "b.json").write_text('{"of": [{"sag_V": 1, "total_current_A": 2}], "set": {"x_V": 1}}')
+    assert set(unknown(tmp_path)) == {"discharge_C", "travel_mm_s", "sag_V"}
+    assert twins(tmp_path / "a.csv") == [("travel_mm_s", "speed_mm_s")]
+
+
+# --- files ----------------------------------------------------------------------------------------------------------
+
+POINTS = "--voltages", "24", "--payloads", "0,2", "--slopes", "0,5", "--configurations", "6T2A", "--no-report"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where commands leave their folders."""
+    return tmp_path_factory.mktemp("names")
+
+
+@pytest.fixture(scope="module")
+def made(folder):
+    """A command's folder, made once."""
+    done: dict[str, Path] = {}
+
+    def run(name: str, *arguments: Any) -> Path:
+        if name not in done:
+            command(folder, *arguments, "--out", name)
+            done[name] = folder / name
+        return done[name]
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def swept(made):
+    return made("sweep", "sweep", *POINTS)
+
+
+def test_files_of_a_sweep_and_of_its_runs_simulated_hold_the_same_numbers(made, swept):
+    sound(swept)
+    simulated = made("simulate", "simulate", "--runs", swept / "runs.csv", "--no-report")
+    sound(simulated)
+    one, other = (numbers(table(f / "runs.csv")) for f in (swept, simulated))
+    assert len(same(one, other)) > 15
+
+
+def test_a_store_and_its_export_hold_the_numbers_of_a_table(made, swept):
+    """A store's arrays have the names of outputs, and the units of their columns as attributes."""
+    import zarr
+
+    stored = made(
+        "store", "sweep", *POINTS, "--zarr", "--export", "csv", "--outputs",
+        "total_current,motor_speed,speed,slip,power_supply,winding_settled,traction,flags",
+    )  # fmt: skip
+    sound(stored)
+    one, other = (numbers(table(f / "runs.csv")) for f in (swept, stored))
+    by = "payload_kg", "slope_deg"
+    order = [np.lexsort([of[name] for name in by]) for of in (one, other)]
+    one, other = ({n: x[o] for n, x in of.items()} for of, o in zip((one, other), order, strict=True))
+    shared = same(one, other)
+    assert shared >= {*by, "total_current_A", "speed_mm_s", "winding_settled_C", "slip"}
+    rows = {row.name: row for row in outputs.table(channels.EVERY)}
+    (group,) = (
+        zarr.open_group(path.parent, mode="r") for path in stored.rglob("zarr.json") if path.parent.parent == stored
+    )
+    for name, array in group.arrays():
+        if name in rows and array.ndim > 1:  # else an axis: the supply's voltage
+            unit = "1" if rows[name].unit == "-" else rows[name].unit
+            assert (array.attrs["units"], array.attrs["long_name"]) == (unit, rows[name].label)
+            np.testing.assert_allclose(np.sort(np.ravel(array[:])), np.sort(other[rows[name].column]), rtol=1e-12)
+
+
+def test_an_export_has_conditions_in_the_units_of_their_columns(folder):
+    """A discharge of 1800 C is 500 mAh; it was a column discharge_C, whose end is that of a temperature."""
+    (folder / "charge.toml").write_text(
+        '[conditions]\nbattery = 1\nconfiguration = "6T2A"\n[axes]\ndischarge = [0, 1800]\n'
+    )
+    command(folder, "sweep", "charge.toml", "--export", "csv", "--no-report", "--out", "charge")
+    sound(folder / "charge")
+    assert numbers(table(folder / "charge" / "runs.csv"))["discharge_mAh"].tolist() == [0.0, 500.0]
+
+
+def test_files_of_compare_hold_the_numbers_of_runs(made):
+    compared = made("compare", "compare", "measured", "--no-report")
+    sound(compared)
+    one, other = (numbers(table(compared / n)) for n in ("comparison.csv", "runs.csv"))
+    simulated = {n.removeprefix("simulated_"): x for n, x in one.items() if n.startswith("simulated_")}
+    assert same(simulated, other) == {c.column for c in channels.usual()}
+
+
+DRIVE = "simulate", "--model", "drive", "--duration", "2", "--voltage", "24", "--slope", "2", "--no-report"
+WALK = "time_s,supply_voltage_V\n0,24\n2,24\n"
+
+
+@pytest.mark.slow
+def test_files_over_time_end_on_the_numbers_of_their_runs(made, folder):
+    (folder / "walk.csv").write_text(WALK)
+    mission = made("mission", "simulate", "--profile", "walk.csv", "--slope", "2", "--no-report")
+    for run in (made("drive", *DRIVE), mission):
+        sound(run)
+        end, course = (numbers(table(run / n)) for n in ("runs.csv", "history.csv"))
+        last = {n: x[-1:] for n, x in course.items()}
+        assert same(last, end, but=("time_s",)) >= {"displacement_m"}
+        result = json.loads((run / "result.json").read_text())
+        stated = {n: np.array([x]) for n, x in result.items() if isinstance(x, float)}
+        assert same(stated, end)
+    rows = numbers(table(mission / "history.csv"))
+    assert rows["winding_temperature_C"][-1] == pytest.approx(
+        numbers(table(mission / "runs.csv"))["winding_end_C"][0]
+    )
+
+
+@pytest.mark.slow
+def test_files_of_a_calibration_are_those_of_compare_with_its_robot(made, folder):
+    found = made("calibrate", "calibrate", "measured", "--starts", "2", "--no-profiles", "--no-report")
+    sound(found)
+    compared = made("after", "compare", "measured", "--robot", "calibrate/robot.toml", "--no-report")
+    rows, other = numbers(table(found / "rows.csv")), numbers(table(compared / "comparison.csv"))
+    after = {n.replace("after_", "simulated_"): x for n, x in rows.items() if n.startswith("after_")}
+    assert len(same(after, other)) == 3
+    assert same(rows, other) >= {f"error_{c.name}_percent" for c in channels.usual()}
+    assert {c.sd_column for c in channels.usual()} <= set(rows)
+    for name, arguments in {
+        "posterior": ("simulate", "--voltage", "24"), "comparison": ("compare", "measured"), "sweeps": ("sweep", *POINTS)
+    }.items():  # fmt: skip
+        sound(made(name, *arguments, "--robot", "calibrate/robot.toml", "--posterior", "10", "--no-report"))
+
+
+#: The rest of the commands, on little.
+OTHERS = {
+    "check": ("check", "few.toml", "--no-report", "--no-changes"),
+    "size": ("size", "few.toml", "--starts", "8", "--motors", "RE 30 24 V", "--no-report"),
+    "sensitivity": (
+        "sensitivity", "--method", "local", "--slopes", "0", "--voltages", "24", "--payloads", "0", "--configurations",
+        "6T2A", "--outputs", "total_current,speed,start,steepest_slope", "--no-report",
+    ),
+    "reproduce": ("reproduce",),
+    "loop": ("loop", "measured", "--replicates", "250", "--no-report"),
+    "track": ("simulate", "--model", "track", "--duration", "0.5", "--voltage", "24", "--no-report"),
+    "resonance": (
+        "resonance", "--voltages", "16:32:2", "--payloads", "0", "--duration", "0.5", "--step", "0.0002", "--no-report",
+    ),
+    "battery": ("simulate", "--profile", "patrol", "--battery", "--no-report"),
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OTHERS)
+def test_files_of_every_other_command_have_known_names(made, folder, name):
+    (folder / "few.toml").write_text("speed_m_s = 0.3\nmass_kg = 30\n[envelope]\nslope_deg = [0, 5]\n")
+    sound(made(name, *OTHERS[name]))
+
+
+@pytest.mark.slow
+def test_every_command_that_leaves_a_folder_is_walked():
+    """Of `render`, `doctor` and `rig` there is no table; what `rig new` writes has names of parameters."""
+    asked = {words[0] for words in OTHERS.values()} | {"sweep", "simulate", "compare", "calibrate"}
+    commands = {(c.name or c.callback.__name__) for c in cli.app.registered_commands}
+    assert commands - asked == {"render", "doctor"}
