@@ -27,18 +27,8 @@ ERROR = 2e-5
 @pytest.fixture(scope="module")
 def package():
     """Histories of `drive` for amplitudes of PASSING, shape (3, runs, instants)."""
-    return driven(PASSING)
-
-
-@pytest.fixture(scope="module")
-def bare():
-    """The same without effects, which compiles in a fraction of the time."""
-    return driven((), 1e-10)  # its steps are longer, and samples lie within them
-
-
-def driven(names, tolerance=1e-9):
     base = params.replace(robots.nominal(), g.CLIMBING)
-    full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in names))
+    full = dataclasses.replace(base, effects=tuple(BY_NAME[n]() for n in PASSING))
     times = jnp.arange(round(DURATION / EVERY) + 1) * EVERY
     every = {p.name: p.value for p in params.walk(full)}
 
@@ -48,7 +38,7 @@ def driven(names, tolerance=1e-9):
         )
         # all of one type, so that one compiled program serves every call
         changed = params.replace(full, {k: jnp.asarray(v, float) for k, v in (every | (values or {})).items()})
-        s = drive_batch(changed, run, times, tolerance, 20000).signals
+        s = drive_batch(changed, run, times, 1e-9, 20000).signals
         return np.stack([s.total_current, s.speed_motor, s.speed])
 
     return read
@@ -65,14 +55,14 @@ def test_series_generator_holds_every_effect_that_only_a_series_shows():
 
 
 @pytest.mark.parametrize("battery", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
-def test_clean_histories_agree_with_drive(bare, battery):
+def test_clean_histories_agree_with_drive(package, battery):
     _, y = gs.histories(RUNS, DURATION, EVERY, battery=np.full(6, battery))
-    assert apart(bare(battery), y) < ERROR
+    assert apart(package(battery), y) < ERROR
 
 
-def test_comparison_with_drive_can_fail(bare):
+def test_comparison_with_drive_can_fail(package):
     _, y = gs.histories(RUNS, DURATION, EVERY, g.CLIMBING | {"motor.inertia": 3.36e-6})
-    assert apart(bare(0.0), y) > 5 * ERROR
+    assert apart(package(0.0), y) > 5 * ERROR
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from calibration.data.runs import Runs
 from calibration.discovery import discover
 from calibration.inference.calibrate import calibrate
 from calibration.inference.foresight import foresee
-from mmrjax import channels, robots
+from mmrjax import robots
 
 ALL = {
     "calibrate": lambda runs, robot: calibrate(runs, robot),
@@ -51,8 +51,7 @@ def test_a_campaign_sees_the_instruments_that_the_table_shows(tmp_path):
     table.write_text(
         "\n".join([",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))])
     )
-    with channels.panel(robot.rig.channels):
-        given = discover.prepared(records.read(table, robot=robot), robot)
+    given = discover.prepared(records.read(table, robot=robot), robot)
     seen = given.robot.rig.instruments[0]
     assert seen.signed is False and seen.quantum == pytest.approx(0.01)
     assert given.noise.sd.min() >= 0.01 / 12**0.5  # with the error of the step

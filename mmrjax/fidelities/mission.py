@@ -164,14 +164,14 @@ def _ends(
     status = jnp.where(stands, STALLED, status_moving(robot, now, signals, driven))
     rests = stands | ((jnp.abs(signals.direction) < 1.0) & (jnp.abs(signals.direction_travel) < 1.0))
     wanted = (mode != BRAKE) & (mode != COAST) & (jnp.abs(driven) > 1e-6)
-    status = jnp.where(~wanted & rests & (status == STALLED), CONVERGED, status)  # it stands, as it should
+    status = jnp.where(~wanted & (status == STALLED), CONVERGED, status)  # it stands, as it should
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
     per_speed = robot.gearbox.ratio / robot.chassis(signals.configuration).radius
     # A ramp that ends in a stop is measured by where it began.
     demanded = segment.demand if segment.linear else segment.demand[:1]
     largest = jnp.max(jnp.abs(demanded)) * jnp.where(mode == SPEED, per_speed, 1.0)
     missed = controlled & (jnp.abs(asked.error) > MISSED * jnp.maximum(largest, 10.0))
-    status = jnp.where(controlled & rests & ~missed, CONVERGED, status)
+    status = jnp.where(controlled & (rests | (status == STALLED)) & ~missed, CONVERGED, status)
     return status, missed
 
 
