@@ -34,9 +34,13 @@ def command(arguments):
     return end.value.code
 
 
-#: Damping ratio and, by payload [kg], frequency [Hz] of the oscillators of `waves`; signal and order they answer to.
+#: Damping ratio and, by payload [kg], frequency [Hz] of the oscillators of `waves`; by signal and payload, the one that
+#: shows in it and the harmonic that drives it.
 OSCILLATORS = {"bounce": (0.06, {0.0: 93.0, 8.0: 79.0}), "pitch": (0.06, {0.0: 52.0, 8.0: 51.0})}
-ANSWERS = {"normal": ("bounce", 3), "total_current": ("pitch", 2)}
+ANSWERS = {
+    "normal": {0.0: ("bounce", 3), 8.0: ("bounce", 3)},
+    "total_current": {0.0: ("pitch", 2), 8.0: ("bounce", 3)},
+}
 
 
 def linear(robot, conditions):
@@ -63,9 +67,10 @@ def waves(robot, conditions, duration, step, **_):
         "speed_wheel": speed / robot.radius_pulley,
     }
     signals = {name: np.outer(np.broadcast_to(x, speed.shape), np.ones(len(time))) for name, x in still.items()}
-    for name, (oscillator, order) in ANSWERS.items():
-        damping, natural = OSCILLATORS[oscillator]
+    for name, by_payload in ANSWERS.items():
         for k, payload in enumerate(np.asarray(conditions.payload)):
+            oscillator, order = by_payload[min(by_payload, key=lambda x: abs(x - payload))]
+            damping, natural = OSCILLATORS[oscillator]
             driven = order * speed[k] / 0.035
             ratio = driven / np.interp(payload, list(natural), list(natural.values()))
             swing = 0.02 / np.hypot(1 - ratio**2, 2 * damping * ratio)
