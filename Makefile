@@ -13,7 +13,7 @@ demo: $(READY)
 	$(BIN)/mmrjax sweep --robot runs/demo/loop/robot.toml --out runs/demo/table8 --force $(DONE)
 	@echo "open runs/demo/loop/report.html, then runs/demo/table8/report.html"
 
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder --durations=10 --durations-min=2
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=10 --durations-min=2
 # The compiler's older emitters: a program compiles in half of the time and runs slower, which short tests don't feel.
 QUICK := XLA_FLAGS=--xla_cpu_use_fusion_emitters=false
 

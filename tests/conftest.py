@@ -78,12 +78,25 @@ SHARING = {
 }  # fmt: skip
 
 
+GROUP = {file: name for name, files in SHARING.items() for file in files}
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """A worker takes a file at a time, or the files that share results."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            file = Path(nodeid.partition("::")[0]).stem
+            return GROUP.get(file, file)
+
+    return ByFile(config, log)
+
+
 def pytest_collection_modifyitems(items):
-    """A worker takes a file at a time, or the files of a group (`--dist loadgroup`)."""
-    group = {file: name for name, files in SHARING.items() for file in files}
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(group.get(item.path.stem, item.path.stem)))
-    items.sort(key=lambda item: list(SHARING).index(g) if (g := group.get(item.path.stem)) else len(SHARING))
+    """Files that share results come first."""
+    items.sort(key=lambda item: list(SHARING).index(g) if (g := GROUP.get(item.path.stem)) else len(SHARING))
 
 
 @pytest.hookimpl(wrapper=True)
