@@ -101,20 +101,19 @@ def discover(
     for sentence in ready.foreign:
         progress(sentence)
     traced, notes = ready.trace(progress=progress), ready.notes
+    silent = [c.name for c, source in zip(known.channels, known.source, strict=True) if source == "assumed"]
+    sizes = observers.kind(distinct).sizes(distinct)
+    sds = {f: noise_room.assumed(distinct, sizes, noise, f) for f in FACTORS if silent}
     # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
     with concurrent.futures.ThreadPoolExecutor(len(FACTORS)) as others:
-        verdicts = {}
-        if "assumed" in known.source:
+        if silent:
             progress(f"the verdict with {' and '.join(f'{f:g}' for f in FACTORS)} times the assumed noise, beside:")
-            sizes = observers.kind(distinct).sizes(distinct)
-            sds = {f: noise_room.assumed(distinct, sizes, noise, f) for f in FACTORS}
-            verdicts = {f: others.submit(ready.trace, sds[f]) for f in FACTORS}
+        verdicts = {f: others.submit(ready.trace, sd) for f, sd in sds.items()}
         found = finished(traced, distinct, ready.numbers, ready.settings, ready.library, progress)
         sensitivity = [in_short(f, verdict.result()) for f, verdict in verdicts.items()]
-    if "assumed" in known.source:
-        silent = ", ".join(c.name for c, w in zip(known.channels, known.source, strict=True) if w == "assumed")
+    if silent:
         usual = noise_room.default(known.channels)
-        said = f"no sd is stated for {silent}: {usual} is assumed; state yours with --noise"
+        said = f"no sd is stated for {', '.join(silent)}: {usual} is assumed; state yours with --noise"
         notes = (*notes, said)
     return dataclasses.replace(found, notes=(*notes, *found.notes), sensitivity=tuple(sensitivity))
 
