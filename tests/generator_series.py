@@ -114,7 +114,8 @@ def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str,
     B = B + s.r * (guide + P) + extra("gearbox")
     A = M_d - p["gearbox.friction_coulomb"] * s.sign - p["gearbox.friction_viscous"] * s.w
     J_w = both("inertia") + extra("inertia")
-    eta = np.where((A * J_w + s.i * J_d * B) * s.sign >= 0, eta_0, 1 / eta_0)
+    # Teeth lose power only where they turn: to 1 with the softened sign, as every friction about rest.
+    eta = 1 + abs(s.sign) * (np.where((A * J_w + s.i * J_d * B) * s.sign >= 0, eta_0, 1 / eta_0) - 1)
     wheel = (s.i * eta * A - B) / (J_w + J_d * s.i**2 * eta)
     return np.stack([
         dI,
