@@ -80,7 +80,6 @@ def posed(base, made):
     """The problem that `found` solves."""
     guided, known = priors.guided(base, "6T2A")
     coordinates = priors.coordinates(guided, [GUIDE_FRICTION, STATIC], known)
-    coordinates = dataclasses.replace(coordinates, stated=())
     sd = noise_room.of(made, observers.kind(made).sizes(made), STATED).sd
     return observers.pose(made, guided, coordinates, sd, "track")
 

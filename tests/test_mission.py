@@ -354,7 +354,7 @@ def test_derivatives_by_every_parameter_and_row_match_differences(robot):
     def outputs(x, moved):
         changed = params.replace(robot, {name: named[name] * x[k] for k, name in enumerate(names)})
         p = dataclasses.replace(start, **{n: getattr(start, n) + moved[n] for n in columns})
-        found = mission(changed, asked(1, adhesion=2.0), p, tolerance=1e-7)
+        found = mission(changed, asked(1, adhesion=2.0), p, tolerance=1e-9)
         return jnp.stack([found.total.energy / found.total.of["path"], found.peaks["temperature"]])
 
     x, moved = jnp.ones(len(names)), {n: jnp.zeros(ROWS) for n in columns}

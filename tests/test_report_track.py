@@ -164,7 +164,7 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
     short = dataclasses.replace(batch, history=jax.tree.map(lambda x: x[:, :100], batch.history))
     for name, shown, figures in (("whole", batch, {"history", "power", "ripple", "reactions"}),
                                  ("short", short, {"history", "power"})):  # fmt: skip
-        table = {**simulation.conditions(robot, runs), **simulation.ended(batch)}
+        table = {**simulation.conditions(robot, runs), **simulation.ended(robot, batch)}
         path = report_runs.write(
             tmp_path / name, robot=robot, robot_name="nominal", model="track", runs=table, histories=shown
         )

@@ -17,6 +17,8 @@ from mmrjax.signals import CONVERGED
 SHARE = 0.95
 #: Instants of the inrush, from the first to the last of it [s], and of the rest of the run.
 INRUSH, EARLIEST, LATEST, REST = 250, 2e-5, 0.02, 800
+#: Error of a step of the run: a derivative of the time to speed is then right to 1e-4 (at `drive`'s 1e-6 to 6e-3).
+TOLERANCE = 1e-7
 
 
 def instants() -> np.ndarray:
@@ -73,7 +75,7 @@ def compute(robot: Robot, conditions: Conditions) -> dict[str, Array]:
         stalls or is not settled has no final speed. Derivatives are forward.
     """
     times = jnp.asarray(instants())
-    run = drive(robot, conditions, times)
+    run = drive(robot, conditions, times, TOLERANCE)
     signals = run.signals
     speed, rate, current = (jnp.asarray(x) for x in (signals.speed, signals.acceleration, signals.total_current))
     power = jnp.asarray(signals.voltage) * current
