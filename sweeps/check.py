@@ -8,9 +8,10 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data import requirements, robot_file
+from calibration.data.errors import rounded
 from calibration.sizing import sheet
 from sweeps import config as configuration
-from sweeps.check_result import CheckResult, changed, corner, label, limit, number, reached, wanted
+from sweeps.check_result import CheckResult, changed, corner, label, limit, reached, wanted
 from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder, open_folder
@@ -70,7 +71,7 @@ def print_check(found: CheckResult, changes: bool = True) -> None:
     shown.add_column("margin", justify="right")
     shown.add_column("at its worst corner")
     for o in found.outcomes:
-        margin = "" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{number(abs(o.margin))}"
+        margin = "" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{rounded(abs(o.margin))}"
         shown.add_row("met" if o.met else "MISSED", label(o), wanted(o), reached(o), margin, corner(o))
     say(shown)
     say(found.statement())

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.data.errors import rounded
 from calibration.data.requirements import Requirements
 from calibration.sizing import sheet
 from calibration.sizing.sheet import Change, Outcome
@@ -66,15 +67,10 @@ def limit(outcome: Outcome) -> float:
     return found
 
 
-def number(value: float) -> str:
-    """A value of the sheet: three digits."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
 def wanted(outcome: Outcome) -> str:
     """What is required."""
     r = outcome.requirement
-    return f"{'≥' if r.least else '≤'} {number(limit(outcome))} {r.quantity.unit}"
+    return f"{'≥' if r.least else '≤'} {rounded(limit(outcome))} {r.quantity.unit}"
 
 
 def reached(outcome: Outcome) -> str:
@@ -82,7 +78,7 @@ def reached(outcome: Outcome) -> str:
     return (
         words.why(outcome.status)
         if outcome.value is None
-        else f"{number(outcome.value)} {outcome.requirement.quantity.unit}"
+        else f"{rounded(outcome.value)} {outcome.requirement.quantity.unit}"
     )
 
 
@@ -92,7 +88,7 @@ def shortfall(outcome: Outcome) -> str:
     if outcome.value is None or outcome.margin is None:
         return f"({reached(outcome)})"
     way = "below" if r.least else "above"
-    return f"{reached(outcome)}, {number(-outcome.margin)} {way} {number(limit(outcome))}"
+    return f"{reached(outcome)}, {rounded(-outcome.margin)} {way} {rounded(limit(outcome))}"
 
 
 _PLACES = {

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calibration.data.errors import rounded
 from sweeps import check_result, figures_check
 from sweeps.report import Album, named, render
 
@@ -40,7 +41,7 @@ def _row(o: check_result.Outcome) -> dict[str, Any]:
         "name": o.requirement.name,
         "wanted": check_result.wanted(o),
         "reached": check_result.reached(o),
-        "margin": "–" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{check_result.number(abs(o.margin))}",
+        "margin": "–" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{rounded(abs(o.margin))}",
         "corner": check_result.corner(o),
         "place": f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}",
         "source": o.requirement.source,
