@@ -14,6 +14,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 import equinox as eqx  # noqa: E402
+import interval_coverage  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import measure  # noqa: E402
 import numpy as np  # noqa: E402
@@ -21,7 +22,7 @@ import reference  # noqa: E402  (tests/reference.py, plain NumPy and SciPy)
 from scipy.optimize import least_squares, root  # noqa: E402
 
 from calibration.data import runs as records  # noqa: E402
-from calibration.inference import identifiability, noise, observers, priors, problem  # noqa: E402
+from calibration.inference import noise, observers, priors, problem  # noqa: E402
 from calibration.inference import optimizers as fit  # noqa: E402
 from calibration.inference.calibrate import calibrate  # noqa: E402
 from calibration.inference.errors import relative_error, summary  # noqa: E402
@@ -73,7 +74,7 @@ def coverage(runs: records.Runs, draws: int) -> dict[str, Any]:
     posed = pose(runs)
     truth = jnp.asarray(0.5 * np.random.default_rng(3).standard_normal(len(posed.coordinates)))
     start = time.perf_counter()
-    found = identifiability.coverage(posed, truth, draws, seed=1, profiles=True)
+    found = interval_coverage.coverage(posed, truth, draws, seed=1, profiles=True)
     took = time.perf_counter() - start
     print(f"coverage of 95 % intervals, {draws} draws in one batch ({took:.0f} s with compiling), "
           f"{found.converged.mean():.1%} converged")  # fmt: skip

@@ -337,6 +337,8 @@ def after(case: g.Case, runs, found) -> dict:
 
 def carried_out(case: g.Case, found, settings) -> list[dict]:
     """Experiments proposed and carried out one after the other, until one alternative or nothing to do is left."""
+    import loop_experiments
+
     from calibration.discovery import experiments
 
     left = experiments.alternatives(found.best, found.alike)
@@ -353,10 +355,10 @@ def carried_out(case: g.Case, found, settings) -> list[dict]:
             done[name] = case.carry_out(
                 next(e for e in whole.experiments if e.name == name), seed=1000 * len(done) + case.label["seed"]
             )
-        says = experiments.supported(whole, done)
+        says = loop_experiments.supported(whole, done)
         what = {k: getattr(proposal, k) for k in ("experiments", "expected_sigma", "settles", "separates")}
         said.append(what | {"chi2": says.chi2, "best": says.best, "left": says.left})
-        seen = whole.among(says.left)
+        seen = loop_experiments.among(whole, says.left)
     return said
 
 

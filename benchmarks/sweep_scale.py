@@ -54,11 +54,13 @@ def divisor(number: int, most: int) -> int:
 
 def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[Any, Any]:
     """Configuration and job of a sweep."""
+    import jax
+
     from mmrjax import channels, robots
     from sweeps import axes, campaign, scale
     from sweeps.config_campaign import Campaign
 
-    chunk = arguments.chunk or scale.default_chunk(arguments.model, scale.accelerated(), devices)
+    chunk = arguments.chunk or scale.default_chunk(arguments.model, jax.default_backend() != "cpu", devices)
     config = Campaign(
         model=arguments.model, chunk=min(chunk, points), storage=arguments.storage, outputs=channels.USUAL,
         duration_s=arguments.duration if arguments.model != "steady" else None,

@@ -74,7 +74,7 @@ def compared(robot: Robot) -> dict[str, jax.Array]:
         percent = 100 / signals.speed_theoretical
         return {
             "slip": 100 * (1 - signals.speed / signals.speed_theoretical),
-            "law": percent * seen.slip_speed(friction),
+            "law": percent * (vibration.speed_sliding(friction, seen.demanded, seen.swing) - seen.lead),
             "without ripple": percent * friction.speed_creep(seen.demanded),
             "swing": percent * seen.swing,
             "lead": percent * seen.lead,

@@ -58,11 +58,6 @@ def inertia_equivalent(mass_side: Scalar, radius: Scalar, inertia_rotating: Scal
     return mass_side * radius**2 + inertia_rotating
 
 
-def mass_factor(mass_side: Scalar, radius: Scalar, inertia_rotating: Scalar) -> Scalar:
-    """Coefficient of rotating masses without sliding δ = J'_eq / (m_i r_k²) [-], eq. (2)."""
-    return inertia_equivalent(mass_side, radius, inertia_rotating) / (mass_side * radius**2)
-
-
 def normal_load(mass: Scalar, slope: Scalar, gravity: float, sides: Scalar) -> Scalar:
     """Normal load of one side m_i g cos α [N], eq. (5)."""
     return mass * (gravity / sides) * cosine(slope)

@@ -29,6 +29,11 @@ def for_equations(x: T) -> T:
     return jax.tree.map(lambda leaf: leaf.for_equations() if _has_more(leaf) else leaf, x, is_leaf=_has_more)
 
 
+def has_tracer(tree: Any) -> bool:
+    """Whether there is a tracer among the leaves."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
+
+
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
     """`eqx.filter_jit` of a function; one that returns a robot returns it as `for_equations` leaves it.
 

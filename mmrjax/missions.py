@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from mmrjax import energy
 from mmrjax.channels import MM, RPM
-from mmrjax.compiling import compiled
+from mmrjax.compiling import compiled, has_tracer
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Run
 from mmrjax.fidelities.mission import TOLERANCE, Mission, Start, Totals, mission
@@ -186,7 +186,7 @@ def batch(
     """
     if not history:
         return together(robot, conditions, profile, start, 0)
-    if _traced((robot, conditions, profile, start)):
+    if has_tracer((robot, conditions, profile, start)):
         return together(robot, conditions, profile, start, _room(profile))
     found = list(parts(robot, conditions, profile, start))
     return jax.tree.map(lambda *x: np.concatenate(x), *found)
@@ -215,10 +215,6 @@ def parts(robot: Robot, conditions: Conditions, profile: Profile, start: Start |
 
 def _room(profile: Profile) -> int:
     return min(MOST_KEPT, max(LEAST_KEPT, _power(ROOM * profile.segments * profile.cycles)))
-
-
-def _traced(tree: Any) -> bool:
-    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
 
 
 def _power(count: int) -> int:

@@ -31,9 +31,6 @@ with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.St
     import mujoco
     from mujoco import mjx  # says on stdout which optional back ends are missing
 
-#: Bodies of the model after the world, in order.
-BODIES = ("chassis", "driving", "driven")
-
 
 class Masses(eqx.Module):
     """Masses of half a robot [kg, m, kg·m²].

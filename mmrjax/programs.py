@@ -146,7 +146,8 @@ class Programs:
             return _arrays(out)
 
         flat.__name__ = f"kept_{getattr(self.function, '__name__', 'function')}"
-        lowered = jax.jit(flat).lower(*_arrays(leaves))
+        # The text names what is on disk: without the arguments that nothing reads, programs of others would be alike.
+        lowered = jax.jit(flat, keep_unused=True).lower(*_arrays(leaves))
         return returned[0], lowered
 
 

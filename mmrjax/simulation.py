@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import channels, fidelities, missions, params, power
-from mmrjax.compiling import compiled
+from mmrjax.compiling import compiled, has_tracer
 from mmrjax.conditions import Conditions, indices
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
@@ -87,7 +87,7 @@ def simulate(
     _check_battery(robot, conditions)
     if profile is not None:
         return _missions(robot, conditions, profile, start, history)
-    fidelity, traced = fidelities.get(model), _traced((robot, conditions))
+    fidelity, traced = fidelities.get(model), has_tracer((robot, conditions))
     if not traced:
         try:
             fidelity.check(robot, _flat(conditions), stated)
@@ -106,7 +106,7 @@ def simulate(
 def _check_battery(robot: Robot, conditions: Conditions) -> None:
     """Refuse a cut-off at which no cell gives current, and warn of one that hardly acts, where a run is on the
     battery."""
-    if _traced((robot.battery, conditions.battery)) or not (np.asarray(conditions.battery) > 0.5).any():
+    if has_tracer((robot.battery, conditions.battery)) or not (np.asarray(conditions.battery) > 0.5).any():
         return
     if any(np.ndim(x) for x in jax.tree.leaves(robot.battery)):  # a batch of robots
         return
@@ -131,7 +131,7 @@ def _check_profile(model: str, profile: Any, options: Mapping[str, float | None]
 def _missions(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None, history: bool) -> Results:
     """Every run of a batch over the same profile."""
     flat = _flat(conditions)
-    if not _traced((robot, flat, profile, start)):
+    if not has_tracer((robot, flat, profile, start)):
         cell = missions.begins_below(robot, flat, profile, start)
         if np.isfinite(cell).any():
             k = int(np.argmax(np.isfinite(cell)))
@@ -188,7 +188,7 @@ def _run(
         raise UsageError(f"history: got {runs} runs; at most {HISTORIES} are kept over time; expected history=False")
     simulate = fidelity.histories if history else fidelity.run
     assert simulate is not None
-    if _traced((robot, conditions)):
+    if has_tracer((robot, conditions)):
         return _shaped(simulate(robot, _flat(conditions), options), conditions.shape)
     return _in_chunks(fidelity, lambda flat: simulate(robot, flat, options), conditions)
 
@@ -243,10 +243,6 @@ def _joined(parts: list[T], runs: int) -> T:
     return jax.tree.map(lambda *x: jnp.concatenate([*x[:-1], x[-1][(len(x) * len(x[-1]) - runs) :]]), *parts)
 
 
-def _traced(tree: Any) -> bool:
-    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
-
-
 def _check_robot(robot: Robot) -> None:
     """Refuse parameters out of the bounds that their fields declare."""
     concrete = [p for p in params.walk(robot) if not isinstance(p.value, jax.core.Tracer)]
@@ -270,7 +266,7 @@ def _resolved(robot: Robot, conditions: Conditions) -> Conditions:
             name = str(np.unique(which[found < 0])[0])
             raise UsageError(f"configuration: got {name}; {choices(name, names)}")
         return dataclasses.replace(conditions, configuration=jnp.asarray(found))
-    if not _traced(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
+    if not has_tracer(which) and which.size and not _within(_ends(which), 0, len(names) - 1):
         wrong = _first_outside(which, 0, len(names) - 1)
         assert wrong is not None
         known = ", ".join(f"{k} ({name})" for k, name in enumerate(names))
@@ -295,7 +291,7 @@ def _check_conditions(conditions: Conditions) -> None:
     ends: dict[int, tuple[float, float]] = {}  # by array: several fields may share one
     for field in dataclasses.fields(conditions):
         value = getattr(conditions, field.name)
-        if field.name == "configuration" or value is None or _traced(value) or not value.size:
+        if field.name == "configuration" or value is None or has_tracer(value) or not value.size:
             continue
         low, high, unit = CONDITION_LIMITS[field.name]
         if id(value) not in ends:
@@ -307,7 +303,7 @@ def _check_conditions(conditions: Conditions) -> None:
                 f"{field.name}{wrong[0]}: got {wrong[1]:.6g}; expected {low:g} to {high:g} {unit}".rstrip()
             )
     stated, payload = conditions.total_mass, conditions.payload
-    if stated is None or _traced((stated, payload)):
+    if stated is None or has_tracer((stated, payload)):
         return
     bare = np.asarray(stated) - np.asarray(payload)
     wrong = _first_outside(bare, np.nextafter(0.0, 1.0), math.inf)

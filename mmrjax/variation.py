@@ -63,11 +63,6 @@ class Axis:
     prior_sd: float | None = None
     spec: params.Spec | None = None
 
-    @property
-    def is_condition(self) -> bool:
-        """Whether it is a condition of runs, else a parameter of the robot."""
-        return self.spec is None
-
 
 class Variation(eqx.Module):
     """A robot of which some parameters, and conditions, take other values at each point.

@@ -68,7 +68,8 @@ def speed_sliding(friction: Friction, demanded: Scalar, swing: Scalar) -> Scalar
 
 
 class Ripple(eqx.Module):
-    """How the contacts of one run shake, over its averaging window; what slip follows from.
+    """How the contacts of one run shake, over its averaging window. The speed lost that follows is the mean sliding
+    that carries the demand (`speed_sliding`), less the lead.
 
     Attributes:
         swing: mean size of the sliding speed less its mean [m/s]; lead: mean less plain mean of the sliding speed
@@ -81,10 +82,6 @@ class Ripple(eqx.Module):
     lead: Scalar
     normal: Scalar
     demanded: Scalar
-
-    def slip_speed(self, friction: Friction) -> Scalar:
-        """Speed lost [m/s] that follows from the ripple: the mean sliding that carries the demand, less the lead."""
-        return speed_sliding(friction, self.demanded, self.swing) - self.lead
 
 
 def ripple(robot: Robot, conditions: Conditions, run: Trajectory, window: float = 0.8) -> Ripple:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.errors import BadConfiguration, choices, stated_number
 from mmrjax import variation
 from mmrjax.channels import RPM
 from mmrjax.rig import IMPOSED
@@ -132,15 +132,9 @@ def _known(name: str, robot: Robot, where: str) -> Axis:
     return variation.Variation(robot, (name,)).axes[name]
 
 
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise BadConfiguration(f"{where}: got {value!r}; expected a number")
-    return float(value)
-
-
 def _value(name: str, value: Any, where: str) -> float:
     """A number; of the battery also true or false."""
-    return float(value) if name == "battery" and isinstance(value, bool) else _number(value, where)
+    return float(value) if name == "battery" and isinstance(value, bool) else stated_number(value, where)
 
 
 def _within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> None:
@@ -190,7 +184,7 @@ _RANGE = ("start", "stop", "number", "scale")
 
 def _range(stated: Mapping[str, Any], where: str) -> np.ndarray:
     _keys(stated, _RANGE, ("start", "stop", "number"), where)
-    start, stop = (_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
+    start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
     number = _count(stated["number"], f"{where}.number", LONGEST)
     scale = stated.get("scale", "linear")
     if scale not in ("linear", "log"):
@@ -306,7 +300,7 @@ def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
         raise BadConfiguration(f"{where}.distribution: got {kind!r}; {choices(str(kind), DISTRIBUTIONS)}")
     needed = DISTRIBUTIONS[kind]
     _keys(table, ("distribution", *needed), needed, where)
-    numbers = {key: _number(table[key], f"{where}.{key}") for key in needed}
+    numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}
     ordered = [numbers[key] for key in ("low", "mode", "high") if key in numbers]
     if ordered != sorted(ordered) or (ordered and ordered[0] == ordered[-1]):
         said = ", ".join(f"{key} {value:g}" for key, value in numbers.items())

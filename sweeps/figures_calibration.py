@@ -12,15 +12,10 @@ from calibration.inference import blocks
 from calibration.inference.identifiability import Z95
 from calibration.inference.result import CalibrationResult
 from mmrjax.channels import Channel
-from sweeps.figures_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure
+from sweeps.figures_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure, short
 
 #: Runs of which histories are drawn.
 HISTORIES = 6
-
-
-def short(name: str) -> str:
-    """A parameter's name without the words that every such name has."""
-    return name.replace("ground.friction.", "").replace("ground.", "").replace("track.", "").replace("effects.", "")
 
 
 def parameters(found: CalibrationResult) -> Figure:

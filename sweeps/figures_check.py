@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.figure import Figure
 
+from sweeps.check_result import CheckResult, label, limit, reached, wanted
 from sweeps.figures_style import FAINT, GREEN, INK, VERMILION, figure
-
-if TYPE_CHECKING:
-    from sweeps.check import CheckResult
 
 #: Margins beyond are drawn so far [%]; their number says how large they are.
 LONGEST = 100.0
@@ -18,8 +14,6 @@ LONGEST = 100.0
 
 def margins(found: CheckResult) -> Figure:
     """A bar for each requirement: its margin in percent of what is required, right where it is met."""
-    from sweeps.check import label, limit, reached, wanted
-
     rows = found.outcomes
     fig, axes = figure(1, 1, 0.9 + 0.42 * len(rows))
     ax = axes[0, 0]

@@ -14,10 +14,10 @@ from mmrjax.channels import MM
 from mmrjax.fidelities.resonance import MATTERS, SIGNALS, strongest
 from sweeps import words
 from sweeps.figures_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
-from sweeps.resonance import percent
+from sweeps.resonance_result import percent
 
 if TYPE_CHECKING:
-    from sweeps.resonance import ResonanceResult
+    from sweeps.resonance_result import ResonanceResult
 
 ORDERS = 8  # lines of the Campbell diagram
 MAPS = ("reaction", "current", "speed")

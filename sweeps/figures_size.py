@@ -14,7 +14,7 @@ from calibration.sizing.design import OBJECTIVES
 from sweeps.figures_style import BLUE, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure
 
 if TYPE_CHECKING:
-    from sweeps.size import SizeResult
+    from sweeps.size_result import SizeResult
 
 _COLOURS = dict(zip(LIMITS, (BLUE, "#555555", VERMILION, PURPLE, ORANGE, "#8c564b", SKY, GREEN), strict=True))
 

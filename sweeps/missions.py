@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax import balances, channels, ground, missions, outputs
 from mmrjax.conditions import Conditions
-from mmrjax.energy import SINKS
 from mmrjax.fidelities.mission import Mission
 from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.missions import JOULE_PER_WH
@@ -28,6 +26,7 @@ from sweeps import config as configuration
 from sweeps import imposed, own, run, words
 from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run, read_runs
+from sweeps.missions_result import Missions
 from sweeps.store import open_folder
 
 #: Rows of history.csv: of a run at most, at least, and of all runs together.
@@ -39,45 +38,6 @@ _PRINTED = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
     "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
 )  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True)
-class Missions:
-    """Runs over one profile, as tables.
-
-    Attributes:
-        table: a row a run, `runs.csv`; segments: a row a segment, `segments.csv`; course: a row an accepted step that
-            is kept, `history.csv`.
-        source: the profile that they follow.
-        whole: whether the course of every run reaches its end.
-    """
-
-    table: dict[str, np.ndarray]
-    segments: dict[str, np.ndarray]
-    course: dict[str, np.ndarray]
-    source: ProfileTable
-    whole: bool
-
-    def to_json(self) -> dict[str, Any]:
-        """What `result.json` says: of one run its numbers by name, of several a list of them."""
-        each = [self._one(k) for k in range(len(self.table["status"]))]
-        about = {
-            "name": self.source.source, "sha256": self.source.digest, "duration_s": self.source.duration,
-            "segments": self.source.segments, "cycles": self.source.cycles,
-            "between_rows": profiles.BETWEEN[self.source.linear],
-        }  # fmt: skip
-        return {"profile": about, **(each[0] if len(each) == 1 else {"missions": each})}
-
-    def _one(self, row: int) -> dict[str, Any]:
-        to = {name: f"energy_to_{name}_Wh" for name in SINKS}
-        numbers = {c: float(self.table[c][row]) for c in missions.names() if c not in to.values()}
-        flags = str(self.table["flags"][row])
-        return {
-            **numbers,
-            "energy_by_where_Wh": {name: float(self.table[column][row]) for name, column in to.items()},
-            "status": str(self.table["status"][row]),
-            "flags_raised": flags.split(";") if flags else [],
-        }
 
 
 def simulate(

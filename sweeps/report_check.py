@@ -6,11 +6,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sweeps import check, figures_check
+from calibration.data.errors import rounded
+from sweeps import check_result, figures_check
 from sweeps.report import Album, named, render
 
 if TYPE_CHECKING:
-    from sweeps.check import CheckResult
+    from sweeps.check_result import CheckResult
 
 
 def write(folder: Path, found: CheckResult, *, robot_name: str) -> Path:
@@ -26,28 +27,28 @@ def write(folder: Path, found: CheckResult, *, robot_name: str) -> Path:
         source=found.asked.source,
         rows=[_row(o) for o in found.outcomes],
         missed=[
-            {"label": f"{check.label(o)} {check.wanted(o)}", "changes": [_change(c) for c in o.change]}
+            {"label": f"{check_result.label(o)} {check_result.wanted(o)}", "changes": [_change(c) for c in o.change]}
             for o in found.missed
         ],
         **named(found.robot, robot_name),
     )
 
 
-def _row(o: check.Outcome) -> dict[str, Any]:
+def _row(o: check_result.Outcome) -> dict[str, Any]:
     return {
         "met": o.met,
-        "label": check.label(o),
+        "label": check_result.label(o),
         "name": o.requirement.name,
-        "wanted": check.wanted(o),
-        "reached": check.reached(o),
-        "margin": "–" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{check.number(abs(o.margin))}",
-        "corner": check.corner(o),
+        "wanted": check_result.wanted(o),
+        "reached": check_result.reached(o),
+        "margin": "–" if o.margin is None else f"{'+' if o.margin >= 0 else '−'}{rounded(abs(o.margin))}",
+        "corner": check_result.corner(o),
         "place": f"{o.at['configuration']}, {o.at['surface'].replace('_', ' ')}",
         "source": o.requirement.source,
     }
 
 
-def _change(c: check.Change) -> dict[str, Any]:
+def _change(c: check_result.Change) -> dict[str, Any]:
     return {
         "parameter": c.parameter,
         "before": f"{c.before:.4g}",

@@ -16,7 +16,7 @@ from sweeps.report_runs import labels
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
-    from sweeps.missions import Missions
+    from sweeps.missions_result import Missions
 
 #: Segments of a cycle that a page has room for.
 SEGMENTS = 60

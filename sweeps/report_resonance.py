@@ -14,7 +14,7 @@ from sweeps import figures_resonance, words
 from sweeps.report import Album, named, render
 
 if TYPE_CHECKING:
-    from sweeps.resonance import ResonanceResult
+    from sweeps.resonance_result import ResonanceResult
 
 
 def write(folder: Path, found: ResonanceResult, *, robot_name: str) -> Path:

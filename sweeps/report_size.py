@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from calibration.sizing.chart import chart, extent
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.search import Found
-from sweeps import check, figures_size, size
+from sweeps import figures_size
+from sweeps.check_result import label, reached, wanted
 from sweeps.report import Album, named, render, words_shown
-
-if TYPE_CHECKING:
-    from sweeps.size import SizeResult
+from sweeps.size_result import SizeResult, missed
 
 
 def write(folder: Path, found: SizeResult, *, robot_name: str) -> Path:
@@ -43,7 +42,12 @@ def write(folder: Path, found: SizeResult, *, robot_name: str) -> Path:
         motors=[_row(f) for f in found.sizing.motors.values()],
         front=[_row(f) for f in found.sizing.front],
         sheet=[
-            {"met": o.met, "label": check.label(o), "wanted": check.wanted(o), "reached": check.reached(o)}
+            {
+                "met": o.met,
+                "label": label(o),
+                "wanted": wanted(o),
+                "reached": reached(o),
+            }
             for o in found.outcomes
         ],
         **named(found.robot if best is None else best.robot, robot_name),
@@ -59,5 +63,5 @@ def _row(f: Found) -> dict[str, Any]:
         "radius": f"{1000 * f.radius:.1f}",
         "cells": f"{f.in_series} × {f.parallel:.3g} {f.cell.name}",
         "objectives": [f"{f.objectives[k]:.4g}" if k in f.objectives else "–" for k in OBJECTIVES],
-        "binds": ", ".join(f.binds if f.feasible else size.missed(f)) or "nothing",
+        "binds": ", ".join(f.binds if f.feasible else missed(f)) or "nothing",
     }

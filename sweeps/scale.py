@@ -68,11 +68,6 @@ class Times:
     total: float = 0.0
 
 
-def accelerated() -> bool:
-    """Whether jax runs on anything but processors."""
-    return jax.default_backend() != "cpu"
-
-
 def device_kind() -> str:
     """What the local devices are, in words."""
     device = jax.local_devices()[0]

@@ -1,6 +1,8 @@
 """The next experiment: what the menu foresees, which experiment is chosen, and what its readings say."""
 
 import dataclasses
+import sys
+from pathlib import Path
 
 import equinox as eqx
 import generator as g
@@ -21,6 +23,9 @@ from calibration.discovery.stated_values import Shift
 from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+from loop_experiments import supported
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},
@@ -132,7 +137,7 @@ def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
     name = experiments.choose(foreseen).name
     done = next(e for e in foreseen.experiments if e.name == name)
-    verdicts = [experiments.supported(foreseen, {name: case.carry_out(done, seed)}) for seed in range(10)]
+    verdicts = [supported(foreseen, {name: case.carry_out(done, seed)}) for seed in range(10)]
     assert sum(v.resolved and v.best == pair[0] for v in verdicts) >= 8
     assert all(pair[0] in v.left for v in verdicts)
 
@@ -159,9 +164,7 @@ def test_chance_is_the_share_of_draws_in_which_the_false_one_is_refuted():
     at, rng = SPANS["stall"], np.random.default_rng(0)
     refuted = [
         "b"
-        in experiments.supported(
-            seen, {"stall": {"value": rng.standard_normal(at.stop - at.start), "sd": np.ones(2)}}
-        ).refuted
+        in supported(seen, {"stall": {"value": rng.standard_normal(at.stop - at.start), "sd": np.ones(2)}}).refuted
         for _ in range(4000)
     ]
     one = next(r for r in experiments.ranked(seen) if r.experiments == ("stall",))

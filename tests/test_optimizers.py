@@ -1,6 +1,8 @@
 """The fit: exact Jacobians, both optimizers, many starts, recovered truth, coverage, and what holds what."""
 
 import dataclasses
+import sys
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,6 +18,9 @@ from calibration.inference import optimizers as fit
 from calibration.inference.normal_equations import backward, cholesky, forward
 from mmrjax import robots
 from mmrjax.signals import CONVERGED, SLIDES
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+from interval_coverage import coverage
 
 solve = eqx.filter_jit(lambda *args, **options: fit.levenberg_marquardt(*args, **options)[0])
 STATED = "current=2%,motor_speed=0.5%,speed=1%"
@@ -192,7 +197,7 @@ def test_intervals_cover_the_truth(posed, truth):
     measured = dataclasses.replace(
         posed, data=dataclasses.replace(posed.data, measured=posed.observation(truth).reading)
     )
-    found = identifiability.coverage(measured, truth, draws=500, seed=1, profiles=True)
+    found = coverage(measured, truth, draws=500, seed=1, profiles=True)
     assert found.converged.mean() > 0.99
     assert np.all((found.profile > 0.92) & (found.profile < 0.98)), found.profile
 

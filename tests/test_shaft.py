@@ -12,7 +12,7 @@ from mmrjax import balances, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
-from mmrjax.fidelities.steady import steady_batch, steady_derivatives
+from mmrjax.fidelities.steady import steady_batch, steady_outputs
 from mmrjax.rig import Begin, Begins, Instrument, Rig
 from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
@@ -87,7 +87,12 @@ def test_friction_holds_a_shaft_that_its_motors_cannot_turn():
 def test_derivatives_at_an_imposed_speed_are_those_of_the_formula():
     robot = bench()
     names = ("bench.loss_coulomb", "bench.loss_viscous", "gearbox.efficiency_load", "motor.resistance")
-    found = steady_derivatives(robot, Conditions(motor_speed=SPEEDS), ("motor_current",), names)["motor_current"]
+    at = {p.name: p.value for p in params.walk(robot) if p.name in names}
+
+    def current(values):
+        return steady_outputs(params.replace(robot, values), Conditions(motor_speed=SPEEDS), ("motor_current",))
+
+    found = jax.jacrev(current)(at)["motor_current"]
     sign, out = np.sign(SPEEDS), SPEEDS / 16
     np.testing.assert_allclose(found["bench.loss_coulomb"], sign / (16 * 0.8 * 0.05), rtol=1e-9)
     np.testing.assert_allclose(found["bench.loss_viscous"], out / (16 * 0.8 * 0.05), rtol=1e-9)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -598,6 +599,52 @@ def test_one_preparation_serves_all():
         tree = ast.parse((ROOT / f"calibration/{room}.py").read_text(encoding="utf-8"))
         calls = {ast.unparse(n.func).rpartition(".")[2] for n in ast.walk(tree) if isinstance(n, ast.Call)}
         assert "prepare" in calls, room
+
+
+def circle(root: Path) -> list[str]:
+    """Modules that import one another in a circle, inside of functions too, as `graphlib` lists them; empty: none.
+
+    Imports for annotations alone (under `TYPE_CHECKING`) are no part of it.
+    """
+
+    class Runs(ast.NodeTransformer):
+        def visit_If(self, node):
+            return node.orelse or None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
+
+    files = {}
+    for file in (file for layer in LAYERS for file in sorted((root / layer).rglob("*.py"))):
+        parts = file.relative_to(root).with_suffix("").parts
+        files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    graph: dict[str, set[str]] = {}
+    for name, file in files.items():
+        package = name if file.name == "__init__.py" else name.rpartition(".")[0]
+        tree = Runs().visit(ast.parse(file.read_text(encoding="utf-8")))
+        graph[name] = set()
+        for node in (n for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom)):
+            imported = [module for module, _ in names_imported(ast.Module([node], []), package)]
+            whole, *each = [m for m in imported if m in files] or [""]
+            # What is imported from a package is its modules, and the package itself only where one is none of them.
+            only = isinstance(node, ast.ImportFrom) and len(each) == len(node.names) and whole == imported[0]
+            graph[name] |= {*each, *(() if only else [whole])} & set(files) - {name}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    assert circle(ROOT) == []
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_a_circle_of_imports_is_found(found, tmp_path):
+    (tmp_path / "sweeps").mkdir()
+    (tmp_path / "sweeps" / "__init__.py").write_text("")
+    (tmp_path / "sweeps" / "a.py").write_text("def f():\n    from sweeps import b")
+    guard = "pass" if found else "if TYPE_CHECKING:\n    from sweeps.a import f"
+    (tmp_path / "sweeps" / "b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
+    assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
 
 
 def test_reference_implementation_imports_nothing_of_ours():

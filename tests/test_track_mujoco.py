@@ -40,7 +40,7 @@ def test_member_has_the_constants_that_mujoco_compiles(robot, name):
         )
     np.testing.assert_allclose(ours.opt.gravity, theirs.opt.gravity, rtol=1e-12, atol=1e-15)
     assert float(ours.opt.timestep) == theirs.opt.timestep == STEP
-    assert [theirs.body(i + 1).name for i in range(3)] == list(mjcf.BODIES)
+    assert [theirs.body(i + 1).name for i in range(3)] == ["chassis", "driving", "driven"]
 
 
 @pytest.mark.parametrize("name", sorted(RUNS))

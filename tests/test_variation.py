@@ -102,7 +102,7 @@ def test_axes_know_unit_bounds_prior_and_meaning(variation):
     assert (resistance.unit, resistance.bounds, resistance.meaning) == (spec.unit, spec.bounds, spec.meaning)
     assert resistance.prior_sd == spec.prior_sd(float(variation.robot.motor.resistance)) > 0
     slope = axes["slope_deg"]
-    assert slope.is_condition and slope.prior_sd is None and slope.bounds == CONDITION_LIMITS["slope_deg"][:2]
+    assert slope.spec is None and slope.prior_sd is None and slope.bounds == CONDITION_LIMITS["slope_deg"][:2]
 
 
 def test_every_condition_has_words_and_limits():

@@ -110,7 +110,7 @@ def shaken():
             slip = 100 * (1 - signals.speed / signals.speed_theoretical)
             return (
                 slip,
-                percent * seen.slip_speed(friction),
+                percent * (vibration.speed_sliding(friction, seen.demanded, seen.swing) - seen.lead),
                 percent * friction.speed_creep(seen.demanded),
                 seen.normal,
             )

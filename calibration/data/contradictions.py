@@ -7,7 +7,7 @@ import numpy as np
 
 from calibration.data.columns import RPM, SPEED, SUPPLY
 from calibration.data.errors import BadData, number
-from calibration.data.runs import Runs
+from calibration.data.table import Runs
 from mmrjax.robot import Robot
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.errors import BadConfiguration, choices, is_number
 from mmrjax import channels, effects, params, robots
 from mmrjax.balances import BALANCES, added, moving
 from mmrjax.conditions import Conditions
@@ -123,7 +123,7 @@ def _check(path: Path, effect: type[Effect]) -> None:
     if effect.movers and effect.movers not in _MOVERS:
         raise refuse(f", movers: got {effect.movers}; {choices(effect.movers, _MOVERS)}, or none for both")
     size = effect.memory_size
-    if size is not None and (isinstance(size, bool) or not isinstance(size, int | float) or not size > 0):
+    if size is not None and not (is_number(size) and size > 0):
         raise refuse(f", memory_size: got {size}; expected a positive number, or None for no memory")
     if "Source:" not in (effect.__doc__ or ""):
         raise refuse(": its docstring states no equation with its «Source:»")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 from mmrjax.errors import choices as choices
 
 
@@ -26,3 +29,33 @@ class BadData(InputError):
 def number(value: float) -> str:
     """A bound as a person writes it."""
     return f"{value:g}"
+
+
+def rounded(value: float) -> str:
+    """A value as a sheet shows it, to three digits."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of a TOML file or of Python is a number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def stated_number(
+    value: Any, where: str, low: float = -math.inf, high: float = math.inf, unit: str | None = None
+) -> float:
+    """A number of a TOML file.
+
+    Args:
+        low, high: bounds; unit: of it, empty or `-` for none; None: not known here, and not said.
+
+    Raises:
+        BadConfiguration: no number, or one that is not finite or out of bounds.
+    """
+    if not is_number(value) or (math.isinf(high - low) and not math.isfinite(value)):
+        kind = "a number" if unit is None else f"a number [{unit or '-'}]"
+        raise BadConfiguration(f"{where}: got {value!r}; expected {kind}")
+    if not math.isfinite(value) or not low <= value <= high:
+        allowed = f"{number(low)} to {number(high)} {unit or ''}".rstrip()
+        raise BadConfiguration(f"{where}: got {value}; expected {allowed}")
+    return float(value)

@@ -13,7 +13,7 @@ from mmrjax.rig import Instrument
 from mmrjax.robot import Robot
 
 if TYPE_CHECKING:
-    from calibration.data.runs import Runs
+    from calibration.data.table import Runs
 
 #: Smallest step that counts as one, and what of a difference is rounding, as shares of the largest difference.
 SMALLEST, ROUNDING = 1e-5, 1e-9

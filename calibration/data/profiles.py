@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import units
-from calibration.data.errors import BadConfiguration, BadData, choices, number
+from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
 from calibration.data.units import Quantity
 from mmrjax import channels
 from mmrjax.fidelities.mission import Start
@@ -264,7 +264,7 @@ def _settings(name: str, comments: list[str]) -> dict[str, Any]:
         value = stated.get(key)
         if value is None:
             continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= greatest:
+        if not is_number(value) or not least <= value <= greatest:
             raise BadData(f"{name}, {key}: got {value!r}; expected a number, {least:g} to {greatest:g}")
         begins[field] = one * value
     return {"cycles": cycles, "linear": between == "linear", "begins": begins}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -12,7 +11,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from calibration.data.errors import BadConfiguration, choices, number
+from calibration.data.errors import BadConfiguration, choices, stated_number
 from mmrjax.requirements import QUANTITIES, Quantity
 from mmrjax.tables import BENCH, CONDITION_LIMITS, SURFACES
 
@@ -203,19 +202,11 @@ def _unknown(name: str, known: Iterable[str]) -> str:
     return f"{name}: no such key; {choices(name, known)}"
 
 
-def _number(value: Any, where: str, low: float, high: float, unit: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise BadConfiguration(f"{where}: got {value!r}; expected a number [{unit or '-'}]")
-    if not math.isfinite(value) or not low <= value <= high:
-        raise BadConfiguration(f"{where}: got {value}; expected {number(low)} to {number(high)} {unit}".rstrip())
-    return float(value)
-
-
 def _range(value: Any, where: str, low: float, high: float, unit: str) -> Range:
     ends = value if isinstance(value, list) else [value, value]
     if len(ends) != 2:
         raise BadConfiguration(f"{where}: got {value}; expected a number or [least, greatest]")
-    first, last = (_number(x, where, low, high, unit) for x in ends)
+    first, last = (stated_number(x, where, low, high, unit) for x in ends)
     if first > last:
         raise BadConfiguration(f"{where}: got {value}, an empty range; expected [least, greatest]")
     return first, last
@@ -291,7 +282,7 @@ def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
                 f"{where}: got {RATED!r}; expected a number, only {', '.join(RATINGS)} have a rating"
             )
         return None
-    return _number(value, where, *STATED, quantity.unit)
+    return stated_number(value, where, *STATED, quantity.unit)
 
 
 def quantity_key(quantity: Quantity) -> str:
@@ -304,7 +295,7 @@ def _share(duty: Any, share: Any, where: str) -> float:
         raise BadConfiguration(f"{where}, duty: got {duty!r}; {choices(str(duty), DUTIES)}")
     if share is None:
         return 1.0 if duty == "driving" else 0.0
-    found = _number(share, f"{where}, share", 0.0, 1.0, "")
+    found = stated_number(share, f"{where}, share", 0.0, 1.0, "")
     if duty == "standing" and found > 0:
         raise BadConfiguration(f"{where}: duty standing and a share of {found:g} contradict each other")
     return found

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 
 from calibration.data import rig_file
+from calibration.data.errors import rounded
 from mmrjax import params
 from mmrjax.channels import RPM
 from mmrjax.robot import Robot
@@ -43,13 +44,9 @@ def _has(robot: Robot, name: str) -> bool:
     return not robot.rig.blank or name in rig_file.needed(robot.rig)
 
 
-def _number(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-
-
 def _within(value: float, low: float, high: float, why: str) -> str:
     """`why` where a value is out of what is usual."""
-    return "" if low <= value <= high else f"{why} (usual: {_number(low)} to {_number(high)})"
+    return "" if low <= value <= high else f"{why} (usual: {rounded(low)} to {rounded(high)})"
 
 
 def _motor(robot: Robot) -> Iterator[Fact]:
@@ -60,29 +57,29 @@ def _motor(robot: Robot) -> Iterator[Fact]:
     if with_constant:
         per_volt = 1 / constant / RPM
         odd = _within(per_volt, 5, 20_000, "is torque_constant in N·m/A? 1 mN·m/A is 0.001")
-        yield Fact("speed without load, of each volt", f"{_number(per_volt)} rpm/V", odd)
+        yield Fact("speed without load, of each volt", f"{rounded(per_volt)} rpm/V", odd)
         idle = float(motor.friction_coulomb) / constant
         odd = _within(idle, 0, 10, "is friction_coulomb in N·m? it is torque_constant times the no-load current")
-        yield Fact("current that the motor's dry friction takes", f"{_number(idle)} A", odd)
+        yield Fact("current that the motor's dry friction takes", f"{rounded(idle)} A", odd)
     if with_constant and voltage is not None:
         fastest = voltage / constant
         odd = "" if fastest < 2 * motor.speed_limit else "more than twice motor.speed_limit; look at torque_constant"
-        yield Fact(f"speed without load at {_number(voltage)} V", f"{_number(fastest / RPM)} rpm", odd)
+        yield Fact(f"speed without load at {rounded(voltage)} V", f"{rounded(fastest / RPM)} rpm", odd)
     if with_resistance and voltage is not None:
         odd = _within(voltage / resistance, 0.02, 1000, "look at motor.resistance")
-        yield Fact(f"stall current at {_number(voltage)} V", f"{_number(voltage / resistance)} A", odd)
+        yield Fact(f"stall current at {rounded(voltage)} V", f"{rounded(voltage / resistance)} A", odd)
     if with_constant and with_resistance:
         size = constant**2 / resistance
         odd = _within(
             size, 1e-7, 1.0, "torque_constant and resistance hardly belong to one motor; look at their units"
         )
-        yield Fact("torque over speed k²/R", f"{_number(size * 1e3)} mN·m·s", odd)
+        yield Fact("torque over speed k²/R", f"{rounded(size * 1e3)} mN·m·s", odd)
         if inertia > 0:
             constant_time = inertia / size
             why = "look at motor.inertia (1 g·cm² is 1e-7 kg·m²), torque_constant and resistance"
             odd = _within(constant_time, 5e-4, 0.5, why)
             yield Fact(
-                "mechanical time constant of the motor alone J R/k²", f"{_number(constant_time * 1e3)} ms", odd
+                "mechanical time constant of the motor alone J R/k²", f"{rounded(constant_time * 1e3)} ms", odd
             )
 
 
@@ -119,8 +116,8 @@ def _drawn(robot: Robot, what: str, torque: float, places: str) -> Iterator[Fact
     if limit is not None and _has(robot, "motor.resistance"):
         stall = limit / float(robot.motor.resistance)
         if current > stall:
-            odd = f"above the stall current {_number(stall)} A at {_number(limit)} V, so it stands; look at {places}"
-    yield Fact(what, f"{_number(current)} A each motor", odd)
+            odd = f"above the stall current {rounded(stall)} A at {rounded(limit)} V, so it stands; look at {places}"
+    yield Fact(what, f"{rounded(current)} A each motor", odd)
 
 
 def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
@@ -133,15 +130,15 @@ def _shaft(robot: Robot, name: str, load: Shaft) -> Iterator[Fact]:
         )
         length = float(load.inertia) * GRAVITY / gravity
         why = f"{name}.inertia and {name}.torque_gravity hardly belong to one arm: m l² and m g l"
-        yield Fact(f"{name}: swings as a pendulum of", f"{_number(length * 1e3)} mm", _within(length, 0.01, 3.0, why))
+        yield Fact(f"{name}: swings as a pendulum of", f"{rounded(length * 1e3)} mm", _within(length, 0.01, 3.0, why))
     if float(load.inertia) > 0 and float(robot.motor.inertia) > 0:
         share = float(load.inertia) / (float(robot.motor.inertia) * float(robot.gearbox.ratio) ** 2)
         why = f"look at {name}.inertia and motor.inertia [kg·m²]; 1 g·cm² is 1e-7"
-        yield Fact(f"{name}: inertia over the motor's at the output", _number(share), _within(share, 1e-4, 1e4, why))
+        yield Fact(f"{name}: inertia over the motor's at the output", rounded(share), _within(share, 1e-4, 1e4, why))
     if float(load.radius) != 1.0:
         travel = 2 * math.pi * float(load.radius)
         yield Fact(
-            f"{name}: travel of a turn", f"{_number(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
+            f"{name}: travel of a turn", f"{rounded(travel * 1e3)} mm", _within(travel, 1e-4, 10.0, "look at it")
         )
 
 
@@ -150,7 +147,7 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     sides, mass, radius = float(robot.sides), float(load.mass), float(load.radius)
     rolling, static = float(load.ground.rolling_resistance), float(load.ground.friction.static)
     odd = _within(mass, 0.05, 2000, f"is {name}.mass in kg?")
-    yield Fact(f"{name}: weight", f"{_number(mass)} kg, {_number(mass * GRAVITY)} N", odd)
+    yield Fact(f"{name}: weight", f"{rounded(mass)} kg, {rounded(mass * GRAVITY)} N", odd)
     guide = float(load.track.guide_friction) * float(load.track.guide_share)
     torque = mass * GRAVITY * (rolling + guide) * radius / sides + float(load.track.loss_coulomb)
     places = f"{name}.ground.rolling_resistance and {name}.track.loss_coulomb"
@@ -167,10 +164,10 @@ def _vehicle(robot: Robot, name: str) -> Iterator[Fact]:
     climb = pull * sides / (radius * mass * GRAVITY) - rolling - guide
     odd = "" if climb > 0 else "its motors cannot move it; look at mass, ratio, torque_constant and resistance"
     angle = "any" if climb >= 1 else f"{math.degrees(math.asin(max(climb, 0.0))):.0f}°"
-    yield Fact(f"{name}: steepest slope that the stall torque holds at {_number(limit)} V", angle, odd)
+    yield Fact(f"{name}: steepest slope that the stall torque holds at {rounded(limit)} V", angle, odd)
     speed = limit / float(robot.motor.torque_constant) / float(robot.gearbox.ratio) * radius
     odd = _within(speed, 0.005, 15, f"look at {name}.radius, gearbox.ratio and motor.torque_constant")
-    yield Fact(f"{name}: speed without load at {_number(limit)} V", f"{_number(speed)} m/s", odd)
+    yield Fact(f"{name}: speed without load at {rounded(limit)} V", f"{rounded(speed)} m/s", odd)
 
 
 @dataclasses.dataclass(frozen=True)

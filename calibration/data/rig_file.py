@@ -11,9 +11,9 @@ from typing import Any
 
 from calibration.data import units
 from calibration.data.columns import Layout
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.errors import BadConfiguration, choices, is_number
 from mmrjax import channels, params
-from mmrjax.rig import IMPOSED, Instrument, Rig
+from mmrjax.rig import IMPOSED, STARTS, Instrument, Rig
 from mmrjax.robot import Robot
 from mmrjax.robots import DYNAMIC_SHARE
 from mmrjax.signals import GRAVITY
@@ -22,8 +22,6 @@ from mmrjax.signals import GRAVITY
 NONE = "none"
 #: Keys and tables of a robot file that state the rig.
 KEYS = ("imposed", "channels", "start", "columns", "instruments", "surfaces")
-#: How the histories of a rig start.
-STARTS = ("rest", "measured", "free")
 #: What a configuration may be.
 LOADS = ("shaft", "linear", "vehicle")
 
@@ -106,8 +104,7 @@ def _known_key(key: str, where: str) -> bool:
 
 def _linear_value(table: Mapping[str, Any], key: str, where: str) -> float:
     value = table[key]
-    fine = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not fine or (key in _LEAST and value <= 0):
+    if not is_number(value) or not math.isfinite(value) or (key in _LEAST and value <= 0):
         least = "a number more than 0" if key in _LEAST else "a number"
         raise BadConfiguration(f"{where}.{key}: got {value!r}; expected {least} ({LINEAR[key]})")
     return float(value)
@@ -222,8 +219,7 @@ def _instruments(stated: Any, names: Sequence[str], where: str) -> tuple[Instrum
                 f"{here}.{name}.signed: got {signed!r}; expected true, false: shows magnitude alone, or {FREE!r}: "
                 "the table tells"
             )
-        number = isinstance(quantum, int | float) and not isinstance(quantum, bool) and 0 <= quantum < math.inf
-        if not number and quantum != FREE:
+        if quantum != FREE and not (is_number(quantum) and 0 <= quantum < math.inf):
             raise BadConfiguration(
                 f"{here}.{name}.quantum: got {quantum!r}; expected the step of its readings, 0 or more "
                 f"{channel.unit}, or {FREE!r}: the table tells"
@@ -254,7 +250,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
         if not isinstance(table, dict) or not isinstance(table.get("column"), str) or {*table} - {"column", "factor"}:
             raise BadConfiguration(f"{here}.{mine}: got {theirs!r}; {form}")
         factor = table.get("factor", 1.0)
-        if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor) or not factor:
+        if not is_number(factor) or not math.isfinite(factor) or not factor:
             raise BadConfiguration(f"{here}.{mine}.factor: got {factor!r}; expected a number that is not 0")
         found.append((mine, table["column"], float(factor)))
     return tuple(found)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.errors import BadConfiguration, choices, number
+from calibration.data.errors import BadConfiguration, choices, is_number, number
 from mmrjax import effects, params, power, robots
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
@@ -263,7 +263,7 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         spec = known[name].spec
         low, high = spec.bounds
         allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if not is_number(value):
             form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
             raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed}{form}")
         if name == "gearbox.ratio" and 0 < value < 1:
@@ -311,8 +311,8 @@ def _switch(where: str, name: str, value: Any) -> bool:
 
 def _rating(where: str, name: str, value: Any) -> float:
     low, high, unit, what = RATINGS[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        got = number(value) if isinstance(value, int | float) and not isinstance(value, bool) else repr(value)
+    if not is_number(value) or not low <= value <= high:
+        got = number(value) if is_number(value) else repr(value)
         raise BadConfiguration(
             f"{where}, {name}: got {got}; expected a number, {number(low)} to {number(high)} {unit} ({what})"
         )
@@ -321,12 +321,7 @@ def _rating(where: str, name: str, value: Any) -> float:
 
 def _count(where: str, name: str, value: Any) -> int:
     low, high, what = COUNTS[name]
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float)
-        or value != value // 1
-        or not low <= value <= high
-    ):
+    if not is_number(value) or value != value // 1 or not low <= value <= high:
         raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a whole number, {low} to {high} {what}")
     return int(value)
 

@@ -7,20 +7,18 @@ import dataclasses
 import difflib
 import hashlib
 import math
-from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data import instruments, surfaces
+from calibration.data import contradictions, instruments, surfaces
 from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
     DRIVEN,
     DUTY,
-    IMPOSED,
     ON_GROUND,
     SUPPLY,
     TIME,
@@ -30,12 +28,11 @@ from calibration.data.columns import (
     Meaning,
 )
 from calibration.data.errors import BadConfiguration, BadData, InputError, choices, number
+from calibration.data.table import Runs
 from mmrjax import channels
 from mmrjax.channels import MM, RPM, Channel
-from mmrjax.tables import adhesion_ratio
 
 if TYPE_CHECKING:
-    from mmrjax.conditions import Conditions
     from mmrjax.robot import Robot
 
 __all__ = ["CONDITIONS", "MM", "RPM", "Runs", "read", "single"]
@@ -45,182 +42,6 @@ __all__ = ["CONDITIONS", "MM", "RPM", "Runs", "read", "single"]
 PACKAGED = {"measured": "measured.csv", "simulated_by_paper": "simulated_by_paper.csv"}
 #: How far beyond zero a reading's noise may carry it: in sds that are stated, and as a share of the channel's rms.
 SIGN_SDS, SIGN_SHARE = 4.0, 0.05
-
-
-@dataclasses.dataclass(frozen=True)
-class Runs:
-    """A table of runs, one row each (or one row a sample, with `time_s` among the columns).
-
-    Attributes:
-        source: where it came from, for messages.
-        columns: name → array of shape (rows,); numbers in the unit of the name, words as str; NaN for a reading
-            that is missing.
-        unknown: columns of the file that this program does not know.
-        digest: SHA-256 of the file, empty for a table that came from none.
-        extras: cells of `unknown` columns, shape (rows,): numbers, NaN where empty, or words; not in `columns`, as
-            they have no role, and looked at only for what residuals go with.
-        layout: what its columns mean for the robot that it is of, and its channels.
-    """
-
-    source: str
-    columns: dict[str, np.ndarray]
-    unknown: tuple[str, ...] = ()
-    digest: str = ""
-    extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    layout: Layout = dataclasses.field(default_factory=Layout)
-
-    def __len__(self) -> int:
-        return len(self.columns["configuration"])
-
-    def __getitem__(self, column: str) -> np.ndarray:
-        return self.columns[column]
-
-    def has(self, column: str) -> bool:
-        """Whether the table has this column."""
-        return column in self.columns
-
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        """That its readings are of, in the order of arrays."""
-        return self.layout.channels
-
-    def of(self, robot: Robot) -> Runs:
-        """The table with the channels of a robot; columns of others have no role then, and are among the unknown.
-
-        Raises:
-            BadData: the table was read for a robot without a channel of this one, so its column was left out.
-        """
-        if self.channels == robot.channels:
-            return self
-        mine = {column for c in robot.channels for column in (c.column, c.sd_column)}
-        if lost := [column for column in self.unknown if column in mine]:
-            raise BadData(
-                f"{self.source}, {lost[0]}: left out as the table was read, but the robot has this channel; read the "
-                "table with robot=, the robot that it is of"
-            )
-        mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0]}
-        others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - mine
-        left = {name: values for name, values in self.columns.items() if name in others}
-        return dataclasses.replace(
-            self,
-            columns={name: values for name, values in self.columns.items() if name not in left},
-            unknown=(*self.unknown, *left),
-            extras={**self.extras, **left},
-            layout=dataclasses.replace(self.layout, channels=robot.channels),
-        )
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """Columns of the conditions that its runs have, what is imposed first."""
-        duty = () if self.sampled else DUTY
-        return tuple(c for c in (*self.layout.axes, *duty) if self.has(c))
-
-    @property
-    def sampled(self) -> bool:
-        """Whether a row is a sample of a run."""
-        return all(self.has(column) for column in TIME)
-
-    def where(self, rows: np.ndarray) -> Runs:
-        """The rows that a mask or an index selects."""
-        columns, extras = ({k: v[rows] for k, v in of.items()} for of in (self.columns, self.extras))
-        return dataclasses.replace(self, columns=columns, extras=extras)
-
-    def measured(self) -> np.ndarray:
-        """Measured readings [SI], NaN where one is missing, shape (rows, channels)."""
-        return self._stacked(tuple(c.column for c in self.channels))
-
-    def deviations(self) -> np.ndarray:
-        """Stated sds of the readings [SI], NaN where none is stated, shape (rows, channels)."""
-        return self._stacked(tuple(c.sd_column for c in self.channels))
-
-    def _stacked(self, columns: tuple[str, ...]) -> np.ndarray:
-        nothing = np.full(len(self), np.nan)
-        found = [self.columns.get(column, nothing) for column in columns]
-        return np.stack(found, 1) * np.asarray(channels.factors(self.channels))
-
-    def missing(self) -> list[str]:
-        """A sentence for each channel of which readings are missing."""
-        said = []
-        for k, channel in enumerate(self.channels):
-            lost = np.flatnonzero(np.isnan(self.measured()[:, k]))
-            if not self.has(channel.column) or lost.size == len(self):
-                said.append(f"{channel.column}: no readings; what they would show is not fitted")
-            elif lost.size:
-                rows = ", ".join(str(r + 1) for r in lost[:8]) + (", ..." if lost.size > 8 else "")
-                said.append(f"{channel.column}: {lost.size} of {len(self)} readings are missing (rows {rows})")
-        return said
-
-    def configurations(self, robot: Robot) -> np.ndarray:
-        """Index of each row's configuration in `robot`, shape (rows,): that of its configuration on its surface
-        (`surfaces.named`) where the robot has one, else that of its configuration.
-
-        Raises:
-            InputError: a configuration that the robot does not have; those that it has are listed.
-        """
-        which = np.empty(len(self), int)
-        names = self.configurations_named(robot)
-        for name in np.unique(names):
-            rows = names == name
-            if name not in robot.configurations:
-                first = int(np.flatnonzero(rows)[0]) + 1
-                raise BadData(
-                    f"{self.source} row {first}, configuration: got {name}; expected one of these; "
-                    f"{choices(str(name), robot.configurations)}"
-                )
-            which[rows] = robot.configurations.index(str(name))
-        return which
-
-    def configurations_named(self, robot: Robot) -> np.ndarray:
-        """As `configurations`, by name; of those that the robot does not have as the table does."""
-        stated = self["configuration"]
-        if not self.has("surface"):
-            return stated
-        pairs = list(zip(stated.tolist(), self["surface"].tolist(), strict=True))
-        on = {pair: surfaces.named(*pair) for pair in set(pairs)}
-        return np.array([on[p] if on[p] in robot.configurations else p[0] for p in pairs])
-
-    def conditions(self, robot: Robot, *, battery: float = 0.0, discharge: float = 0.0) -> Conditions:
-        """The conditions as one batch of shape (rows,).
-
-        The mass is the stated `total_mass_kg` where the table has that column, else the robot's own mass
-        and the payload.
-
-        Args:
-            robot: has the configurations of the table.
-            battery: 1 for the on-board battery; discharge: charge already taken from it [C].
-
-        Raises:
-            BadData: as `configurations`.
-        """
-        from mmrjax.conditions import Conditions
-
-        which = self.configurations(robot)
-        held = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
-        adhesion = np.ones(len(self))
-        if self.has("surface"):
-            on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
-            scaled = surfaces.scaled(robot, self["configuration"], self["surface"])
-            adhesion[scaled] = [
-                adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
-            ]
-        column, factor = IMPOSED["motor_speed"]
-        imposed = robot.rig.imposed == "motor_speed"
-        if imposed and not self.has(column):
-            raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
-        return Conditions(
-            which,
-            np.zeros(len(self)) if battery or imposed else self[SUPPLY],
-            self.columns.get("slope_deg", 0.0),
-            self.columns.get("payload_kg", 0.0),
-            battery=battery,
-            discharge=discharge,
-            adhesion=adhesion,
-            total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
-            order=self["order"] if self.has("order") else 0.0,
-            duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),
-            open=self["mode"] == "coast" if self.has("mode") else 0.0,
-            motor_speed=self[column] * factor if imposed else None,
-        )
 
 
 def read(source: str | Path, *, measured: bool = True, battery: bool = False, robot: Robot | None = None) -> Runs:
@@ -249,8 +70,6 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         runs = _read(path, path.name or str(source), measured, battery, layout, inferred=robot is None)
     if robot is not None and not layout.usual:
-        from calibration.data import contradictions
-
         contradictions.check(runs, robot)
     return runs
 

@@ -20,7 +20,7 @@ from mmrjax.tables import SURFACES
 
 if TYPE_CHECKING:
     from calibration.data.columns import Layout
-    from calibration.data.runs import Runs
+    from calibration.data.table import Runs
     from mmrjax.robot import Robot
 
 #: Beginning of the parameters of a configuration that are its surface's.

@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,13 +72,6 @@ class Prospect:
         d = self.value[a, at] - self.value[b, at]
         squares = [d @ np.linalg.solve(_covariance(self.half[x, at], self.sd[at]), d) for x in (a, b)]
         return float(np.sqrt(max(min(squares), 0.0)))
-
-    def among(self, names: Sequence[str]) -> Prospect:
-        """Of these alternatives alone, in their order; the first is the best fit only while that is among them."""
-        kept = [k for k, n in enumerate(self.names) if n in names]
-        return dataclasses.replace(
-            self, names=tuple(self.names[k] for k in kept), value=self.value[kept], half=self.half[kept]
-        )
 
 
 def _covariance(half: np.ndarray, sd: np.ndarray) -> np.ndarray:
@@ -143,31 +135,6 @@ class Proposal:
     def name(self) -> str:
         """Of all of it."""
         return " and ".join(self.experiments)
-
-
-@dataclasses.dataclass(frozen=True)
-class Verdict:
-    """What readings of experiments say of alternatives.
-
-    Attributes:
-        chi2: of each alternative, by name; best: whose is the smallest.
-        refuted: alternatives whose χ² is larger by `Settings.refuted` or more.
-        resolved: whether the best alone is left.
-    """
-
-    chi2: dict[str, float]
-    best: str
-    refuted: tuple[str, ...]
-
-    @property
-    def resolved(self) -> bool:
-        """Whether one alternative is left."""
-        return len(self.refuted) == len(self.chi2) - 1
-
-    @property
-    def left(self) -> tuple[str, ...]:
-        """Alternatives that are not refuted."""
-        return tuple(n for n in self.chi2 if n not in self.refuted)
 
 
 # --- alternatives -----------------------------------------------------------------------------------
@@ -438,29 +405,3 @@ def separating(space: CandidateSpace, best: Candidate, found: Classes, settings:
     """What tells the alternatives of a class apart; None where each effect has one name."""
     left = alternatives(best, found)
     return choose(prospect(space, left, settings)) if len(left) > 1 else None
-
-
-# --- what came of it --------------------------------------------------------------------------------
-
-
-def supported(seen: Prospect, carried_out: Mapping[str, Mapping[str, Any]]) -> Verdict:
-    """Which alternative the readings of experiments support.
-
-    Args:
-        seen: what was foreseen.
-        carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
-            NaN for what was not read.
-    """
-    spans = foreseen.spans(seen.experiments)
-    at = np.concatenate([np.arange(len(seen.sd))[spans[name]] for name in carried_out])
-    value, sd = (
-        np.concatenate([np.asarray(r[what], float) for r in carried_out.values()]) for what in ("value", "sd")
-    )
-    read = seen.there[at] & np.isfinite(value)
-    at, value, sd = at[read], value[read], sd[read]
-    chi2 = {}
-    for k, name in enumerate(seen.names):
-        d = value - seen.value[k, at]
-        chi2[name] = float(d @ np.linalg.solve(_covariance(seen.half[k, at], sd), d))
-    best = min(chi2, key=chi2.__getitem__)
-    return Verdict(chi2, best, tuple(n for n, c in chi2.items() if c - chi2[best] >= seen.settings.refuted))

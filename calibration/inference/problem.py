@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -74,16 +74,6 @@ def data_of(measured: np.ndarray, sd: np.ndarray, parameters: int) -> Data:
     )
 
 
-class FreeParameters(Protocol):
-    """Coordinates of a fit: standard normal beforehand, and the robot at any point of them."""
-
-    def __len__(self) -> int: ...
-
-    def robot(self, base: Robot, z: Float[Array, " parameters"]) -> Robot:
-        """`base` with what is free at coordinates z."""
-        ...
-
-
 class Problem(eqx.Module):
     """Maximum a posteriori over z: minimise half the sum of squared residuals.
 
@@ -100,7 +90,7 @@ class Problem(eqx.Module):
     """
 
     base: Robot
-    coordinates: Any  # FreeParameters
+    coordinates: Any
     observe: Observer
     data: Data
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import balances, channels, outputs, params
+from mmrjax import balances, channels, outputs
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, Progress, Run
@@ -255,47 +255,6 @@ def steady_outputs(robot: Robot, conditions: Conditions, names: tuple[str, ...])
         return {name: jnp.asarray(_getters()[name](answer)) for name in names}
 
     return _over_points(one, robot, conditions)
-
-
-@compiled
-def steady_derivatives(
-    robot: Robot, conditions: Conditions, names: tuple[str, ...], parameters: tuple[str, ...]
-) -> dict[str, dict[str, Float[Array, " points"]]]:
-    """Derivatives of outputs over a batch by parameters of the robot: exact, implicit.
-
-    In reverse, by one output after another: a few outputs by many parameters cost about as much as a run for each
-    output. `jax.jacfwd` carries a tangent of every term for every parameter.
-
-    Args:
-        robot, conditions: as for `steady_outputs`.
-        names: of `outputs.table`.
-        parameters: dotted names as `params.walk` gives them, such as `motor.resistance`.
-
-    Returns:
-        Derivatives [SI of the output / unit of the parameter] by output and parameter, each of shape (points,);
-        zero where a point has no such number.
-
-    Raises:
-        KeyError: an unknown name; the message lists the outputs that there are, or says that the robot has no such
-            parameter.
-    """
-    _check_outputs(names)
-    for name in set(names) & set(CODES):
-        raise KeyError(
-            f"{name} has no derivative; there are {', '.join(o.name for o in outputs.table(channels.EVERY))}"
-        )
-    values = {p.name: p.value for p in params.walk(robot)}
-    params.replace(robot, dict.fromkeys(parameters, 0.0))  # refuses what the robot does not have
-
-    def one(robot: Robot, conditions: Conditions, at: tuple[Array, ...]) -> dict[str, dict[str, Array]]:
-        def outcome(at: tuple[Array, ...], name: str) -> Array:
-            given = params.replace(robot, dict(zip(parameters, at, strict=True)))
-            return _getters()[name](steady(given, conditions))
-
-        return {name: dict(zip(parameters, jax.grad(outcome)(at, name), strict=True)) for name in names}
-
-    arguments = robot, conditions, tuple(jnp.asarray(values[name], float) for name in parameters)
-    return jax.vmap(one, in_axes=_axes(arguments))(*arguments)
 
 
 def _settled(robot: Robot, conditions: Conditions) -> Result:

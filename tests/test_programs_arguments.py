@@ -1,0 +1,27 @@
+"""Programs on disk whose equations leave arguments out: each reads its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_programs import folder  # noqa: F401 (a fixture)
+
+from mmrjax import programs
+
+
+def one_of(numbers, which):
+    """Twice one of some arrays."""
+    return 2 * numbers[which]
+
+
+one_of.__module__ = "mmrjax.one_of"  # of what is kept by name
+
+
+@pytest.mark.parametrize("others", [2, 3])
+def test_programs_that_read_other_arguments_are_not_one(folder, others):  # noqa: F811
+    """What is compiled of the first and of the second array is the same text but for the arguments that neither reads."""
+    kept = programs.Programs(one_of)
+    pair = [np.array([1.0, 2.0]), np.array([5.0, 7.0])]
+    for arrays, which in ((pair, 0), (pair, 1), ([pair[0], np.arange(float(others))], 0)):
+        arguments = (arrays, which), {}
+        np.testing.assert_array_equal(kept.of(arguments)(arguments), 2 * arrays[which])
