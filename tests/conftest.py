@@ -38,27 +38,32 @@ from sweeps import cli
 MAPPINGS = 30_000
 #: Memory from which they are dropped too [bytes]; one file may add as much again.
 MEMORY = 2.2e9
+#: The same between files that share results, which make the same programs.
+MEMORY_SHARING = 3.2e9
 #: What a test that is not marked slow may take [s of processor time, on a core that does nothing else].
 LIMIT = 10.0
 STARTED = pytest.StashKey[float]()
 
 
-def _crowded() -> bool:
-    """Whether this process has too many programs to begin another file; where Linux's files are not there: no."""
+def _crowded(limit: float) -> bool:
+    """Whether this process has too many programs to begin another file; where Linux's files are not there: no.
+
+    Args:
+        limit: of its memory [bytes].
+    """
     own = Path("/proc/self")
     if not (own / "statm").exists():
         return False
     resident = int((own / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return resident > MEMORY or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
+    return resident > limit or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _room_for_programs():
-    """Forget compiled programs between files before the process has too many, and give their memory back."""
-    yield
-    if _crowded():
-        gc.collect()  # what is no longer used, which may be enough
-    if _crowded():
+def _make_room(limit: float) -> None:
+    """Forget compiled programs before the process has too many, and give their memory back."""
+    if not _crowded(limit):
+        return
+    gc.collect()  # what is no longer used, which may be enough
+    if _crowded(limit):
         jax.clear_caches()
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):  # not every C library has it
@@ -111,11 +116,15 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item, nextitem):
-    """Note the processor time of each test, its fixtures included."""
+    """Note the processor time of each test, its fixtures included, and make room between files."""
     start = _spent()
     item.user_properties.append(("slow", item.get_closest_marker("slow") is not None))
     item.config.stash[STARTED] = start
-    return (yield)
+    done = yield
+    if nextitem is not None and nextitem.path != item.path:
+        groups = {GROUP.get(x.path.stem, x.path.stem) for x in (item, nextitem)}
+        _make_room(MEMORY_SHARING if len(groups) == 1 else MEMORY)
+    return done
 
 
 @pytest.hookimpl(wrapper=True)

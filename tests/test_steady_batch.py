@@ -129,7 +129,9 @@ def test_steady_blocks_change_no_number(robot, monkeypatch, size):
     whole = steady_outputs(robot, runs, ("status", *ALL))
     batch = params.replace(robot, {"motor.resistance": jnp.linspace(0.5, 0.9, size)})
     whole_batch = steady_batch(batch, runs)
-    monkeypatch.setattr(room, "BLOCK", 40)  # which is read when a function is traced: these are functions of their own
+    monkeypatch.setattr(
+        room, "BLOCK", 40
+    )  # which is read when a function is traced: these are functions of their own
     found = eqx.filter_jit(lambda *of: steady_outputs.__wrapped__(*of, ("status", *ALL)))(robot, runs)
     in_blocks = eqx.filter_jit(lambda *of: steady_batch.__wrapped__(*of))(batch, runs)
     for name, values in whole.items():
