@@ -53,7 +53,6 @@ def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind, most):
     assert jax.tree.structure(seen[0]) == jax.tree.structure(seen[1])
     assert [x.shape for x in jax.tree.leaves(seen[0])] == [x.shape for x in jax.tree.leaves(seen[1])]
     sizes = [[float(effects_sd(e)) for e in s.library.effects] for s in spaces]
-    assert len(sizes[0]) == most or len(sizes[0]) > 10
     assert not np.allclose(*sizes)  # while effects are of another size in each
 
 
