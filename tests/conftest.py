@@ -19,6 +19,7 @@ compilation_cache.enable()  # one for all workers, and for the next time
 import jax
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_traceback_in_locations_limit", 0)  # no lines of source in programs that only run here
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,28 +35,35 @@ from sweeps import cli
 
 #: Memory mappings of a process from which its compiled programs are dropped; Linux allows 65530, and the
 #: compiler crashes or hangs beyond. A program takes some dozens.
-MAPPINGS = 12_000
+MAPPINGS = 30_000
 #: Memory from which they are dropped too [bytes]; one file may add as much again.
-MEMORY = 1.5e9
+MEMORY = 2.2e9
+#: The same between files that share results, which make the same programs.
+MEMORY_SHARING = 3.2e9
 #: What a test that is not marked slow may take [s of processor time, on a core that does nothing else].
 LIMIT = 10.0
 STARTED = pytest.StashKey[float]()
 
 
-def _crowded() -> bool:
-    """Whether this process has too many programs to begin another file; where Linux's files are not there: no."""
+def _crowded(limit: float) -> bool:
+    """Whether this process has too many programs to begin another file; where Linux's files are not there: no.
+
+    Args:
+        limit: of its memory [bytes].
+    """
     own = Path("/proc/self")
     if not (own / "statm").exists():
         return False
     resident = int((own / "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return resident > MEMORY or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
+    return resident > limit or (own / "maps").read_bytes().count(b"\n") > MAPPINGS
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _room_for_programs():
-    """Forget compiled programs between files before the process has too many, and give their memory back."""
-    yield
-    if _crowded():
+def _make_room(limit: float) -> None:
+    """Forget compiled programs before the process has too many, and give their memory back."""
+    if not _crowded(limit):
+        return
+    gc.collect()  # what is no longer used, which may be enough
+    if _crowded(limit):
         jax.clear_caches()
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):  # not every C library has it
@@ -94,6 +102,13 @@ def pytest_xdist_make_scheduler(config, log):
     return ByFile(config, log)
 
 
+def pytest_collection_finish():
+    """Look for cycles of garbage seldom, and never in what was imported: a tenth of the time goes otherwise."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
+
+
 def pytest_collection_modifyitems(items):
     """Files that share results come first."""
     items.sort(key=lambda item: list(SHARING).index(g) if (g := GROUP.get(item.path.stem)) else len(SHARING))
@@ -101,11 +116,15 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item, nextitem):
-    """Note the processor time of each test, its fixtures included."""
+    """Note the processor time of each test, its fixtures included, and make room between files."""
     start = _spent()
     item.user_properties.append(("slow", item.get_closest_marker("slow") is not None))
     item.config.stash[STARTED] = start
-    return (yield)
+    done = yield
+    if nextitem is not None and nextitem.path != item.path:
+        groups = {GROUP.get(x.path.stem, x.path.stem) for x in (item, nextitem)}
+        _make_room(MEMORY_SHARING if len(groups) == 1 else MEMORY)
+    return done
 
 
 @pytest.hookimpl(wrapper=True)

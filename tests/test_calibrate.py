@@ -16,6 +16,7 @@ import jsonschema
 import numpy as np
 import pytest
 from synthetic import calibrated
+from test_residual_clusters import clustered
 
 import calibration
 from calibration.data import robot_file
@@ -27,6 +28,7 @@ from calibration.inference.calibrate import calibrate
 from calibration.inference.observers import SettledRuns
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
+from sweeps import report_calibration
 
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = json.loads((ROOT / "docs" / "schemas" / "calibrate.schema.json").read_text(encoding="utf-8"))
@@ -499,3 +501,17 @@ def test_single_precision_is_refused():
         [sys.executable, "-c", code], cwd=ROOT, env=single, capture_output=True, text=True, timeout=60
     )
     assert 'set jax.config.update("jax_enable_x64", True) first' in done.stderr
+
+
+def test_clusters_are_in_the_document_and_on_the_page_of_a_calibration(tmp_path):
+    found, plain = clustered(), calibrated()
+    made = dataclasses.replace(plain, residual_clusters=(found,))
+    document = json.loads(json.dumps(made.to_json()))
+    jsonschema.validate(document, SCHEMA)
+    assert document["residual_clusters"][0]["statement"] == found.statement
+    page = report_calibration.write(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
+    assert "cluster by idle_wheel" in page and (tmp_path / "with" / "figures" / "clusters.svg").exists()
+    bare = dataclasses.replace(plain, residual_clusters=())
+    assert 'id="clusters"' not in report_calibration.write(tmp_path / "bare", bare, robot_name="nominal").read_text(
+        "utf-8"
+    )

@@ -15,6 +15,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import fastsim_comparison as comparison
 
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.steady import steady_batch
+
 INSTALLED = importlib.util.find_spec("fastsim") is not None
 
 
@@ -24,6 +27,7 @@ def missions() -> dict[str, dict[str, Any]]:
     return {vehicle.name: comparison.mmrjax_of(vehicle, asked) for vehicle, asked in comparison.CASES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", range(len(comparison.CASES)))
 def test_mission_follows_the_integral(case: int, missions: dict[str, dict[str, Any]]) -> None:
     """Work at the wheel both ways, distance and Wh/km; the rest is what windings and sliding take."""
@@ -35,6 +39,7 @@ def test_mission_follows_the_integral(case: int, missions: dict[str, dict[str, A
     assert abs(ours["unaccounted_J"]) < 1e-6 * ours["battery_J"]
 
 
+@pytest.mark.slow
 def test_comparison_can_fail(missions: dict[str, dict[str, Any]]) -> None:
     """Rolling resistance off by 2 % or a gear lossless on the way back is beyond the goals."""
     vehicle, asked = comparison.CASES[0]
@@ -44,6 +49,23 @@ def test_comparison_can_fail(missions: dict[str, dict[str, Any]]) -> None:
     exact = comparison.integral_of(vehicle, asked)
     lossless = exact["wheel_J"] / vehicle.efficiency - exact["wheel_back_J"]
     assert abs(ours["battery_J"] / lossless - 1) > 0.01
+
+
+@pytest.mark.parametrize("slope_deg", [0.0, 4.0])
+@pytest.mark.parametrize("case", range(len(comparison.CASES)))
+def test_vehicle_travels_by_the_force_and_the_power_of_the_integral(case: int, slope_deg: float) -> None:
+    """Settled travel of the robot that missions are made of: rolling, climb, the transmission and the windings."""
+    vehicle, _ = comparison.CASES[case]
+    run = Conditions(np.array([1]), np.array([4.0 * vehicle.cells]), np.array([slope_deg]))
+    found = steady_batch(comparison.robot_of(vehicle), run)
+    slope, current = np.radians(slope_deg), float(found.reading["total_current"][0])
+    force = vehicle.mass * comparison.GRAVITY * (np.sin(slope) + vehicle.rolling * np.cos(slope))
+    assert float(found.traction[0]) == pytest.approx(force, rel=1e-6)
+    winding = vehicle.resistance * current**2 / 2  # of two motors
+    taken = 4.0 * vehicle.cells * current - winding
+    assert force * float(found.theoretical_speed[0]) == pytest.approx(vehicle.efficiency * taken, rel=1e-6)
+    expected = (4.0 * vehicle.cells - vehicle.resistance * current / 2) / vehicle.torque_constant
+    assert float(found.theoretical_speed[0]) == pytest.approx(expected / vehicle.ratio * vehicle.radius, rel=1e-9)
 
 
 def test_integral_of_a_plain_ramp() -> None:

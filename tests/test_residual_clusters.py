@@ -9,7 +9,7 @@ import jsonschema
 import numpy as np
 import pytest
 from pages import Tables
-from synthetic import SETTLED, calibrated, known
+from synthetic import SETTLED, known
 from test_lack_of_fit import SIGMA, toy
 from test_loop_command import commanded
 
@@ -297,20 +297,6 @@ def clustered():
     """What residuals cluster by where one wheel in three idles, of a linear fit."""
     (found,) = residual_clusters(left(0, shift=by_wheel(2.0)))
     return found
-
-
-def test_clusters_are_in_the_document_and_on_the_page_of_a_calibration(tmp_path):
-    found, plain = clustered(), calibrated()
-    made = dataclasses.replace(plain, residual_clusters=(found,))
-    document = json.loads(json.dumps(made.to_json()))
-    jsonschema.validate(document, json.loads((SCHEMAS / "calibrate.schema.json").read_text("utf-8")))
-    assert document["residual_clusters"][0]["statement"] == found.statement
-    page = report_calibration.write(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
-    assert "cluster by idle_wheel" in page and (tmp_path / "with" / "figures" / "clusters.svg").exists()
-    bare = dataclasses.replace(plain, residual_clusters=())
-    assert 'id="clusters"' not in report_calibration.write(tmp_path / "bare", bare, robot_name="nominal").read_text(
-        "utf-8"
-    )
 
 
 def test_the_loop_gives_its_document_what_its_last_fit_leaves_clustered():
