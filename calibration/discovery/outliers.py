@@ -20,7 +20,7 @@ from calibration.discovery.score_tests import Diagnosed, ScoreTable, diagnosed
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import search_in_batches
+from calibration.inference.held_out import search_each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,20 +149,19 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
 
     They are looked for at a robust fit: Cauchy's weights, iterated (Holland and Welsch 1977).
     """
-    space, batch = base.space, base.space.bare.observe.policy.batch
+    space = base.space
     data, included = space.bare.data, space.included
     sd, measured, weight = (np.asarray(x) for x in (data.sd, data.measured, data.weight))
 
     def off(reading: np.ndarray) -> np.ndarray:
         return np.max(np.abs((reading - measured) / sd) * (weight > 0), 1)
 
-    far, start = off(base.reading), base.candidate.z
+    far, start = off(base.reading), base.candidate.z[: space.free]
     if far[included].max() < settings.gross:
         return base, ()
-    none = [space.library.indices(empty(settings))] * batch
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        found, seen = search_in_batches(space.equipped, [start] * batch, [robust] * batch, none)
+        found, seen = search_each(space.bare, [start], [robust])
         far, start = off(np.asarray(seen.reading[0])), np.asarray(found.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):

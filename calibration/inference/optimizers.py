@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
+import itertools
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -30,6 +33,8 @@ TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
 HOPELESS = 10.0
 #: How many of them have to end in one place, to within so much of the objective, for it to be the optimum.
 AGREE, SAME = 3, 0.01
+#: Cores on which many searches run, at most.
+CORES = min(4, os.cpu_count() or 1)
 
 Z = Float[Array, " parameters"]
 
@@ -179,42 +184,164 @@ class Search(optx.LevenbergMarquardt):
         return done | (state.num_steps_since_acceptance >= PATIENCE), result
 
 
+class Progress(eqx.Module):
+    """A search between two steps.
+
+    Attributes:
+        y: the best point so far; state: of the solver, its arrays.
+        found: residuals, Jacobian and observation at y; over: whether the search has ended.
+    """
+
+    y: Z
+    state: Any
+    found: tuple[Array, Array, Observation]
+    over: Bool[Array, ""]
+
+
+def _begin(problem: Problem, start: Z, data: Data) -> tuple[Progress, Any, Search]:
+    """A search that has evaluated nothing yet, what else its state holds, and its solver."""
+    rows, count = data.measured.shape
+    size = rows * count + rows + start.size
+    nowhere = Observation(jnp.zeros((rows, count)), jnp.zeros(rows), jnp.zeros(rows, int), jnp.zeros(rows, int))
+    r, jacobian = jnp.zeros(size), jnp.zeros((size, start.size))
+    solver = Search(TOLERANCE_LONG if problem.observe.long else TOLERANCE)
+    shape = jax.ShapeDtypeStruct(r.shape, r.dtype)
+    state = solver.init(_known(r, jacobian), start, None, {}, shape, None, frozenset())
+    arrays, fixed = eqx.partition(state, eqx.is_array)
+    return Progress(start, arrays, (r, jacobian, nowhere), jnp.asarray(False)), fixed, solver
+
+
+def _advance(problem: Problem, at: Progress, data: Data, pin: Pin, max_steps: int) -> Progress:
+    """One step of a search. The model is evaluated in one place of the program, at the start of a step: what was
+    accepted there is what the search returns, with its residuals, Jacobian and observation."""
+    _, fixed, solver = _begin(problem, at.y, data)
+    state = eqx.combine(at.state, fixed)
+    found = _evaluated(problem, data, pin)(state.y_eval)
+    function = _known(*found[:2])
+    y, state, _ = solver.step(function, at.y, None, {}, state, frozenset())
+    done, _ = solver.terminate(function, y, None, {}, state, frozenset())
+    accepted = state.num_steps_since_acceptance == 0
+    best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), found, at.found)
+    over = done | (state.num_steps >= max_steps) | ~jnp.all(jnp.isfinite(y))
+    return Progress(y, eqx.filter(state, eqx.is_array), best, over)
+
+
+def _ended(at: Progress, data: Data, pin: Pin) -> tuple[Optimum, Observation]:
+    r, jacobian, seen = at.found
+    return _optimum(jacobian, r, at.y, data, pin, at.state.num_steps), seen
+
+
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
     """One search by `optimistix.LevenbergMarquardt`, and what the model says where it ended. To be vmapped over
-    starts, data and pins.
-
-    The model is evaluated in one place of the program, at the start of a step: what was accepted there is what the
-    search returns, with its residuals, Jacobian and observation.
-    """
+    starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
-    evaluate, start = _evaluated(problem, data, pin), pin.apply(start)
-    solver = Search(TOLERANCE_LONG if problem.observe.long else TOLERANCE)
-    shapes = jax.eval_shape(evaluate, start)
-    nowhere = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    state = solver.init(_known(*nowhere[:2]), start, None, {}, shapes[0], None, frozenset())
-    searching, fixed = eqx.partition(state, eqx.is_array)
+    begun = _begin(problem, pin.apply(start), data)[0]
+    end = jax.lax.while_loop(
+        lambda at: ~at.over, lambda at: _advance(problem, at, data, pin, max_steps), begun
+    )
+    return _ended(end, data, pin)
 
-    def going(carry: tuple) -> Array:
-        y, searching, _, done = carry
-        return ~done & (eqx.combine(searching, fixed).num_steps < max_steps) & jnp.all(jnp.isfinite(y))
 
-    def step(carry: tuple) -> tuple:
-        y, searching, best, _ = carry
-        state = eqx.combine(searching, fixed)
-        found = evaluate(state.y_eval)
-        function = _known(*found[:2])
-        y, state, _ = solver.step(function, y, None, {}, state, frozenset())
-        done, _ = solver.terminate(function, y, None, {}, state, frozenset())
-        accepted = state.num_steps_since_acceptance == 0
-        best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), found, best)
-        return y, eqx.filter(state, eqx.is_array), best, done
+class Member(eqx.Module):
+    """What one of many searches of a problem has of its own; a leading axis where there are many.
 
-    carry = (start, searching, nowhere, jnp.asarray(False))
-    z, searching, (r, jacobian, seen), _ = jax.lax.while_loop(going, step, carry)
-    steps = eqx.combine(searching, fixed).num_steps
-    return _optimum(jacobian, r, z, data, pin, steps), seen
+    Attributes:
+        start: where it begins; weight, measured, centre: as of `Data`; active: its effects, see `ActiveSet`, None
+            for those of the problem.
+    """
+
+    start: Z
+    weight: Float[Array, "rows channels"]
+    measured: Float[Array, "rows channels"]
+    centre: Z
+    active: Array | None = None
+
+    def problem(self, problem: Problem) -> Problem:
+        """The problem that it is a search of."""
+        data = dataclasses.replace(
+            problem.data, weight=self.weight, measured=self.measured, centre=self.centre
+        )
+        coordinates = problem.coordinates
+        if self.active is not None:
+            coordinates = coordinates.with_effects(self.active)
+        return dataclasses.replace(problem, data=data, coordinates=coordinates)
+
+
+@compiled
+def _vacant(problem: Problem, members: Member) -> Progress:
+    """Searches that have ended before they began, from which nothing is taken."""
+
+    def one(member: Member) -> Progress:
+        begun = _begin(problem, member.start, member.problem(problem).data)[0]
+        return dataclasses.replace(begun, over=jnp.asarray(True))
+
+    return jax.vmap(one)(members)
+
+
+@compiled
+def _go_on(
+    problem: Problem, members: Member, fresh: Array, at: Progress, enough: Array, max_steps: int
+) -> tuple[Progress, Optimum]:
+    """Searches side by side until `enough` of them have ended, those that are `fresh` from their starts."""
+    pin = no_pin(members.start.shape[-1])
+
+    def begin(member: Member, fresh: Array, at: Progress) -> Progress:
+        begun = _begin(problem, member.start, member.problem(problem).data)[0]
+        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
+
+    def step(member: Member, at: Progress) -> Progress:
+        here = member.problem(problem)
+        new = _advance(here, at, here.data, pin, max_steps)
+        return jax.tree.map(lambda new, old: jnp.where(at.over, old, new), new, at)
+
+    at = jax.vmap(begin)(members, fresh, at)
+    at = jax.lax.while_loop(lambda at: jnp.sum(at.over) < enough, lambda at: jax.vmap(step)(members, at), at)
+    return at, jax.vmap(lambda member, at: _ended(at, member.problem(problem).data, pin)[0])(members, at)
+
+
+def searches_refilled(
+    problem: Problem, members: Member, max_steps: int, places: int
+) -> tuple[Optimum, Observation]:
+    """`levenberg_marquardt` of any number of members, so many at a time: one that has ended leaves its place to one
+    that waits, where a batch would wait for the slowest of it. One program serves any number.
+
+    Args:
+        members: leading axis the searches, NumPy's arrays.
+        places: searches side by side on each core.
+
+    Returns:
+        Where each search ended, and what the model says there.
+    """
+    count = len(members.start)
+    cores = min(CORES, -(-count // places))
+    idle = _vacant(problem, jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members))
+
+    def some(first: int) -> list[tuple[int, Any]]:
+        waiting, ended = list(range(first, count, cores))[::-1], []
+        holds = np.full(places, -1)
+        at = idle
+        while waiting or (holds >= 0).any():
+            fresh = np.zeros(places, bool)
+            for place in np.flatnonzero(holds < 0)[: len(waiting)]:
+                holds[place], fresh[place] = waiting.pop(), True
+            own = jax.tree.map(lambda x: x[np.maximum(holds, 0)], members)
+            running = int((holds >= 0).sum())
+            enough = places - running + (max(1, places // 4) if waiting else running)
+            at, found = _go_on(problem, own, fresh, at, np.asarray(enough), max_steps)
+            over, found, seen = jax.device_get((at.over, found, at.found[2]))
+            for place in np.flatnonzero(over & (holds >= 0)):
+                ended.append((holds[place], jax.tree.map(lambda x: x[place], (found, seen))))  # noqa: B023
+                holds[place] = -1
+        return ended
+
+    if cores > 1:  # the program is made once, by a call that takes no step
+        own = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
+        _go_on(problem, own, np.zeros(places, bool), idle, np.asarray(0), max_steps)
+    with concurrent.futures.ThreadPoolExecutor(cores) as pool:
+        ended = dict(itertools.chain(*pool.map(some, range(cores))))
+    return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
 def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
