@@ -569,7 +569,10 @@ class Histories(Observer):
         one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
         data = dataclasses.replace(problem.data, weight=weights[k])
         best = scans.searched_on(
-            problem, one(found), data, lambda z: one(batch(jnp.tile(z, (len(starts), 1)), weights, active)),
+            problem,
+            one(found),
+            data,
+            lambda z: one(batch(jnp.tile(z, (len(starts), 1)), weights, active)),
             lambda _: None,
         )
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)

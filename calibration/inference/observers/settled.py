@@ -214,8 +214,8 @@ class SettledRuns(Observer):
         )
 
     def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array) -> tuple[Array, Array, Array]:
-        """As the protocol says: readings and priors of each table, and its fit. Readings are drawn with their sds, and
-        the bench values too: a prior is a measurement made beforehand. The refit is the search that found the fit,
+        """As the protocol says: readings and priors of each table, and its fit. Readings are drawn with their sds,
+        and the bench values too: a prior is a measurement made beforehand. The refit is the search that found the fit,
         from the truth."""
         data, count = problem.data, len(keys)
         clean = data.measured + data.sd * linear.by_row()  # where a reading counts
