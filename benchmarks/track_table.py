@@ -45,7 +45,7 @@ from scipy.optimize import least_squares  # noqa: E402
 from calibration.data import own_mass  # noqa: E402
 from calibration.data.runs import Runs, read  # noqa: E402
 from calibration.inference import priors  # noqa: E402
-from calibration.inference.held_out import search_in_batches  # noqa: E402
+from calibration.inference.held_out import search_each  # noqa: E402
 from calibration.inference.observers.settled import SettledRuns  # noqa: E402
 from calibration.inference.population import Members, Rows  # noqa: E402
 from calibration.inference.problem import MARGIN, STIFFNESS, Observation, Problem, data_of  # noqa: E402
@@ -292,7 +292,7 @@ def lumped(posed: Posed, robot: Robot, table: Runs, seen: list[np.ndarray]) -> t
     coordinates = priors.coordinates(robot, names, stated, any_surface=True)
     problem = Problem(params.strong(robot), coordinates, SettledRuns.of(table, robot, "steady"), data)
     weights = [np.asarray(data.weight) * s[:, None] for s in seen]
-    found, _ = search_in_batches(problem, [np.zeros(len(names))] * len(seen), weights)
+    found, _ = search_each(problem, [np.zeros(len(names))] * len(seen), weights)
     slope = jax.jit(jax.jacfwd(lambda z, data: problem.misfit(z, data)))
     spread = []
     for z, weight in zip(found.z, weights, strict=True):

@@ -13,7 +13,7 @@ from calibration.data.errors import BadData
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.settings import Settings
-from calibration.inference.held_out import search_in_batches
+from calibration.inference.held_out import search_each
 from calibration.inference.linearization import amplitude_of
 from calibration.inference.optimizers import Optimum
 from calibration.inference.problem import Observation
@@ -140,19 +140,11 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
 
 
 def _base_searches(space: CandidateSpace, settings: Settings) -> tuple[Optimum, Observation]:
-    """Where searches of the base end, from the starts that its data propose, and what it says there.
-
-    Where rollouts are slow they run without slots.
-    """
-    observe, p = space.bare.observe, space.free
+    """Where searches of the base end, from the starts that its data propose, and what it says there."""
+    observe = space.bare.observe
     starts = observe.starts(space.bare, np.random.default_rng(settings.seed), observe.policy.searches)
-    if observe.long:
-        weights = jnp.repeat(space.bare.data.weight[None], len(starts), 0)
-        return jax.device_get(observe.search(space.bare, jnp.asarray(starts), weights, rivals=True))
-    wide = np.zeros((len(starts), len(space.coordinates)))
-    wide[:, :p] = starts
-    none = [space.library.indices(empty(settings))] * len(starts)
-    return search_in_batches(space.equipped, list(wide), [space.weight] * len(starts), none)
+    weights = np.repeat(space.weight[None], len(starts), 0)
+    return jax.device_get(observe.search(space.bare, jnp.asarray(starts), jnp.asarray(weights), rivals=True))
 
 
 Proposal = tuple[tuple[str, ...], np.ndarray]
@@ -164,7 +156,7 @@ def fit_candidates(space: CandidateSpace, proposals: Sequence[Proposal], setting
         return []
     active = [space.library.indices(names) for names, _ in proposals]
     starts = [z for _, z in proposals]
-    found, _ = search_in_batches(space.equipped, starts, [space.weight] * len(proposals), active)
+    found, _ = search_each(space.equipped, starts, [space.weight] * len(proposals), active)
     return [
         candidate(space, names, jax.tree.map(lambda x: x[k], found), settings)  # noqa: B023
         for k, (names, _) in enumerate(proposals)

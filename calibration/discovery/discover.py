@@ -100,7 +100,9 @@ def discover(
     distinct, known = ready.runs, ready.noise
     for sentence in ready.foreign:
         progress(sentence)
-    traced, notes = ready.trace(progress=progress), ready.notes
+    space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
+    with ahead(space, functools.partial(bases_at, distinct), ready.settings):
+        traced, notes = ready.trace(progress=progress), ready.notes
     silent = [c.name for c, source in zip(known.channels, known.source, strict=True) if source == "assumed"]
     sizes = observers.kind(distinct).sizes(distinct)
     sds = {f: noise_room.assumed(distinct, sizes, noise, f) for f in FACTORS if silent}
@@ -306,9 +308,7 @@ def trace(
         space = pose(runs, robot, noise.sd, settings, stated, library)
         progress("fitting the base model")
         at = functools.partial(bases_at, runs)
-        with ahead(space, at, settings):
-            fitted = fit_base(space, settings, runs.source)
-        return screen(fitted, at, runs, settings)
+        return screen(fit_base(space, settings, runs.source), at, runs, settings)
 
     screened = look(noise)
     residuals = residuals_of(screened, runs)

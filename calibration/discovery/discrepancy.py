@@ -24,7 +24,7 @@ from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.smooth import Smooth, smooth
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import search_in_batches
+from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem
@@ -266,7 +266,7 @@ def fit_discrepancy(
     starts = np.zeros((STARTS, len(problem.coordinates)))
     starts[:, :inner] = base.z[:inner]
     starts[:, inner:] = np.linspace(1.0, 0.0, STARTS)[:, None] * at_base.start
-    found, seen = search_in_batches(problem, list(starts), [space.weight] * STARTS)
+    found, seen = search_each(problem, list(starts), [space.weight] * STARTS)
     k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
     z = np.asarray(found.z[k])
     covariance = np.asarray(found.covariance[k])

@@ -16,11 +16,11 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
 from calibration.discovery.clusters import LEVELS, Cluster, cluster
-from calibration.discovery.score_tests import Diagnosed, ScoreTable, diagnosed
+from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap, diagnosed
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
-from calibration.inference.held_out import search_in_batches
+from calibration.inference.held_out import search_each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,15 +43,25 @@ class Screening:
 
 @contextlib.contextmanager
 def ahead(space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> Iterator[None]:
-    """Beside what is done meanwhile, the base fit, a first look at the prior's mean on another core: what every later
-    look needs is then compiled."""
-    nothing = np.zeros(len(space.coordinates))
-    mean = Candidate(empty(settings), nothing, nothing, np.inf, nothing, nothing, False, False, False)
+    """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit with
+    room for effects, on other cores: what every later one needs is then compiled. What they find is not read."""
+    nothing, none = np.zeros(len(space.coordinates)), empty(settings)
+    mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
-    with concurrent.futures.ThreadPoolExecutor(1) as other:
-        looked = other.submit(_look, start, bases_at, settings)
+
+    def look() -> None:
+        bases, (linear, _, _) = _look(start, bases_at, settings)
+        bootstrap(space.bare, nothing[: space.free], linear, space.library.scored, bases, 1, settings.seed)
+
+    def fit() -> None:
+        if not space.bare.observe.long:
+            search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
+
+    with concurrent.futures.ThreadPoolExecutor(2) as others:
+        jobs = [others.submit(look), others.submit(fit)]
         yield
-    looked.result()
+    for job in jobs:
+        job.result()
 
 
 def screen(base: BaseFit, bases_at: Callable[[BaseFit], Bases], runs: Runs, settings: Settings) -> Screening:
@@ -149,20 +159,19 @@ def _set_gross_aside(base: BaseFit, settings: Settings, where: str) -> tuple[Bas
 
     They are looked for at a robust fit: Cauchy's weights, iterated (Holland and Welsch 1977).
     """
-    space, batch = base.space, base.space.bare.observe.policy.batch
+    space = base.space
     data, included = space.bare.data, space.included
     sd, measured, weight = (np.asarray(x) for x in (data.sd, data.measured, data.weight))
 
     def off(reading: np.ndarray) -> np.ndarray:
         return np.max(np.abs((reading - measured) / sd) * (weight > 0), 1)
 
-    far, start = off(base.reading), base.candidate.z
+    far, start = off(base.reading), base.candidate.z[: space.free]
     if far[included].max() < settings.gross:
         return base, ()
-    none = [space.library.indices(empty(settings))] * batch
     for _ in range(settings.reweightings):
         robust = space.weight / np.sqrt(1 + (far / settings.cauchy) ** 2)[:, None]
-        found, seen = search_in_batches(space.equipped, [start] * batch, [robust] * batch, none)
+        found, seen = search_each(space.bare, [start], [robust])
         far, start = off(np.asarray(seen.reading[0])), np.asarray(found.z[0])
     gross = included & (far > settings.gross * max(1.0, float(np.median(far[included]))))
     if not gross.any() or gross.sum() > settings.outliers(int(included.sum())):

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,6 +22,7 @@ from jaxtyping import Array, Float
 from calibration.inference.bases import Bases, signature
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.normal_equations import cholesky, forward
+from calibration.inference.optimizers import CORES
 from calibration.inference.problem import Problem
 from mmrjax.compiling import compiled
 
@@ -36,8 +36,6 @@ WIDE = 30.0
 FILLED = 36
 #: Replicates in one batch of the bootstrap.
 CHUNK = 64
-#: Batches that run side by side, at most as many as there are cores.
-BATCHES = min(4, os.cpu_count() or 1)
 
 
 class ScoreTable(eqx.Module):
@@ -257,12 +255,17 @@ def bootstrap(
         seed: random seed.
     """
     count = -(-replicates // CHUNK)
+    keys = jax.random.key_data(jax.random.split(jax.random.key(seed), (count, CHUNK)))
+    drawn = problem.observe.draws(problem, jnp.asarray(z), linear, keys.reshape(count * CHUNK, -1)[:replicates])
+    # To whole batches: those that are repeated are cut off.
+    drawn = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), drawn)
 
     def part(k: int) -> Statistics:
-        return jax.device_get(_replicates(problem, z, linear, effects, bases, np.asarray(seed), np.asarray(k), count))
+        mine = jax.tree.map(lambda x: x[k], drawn)
+        return jax.device_get(_replicates(problem, linear, effects, bases, mine))
 
     # The first batch compiles what the others run; a batch keeps one core busy.
-    with concurrent.futures.ThreadPoolExecutor(BATCHES) as cores:
+    with concurrent.futures.ThreadPoolExecutor(CORES) as cores:
         parts = [part(0), *cores.map(part, range(1, count))]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)
@@ -270,20 +273,12 @@ def bootstrap(
 
 @compiled
 def _replicates(
-    problem: Problem,
-    z: np.ndarray,
-    linear: Linearization,
-    effects: tuple[ScoredEffect, ...],
-    bases: Bases,
-    seed: np.ndarray,
-    chunk: np.ndarray,
-    count: int,
+    problem: Problem, linear: Linearization, effects: tuple[ScoredEffect, ...], bases: Bases, drawn: Any
 ) -> Statistics:
-    """One of `count` chunks of a bootstrap."""
-    keys = jax.random.split(jax.random.key(seed), (count, CHUNK))[chunk]
+    """A batch of a bootstrap, from what the observer drew."""
 
-    def one(key: Array) -> Statistics:
-        drawn = problem.observe.replicate(problem, jnp.asarray(z), problem.data, effects, linear, key)
-        return strongest(score_tests(drawn, bases), drawn)
+    def one(drawn: Any) -> Statistics:
+        again = problem.observe.replicate(problem, problem.data, effects, linear, drawn)
+        return strongest(score_tests(again, bases), again)
 
-    return jax.vmap(one)(keys)
+    return jax.vmap(one)(drawn)

@@ -15,7 +15,7 @@ import numpy as np
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, candidate
 from calibration.discovery.settings import Settings
-from calibration.inference.held_out import search_in_batches
+from calibration.inference.held_out import search_each
 from calibration.inference.linearization import Linearization
 from calibration.inference.optimizers import linearised
 
@@ -85,22 +85,21 @@ def _without_prior(
     None where that is beyond the parameter's bounds, or no optimum.
     """
     p, mean, start = space.free, value, np.array(at.z)
-    batch = space.bare.observe.policy.batch
-    indices = [space.library.indices(at.active)] * batch
+    indices = space.library.indices(at.active)
     for _ in range(ROUNDS):
         centre = np.zeros(len(start))
         centre[k] = mean
         start[k] = mean
         data = dataclasses.replace(space.equipped.data, centre=jnp.asarray(centre))
         problem = dataclasses.replace(space.equipped, data=data)
-        found, _ = search_in_batches(problem, [start] * batch, [space.weight] * batch, indices)
-        best = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
-        z = np.asarray(found.z[best])
-        if not np.isfinite(found.cost[best]):
+        found, _ = search_each(problem, [start], [space.weight], [indices])
+        best = jax.tree.map(lambda x: x[0], found)
+        z = np.asarray(best.z)
+        if not np.isfinite(best.cost):
             return None
         if abs(z[k] - mean) < PULL:
             break
         mean, start = float(z[k]), z.copy()
     if space.coordinates.base.beyond(z[:p])[k]:
         return None
-    return candidate(space, at.active, jax.tree.map(lambda x: x[best], found), settings)
+    return candidate(space, at.active, best, settings)

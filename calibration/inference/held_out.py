@@ -1,4 +1,4 @@
-"""Readings of rows that a fit has not seen: whole blocks left out, refits in batches of one size."""
+"""Readings of rows that a fit has not seen: whole blocks left out."""
 
 from __future__ import annotations
 
@@ -6,40 +6,27 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.inference.optimizers import Optimum
 from calibration.inference.problem import Observation, Problem
 
 
-def search_in_batches(
-    problem: Problem,
-    starts: Sequence[np.ndarray],
-    weights: Sequence[np.ndarray],
-    active: Sequence | None = None,
-    batch: int | None = None,
+def search_each(
+    problem: Problem, starts: Sequence[np.ndarray], weights: Sequence[np.ndarray], active: Sequence | None = None
 ) -> tuple[Optimum, Observation]:
-    """Fits from any number of starts, each to its own weights, in batches of one size.
+    """Fits from any number of starts, each to its own weights.
 
     Args:
         starts: coordinates; weights: of the readings, (rows, channels) each; active: sets of effects, None for a
             problem without slots.
-        batch: fits in one batch; None takes the observer's.
 
     Returns:
         Where each search ended, and what the model says of every row there; leading axis the starts.
     """
-    batch = batch or problem.observe.policy.batch
-    parts = []
-    for first in range(0, len(starts), batch):
-        chosen = list(range(first, min(first + batch, len(starts))))
-        filled = chosen + [chosen[0]] * (batch - len(chosen))
-        z, weight = (jnp.asarray(np.stack([np.asarray(xs[k]) for k in filled])) for xs in (starts, weights))
-        which = None if active is None else jnp.asarray(np.stack([np.asarray(active[k]) for k in filled]))
-        found = jax.device_get(problem.observe.search(problem, z, weight, which))
-        parts.append(jax.tree.map(lambda x: x[: len(chosen)], found))  # noqa: B023
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    z, weight = (np.stack([np.asarray(x) for x in xs]) for xs in (starts, weights))
+    which = None if active is None else np.stack([np.asarray(x) for x in active])
+    return jax.device_get(problem.observe.search(problem, z, weight, which))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +59,7 @@ def held_out(
     rows, weight = len(masks[0]), np.asarray(problem.data.weight)
     out = [np.concatenate([m, np.zeros(len(weight) - rows, bool)]) for m in masks]
     which = None if active is None else [active] * len(masks)
-    found, seen = search_in_batches(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
+    found, seen = search_each(problem, [start] * len(masks), [weight * ~m[:, None] for m in out], which)
     reading, status = np.full((rows, weight.shape[1]), np.nan), np.full(rows, -1)
     block = np.full(rows, -1)
     for k, mask in enumerate(masks):

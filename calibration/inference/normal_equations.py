@@ -8,12 +8,8 @@ two of them in flight have waited for each other for ever (jax 0.10.2, CPU).
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-import lineax as lx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 
@@ -44,26 +40,3 @@ def backward(lower: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Arra
     """Solve Lᵀ x = b."""
     flipped = lower[::-1, ::-1].T
     return forward(flipped, b[::-1])[::-1]
-
-
-class Normal(lx.AbstractLinearSolver):
-    """Least-squares solution x = (AᵀA)⁻¹ Aᵀb as a lineax solver, for operators of full column rank."""
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        return operator.as_matrix(), operator.in_structure()
-
-    def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> Any:
-        matrix, structure = state
-        b, _ = ravel_pytree(vector)
-        _, unravel = ravel_pytree(jnp.zeros(structure.shape, structure.dtype))
-        lower = cholesky(matrix.T @ matrix)
-        return unravel(backward(lower, forward(lower, matrix.T @ b))), lx.RESULTS.successful, {}
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
-        raise NotImplementedError("a least-squares solver inside a search is not differentiated")
-
-    def conj(self, state: Any, options: dict[str, Any]) -> Any:
-        return state, {}
-
-    def assume_full_rank(self) -> bool:
-        return True

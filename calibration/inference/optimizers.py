@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
+import itertools
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -11,10 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from calibration.inference.normal_equations import Normal, cholesky, forward
+from calibration.inference.normal_equations import backward, cholesky, forward
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax.compiling import compiled
 from mmrjax.robot import Robot
@@ -25,11 +27,17 @@ DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
 #: Rejected steps in a row after which a search ends, and change of z (and of the objective, relative) at which
 #: it does; the second for rollouts.
 PATIENCE = 12
+#: Shares of the predicted fall of the objective below which a step is rejected and above which the next may be
+#: longer, and by what the length of the next is then multiplied.
+LITTLE, NEARLY_ALL = 0.01, 0.99
+SHORTER, LONGER = 0.25, 3.5
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
 #: How many times the decrease that its linearisation predicts a search of rollouts is given the hope of.
 HOPELESS = 10.0
 #: How many of them have to end in one place, to within so much of the objective, for it to be the optimum.
 AGREE, SAME = 3, 0.01
+#: Cores on which many searches run, at most.
+CORES = min(4, os.cpu_count() or 1)
 
 Z = Float[Array, " parameters"]
 
@@ -126,20 +134,6 @@ def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Ar
     return at
 
 
-def _known(r: Array, jacobian: Array) -> Callable[[Z, None], tuple[Array, None]]:
-    """What a step asks of the residuals at the one place where it asks, where they and their Jacobian are known."""
-
-    @jax.custom_jvp
-    def value(z: Z) -> Array:
-        return r
-
-    @value.defjvp
-    def derivative(primals: tuple[Z], tangents: tuple[Z]) -> tuple[Array, Array]:
-        return r, jacobian @ tangents[0]
-
-    return lambda z, _: (value(z), None)
-
-
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
     informed = jacobian[informing(data)]
     lower = cholesky(informed.T @ informed)
@@ -162,59 +156,201 @@ def optimum(jacobian: np.ndarray, residual: np.ndarray, z: np.ndarray, data: Dat
     return _optimum(j, r, at, data, no_pin(len(z)), jnp.asarray(0))
 
 
-class Search(optx.LevenbergMarquardt):
-    """Levenberg-Marquardt that also ends after `PATIENCE` steps in a row that did not lower the objective.
+class Progress(eqx.Module):
+    """A search between two steps.
 
-    Each rejected step is a quarter of the one before, so nothing is left to gain but rounding (or, of a
-    rollout, the integrator's tolerance); `Optimum.converged` says whether that place is an optimum.
+    Attributes:
+        y: the best point so far; found: residuals and Jacobian there, and what the model says.
+        normal, gradient: J^T J and J^T r there.
+        ahead: where the model is to be evaluated next; size: of the step to it, 1 / damping.
+        steps: evaluations so far; rejected: those since y was found; over: whether the search has ended.
     """
 
-    def __init__(self, tolerance: float) -> None:
-        super().__init__(rtol=tolerance, atol=tolerance, linear_solver=Normal())
+    y: Z
+    found: tuple[Float[Array, " residuals"], Float[Array, "residuals parameters"], Any]
+    normal: Float[Array, "parameters parameters"]
+    gradient: Z
+    ahead: Z
+    size: Float[Array, ""]
+    steps: Int[Array, ""]
+    rejected: Int[Array, ""]
+    over: Bool[Array, ""]
 
-    def terminate(
-        self, fn: Any, y: Any, args: Any, options: dict[str, Any], state: Any, tags: frozenset[object]
-    ) -> tuple[Array, optx.RESULTS]:
-        done, result = super().terminate(fn, y, args, options, state, tags)
-        return done | (state.num_steps_since_acceptance >= PATIENCE), result
+
+def begun(start: Z, nowhere: tuple[Array, Array, Any]) -> Progress:
+    """A search that has evaluated nothing yet.
+
+    Args:
+        nowhere: of the shapes of what it will find, all 0.
+    """
+    n, none = start.shape[0], jnp.asarray(0)
+    return Progress(
+        start, nowhere, jnp.zeros((n, n)), jnp.zeros(n), start, jnp.asarray(1.0), none, none, jnp.asarray(False)
+    )
+
+
+def step(at: Progress, found: tuple[Array, Array, Any], tolerance: float) -> Progress:
+    """One step of Levenberg-Marquardt, d = -(J^T J + I / size)^-1 J^T r, from what was found where the last one led.
+
+    A step by which the objective falls by less than `LITTLE` of what the linearisation predicts is rejected and the
+    next one shortened; one by which it falls by `NEARLY_ALL` of it lets the next one be longer (Conn, Gould, Toint
+    2000, alg. 6.1.1, with the numbers of optimistix 0.1). A search ends where an accepted step changes neither z nor
+    any residual by more than the tolerance, and after `PATIENCE` steps in a row that were rejected: each is a quarter
+    of the one before, so nothing is left to gain but rounding (or, of a rollout, the integrator's tolerance);
+    `Optimum.converged` says whether that place is an optimum.
+    """
+    (r, jacobian, _), (r_old, jacobian_old, _) = found, at.found
+    moved, changed, first = at.ahead - at.y, r - r_old, at.steps == 0
+    fall = 0.5 * (jnp.sum(r**2) - jnp.sum(r_old**2))
+    predicted = 0.5 * (jnp.sum((jacobian_old @ moved + r_old) ** 2) - jnp.sum(r_old**2))
+    accepted = first | (fall <= LITTLE * predicted)
+    good = ~first & (predicted < 0) & (fall < NEARLY_ALL * predicted)
+    size = at.size * jnp.where(accepted, jnp.where(good, LONGER, 1.0), SHORTER)
+    ended = jnp.all(jnp.abs(moved) < tolerance * (1 + jnp.abs(at.ahead)))
+    ended &= accepted & jnp.all(jnp.abs(changed) < tolerance * (1 + jnp.abs(r)))
+
+    new = at.ahead, found, jacobian.T @ jacobian, jacobian.T @ r
+    old = at.y, at.found, at.normal, at.gradient
+    y, best, normal, gradient = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
+    tiny = jnp.finfo(size.dtype)
+    damping = jnp.where(size > tiny.eps, 1 / jnp.maximum(size, tiny.eps), tiny.max)
+    lower = cholesky(normal + damping * jnp.eye(y.shape[0]))
+    ahead = y - backward(lower, forward(lower, gradient))
+    rejected = jnp.where(accepted, 0, at.rejected + 1)
+    over = ended | (rejected >= PATIENCE)
+    return Progress(y, best, normal, gradient, ahead, size, at.steps + 1, rejected, over)
+
+
+def _begin(problem: Problem, start: Z, data: Data) -> Progress:
+    """A search of a problem that has evaluated nothing yet."""
+    rows, count = data.measured.shape
+    size, codes = rows * count + rows + start.shape[0], jnp.zeros(rows, int)
+    seen = Observation(jnp.zeros((rows, count)), jnp.zeros(rows), codes, codes)
+    return begun(start, (jnp.zeros(size), jnp.zeros((size, start.shape[0])), seen))
+
+
+def _advance(problem: Problem, at: Progress, data: Data, pin: Pin, max_steps: int) -> Progress:
+    """One step of a search. The model is evaluated in one place of the program, at the start of a step: what was
+    accepted there is what the search returns, with its residuals, Jacobian and observation."""
+    found = _evaluated(problem, data, pin)(at.ahead)
+    new = step(at, found, TOLERANCE_LONG if problem.observe.long else TOLERANCE)
+    over = new.over | (new.steps >= max_steps) | ~jnp.all(jnp.isfinite(new.y))
+    return dataclasses.replace(new, over=over)
+
+
+def _ended(at: Progress, data: Data, pin: Pin) -> Optimum:
+    r, jacobian, _ = at.found
+    return _optimum(jacobian, r, at.y, data, pin, at.steps)
 
 
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
-    """One search by `optimistix.LevenbergMarquardt`, and what the model says where it ended. To be vmapped over
-    starts, data and pins.
-
-    The model is evaluated in one place of the program, at the start of a step: what was accepted there is what the
-    search returns, with its residuals, Jacobian and observation.
-    """
+    """One search, and what the model says where it ended. To be vmapped over
+    starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
-    evaluate, start = _evaluated(problem, data, pin), pin.apply(start)
-    solver = Search(TOLERANCE_LONG if problem.observe.long else TOLERANCE)
-    shapes = jax.eval_shape(evaluate, start)
-    nowhere = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    state = solver.init(_known(*nowhere[:2]), start, None, {}, shapes[0], None, frozenset())
-    searching, fixed = eqx.partition(state, eqx.is_array)
+    end = jax.lax.while_loop(
+        lambda at: ~at.over,
+        lambda at: _advance(problem, at, data, pin, max_steps),
+        _begin(problem, pin.apply(start), data),
+    )
+    return _ended(end, data, pin), end.found[2]
 
-    def going(carry: tuple) -> Array:
-        y, searching, _, done = carry
-        return ~done & (eqx.combine(searching, fixed).num_steps < max_steps) & jnp.all(jnp.isfinite(y))
 
-    def step(carry: tuple) -> tuple:
-        y, searching, best, _ = carry
-        state = eqx.combine(searching, fixed)
-        found = evaluate(state.y_eval)
-        function = _known(*found[:2])
-        y, state, _ = solver.step(function, y, None, {}, state, frozenset())
-        done, _ = solver.terminate(function, y, None, {}, state, frozenset())
-        accepted = state.num_steps_since_acceptance == 0
-        best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), found, best)
-        return y, eqx.filter(state, eqx.is_array), best, done
+class Member(eqx.Module):
+    """What one of many searches of a problem has of its own; a leading axis where there are many.
 
-    carry = (start, searching, nowhere, jnp.asarray(False))
-    z, searching, (r, jacobian, seen), _ = jax.lax.while_loop(going, step, carry)
-    steps = eqx.combine(searching, fixed).num_steps
-    return _optimum(jacobian, r, z, data, pin, steps), seen
+    Attributes:
+        start: where it begins; weight, measured, centre: as of `Data`; active: its effects, see `ActiveSet`, None
+            for those of the problem.
+    """
+
+    start: Z
+    weight: Float[Array, "rows channels"]
+    measured: Float[Array, "rows channels"]
+    centre: Z
+    active: Array | None = None
+
+    def problem(self, problem: Problem) -> Problem:
+        """The problem that it is a search of."""
+        data = dataclasses.replace(problem.data, weight=self.weight, measured=self.measured, centre=self.centre)
+        coordinates = problem.coordinates
+        if self.active is not None:
+            coordinates = coordinates.with_effects(self.active)
+        return dataclasses.replace(problem, data=data, coordinates=coordinates)
+
+
+@compiled
+def _vacant(problem: Problem, members: Member) -> Progress:
+    """Searches that have ended before they began, from which nothing is taken."""
+
+    def one(member: Member) -> Progress:
+        begun = _begin(problem, member.start, member.problem(problem).data)
+        return dataclasses.replace(begun, over=jnp.asarray(True))
+
+    return jax.vmap(one)(members)
+
+
+@compiled
+def _go_on(
+    problem: Problem, members: Member, fresh: Array, at: Progress, enough: Array, max_steps: int
+) -> tuple[Progress, Optimum]:
+    """Searches side by side until `enough` of them have ended, those that are `fresh` from their starts."""
+    pin = no_pin(members.start.shape[-1])
+
+    def begin(member: Member, fresh: Array, at: Progress) -> Progress:
+        begun = _begin(problem, member.start, member.problem(problem).data)
+        return jax.tree.map(lambda new, old: jnp.where(fresh, new, old), begun, at)
+
+    def advance(member: Member, at: Progress) -> Progress:
+        here = member.problem(problem)
+        new = _advance(here, at, here.data, pin, max_steps)
+        return jax.tree.map(lambda new, old: jnp.where(at.over, old, new), new, at)
+
+    at = jax.vmap(begin)(members, fresh, at)
+    at = jax.lax.while_loop(lambda at: jnp.sum(at.over) < enough, lambda at: jax.vmap(advance)(members, at), at)
+    return at, jax.vmap(lambda member, at: _ended(at, member.problem(problem).data, pin))(members, at)
+
+
+def searches_refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
+    """`levenberg_marquardt` of any number of members, so many at a time: one that has ended leaves its place to one
+    that waits, where a batch would wait for the slowest of it. One program serves any number.
+
+    Args:
+        members: leading axis the searches, NumPy's arrays.
+        places: searches side by side on each core.
+
+    Returns:
+        Where each search ended, and what the model says there.
+    """
+    count = len(members.start)
+    cores = min(CORES, -(-count // places))
+    idle = _vacant(problem, jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members))
+
+    def some(first: int) -> list[tuple[int, Any]]:
+        waiting, ended = list(range(first, count, cores))[::-1], []
+        holds = np.full(places, -1)
+        at = idle
+        while waiting or (holds >= 0).any():
+            fresh = np.zeros(places, bool)
+            for place in np.flatnonzero(holds < 0)[: len(waiting)]:
+                holds[place], fresh[place] = waiting.pop(), True
+            own = jax.tree.map(lambda x: x[np.maximum(holds, 0)], members)
+            running = int((holds >= 0).sum())
+            enough = places - running + (max(1, places // 4) if waiting else running)
+            at, found = _go_on(problem, own, fresh, at, np.asarray(enough), max_steps)
+            over, found, seen = jax.device_get((at.over, found, at.found[2]))
+            for place in np.flatnonzero(over & (holds >= 0)):
+                ended.append((holds[place], jax.tree.map(lambda x: x[place], (found, seen))))  # noqa: B023
+                holds[place] = -1
+        return ended
+
+    if cores > 1:  # the program is made once, by a call that takes no step
+        own = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
+        _go_on(problem, own, np.zeros(places, bool), idle, np.asarray(0), max_steps)
+    with concurrent.futures.ThreadPoolExecutor(cores) as pool:
+        ended = dict(itertools.chain(*pool.map(some, range(cores))))
+    return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
 def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
@@ -286,13 +422,9 @@ def evaluated(problem: Problem, z: Z, data: Data) -> Array:
     return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
 
 
-@eqx.filter_jit
-def _step(solver: Search, y: Z, state: Any, r: Array, jacobian: Array) -> tuple[Z, Any, Array]:
-    def tangent(z: Z, _: None) -> tuple[Array, None]:
-        return r + jacobian @ (z - state.y_eval), None  # evaluated at y_eval alone
-
-    y, state, _ = solver.step(tangent, y, None, {}, state, frozenset())
-    return y, state, solver.terminate(tangent, y, None, {}, state, frozenset())[0]
+@jax.jit
+def _stepped(at: Progress, found: tuple[Array, Array, Any]) -> Progress:
+    return step(at, found, TOLERANCE_LONG)
 
 
 def search_long(
@@ -305,8 +437,9 @@ def search_long(
     Returns:
         Where the search ended, and what the model says where it started and where it ended.
     """
-    pin, solver = no_pin(start.shape[0]), Search(TOLERANCE_LONG)
-    y, state, accepted = start, None, True
+    pin = no_pin(start.shape[0])
+    search: Progress | None = None
+    accepted = True
     first: Observation | None = None
     best: tuple[Optimum, Observation] | None = None
 
@@ -316,22 +449,20 @@ def search_long(
         return dataclasses.replace(found, decrement=jnp.asarray(gain), converged=_small(gain, found.cost)), ahead
 
     for steps in range(1, max_steps + 1):
-        at = start if state is None else state.y_eval
+        at = start if search is None else search.ahead
         # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
         r = None if accepted else evaluated(problem, at, data)
         if r is None or best is None or 0.5 * jnp.sum(r**2) < best[0].cost:
             signed, slope, seen = _linearised(problem, at, data)
             r, jacobian = _counted(signed, slope, data)
-        if state is None:
-            shape = jax.eval_shape(lambda: r)  # noqa: B023
-            tangent = lambda z, _: (r + jacobian @ (z - start), None)  # noqa: B023, E731
-            state, first = solver.init(tangent, y, None, {}, shape, None, frozenset()), seen
-        y, state, done = _step(solver, y, state, r, jacobian)
-        accepted = np.array_equal(y, at)
+        if search is None:
+            search, first = begun(start, jax.tree.map(jnp.zeros_like, (r, jacobian, None))), seen
+        search = _stepped(search, (r, jacobian, None))
+        accepted, done = bool(search.rejected == 0), bool(search.over)
         if accepted:
-            found, ahead = judged(y, steps, signed, slope)
+            found, ahead = judged(search.y, steps, signed, slope)
             best = found, seen
-            done |= found.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost)
+            done |= bool(found.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
         tell(f"step {steps}: objective {float(best[0].cost):.4f}")
         if done:
@@ -352,18 +483,7 @@ def search_long(
 Evaluate = Callable[[Array], tuple[Array, Array, Observation]]
 
 
-@eqx.filter_jit
-def _begun(solver: Search, starts: Array, r: Array, jacobian: Array) -> Any:
-    def one(y: Array, r: Array, jacobian: Array) -> Any:
-        shape = jax.eval_shape(lambda: r)
-        return solver.init(lambda z, _: (r + jacobian @ (z - y), None), y, None, {}, shape, None, frozenset())
-
-    return eqx.filter_vmap(one)(starts, r, jacobian)
-
-
-@eqx.filter_jit
-def _steps(solver: Search, y: Array, state: Any, r: Array, jacobian: Array) -> tuple[Array, Any, Array]:
-    return eqx.filter_vmap(lambda *x: _step(solver, *x))(y, state, r, jacobian)
+_steps = jax.jit(jax.vmap(lambda at, found: step(at, found, TOLERANCE_LONG)))
 
 
 @eqx.filter_jit
@@ -390,30 +510,29 @@ def searches_long(
     Returns:
         Where each search ended, and what the model says there.
     """
-    solver = Search(TOLERANCE_LONG)
     starts = jnp.asarray(starts)
-    r, jacobian, seen = evaluate(starts)
-    y, at, state = starts, starts, _begun(solver, starts, r, jacobian)
-    best, over, taken = (r, jacobian, seen), np.zeros(len(starts), bool), np.zeros(len(starts), int)
+    found = evaluate(starts)
+    at = jax.vmap(begun)(starts, jax.tree.map(jnp.zeros_like, found))
+    over, taken = np.zeros(len(starts), bool), np.zeros(len(starts), int)
     for steps in range(1, max_steps + 1):
         # A step judges what was found where the last one led; what is accepted becomes y.
-        new_y, state, done = _steps(solver, y, state, r, jacobian)
-        moved = np.asarray(jnp.all(new_y == at, 1)) & ~over
-        y, best = _where(moved, (new_y, (r, jacobian, seen)), (y, best))
+        new = _steps(at, found)
+        moved, done = np.asarray(new.rejected == 0), np.asarray(new.over)
+        at = _where(over, at, new)
         taken = np.where(over, taken, steps)
-        found = _optima(best[1], best[0], y, data, weights, jnp.asarray(taken))
-        small = 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost)
-        over = over | np.asarray(done) | np.asarray(moved & (found.decrement < small))
+        r, jacobian, seen = at.found
+        ends = _optima(jacobian, r, at.y, data, weights, jnp.asarray(taken))
+        small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
+        over = over | done | np.asarray(moved & (ends.decrement < small))
         if rivals:
-            cost, reach = np.asarray(found.cost), HOPELESS * np.asarray(found.decrement)
+            cost, reach = np.asarray(ends.cost), HOPELESS * np.asarray(ends.decrement)
             lowest = np.min(cost[over], initial=np.inf)
             agree = np.sum(over & (cost < lowest + SAME)) >= AGREE and not np.any(~over & (cost < lowest - SAME))
             over = over | (cost - reach > lowest) | agree
         if over.all():
             break
-        at = jnp.where(over[:, None], y, state.y_eval)
-        r, jacobian, seen = evaluate(at)
-    return found, best[2]
+        found = evaluate(jnp.where(over[:, None], at.y, at.ahead))
+    return ends, seen
 
 
 @jax.jit

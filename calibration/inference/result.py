@@ -21,7 +21,7 @@ from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
 
 SCHEMA = "mmrjax.calibrate/1"
-METHOD = "optimistix.LevenbergMarquardt"
+METHOD = "Levenberg-Marquardt"
 
 Interval = tuple[float, float]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -191,22 +191,24 @@ class Observer(eqx.Module):
     def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Residuals, Jacobian and signatures at z."""
 
-    @abc.abstractmethod
-    def replicate(
-        self,
-        problem: Problem,
-        z: Array,
-        data: Data,
-        effects: tuple[ScoredEffect, ...],
-        linear: Linearization,
-        key: Array,
-    ) -> Linearization:
-        """A table drawn from the fit `z` of the base, fitted again and linearised: one replicate of the bootstrap.
+    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array) -> Any:
+        """What replicates of the bootstrap begin with, leading axis the keys: the keys, or fits of tables drawn.
 
         Args:
-            problem: of the base alone, at its fit z; data: of the table.
-            linear: the same fit, linearised.
-            key: random.
+            problem: of the base alone, at its fit z; linear: the same fit, linearised.
+            keys: random, as numbers, shape (replicates, words).
+        """
+        return keys
+
+    @abc.abstractmethod
+    def replicate(
+        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Any
+    ) -> Linearization:
+        """A table drawn from the fit of the base, fitted again and linearised: one replicate of the bootstrap.
+
+        Args:
+            problem: of the base alone; data: of the table; linear: the fit, linearised.
+            drawn: one of `draws`.
         """
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
@@ -236,7 +238,7 @@ class Observer(eqx.Module):
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
     ) -> tuple[Optimum, Observation]:
-        """A batch of fits, each to its own weights, and what each says of every row.
+        """Any number of fits, each to its own weights, and what each says of every row.
 
         Args:
             starts: shape (members, coordinates); weights: of each member's readings, (members, rows, channels).

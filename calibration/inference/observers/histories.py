@@ -488,18 +488,12 @@ class Histories(Observer):
         )
 
     def replicate(
-        self,
-        problem: Problem,
-        z: Array,
-        data: Data,
-        effects: tuple[ScoredEffect, ...],
-        linear: Linearization,
-        key: Array,
+        self, problem: Problem, data: Data, effects: tuple[ScoredEffect, ...], linear: Linearization, drawn: Array
     ) -> Linearization:
         jacobian = linear.jacobian
         lower = cholesky(jacobian.T @ jacobian)
         counts = jnp.concatenate([data.weight.ravel(), jnp.zeros(linear.rows), jnp.ones(jacobian.shape[1])])
-        noise = counts * jax.random.normal(key, counts.shape)
+        noise = counts * jax.random.normal(jax.random.wrap_key_data(drawn), counts.shape)
         return linear.with_residual(noise - jacobian @ backward(lower, forward(lower, jacobian.T @ noise)))
 
     def starts(self, problem: Problem, random: np.random.Generator, count: int) -> Float[np.ndarray, "starts z"]:
@@ -548,9 +542,9 @@ class Histories(Observer):
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
     ) -> tuple[Optimum, Observation]:
-        """As the protocol says; the runs are compiled once for all steps."""
+        """As the protocol says; the runs are compiled once for all steps, and fits go in batches of one size."""
 
-        def batch(starts: Array) -> tuple[Optimum, Observation]:
+        def batch(starts: Array, weights: Array, active: Array | None) -> tuple[Optimum, Observation]:
             return searches_long(
                 lambda z: _evaluate(problem, z, weights, active),
                 starts,
@@ -560,14 +554,26 @@ class Histories(Observer):
                 rivals=rivals,
             )
 
-        found = batch(starts)
-        if not rivals or not scans.scanned(problem):
+        if not rivals:
+            parts, size, count = [], self.policy.batch, len(starts)
+            for first in range(0, count, size):
+                chosen = np.r_[first : min(first + size, count)]
+                filled = np.append(chosen, [first] * (size - len(chosen))).astype(int)
+                found = batch(*jax.tree.map(lambda x: jnp.asarray(x)[filled], (starts, weights, active)))  # noqa: B023
+                parts.append(jax.tree.map(lambda x: x[: len(chosen)], jax.device_get(found)))  # noqa: B023
+            return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        found = batch(starts, weights, active)
+        if not scans.scanned(problem):
             return found
         k = int(np.nanargmin(found[0].cost))
         one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
         data = dataclasses.replace(problem.data, weight=weights[k])
         best = scans.searched_on(
-            problem, one(found), data, lambda z: one(batch(jnp.tile(z, (len(starts), 1)))), lambda _: None
+            problem,
+            one(found),
+            data,
+            lambda z: one(batch(jnp.tile(z, (len(starts), 1)), weights, active)),
+            lambda _: None,
         )
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
 

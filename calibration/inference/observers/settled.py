@@ -21,7 +21,7 @@ from calibration.inference.errors import OF_SIZE, relative_error, sized_error
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Observer, SearchPolicy
-from calibration.inference.optimizers import Optimum, levenberg_marquardt
+from calibration.inference.optimizers import Member, Optimum, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities
 from mmrjax.compiling import compiled
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 CONTRADICTION = 6.0
 #: The same for replicates whose sd is not known, as a share of their mean.
 CONTRADICTION_SHARE = 0.25
+#: Searches side by side on a core: of a robot without effects, and with.
+MANY, FEW = 16, 4
 #: Balances to which the defect of a row is attributed, one for each equation that the channels close.
 EQUATIONS = ("electrical", "track", "slip")
 
@@ -211,31 +213,42 @@ class SettledRuns(Observer):
             residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown
         )
 
+    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array) -> tuple[Array, Array, Array]:
+        """As the protocol says: readings and priors of each table, and its fit. Readings are drawn with their sds,
+        and the bench values too: a prior is a measurement made beforehand. The refit is the search that found the fit,
+        from the truth."""
+        data, count = problem.data, len(keys)
+        clean = data.measured + data.sd * linear.by_row()  # where a reading counts
+        measured, centre = jax.device_get(_drawn(clean, data.sd, z, keys))
+        start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
+        members = Member(start, weight, measured, centre)
+        refits, _ = searches_refilled(problem, members, self.policy.steps, self.places(problem))
+        return measured, centre, refits.z
+
     def replicate(
         self,
         problem: Problem,
-        z: Array,
         data: Data,
         effects: tuple[ScoredEffect, ...],
         linear: Linearization,
-        key: Array,
+        drawn: tuple[Array, Array, Array],
     ) -> Linearization:
-        """As the protocol says. Readings are drawn with their sds, and the bench values too: a prior is a
-        measurement made beforehand. The refit is the search that found the fit, from the truth."""
-        one, two = jax.random.split(key)
-        clean = problem.observation(z).reading
-        noisy = dataclasses.replace(
-            data,
-            measured=clean + data.sd * jax.random.normal(one, clean.shape),
-            centre=z + jax.random.normal(two, z.shape),
-        )
-        refit, _ = levenberg_marquardt(problem, z, noisy, max_steps=self.policy.steps)
-        return self.linearise(problem, refit.z, noisy, effects)
+        measured, centre, refit = drawn
+        noisy = dataclasses.replace(data, measured=measured, centre=centre)
+        return self.linearise(problem, refit, noisy, effects)
 
     def search(
         self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
     ) -> tuple[Optimum, Observation]:
-        return _fits(problem, starts, weights, active, self.policy.steps)
+        data, count = problem.data, len(starts)
+        measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))
+        starts, weights = np.asarray(starts), np.asarray(weights)
+        members = Member(starts, weights, measured, centre, None if active is None else np.asarray(active))
+        return searches_refilled(problem, members, self.policy.steps, self.places(problem))
+
+    def places(self, problem: Problem) -> int:
+        """Searches side by side on a core: fewer where effects make the model costly, so that few wait for one."""
+        return FEW if problem.base.effects else MANY
 
     def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
         weight = included.astype(float)
@@ -260,17 +273,14 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
 
 
 @compiled
-def _fits(
-    problem: Problem, starts: Array, weights: Array, active: Array | None, steps: int
-) -> tuple[Optimum, Observation]:
-    def one(z: Array, weight: Array, which: Array | None) -> tuple[Optimum, Observation]:
-        here = problem
-        if which is not None:
-            here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
-        data = dataclasses.replace(problem.data, weight=weight)
-        return levenberg_marquardt(here, z, data, max_steps=steps)
+def _drawn(clean: Array, sd: Array, z: Array, keys: Array) -> tuple[Array, Array]:
+    """Readings and bench values of a table for each key."""
 
-    return jax.vmap(one)(starts, weights, active)
+    def one(key: Array) -> tuple[Array, Array]:
+        one, two = jax.random.split(jax.random.wrap_key_data(key))
+        return clean + sd * jax.random.normal(one, clean.shape), z + jax.random.normal(two, z.shape)
+
+    return jax.vmap(one)(keys)
 
 
 class SettledRigRuns(SettledRuns):
