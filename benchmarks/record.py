@@ -94,8 +94,8 @@ CASES = {
         for kind in ("tracked", "wheeled", "bench", "pendulum", "linear")
     },
 }
-#: Cases that solve alone: those of `make test`.
-QUICK = ("simulate", "sweep_rig", "rig_new_bench")
+#: Cases that take little, those of `make test`: a rig solved, and files written.
+QUICK = ("simulate_rig", "sweep_rig", "rig_new_bench", "rig_new_tracked")
 
 
 def run(name: str, folder: Path) -> dict[str, Any]:

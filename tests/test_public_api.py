@@ -45,9 +45,8 @@ def python(code: str, **environment: str) -> str:
     return answer.stdout
 
 
-def test_five_lines(capsys):
-    exec(compile(FIVE_LINES, "five_lines", "exec"), {})
-    printed = capsys.readouterr().out.splitlines()
+def test_five_lines():
+    printed = python(FIVE_LINES).splitlines()
     current, header = printed[0].split(maxsplit=1)
     assert float(current) == pytest.approx(3.6786702697, rel=1e-9)
     assert header.startswith("configuration  supply  slope  payload  total current  motor speed   speed")

@@ -79,9 +79,9 @@ def space(robot, asked, found):
     return of, search.space(robot, of, found.options)
 
 
-def test_best_meets_every_requirement_as_check_has_it(asked, found):
+def test_best_meets_every_requirement_as_check_has_it(text, asked, found):
     assert found.best is not None and found.best.feasible and found.unmeetable == ()
-    for f in (found.best, *found.alternatives[:3]):
+    for f in (found.best, *found.alternatives[: 1 if text is FEW else 3]):  # each a structure of its own to compile
         outcomes = sheet.check(f.robot, asked, changes=False)
         assert all(o.met for o in outcomes), (f.to_json(), outcomes)
         assert float(f.robot.chassis(0).mass) == pytest.approx(f.objectives["mass"])
