@@ -254,6 +254,20 @@ def record(name: str) -> dict[str, Any]:
     return json.loads((RECORD / f"{name}.json").read_text(encoding="utf-8"))
 
 
+def as_text(kept: dict[str, Any]) -> str:
+    """A record as JSON, a line for each name."""
+
+    def line(value: Any) -> str:
+        return json.dumps(value, ensure_ascii=False)
+
+    files = [
+        f"  {line(at)}: {{\n" + ",\n".join(f"   {line(k)}: {line(v)}" for k, v in names.items()) + "\n  }"
+        for at, names in kept["files"].items()
+    ]
+    head = "".join(f" {line(key)}: {line(kept[key])},\n" for key in ("words", "code"))
+    return "{\n" + head + ' "files": {\n' + ",\n".join(files) + "\n }\n}\n"
+
+
 def with_needed(names: list[str]) -> list[str]:
     """Cases in the order of `CASES`, with those whose folders they read."""
     wanted = {*names, *(CASES[name].after for name in names)} - {""}
@@ -279,9 +293,7 @@ def main() -> int:
             now = run(name, Path(folder))
             spent = f"{time.process_time() - began:6.1f} s"
             if options.write:
-                (RECORD / f"{name}.json").write_text(
-                    json.dumps(now, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
-                )
+                (RECORD / f"{name}.json").write_text(as_text(now), encoding="utf-8")
                 print(f"{spent}  {name}: exit code {now['code']}", flush=True)
                 continue
             found = differences(record(name), now, CASES[name].rtol, options.exact)
