@@ -202,6 +202,7 @@ def test_derivatives_of_a_step_are_those_of_what_it_computes(eventful, forward, 
     assert sum(float(jnp.sum(a * b)) for a, b in pairs) == pytest.approx(float(_some(*ours)), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_derivative_of_a_step_along_a_direction_is_that_of_what_it_computes(recessed):
     """Of motion and one parameter of each part at once; every parameter, effects and reverse mode: see below."""
     run = Conditions(**RUNS["tracked"])

@@ -86,6 +86,7 @@ def test_clean_table_lacks_nothing(clean):
     assert abs(np.mean(null.chi2) - readings) < 4 * np.sqrt(2 * readings / len(null.chi2))
 
 
+@pytest.mark.slow
 def test_result_is_that_of_the_stages(clean, churning, looks):
     for at in (clean, churning):
         found = looks.analyst.discover(at.runs)

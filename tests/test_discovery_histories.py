@@ -170,6 +170,7 @@ def test_sample_that_stands_alone_is_an_outlier(clean):
 # --- linear algebra ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_signatures_are_differences_of_runs(seen):
     """At the first and the last point of each shape's grid, through everything that an effect remembers."""
     problem, linear, library = seen.problem, seen.linear, seen.space.library

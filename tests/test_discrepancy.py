@@ -154,6 +154,7 @@ def test_formula_finds_the_variable(found):
     assert proposal.formula.count(f" {unit} (") == len(proposal.terms)
 
 
+@pytest.mark.slow
 def test_curve_of_a_result_is_in_its_robot_and_takes_the_discrepancy_out(tmp_path):
     found = unnamed()
     what, path = found.unnamed, tmp_path / "robot.toml"

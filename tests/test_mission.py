@@ -143,6 +143,7 @@ def test_regeneration_charges_the_battery_and_is_flagged_above_its_charge_voltag
     assert float(drained.discharge) < 3600.0 and "overvoltage" not in flagged(drained.result.flags)
 
 
+@pytest.mark.slow
 def test_a_supply_that_takes_nothing_back_lets_the_motors_coast(robot):
     one_way = dataclasses.replace(robot, driver=dataclasses.replace(robot.driver, returns_current=False))
     p = rows([0, 5], voltage=10.0, slope_deg=-20.0, payload=8.0)
@@ -279,6 +280,7 @@ def test_a_demand_that_cannot_be_met_is_followed_as_far_as_possible_and_flagged(
 BY = ("motor.resistance", "gearbox.efficiency_load", "6T2A.track.loss_coulomb", "6T2A.mass", "motor.torque_constant")
 
 
+@pytest.mark.slow
 def test_derivative_along_a_direction_through_stops_and_reversals_is_that_of_differences(robot):
     """Of energy and path, along a random direction of parameters, times and values of rows at once, to 1e-3."""
     time, mode, values = MANY

@@ -37,6 +37,7 @@ def named(of, name):
     return mode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [0, 1])
 def test_bounce_on_wheels_is_that_of_a_mass_on_two_springs(robot, wheeled, k):
     """k = 1.5 c δ^0.5 at the load F = c δ^1.5 of each wheel; f = sqrt(2 k / m) / 2π."""

@@ -362,7 +362,8 @@ def test_compare_takes_a_table_by_voltage(mmrjax, tmp_path, kind):
 # --- sensitivity --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["bench", pytest.param("wheeled", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["bench", "wheeled"])
 def test_sensitivity_takes_what_a_rig_has(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind, speed=kind == "bench")
     where = ["--motor-speeds", "1000,3000"] if kind == "bench" else ["--voltages", "12,24", "--slopes", "0,5"]

@@ -56,6 +56,7 @@ def table(path):
 # --- the study ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_local_derivatives_are_finite_differences_and_zero_across_configurations(study, robot):
     found = local(study)
     step = 1e-6

@@ -116,6 +116,7 @@ def test_steady_outputs_compile_once_for_other_numbers(robot, compilations):
     assert not compilations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [96, pytest.param(97, marks=pytest.mark.slow)])
 def test_steady_blocks_change_no_number(robot, monkeypatch, size):
     """97 points have no block that divides them, and go together."""
