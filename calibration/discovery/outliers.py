@@ -43,8 +43,8 @@ class Screening:
 
 @contextlib.contextmanager
 def ahead(space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> Iterator[None]:
-    """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit with
-    room for effects, on other cores: what every later one needs is then compiled. What they find is not read."""
+    """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit
+    with room for effects, on other cores: what every later one needs is then compiled. What they find is not read."""
     nothing, none = np.zeros(len(space.coordinates)), empty(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
