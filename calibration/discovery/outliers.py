@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri
 
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
@@ -119,7 +119,7 @@ def screen_beside(
 def _alone(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
     """Indices of rows of which a reading's own shift is less probable than any effect or curve, at most so many."""
     included = base.space.included
-    level = stats.norm.isf(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
+    level = -ndtri(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
     alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
     smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.names(bases)]
     together = max(np.max(np.abs(np.asarray(scores.single))), np.max(np.asarray(scores.curve)[smooth]))
