@@ -77,6 +77,106 @@ def test_normal_equations_solve():
     np.testing.assert_allclose(x, np.linalg.lstsq(a, b)[0], rtol=1e-9)
 
 
+class Bent(eqx.Module):
+    """An observer of rows with residuals a function of four numbers: curved, and with a penalty beyond a line."""
+
+    long: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, robot):
+        x = jnp.linspace(0.0, 1.0, 6)
+        first = robot[0] * jnp.exp(-3 * x * robot[1]) + robot[2]
+        second = jnp.sin(2 * robot[3] * x) + robot[0] * robot[2]
+        used = jnp.full(6, 0.975) + 0.01 * robot[3] * x
+        codes = jnp.zeros(6, int)
+        return problem.Observation(jnp.stack([first, second], 1), used, codes, codes)
+
+
+class Plain(eqx.Module):
+    """Coordinates that are the robot."""
+
+    size: int = eqx.field(static=True, default=4)
+
+    def __len__(self):
+        return self.size
+
+    def robot(self, base, z):
+        return z
+
+
+def alone(posed, members, max_steps):
+    """Each search by itself."""
+
+    def one(member):
+        return fit.levenberg_marquardt(posed, member.start, member.problem(posed).data, max_steps=max_steps)
+
+    return jax.vmap(one)(jax.tree.map(jnp.asarray, members))
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """A small problem, nine searches of it with data and starts of their own, and where each ends by itself."""
+    rng = np.random.default_rng(1)
+    data = problem.data_of(rng.standard_normal((6, 2)), np.full((6, 2), 0.1), 4)
+    measured = rng.standard_normal((9, 6, 2))
+    weight = (rng.random((9, 6, 2)) > 0.1).astype(float)
+    members = fit.Member(rng.standard_normal((9, 4)), weight, measured, 0.1 * rng.standard_normal((9, 4)))
+    posed = problem.Problem(None, Plain(), Bent(), data)
+    return posed, members, eqx.filter_jit(alone)(posed, members, 40)
+
+
+@pytest.mark.parametrize("places", [2, 16])
+def test_searches_do_not_depend_on_those_beside_them(bent, places):
+    """Whatever waits, ends and takes whose place, each search is what it is alone; steps included."""
+    posed, members, (wanted, seen) = bent
+    assert len({*np.asarray(wanted.steps).tolist()}) > 3  # they end at different times
+    found, here = fit.searches_refilled(posed, members, 40, places)
+    np.testing.assert_array_equal(found.steps, wanted.steps)
+    np.testing.assert_allclose(found.z, wanted.z, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.cost, wanted.cost, rtol=1e-9)
+    np.testing.assert_allclose(here.reading, seen.reading, rtol=1e-9, atol=1e-9)
+
+
+def test_steps_are_those_of_another_implementation(bent):
+    """Against `optimistix.LevenbergMarquardt`, evaluation by evaluation, accepted and rejected ones."""
+    import lineax as lx
+    import optimistix as optx
+
+    posed, members, _ = bent
+    solver = optx.LevenbergMarquardt(rtol=fit.TOLERANCE, atol=fit.TOLERANCE, linear_solver=lx.QR())
+    member = jax.tree.map(lambda x: jnp.asarray(x[2]), members)
+    here = member.problem(posed)
+    function = fit.residuals(here, here.data, fit.no_pin(4))
+
+    def theirs(z, _):
+        return function(z), None
+
+    @eqx.filter_jit
+    def both(y, state, at):
+        r, jacobian = function(at.ahead), jax.jacfwd(function)(at.ahead)
+        y, state, _ = solver.step(theirs, y, None, {}, state, frozenset())
+        return (
+            y,
+            state,
+            state.y_eval,
+            solver.terminate(theirs, y, None, {}, state, frozenset())[0],
+            fit.step(at, (r, jacobian, None), fit.TOLERANCE),
+        )
+
+    y = 3 * member.start
+    shape = jax.eval_shape(lambda: function(y))
+    state = solver.init(theirs, y, None, {}, shape, None, frozenset())
+    at, rejected = fit.begun(y, (jnp.zeros(shape.shape), jnp.zeros((shape.shape[0], 4)), None)), 0
+    for _ in range(40):
+        y, state, ahead, ended, at = both(y, state, at)
+        np.testing.assert_allclose(at.y, y, rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(at.ahead, ahead, rtol=1e-6, atol=1e-8)
+        rejected += int(at.rejected > 0)
+        assert bool(at.over) == bool(ended)
+        if ended:
+            break
+    assert bool(at.over) and rejected > 0
+
+
 def test_search_has_its_model_in_one_place_of_its_program(posed):
     """What a search costs to compile is one evaluation of the model with its Jacobian, not one for each use of it."""
 

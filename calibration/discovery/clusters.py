@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtr
 
 #: Fewest outliers that can be a cluster.
 FEWEST = 3
@@ -84,7 +84,7 @@ def _along(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray, seed: i
         null, _ = _fullest(x[drawn], width)
         p = (1 + int(np.sum(null >= count[0]))) / (1 + PERMUTATIONS)
         if p == 1 / (1 + PERMUTATIONS):  # beyond what permutations tell: as of a normal count
-            p = min(p, float(stats.norm.sf((count[0] - null.mean()) / max(null.std(), 0.3))))
+            p = min(p, float(ndtr((null.mean() - count[0]) / max(null.std(), 0.3))))
         inside = x[mine][(x[mine] >= first[0]) & (x[mine] <= first[0] + width)]
         found.append(Cluster(name, float(inside.min()), float(inside.max()), "", int(count[0]), len(mine), p))
     best = min(found, key=lambda c: c.p)
@@ -103,9 +103,11 @@ def _at_levels(name: str, x: np.ndarray, mine: np.ndarray, pool: np.ndarray) -> 
     values = np.unique(x[pool])
     if not 1 < len(values) <= 0.5 * len(pool):
         return []
+    from scipy.stats import hypergeom  # a second to import, and seldom needed
+
     answers = []
     for value in values:
         inside, size = int(np.sum(x[mine] == value)), int(np.sum(x[pool] == value))
-        p = float(stats.hypergeom.sf(inside - 1, len(pool), size, len(mine)))
+        p = float(hypergeom.sf(inside - 1, len(pool), size, len(mine)))
         answers.append(Cluster(name, np.nan, np.nan, str(value), inside, len(mine), min(1.0, p * len(values))))
     return answers

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import stats
+from scipy.special import ndtr
 
 from calibration.discovery import foreseen, menu
 from calibration.discovery.active_set import CandidateSpace
@@ -108,7 +108,7 @@ class Ranked:
     def chances(self) -> np.ndarray:
         """For each pair, that the false one is refuted if either is true."""
         sigma = np.maximum(self.sigma, 1e-9)
-        return stats.norm.cdf((sigma**2 - self.settings.refuted) / (2 * sigma))
+        return ndtr((sigma**2 - self.settings.refuted) / (2 * sigma))
 
 
 @dataclasses.dataclass(frozen=True)

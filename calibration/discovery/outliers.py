@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri
 
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
@@ -43,8 +43,8 @@ class Screening:
 
 @contextlib.contextmanager
 def ahead(space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> Iterator[None]:
-    """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit with
-    room for effects, on other cores: what every later one needs is then compiled. What they find is not read."""
+    """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit
+    with room for effects, on other cores: what every later one needs is then compiled. What they find is not read."""
     nothing, none = np.zeros(len(space.coordinates)), empty(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
@@ -119,7 +119,7 @@ def screen_beside(
 def _alone(base: BaseFit, scores: ScoreTable, bases: Bases, allowed: int, settings: Settings) -> np.ndarray:
     """Indices of rows of which a reading's own shift is less probable than any effect or curve, at most so many."""
     included = base.space.included
-    level = stats.norm.isf(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
+    level = -ndtri(settings.outlier_error / 2 / (base.space.weight.shape[1] * included.sum()))
     alone = (np.abs(np.asarray(scores.row)) * included[:, None]).max(1)
     smooth = [variable not in bases_room.ORDERS for _, variable in bases_room.names(bases)]
     together = max(np.max(np.abs(np.asarray(scores.single))), np.max(np.asarray(scores.curve)[smooth]))

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from calibration.data.errors import BadConfiguration
 from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, Resolved
@@ -114,7 +114,7 @@ def resolve(
         outside=tuple(n for n, p in free.parameters.items() if n in gear and abs(p.shift) > PLAUSIBLE),
         settled=stated.converged and free.converged,
         fall=float(fall),
-        p=float(chi2.sf(max(fall, 0.0), len(gear))),
+        p=float(chdtrc(len(gear), max(fall, 0.0))),
         chi2=(stated.chi_square.value, free.chi_square.value),
         readings=int(np.isfinite(rows.measured()).sum()),
         rms_percent={

@@ -14,7 +14,7 @@ import functools
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy import stats
+from scipy.special import chdtrc, fdtrc, ndtr
 
 from calibration.data.courses import courses
 from calibration.data.runs import DUTY, Runs
@@ -131,7 +131,7 @@ def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
     found = structure(fit, known=known)
     if known and freedom > 0:
-        found.append((float(stats.chi2.sf(chi2, freedom)), "the residuals exceed the stated noise"))
+        found.append((float(chdtrc(freedom, chi2)), "the residuals exceed the stated noise"))
     if not found:
         return Adequacy(None, chi2, freedom, None, "", known)
     p, words = min(found)
@@ -164,9 +164,9 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
         return None
     explained = float(np.sum((directions.T @ np.concatenate([fit.whitened.ravel(), fit.z])) ** 2))
     if known:
-        return float(stats.chi2.sf(explained, terms))
+        return float(chdtrc(terms, explained))
     rest = max(float(fit.chi2.sum()) - explained, 1e-12) / (freedom - terms)
-    return float(stats.f.sf(explained / terms / rest, terms, freedom - terms))
+    return float(fdtrc(terms, freedom - terms, explained / terms / rest))
 
 
 def _families(fit: Residuals) -> dict[str, np.ndarray]:
@@ -213,9 +213,7 @@ def _memory(fit: Residuals) -> tuple[float, str] | None:
         power = float(np.sum(e[ok] ** 2))
         if both.sum() >= 20 and power > 0:
             r = float(np.sum(e[1:][both] * e[:-1][both])) / power
-            found.append(
-                (float(stats.norm.sf(r * np.sqrt(both.sum()))), f"the residuals of {channel.label} remember")
-            )
+            found.append((float(ndtr(-r * np.sqrt(both.sum()))), f"the residuals of {channel.label} remember"))
     if not found:
         return None
     p, words = min(found)
@@ -240,4 +238,4 @@ def _replicates(fit: Residuals) -> tuple[float, str] | None:
     if own < REPLICATES or freedom - own < 1 or pure <= 0:
         return None
     quotient = max(chi2 - pure, 0.0) / (freedom - own) / (pure / own)
-    return float(stats.f.sf(quotient, freedom - own, own)), "the residuals exceed the scatter of repeated runs"
+    return float(fdtrc(freedom - own, own, quotient)), "the residuals exceed the scatter of repeated runs"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtr, chdtrc
 
 from calibration.inference.lack_of_fit import LEVEL, Residuals, structure
 from mmrjax import channels
@@ -34,7 +34,7 @@ def noise_factors(fit: Residuals, level: float = LEVEL) -> dict[str, float]:
         if freedom < 1 or chi2 <= 0:
             continue
         factor = float(np.sqrt(chi2 / freedom))
-        p = stats.chi2.sf(chi2, freedom) if factor > 1 else stats.chi2.cdf(chi2, freedom)
+        p = chdtrc(freedom, chi2) if factor > 1 else chdtr(freedom, chi2)
         if max(factor, 1 / factor) > OFF and p < IMPROBABLE:
             found[channel.name] = factor
     return found

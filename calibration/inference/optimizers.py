@@ -40,6 +40,8 @@ AGREE, SAME = 3, 0.01
 CORES = min(4, os.cpu_count() or 1)
 
 Z = Float[Array, " parameters"]
+#: An array of JAX or NumPy.
+Numbers = Any
 
 
 class Pin(eqx.Module):
@@ -261,15 +263,15 @@ class Member(eqx.Module):
     """What one of many searches of a problem has of its own; a leading axis where there are many.
 
     Attributes:
-        start: where it begins; weight, measured, centre: as of `Data`; active: its effects, see `ActiveSet`, None
-            for those of the problem.
+        start: where it begins, shape (parameters,); weight, measured, centre: as of `Data`; active: its effects, see
+            `ActiveSet`, None for those of the problem.
     """
 
-    start: Z
-    weight: Float[Array, "rows channels"]
-    measured: Float[Array, "rows channels"]
-    centre: Z
-    active: Array | None = None
+    start: Numbers
+    weight: Numbers
+    measured: Numbers
+    centre: Numbers
+    active: Numbers | None = None
 
     def problem(self, problem: Problem) -> Problem:
         """The problem that it is a search of."""
@@ -293,7 +295,7 @@ def _vacant(problem: Problem, members: Member) -> Progress:
 
 @compiled
 def _go_on(
-    problem: Problem, members: Member, fresh: Array, at: Progress, enough: Array, max_steps: int
+    problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: int
 ) -> tuple[Progress, Optimum]:
     """Searches side by side until `enough` of them have ended, those that are `fresh` from their starts."""
     pin = no_pin(members.start.shape[-1])

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtrc
 
 from calibration.data.runs import CONDITIONS, WHEN, Runs
 from calibration.inference.lack_of_fit import CLEAR, Residuals
@@ -383,7 +383,7 @@ def _ratio(basis: np.ndarray, residuals: np.ndarray, total: np.ndarray, freedom:
     terms = basis.shape[1]
     explained = np.sum((basis.T @ residuals) ** 2, 0)
     rest = np.maximum(total - explained, 1e-300) / (freedom - terms)
-    return np.asarray(stats.f.sf(explained / terms / rest, terms, freedom - terms))
+    return np.asarray(fdtrc(terms, freedom - terms, explained / terms / rest))
 
 
 def _orthonormal(columns: np.ndarray, least: float = CLEAR) -> np.ndarray:
@@ -448,7 +448,9 @@ def _ranks(cells: np.ndarray) -> np.ndarray:
     fine = np.isfinite(cells)
     ranks = np.zeros(len(cells))
     if fine.any():
-        ranks[fine] = stats.rankdata(cells[fine]) - (fine.sum() + 1) / 2
+        from scipy.stats import rankdata  # a second to import, and seldom needed
+
+        ranks[fine] = rankdata(cells[fine]) - (fine.sum() + 1) / 2
     return ranks
 
 
@@ -511,8 +513,10 @@ def _reported(whole: _Units, k: int, test: _Comparison, p: float, alike: tuple[s
     words = np.where(words == "", "not stated", words)
     levels: tuple[LevelMean, ...] = ()
     if _numbers(cells):
+        from scipy.stats import spearmanr
+
         fine = np.isfinite(cells)
-        correlation = float(stats.spearmanr(cells[fine], signed[fine]).statistic)
+        correlation = float(spearmanr(cells[fine], signed[fine]).statistic)
     else:
         at = np.array([f"{w} at {c}" if c else w for w, c in zip(words, within, strict=True)])
         keys = sorted(set(zip(within.tolist(), words.tolist(), strict=True)), key=lambda x: (x[0], _place(x[1])))

@@ -16,7 +16,7 @@ from calibration.inference.bases import Bases
 from calibration.inference.details import Detail
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
-from calibration.inference.optimizers import Optimum
+from calibration.inference.optimizers import Numbers, Optimum
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
@@ -236,7 +236,13 @@ class Observer(eqx.Module):
 
     @abc.abstractmethod
     def search(
-        self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
+        self,
+        problem: Problem,
+        starts: Numbers,
+        weights: Numbers,
+        active: Numbers | None = None,
+        *,
+        rivals: bool = False,
     ) -> tuple[Optimum, Observation]:
         """Any number of fits, each to its own weights, and what each says of every row.
 

@@ -32,7 +32,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import backward, cholesky, forward
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
-from calibration.inference.optimizers import Optimum, linearised, searches_long
+from calibration.inference.optimizers import Numbers, Optimum, linearised, searches_long
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
@@ -540,11 +540,17 @@ class Histories(Observer):
         return jnp.stack([cost for cost, _ in found]), jnp.stack([at for _, at in found])
 
     def search(
-        self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
+        self,
+        problem: Problem,
+        starts: Numbers,
+        weights: Numbers,
+        active: Numbers | None = None,
+        *,
+        rivals: bool = False,
     ) -> tuple[Optimum, Observation]:
         """As the protocol says; the runs are compiled once for all steps, and fits go in batches of one size."""
 
-        def batch(starts: Array, weights: Array, active: Array | None) -> tuple[Optimum, Observation]:
+        def batch(starts: Numbers, weights: Numbers, active: Numbers | None) -> tuple[Optimum, Observation]:
             return searches_long(
                 lambda z: _evaluate(problem, z, weights, active),
                 starts,

@@ -21,7 +21,7 @@ from calibration.inference.errors import OF_SIZE, relative_error, sized_error
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Observer, SearchPolicy
-from calibration.inference.optimizers import Member, Optimum, searches_refilled
+from calibration.inference.optimizers import Member, Numbers, Optimum, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities
 from mmrjax.compiling import compiled
@@ -215,8 +215,8 @@ class SettledRuns(Observer):
 
     def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array) -> tuple[Array, Array, Array]:
         """As the protocol says: readings and priors of each table, and its fit. Readings are drawn with their sds,
-        and the bench values too: a prior is a measurement made beforehand. The refit is the search that found the fit,
-        from the truth."""
+        and the bench values too: a prior is a measurement made beforehand. The refit is the search that found
+        the fit, from the truth."""
         data, count = problem.data, len(keys)
         clean = data.measured + data.sd * linear.by_row()  # where a reading counts
         measured, centre = jax.device_get(_drawn(clean, data.sd, z, keys))
@@ -238,12 +238,18 @@ class SettledRuns(Observer):
         return self.linearise(problem, refit, noisy, effects)
 
     def search(
-        self, problem: Problem, starts: Array, weights: Array, active: Array | None = None, *, rivals: bool = False
+        self,
+        problem: Problem,
+        starts: Numbers,
+        weights: Numbers,
+        active: Numbers | None = None,
+        *,
+        rivals: bool = False,
     ) -> tuple[Optimum, Observation]:
         data, count = problem.data, len(starts)
         measured, centre = (np.repeat(np.asarray(x)[None], count, 0) for x in (data.measured, data.centre))
-        starts, weights = np.asarray(starts), np.asarray(weights)
-        members = Member(starts, weights, measured, centre, None if active is None else np.asarray(active))
+        own = np.asarray(starts), np.asarray(weights), measured, centre
+        members = Member(*own, active=None if active is None else np.asarray(active))
         return searches_refilled(problem, members, self.policy.steps, self.places(problem))
 
     def places(self, problem: Problem) -> int:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import stats
+from scipy.special import ndtr
 
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.optimizers import Optimum, Pin, levenberg_marquardt
@@ -150,7 +150,7 @@ def _spread(problem: Problem, draws: np.ndarray) -> np.ndarray:
         for k, name in enumerate(problem.coordinates.names):
             for suffix, (low, high) in SURFACES.items():
                 if name.endswith(suffix):
-                    share = stats.norm.cdf(z[k])
+                    share = ndtr(z[k])
                     z[k] = _coordinate(problem, k, low * (high / low) ** share)
         out.append(_with_sliding(problem, z, 1.0))
     return np.stack(out)
