@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 import itertools
 import os
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.normal_equations import backward, cholesky, forward
 from calibration.inference.problem import MISSING, Data, Observation, Problem
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, SMALL, compiled
 from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
@@ -282,7 +283,7 @@ class Member(eqx.Module):
         return dataclasses.replace(problem, data=data, coordinates=coordinates)
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def _vacant(problem: Problem, members: Member) -> Progress:
     """Searches that have ended before they began, from which nothing is taken."""
 
@@ -293,7 +294,7 @@ def _vacant(problem: Problem, members: Member) -> Progress:
     return jax.vmap(one)(members)
 
 
-@compiled
+@functools.partial(compiled, options=SMALL)
 def _go_on(
     problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: int
 ) -> tuple[Progress, Optimum]:
