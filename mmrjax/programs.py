@@ -72,8 +72,9 @@ class Program:
 class Programs:
     """The programs of a function by the structure of its arguments: those of this process, and those on disk."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any] | None = None) -> None:
+        """Of a function, by these options of the compiler."""
+        self.function, self.options = function, options or {}
         self._found: dict[Any, Future[Program | None]] = {}
         self._lock = threading.Lock()
 
@@ -118,11 +119,14 @@ class Programs:
                 return Program(executable, result)
         result, lowered = self._lowered(leaves, tree)
         text = lowered.as_text()
-        compiled = hashlib.sha256(text.encode()).hexdigest()
+        compiled = hashlib.sha256(f"{sorted(self.options.items())}{text}".encode()).hexdigest()
         executable = _loaded(folder, compiled, len(arrays), result)
         if executable is None:
             with _read_from_cache() as read:
-                executable = lowered.compile()
+                try:
+                    executable = lowered.compile(self.options)
+                except jax.errors.JaxRuntimeError:  # another XLA may not have these options
+                    executable = lowered.compile()
             # One that JAX has read from its cache lacks functions when it is written again (XLA on a CPU), and one
             # that calls back into Python holds addresses of this process.
             if read or "callback" in text:

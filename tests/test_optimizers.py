@@ -165,7 +165,7 @@ def test_steps_are_those_of_another_implementation(bent):
     y = 3 * member.start
     shape = jax.eval_shape(lambda: function(y))
     state = solver.init(theirs, y, None, {}, shape, None, frozenset())
-    at, rejected = fit.begun(y, (jnp.zeros(shape.shape), jnp.zeros((shape.shape[0], 4)), None)), 0
+    at, rejected = fit.begin_at(y, (jnp.zeros(shape.shape), jnp.zeros((shape.shape[0], 4)), None)), 0
     for _ in range(40):
         y, state, ahead, ended, at = both(y, state, at)
         np.testing.assert_allclose(at.y, y, rtol=1e-7, atol=1e-9)

@@ -25,3 +25,9 @@ def test_programs_that_read_other_arguments_are_not_one(folder, others):  # noqa
     for arrays, which in ((pair, 0), (pair, 1), ([pair[0], np.arange(float(others))], 0)):
         arguments = (arrays, which), {}
         np.testing.assert_array_equal(kept.of(arguments)(arguments), 2 * arrays[which])
+
+
+def test_options_that_the_compiler_does_not_have_are_left_out(folder):  # noqa: F811
+    kept = programs.Programs(one_of, {"xla_no_such_option": 1})
+    arguments = ([np.array([1.0, 2.0])], 0), {}
+    np.testing.assert_array_equal(kept.of(arguments)(arguments), [2.0, 4.0])

@@ -20,6 +20,8 @@ from calibration.inference.problem import Observation
 
 #: Fewest rows that a base can be fitted to.
 FEWEST = 4
+#: Difference of the objective of searches that end in one place [½σ²].
+ALIKE = 1e-9
 #: Rise of the objective beyond which a fit with more effects is worse than without [½σ²].
 STUCK = 0.1
 
@@ -122,7 +124,9 @@ def fit_base(space: CandidateSpace, settings: Settings, where: str) -> BaseFit:
     unusable: tuple[int, ...] = ()
     while True:
         found, seen = _base_searches(space, settings)
-        k = int(np.argmin(np.where(np.isfinite(found.cost), found.cost, np.inf)))
+        # The first of those that end in one place: which of them is the lowest is rounding's choice.
+        cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
+        k = int(np.argmax(cost <= np.min(cost) + ALIKE))
         lost = space.bare.observe.unreachable(np.asarray(seen.status[k])) & space.included
         if not lost.any():
             slots = np.zeros(2 * settings.slots)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,7 +25,7 @@ from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.optimizers import CORES
 from calibration.inference.problem import Problem
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, SMALL, compiled
 
 #: Share of a signature's norm below which the free parameters explain it all.
 ABSORBED = 1e-3
@@ -167,7 +168,7 @@ def strongest(scores: ScoreTable, linear: Linearization) -> Statistics:
 Diagnosed = tuple[Linearization, ScoreTable, Statistics]
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def diagnosed(problem: Problem, z: Array, effects: tuple[ScoredEffect, ...], bases: Bases) -> Diagnosed:
     """A fit linearised, what effects and curves could explain of its residual, and the strongest of that."""
     linear = problem.observe.linearise(problem, z, problem.data, effects)
@@ -234,7 +235,7 @@ def beside_columns(
     return found, deviate
 
 
-_score_tests = compiled(score_tests)
+_score_tests = compiled(score_tests, options=SELDOM)
 
 
 def bootstrap(
@@ -271,7 +272,7 @@ def bootstrap(
     return jax.tree.map(lambda x: x[whole.settled], whole)
 
 
-@compiled
+@functools.partial(compiled, options=SMALL)
 def _replicates(
     problem: Problem, linear: Linearization, effects: tuple[ScoredEffect, ...], bases: Bases, drawn: Any
 ) -> Statistics:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import functools
 import itertools
 import os
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.normal_equations import backward, cholesky, forward
 from calibration.inference.problem import MISSING, Data, Observation, Problem
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, SMALL, compiled
 from mmrjax.robot import Robot
 
 #: Predicted decrease of the objective below which a point is an optimum: in ½σ² (the step left is then below
@@ -179,7 +180,7 @@ class Progress(eqx.Module):
     over: Bool[Array, ""]
 
 
-def begun(start: Z, nowhere: tuple[Array, Array, Any]) -> Progress:
+def begin_at(start: Z, nowhere: tuple[Array, Array, Any]) -> Progress:
     """A search that has evaluated nothing yet.
 
     Args:
@@ -228,7 +229,7 @@ def _begin(problem: Problem, start: Z, data: Data) -> Progress:
     rows, count = data.measured.shape
     size, codes = rows * count + rows + start.shape[0], jnp.zeros(rows, int)
     seen = Observation(jnp.zeros((rows, count)), jnp.zeros(rows), codes, codes)
-    return begun(start, (jnp.zeros(size), jnp.zeros((size, start.shape[0])), seen))
+    return begin_at(start, (jnp.zeros(size), jnp.zeros((size, start.shape[0])), seen))
 
 
 def _advance(problem: Problem, at: Progress, data: Data, pin: Pin, max_steps: int) -> Progress:
@@ -282,7 +283,7 @@ class Member(eqx.Module):
         return dataclasses.replace(problem, data=data, coordinates=coordinates)
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def _vacant(problem: Problem, members: Member) -> Progress:
     """Searches that have ended before they began, from which nothing is taken."""
 
@@ -293,7 +294,7 @@ def _vacant(problem: Problem, members: Member) -> Progress:
     return jax.vmap(one)(members)
 
 
-@compiled
+@functools.partial(compiled, options=SMALL)
 def _go_on(
     problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: int
 ) -> tuple[Progress, Optimum]:
@@ -458,7 +459,7 @@ def search_long(
             signed, slope, seen = _linearised(problem, at, data)
             r, jacobian = _counted(signed, slope, data)
         if search is None:
-            search, first = begun(start, jax.tree.map(jnp.zeros_like, (r, jacobian, None))), seen
+            search, first = begin_at(start, jax.tree.map(jnp.zeros_like, (r, jacobian, None))), seen
         search = _stepped(search, (r, jacobian, None))
         accepted, done = bool(search.rejected == 0), bool(search.over)
         if accepted:
@@ -514,7 +515,7 @@ def searches_long(
     """
     starts = jnp.asarray(starts)
     found = evaluate(starts)
-    at = jax.vmap(begun)(starts, jax.tree.map(jnp.zeros_like, found))
+    at = jax.vmap(begin_at)(starts, jax.tree.map(jnp.zeros_like, found))
     over, taken = np.zeros(len(starts), bool), np.zeros(len(starts), int)
     for steps in range(1, max_steps + 1):
         # A step judges what was found where the last one led; what is accepted becomes y.

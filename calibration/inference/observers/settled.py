@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
@@ -24,7 +25,7 @@ from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Member, Numbers, Optimum, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax import balances, channels, fidelities
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.fidelities.steady import operating_signals
@@ -278,7 +279,7 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
     return dict(zip(EQUATIONS, found.T, strict=True))
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def _drawn(clean: Array, sd: Array, z: Array, keys: Array) -> tuple[Array, Array]:
     """Readings and bench values of a table for each key."""
 
