@@ -30,6 +30,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from calibration.data.errors import is_number
+
 RECORD = Path(__file__).resolve().parents[1] / "tests" / "record" / "commands"
 ROBOTINO = Path(__file__).resolve().parents[1] / "docs" / "rigs" / "robotino"
 #: Largest relative difference of numbers: of what is solved, and of what is searched for until little is gained.
@@ -89,10 +91,7 @@ CASES = {
     "size": Case("size aims.toml --starts 16 --no-report", rtol=SEARCHED),
     "rig_check": Case("rig check bench.toml bench.csv --json"),
     "rig_check_robotino": Case("rig check robotino.toml settled.csv --json"),
-    **{
-        f"rig_new_{kind}": Case(f"rig new new_{kind}.toml --kind {kind}")
-        for kind in ("tracked", "wheeled", "bench", "pendulum", "linear")
-    },
+    **{f"rig_new_{kind}": Case(f"rig new new_{kind}.toml --kind {kind}") for kind in KINDS},
 }
 #: Cases that take little, those of `make test`: a rig solved, and files written.
 QUICK = ("simulate_rig", "sweep_rig", "rig_new_bench", "rig_new_tracked")
@@ -184,17 +183,13 @@ def digest(leaves: list[Leaf]) -> dict[str, Any]:
         groups.setdefault(name, []).append(value)
     kept: dict[str, Any] = {"exact": _hash(leaves)}
     for name, values in groups.items():
-        numbers = [v for v in values if _is_number(v)]
-        rest = [None if _is_number(v) else v for v in values]
+        numbers = [v for v in values if is_number(v)]
+        rest = [None if is_number(v) else v for v in values]
         if numbers:
             kept[name] = numbers if len(numbers) <= SHORT else _sums(numbers)
         if len(numbers) < len(values):
             kept[f"{name}, text"] = values[0] if len(values) == 1 and len(str(values[0])) <= 40 else _hash(rest)
     return kept
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _hash(values: Any) -> str:

@@ -29,11 +29,6 @@ def for_equations(x: T) -> T:
     return jax.tree.map(lambda leaf: leaf.for_equations() if _has_more(leaf) else leaf, x, is_leaf=_has_more)
 
 
-def has_tracer(tree: Any) -> bool:
-    """Whether there is a tracer among the leaves."""
-    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
-
-
 #: Options of XLA for programs over a few hundred points: compiled in three quarters of the time, no slower to run.
 SMALL = {"xla_cpu_use_fusion_emitters": False}
 #: The same for programs that run a few times each: compiled in a third of the time, and half as fast.

@@ -13,12 +13,13 @@ from jaxtyping import Array
 
 from mmrjax import energy
 from mmrjax.channels import MM, RPM
-from mmrjax.compiling import compiled, has_tracer
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Run
 from mmrjax.fidelities.mission import TOLERANCE, Mission, Start, Totals, mission
 from mmrjax.params import Scalar
 from mmrjax.profile import Profile
+from mmrjax.programs import has_tracer
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, CUT_OFF
 

@@ -84,7 +84,7 @@ class Programs:
         if not folder or not _keeps():
             return None
         leaves, tree = jax.tree.flatten(arguments)
-        if any(isinstance(x, jax.core.Tracer) for x in leaves):
+        if has_tracer(leaves):
             return None
         try:
             structure = tree, tuple(_shape(x) for x in leaves)
@@ -153,6 +153,11 @@ class Programs:
         # The text names what is on disk: without the arguments that nothing reads, programs of others would be alike.
         lowered = jax.jit(flat, keep_unused=True).lower(*_arrays(leaves))
         return returned[0], lowered
+
+
+def has_tracer(tree: Any) -> bool:
+    """Whether there is a tracer among the leaves."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))
 
 
 def _arrays(leaves: list[Any]) -> list[Any]:

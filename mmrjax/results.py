@@ -16,6 +16,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import History
 from mmrjax.fidelities.mission import Mission
 from mmrjax.params import Scalar
+from mmrjax.programs import has_tracer
 from mmrjax.signals import CODES, STATUSES, Result
 
 if TYPE_CHECKING:
@@ -191,7 +192,7 @@ class Results:
         return self.table()
 
     def __repr__(self) -> str:
-        if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(self)):
+        if has_tracer(self):
             return f"Results of {self.model}, traced"
         return f"Results of {self.model}, {max(self.status.size, 1)} runs\n{self.table()}"
 

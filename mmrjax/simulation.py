@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from mmrjax import channels, fidelities, missions, params, power
-from mmrjax.compiling import compiled, has_tracer
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions, indices
 from mmrjax.errors import UsageError, choices
 from mmrjax.fidelities.base import Fidelity, History, Run
 from mmrjax.fidelities.mission import Start
 from mmrjax.params import Scalar
 from mmrjax.profile import Profile
+from mmrjax.programs import has_tracer
 from mmrjax.results import Results
 from mmrjax.robot import Robot
 from mmrjax.signals import CODES, Result

@@ -18,7 +18,6 @@ from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
 
-steepest, starting = eqx.filter_jit(steepest_slope.compute), eqx.filter_jit(start.compute)
 NAMES = ("motor.resistance", "motor.torque_constant", "6T2A.ground.friction.static", "6T2A.ground.rolling_resistance")
 
 
@@ -62,7 +61,7 @@ def test_table_names_modules_that_compute_them(robot):
 
 @pytest.mark.parametrize("configuration", [0, 1])
 def test_steepest_slope_that_sliding_ends_is_where_adhesion_is_used_up(robot, configuration):
-    found = steepest(robot, asked(configuration, 24.0, slope_deg=17.0, payload=3.0))
+    found = steepest_slope.compute(robot, asked(configuration, 24.0, slope_deg=17.0, payload=3.0))
     ground = robot.configurations.members[configuration].ground
     closed = math.degrees(math.atan(float(ground.friction.static - ground.rolling_resistance)))
     assert float(found["steepest_slope"]) == pytest.approx(closed, abs=1e-9)
@@ -71,7 +70,7 @@ def test_steepest_slope_that_sliding_ends_is_where_adhesion_is_used_up(robot, co
 def test_steepest_slope_that_the_motors_end_is_where_the_robot_comes_to_stand(robot):
     weak = changed(robot, **{"6T2A__ground__friction__static": 2.5})
     conditions = asked(0, 2.0, payload=8.0)
-    found, settled = float(steepest(weak, conditions)["steepest_slope"]), eqx.filter_jit(steady)
+    found, settled = float(steepest_slope.compute(weak, conditions)["steepest_slope"]), eqx.filter_jit(steady)
     status = [
         int(settled(weak, dataclasses.replace(conditions, slope_deg=jnp.asarray(found + d))).status)
         for d in (-1e-6, 1e-6)
@@ -81,10 +80,10 @@ def test_steepest_slope_that_the_motors_end_is_where_the_robot_comes_to_stand(ro
 
 def test_steepest_slope_ends_at_the_limit_and_is_missing_where_the_flat_is_not_held(robot):
     sticky = changed(robot, **{"6T2A__ground__friction__static": 2.5})
-    at = steepest(sticky, asked(0, 33.0))
+    at = steepest_slope.compute(sticky, asked(0, 33.0))
     assert float(at["steepest_slope"]) == steepest_slope.STEEPEST
     icy = changed(robot, **{"6T2A__ground__friction__static": 0.02})
-    none = steepest(icy, asked(0, 24.0))
+    none = steepest_slope.compute(icy, asked(0, 24.0))
     assert np.isnan(none["steepest_slope"]) and int(none["status"]) == SLIDES
 
 
@@ -104,7 +103,7 @@ def test_steepest_slope_derivatives_are_finite_differences(robot, static, voltag
 def test_steepest_slope_of_a_batch_is_that_of_each(robot):
     conditions = Conditions(np.array([0, 1, 0]), np.array([15.0, 24.0, 6.0]), payload=np.array([0.0, 3.0, 8.0]))
     batch = jax.vmap(lambda c: steepest_slope.compute(robot, c))(conditions)
-    each = [steepest(robot, jax.tree.map(lambda x, k=k: x[k], conditions)) for k in range(3)]
+    each = [steepest_slope.compute(robot, jax.tree.map(lambda x, k=k: x[k], conditions)) for k in range(3)]
     np.testing.assert_allclose(batch["steepest_slope"], [float(e["steepest_slope"]) for e in each], rtol=1e-12)
 
 
@@ -114,7 +113,7 @@ CONDITIONS = asked(0, 24.0, slope_deg=5.0, payload=3.0)
 
 
 def test_start_is_that_of_a_run_kept_at_many_instants(robot):
-    found = {k: float(v) for k, v in starting(robot, CONDITIONS).items()}
+    found = {k: float(v) for k, v in start.compute(robot, CONDITIONS).items()}
     times = np.concatenate([np.linspace(0, 0.05, 5000, endpoint=False), np.linspace(0.05, 4.0, 40_000)])
     run = eqx.filter_jit(drive)(robot, CONDITIONS, jnp.asarray(times), tolerance=1e-9)
     current, speed = np.asarray(run.signals.total_current), np.asarray(run.signals.speed)
@@ -139,7 +138,7 @@ def test_start_derivatives_are_finite_differences(robot):
 
 def test_start_of_a_run_that_does_not_settle_has_no_numbers(robot):
     steep = dataclasses.replace(CONDITIONS, slope_deg=jnp.asarray(25.0))
-    found = starting(robot, steep)
+    found = start.compute(robot, steep)
     assert STATUSES[int(found["status"])] == "slides"
     assert all(np.isnan(found[n]) for n in ("peak_current", "time_to_speed", "energy_start"))
 

@@ -117,16 +117,15 @@ def test_steady_outputs_compile_once_for_other_numbers(robot, compilations):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [96, pytest.param(97, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [96, 97])
 def test_steady_blocks_change_no_number(robot, monkeypatch, size):
     """97 points have no block that divides them, and go together."""
     runs = Conditions(*points(size))
     whole = steady_outputs(robot, runs, ("status", *ALL))
     batch = params.replace(robot, {"motor.resistance": jnp.linspace(0.5, 0.9, size)})
     whole_batch = steady_batch(batch, runs)
-    monkeypatch.setattr(
-        room, "BLOCK", 40
-    )  # which is read when a function is traced: these are functions of their own
+    # Read where a function is traced: these are functions of their own.
+    monkeypatch.setattr(room, "BLOCK", 40)
     found = eqx.filter_jit(lambda *of: steady_outputs.__wrapped__(*of, ("status", *ALL)))(robot, runs)
     in_blocks = eqx.filter_jit(lambda *of: steady_batch.__wrapped__(*of))(batch, runs)
     for name, values in whole.items():

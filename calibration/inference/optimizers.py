@@ -249,8 +249,7 @@ def _ended(at: Progress, data: Data, pin: Pin) -> Optimum:
 def levenberg_marquardt(
     problem: Problem, start: Z, data: Data, pin: Pin | None = None, max_steps: int = 100
 ) -> tuple[Optimum, Observation]:
-    """One search, and what the model says where it ended. To be vmapped over
-    starts, data and pins."""
+    """One search, and what the model says where it ended. To be vmapped over starts, data and pins."""
     pin = no_pin(start.shape[0]) if pin is None else pin
     end = jax.lax.while_loop(
         lambda at: ~at.over,
@@ -328,10 +327,11 @@ def searches_refilled(problem: Problem, members: Member, max_steps: int, places:
     """
     count = len(members.start)
     cores = min(CORES, -(-count // places))
-    idle = _vacant(problem, jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members))
+    first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
+    idle = _vacant(problem, first)
 
-    def some(first: int) -> list[tuple[int, Any]]:
-        waiting, ended = list(range(first, count, cores))[::-1], []
+    def some(core: int) -> list[tuple[int, Any]]:
+        waiting, ended = list(range(core, count, cores))[::-1], []
         holds = np.full(places, -1)
         at = idle
         while waiting or (holds >= 0).any():
@@ -349,8 +349,7 @@ def searches_refilled(problem: Problem, members: Member, max_steps: int, places:
         return ended
 
     if cores > 1:  # the program is made once, by a call that takes no step
-        own = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
-        _go_on(problem, own, np.zeros(places, bool), idle, np.asarray(0), max_steps)
+        _go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), max_steps)
     with concurrent.futures.ThreadPoolExecutor(cores) as pool:
         ended = dict(itertools.chain(*pool.map(some, range(cores))))
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))

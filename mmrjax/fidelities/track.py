@@ -21,6 +21,7 @@ from mmrjax.fidelities.rest import STARTS, creeps, direction, unless_slipping, v
 from mmrjax.fidelities.result import mask, result, travels, withhold
 from mmrjax.fidelities.stability import largest_step, refuse
 from mmrjax.params import Scalar
+from mmrjax.programs import has_tracer
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,
@@ -228,7 +229,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")
     if duration < sample or abs(duration / sample - round(duration / sample)) > 1e-6:
         raise ValueError(f"duration: got {duration:g} s; expected a whole number of samples of {sample:g} s")
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((robot, conditions))):
+    if has_tracer((robot, conditions)):
         return  # inside a transformation no number is known
     for name, chassis in robot.configurations.items():
         if not np.all(np.asarray(chassis.inertia) > 0):
