@@ -220,7 +220,7 @@ def one(task: Task) -> dict:
 
 
 def verdict(found) -> dict:
-    """What a `Traced` says."""
+    """What a `LoopStages` says."""
     base = found.screened.base.candidate
     further = {name: plain(getattr(found, name)) for name in FURTHER if getattr(found, name, None) is not None}
     return {
@@ -249,7 +249,7 @@ def judged(kind: str, case: g.Case, runs, found, settings) -> dict:
     """The truth of a case, and what only the truth can judge.
 
     Args:
-        found: what the stages of the loop found, a `Traced`.
+        found: what the stages of the loop found, a `LoopStages`.
     """
     label = case.label
     facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
@@ -342,7 +342,7 @@ def carried_out(case: g.Case, found, settings) -> list[dict]:
     from calibration.discovery import experiments
 
     left = experiments.alternatives(found.best, found.alike)
-    seen = whole = experiments.prospect(found.screened.base.space, left, settings)
+    seen = whole = experiments.predict(found.screened.base.space, left, settings)
     done: dict[str, dict] = {}
     said: list[dict] = []
     while len(seen.names) > 1 and len(said) < EXPERIMENTS:

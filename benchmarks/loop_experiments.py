@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.discovery import experiments, foreseen
+from calibration.discovery import experiments, predicted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Verdict:
         return tuple(n for n in self.chi2 if n not in self.refuted)
 
 
-def among(seen: experiments.Prospect, names: Sequence[str]) -> experiments.Prospect:
+def among(seen: experiments.PredictedReadings, names: Sequence[str]) -> experiments.PredictedReadings:
     """Of these alternatives alone, in their order; the first is the best fit only while that is among them."""
     kept = [k for k, n in enumerate(seen.names) if n in names]
     return dataclasses.replace(
@@ -44,7 +44,7 @@ def among(seen: experiments.Prospect, names: Sequence[str]) -> experiments.Prosp
     )
 
 
-def supported(seen: experiments.Prospect, carried_out: Mapping[str, Mapping[str, Any]]) -> Verdict:
+def supported(seen: experiments.PredictedReadings, carried_out: Mapping[str, Mapping[str, Any]]) -> Verdict:
     """Which alternative the readings of experiments support.
 
     Args:
@@ -52,7 +52,7 @@ def supported(seen: experiments.Prospect, carried_out: Mapping[str, Mapping[str,
         carried_out: experiment → `value` and `sd` of its readings [SI], repeats averaged, in the menu's order;
             NaN for what was not read.
     """
-    spans = foreseen.spans(seen.experiments)
+    spans = predicted.spans(seen.experiments)
     at = np.concatenate([np.arange(len(seen.sd))[spans[name]] for name in carried_out])
     value, sd = (
         np.concatenate([np.asarray(r[what], float) for r in carried_out.values()]) for what in ("value", "sd")

@@ -30,7 +30,7 @@ from measure import machine  # noqa: E402
 
 from calibration.sensitivity import inputs as room  # noqa: E402
 from calibration.sensitivity import sobol  # noqa: E402
-from calibration.sensitivity.methods import by_derivative  # noqa: E402
+from calibration.sensitivity.methods import derivative_bounds  # noqa: E402
 from calibration.sensitivity.model import Model, chosen_outputs  # noqa: E402
 from calibration.sensitivity.result import Points  # noqa: E402
 from calibration.sensitivity.study import Study  # noqa: E402
@@ -222,7 +222,7 @@ def table8(repeats: int) -> dict[str, Any]:
     for _ in range(repeats + 1):
         study = Study(robot, inputs, points, chosen_outputs((), robot))
         began = time.perf_counter()
-        by_derivative(study, moving, 0)
+        derivative_bounds(study, moving, 0)
         times.append(time.perf_counter() - began)
     record = {"points": len(points), "inputs": len(inputs), "gradients": study.evaluations}
     record |= {"first_s": times[0], "best_s": min(times[1:]), "median_s": float(np.median(times[1:]))}

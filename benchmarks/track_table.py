@@ -243,7 +243,7 @@ def pose(what: str) -> tuple[Posed, Robot, Runs]:
     table = read("measured")
     if what == "slip":
         table = table.where(table["configuration"] == "6T2A")
-    robot = own_mass.weighed(robots.nominal(), read("measured"))
+    robot = own_mass.with_table_mass(robots.nominal(), read("measured"))
     if what == "slip":
         robot = params.replace(robot, {"6T2A.track.guide_friction": 0.06})
         names, stated = FRICTION + GEAR, {}
@@ -434,7 +434,7 @@ def lumped_slip(arguments: argparse.Namespace) -> None:
 def timed(arguments: argparse.Namespace) -> dict[str, Any]:
     """How long one generation of gears over all twenty rows takes, wheeled ones by the track model too."""
     table = read("measured")
-    robot = own_mass.weighed(params.replace(robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table)
+    robot = own_mass.with_table_mass(params.replace(robots.nominal(), {"6T2A.track.guide_friction": 0.06}), table)
     coordinates = priors.coordinates(robot, FRICTION + GEAR, any_surface=True)
     conditions = table.conditions(robot)
     data = data_of(table.measured(), SettledRuns.sizes(table), len(coordinates))

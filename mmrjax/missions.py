@@ -186,14 +186,16 @@ def batch(
         start: that all begin in; history: whether the missions over time are kept, see `parts`.
     """
     if not history:
-        return together(robot, conditions, profile, start, 0)
+        return simulate_batch(robot, conditions, profile, start, 0)
     if has_tracer((robot, conditions, profile, start)):
-        return together(robot, conditions, profile, start, _room(profile))
-    found = list(parts(robot, conditions, profile, start))
+        return simulate_batch(robot, conditions, profile, start, _room(profile))
+    found = list(simulate_in_parts(robot, conditions, profile, start))
     return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
-def parts(robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None) -> Iterator[Mission]:
+def simulate_in_parts(
+    robot: Robot, conditions: Conditions, profile: Profile, start: Start | None = None
+) -> Iterator[Mission]:
     """Missions of a batch of runs, kept over time, some runs after others, so that all their steps fit into memory.
 
     Where a mission has taken more steps than there was room for it is simulated again with more room, up to
@@ -205,7 +207,7 @@ def parts(robot: Robot, conditions: Conditions, profile: Profile, start: Start |
         size = max(1, min(runs, MOST_KEPT // keep))
         rows = np.minimum(np.arange(first, first + size), runs - 1)  # the last ones stand for the last run again
         some = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
-        found = jax.device_get(together(robot, some, _rows_of(profile, rows), start, keep))
+        found = jax.device_get(simulate_batch(robot, some, _rows_of(profile, rows), start, keep))
         steps = int(np.max(found.steps - found.rejected))
         if steps > keep and keep < MOST_KEPT:
             keep = min(MOST_KEPT, _power(steps))
@@ -227,7 +229,7 @@ def _rows_of(profile: Profile, rows: np.ndarray) -> Profile:
 
 
 @compiled
-def together(
+def simulate_batch(
     robot: Robot,
     conditions: Conditions,
     profile: Profile,

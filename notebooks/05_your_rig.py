@@ -82,7 +82,7 @@ print(
 # priors of effects are brought to the rig's size first.
 
 # %%
-separated = surfaces.separated(rig, runs)
+separated = surfaces.with_surface_configurations(rig, runs)
 library = library_for(separated, runs.conditions(separated), effects.BY_NAME)
 with_slip = dataclasses.replace(rig, effects=(library["nonlinear_slip"](amplitude=jnp.asarray(0.5)),))
 found = calibration.calibrate(runs, with_slip, **options)

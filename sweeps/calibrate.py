@@ -11,9 +11,9 @@ from calibration.inference.calibrate import calibrate as run
 from calibration.inference.result import CalibrationResult
 from sweeps import config as configuration
 from sweeps import words
+from sweeps.capabilities import is_rig
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
-from sweeps.own import is_rig
 from sweeps.report import rms
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
 
@@ -71,7 +71,7 @@ def print_calibration(found: CalibrationResult) -> None:
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
     if is_rig(found.robot):
-        say(words.said_rms(rms(found.rows(), found.channels, ("before", "after", "held_out"))))
+        say(words.describe_rms(rms(found.rows(), found.channels, ("before", "after", "held_out"))))
     say(found.starts.statement())
     for note in found.notes:
         say(f"- {note}")

@@ -45,7 +45,7 @@ PROBED = 64
 NOTHING_SPECIAL = How()
 
 
-def campaign(
+def store_sweep(
     config: Campaign | Sweep,
     where: str,
     out: Path | None,

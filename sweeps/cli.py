@@ -287,7 +287,7 @@ def sweep(
         stored = _prepared(config_campaign.resolve_campaign(file, options), no_cache)
         from sweeps import campaign
 
-        return campaign.campaign(stored, where, out, force, how, wanted)
+        return campaign.store_sweep(stored, where, out, force, how, wanted)
     resolved = _prepared(config.resolve(config.Sweep, file, options), no_cache)
     from sweeps import sweep as room
 

@@ -34,7 +34,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
     robot = load_robot(config)
     stated = runs = read_runs(source, robot, measured=True)
-    robot = instruments.as_read(robot, runs)
+    robot = instruments.with_inferred_instruments(robot, runs)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     said = check_ranges(runs, robot)

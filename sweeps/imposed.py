@@ -9,7 +9,7 @@ import numpy as np
 from calibration.data.errors import BadConfiguration
 from mmrjax.channels import RPM
 from mmrjax.robot import Robot
-from sweeps import own
+from sweeps import capabilities
 
 #: A limit from which on there is none (`robots.blank`).
 UNLIMITED = 1e8
@@ -96,7 +96,7 @@ def check_battery(robot: Robot) -> None:
         raise BadConfiguration(
             "--battery: the motors' speed is imposed on this robot, whatever feeds them; leave it out"
         )
-    if not own.battery(robot):
+    if not capabilities.battery(robot):
         raise BadConfiguration("--battery: the robot's file states no battery; add [battery], or state --voltage")
 
 

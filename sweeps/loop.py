@@ -16,9 +16,9 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks, priors
 from sweeps import config as configuration
 from sweeps import words
+from sweeps.capabilities import is_rig
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
-from sweeps.own import is_rig
 from sweeps.report import rms
 from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
 
@@ -67,10 +67,10 @@ def print_discovery(found: DiscoveryResult) -> None:
     say(f"{found.verdict}: {found.statement}")
     if found.robot.on_shaft and found.verdict != "none":
         say("The balance track of a shaft is what its load loses.")
-    for said in (findings.said_standing(found), findings.said_ruled_out(found)):
+    for said in (findings.describe_standing(found), findings.describe_ruled_out(found)):
         if said:
             say(said)
-    rise = preference.said_worse(found.held_out_worse, found.errors_held_out)
+    rise = preference.describe_worse(found.held_out_worse, found.errors_held_out)
     if rise:
         say(rise)
     if found.effects:
@@ -87,7 +87,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(shown)
         say("explains: rise of χ² without it, all else fitted again; own p: among the strongest of the library")
     if found.hidden:
-        say(findings.said_hidden(found))
+        say(findings.describe_hidden(found))
     if found.unnamed is not None:
         say(f"{found.unnamed.proposal.formula} ({found.unnamed.proposal.mark})")
     if found.resolved is not None:
@@ -113,7 +113,7 @@ def print_discovery(found: DiscoveryResult) -> None:
     say(errors)
     if is_rig(found.robot):
         say(
-            words.said_rms(
+            words.describe_rms(
                 rms(found.rows_table(), found.channels, ("before", "after", "held_out_before", "held_out_after"))
             )
         )

@@ -22,8 +22,8 @@ from mmrjax.missions import JOULE_PER_WH
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
+from sweeps import capabilities, imposed, run, words
 from sweeps import config as configuration
-from sweeps import imposed, own, run, words
 from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run, read_runs
 from sweeps.missions_result import Missions
@@ -81,9 +81,9 @@ def simulate(
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         found = simulated(robot, runs, source, config)
-        folder.write_table("segments.csv", own.of(robot, found.segments))
-        folder.write_table("history.csv", own.of(robot, found.course))
-        print_missions(found, own.idle_columns(robot))
+        folder.write_table("segments.csv", capabilities.of(robot, found.segments))
+        folder.write_table("history.csv", capabilities.of(robot, found.course))
+        print_missions(found, capabilities.idle_columns(robot))
         if config.report:
             from sweeps import report_mission
 
@@ -158,7 +158,7 @@ def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: co
     courses: list[dict[str, np.ndarray]] = []
     done, whole = 0, True
     with progress(len(runs), quiet=False) as advance:
-        for found in missions.parts(robot, conditions, profile, source.start):
+        for found in missions.simulate_in_parts(robot, conditions, profile, source.start):
             count = len(found.steps)
             own = slice(done, done + count)
             at = jax.tree.map(lambda x, own=own: x[own], conditions)

@@ -11,8 +11,8 @@ from calibration.data.errors import BadConfiguration
 from mmrjax import render as pictures
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import STATUSES
+from sweeps import capabilities, imposed, run, words
 from sweeps import config as configuration
-from sweeps import imposed, own, run, words
 from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run
 from sweeps.store import DONE, SOME_NOT_CONVERGED
@@ -39,7 +39,7 @@ def render(
     imposed.check_on_ground(robot, "render")
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
-    if robot.rig.blank and not own.stated(robot, "running_gear."):
+    if robot.rig.blank and not capabilities.stated(robot, "running_gear."):
         tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     with progress(1, quiet=False) as advance:
         told = run.shares(advance, 1)

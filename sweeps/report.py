@@ -14,7 +14,7 @@ import numpy as np
 
 from mmrjax import __version__, channels, params
 from mmrjax.channels import Channel
-from sweeps import own, words
+from sweeps import capabilities, words
 from sweeps.figures_style import style, svg
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def named(robot: Robot, robot_name: str) -> dict[str, Any]:
 
     name = Path(robot_name).name
     if robot.rig.blank:
-        return {"robot": name, "changed": [], "own": own.parameters(robot, robot_name)}
+        return {"robot": name, "changed": [], "own": capabilities.parameters(robot, robot_name)}
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
         name = f"{name}, changed"
     return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]()), "own": []}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
-from sweeps import figures_calibration, figures_clusters, figures_comparison, own
+from sweeps import capabilities, figures_calibration, figures_clusters, figures_comparison
 from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
 
@@ -28,7 +28,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
     if found.axis:
         album.add("histories", lambda: figures_calibration.histories(table, found.channels))
     along = {found.axis: "time [s]"} if found.axis else {}
-    sized = own.is_rig(found.robot)
+    sized = capabilities.is_rig(found.robot)
     album.add("parity", lambda: figures_comparison.parity(table, found.channels, band=not sized))
     album.add("residuals", lambda: figures_comparison.errors_over(table, found.channels, sized, along))
     if found.residual_clusters:

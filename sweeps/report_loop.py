@@ -10,7 +10,7 @@ import numpy as np
 from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from sweeps import figures_clusters, figures_loop, own
+from sweeps import capabilities, figures_clusters, figures_loop
 from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
 Section = Callable[[Album, DiscoveryResult], None]
@@ -19,7 +19,7 @@ Section = Callable[[Album, DiscoveryResult], None]
 def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
     """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
     table = found.rows_table()
-    if own.is_rig(found.robot):
+    if capabilities.is_rig(found.robot):
         table["configuration"] = found.runs.configurations_named(found.robot)
     return table
 
@@ -27,7 +27,7 @@ def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
 def _run_by_run(album: Album, found: DiscoveryResult) -> None:
     table = rows_of(found)
     album.add("before_after", lambda: figures_loop.before_after(table, found.channels, found.verdict))
-    album.add("defects", lambda: figures_loop.defects(table, found.verdict, own.is_rig(found.robot)))
+    album.add("defects", lambda: figures_loop.defects(table, found.verdict, capabilities.is_rig(found.robot)))
 
 
 def _over_time(album: Album, found: DiscoveryResult) -> None:
@@ -59,7 +59,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         The path of the page.
     """
     album = Album(Path(folder))
-    table, sized = rows_of(found), own.is_rig(found.robot)
+    table, sized = rows_of(found), capabilities.is_rig(found.robot)
     SECTIONS[type(found.detail)](album, found)
     if found.residual_clusters:
         album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
@@ -78,12 +78,12 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         of_channels=found.channels,
         title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
         document=found.to_json(),
-        p=findings.said_p(found.before.p_value),
+        p=findings.describe_p_value(found.before.p_value),
         cluster=str(found.cluster or ""),
-        standing=findings.said_standing(found),
-        ruled_out=findings.said_ruled_out(found),
+        standing=findings.describe_standing(found),
+        ruled_out=findings.describe_ruled_out(found),
         alike=alike(found),
-        worse=preference.said_worse(found.held_out_worse, found.errors_held_out),
+        worse=preference.describe_worse(found.held_out_worse, found.errors_held_out),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
         columns=columns(found.channels),

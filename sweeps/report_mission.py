@@ -9,7 +9,7 @@ import numpy as np
 
 from mmrjax import missions
 from mmrjax.signals import FLAGS
-from sweeps import figures_mission, own, words
+from sweeps import capabilities, figures_mission, words
 from sweeps.imposed import UNLIMITED
 from sweeps.report import ROWS, Album, named, render, statuses
 from sweeps.report_runs import labels
@@ -35,8 +35,8 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
     runs, source = found.table, found.source
     first = {key: value[0] for key, value in runs.items()}
     name = found.segments["run_id"][0]
-    rows = {key: value[found.course["run_id"] == name] for key, value in own.of(robot, found.course).items()}
-    idle = own.idle_columns(robot)
+    rows = {key: value[found.course["run_id"] == name] for key, value in capabilities.of(robot, found.course).items()}
+    idle = capabilities.idle_columns(robot)
     limit = float(robot.motor.temperature_limit)
     cycle = float(source.time[-1] - source.time[0]) if source.cycles > 1 else None
     on_battery = bool(np.isfinite(first["state_of_charge"]))
@@ -64,7 +64,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
         returned=max(float(first["energy_returned_Wh"]), 0.0),
         kept=len(rows["time_s"]),
         whole=found.whole,
-        heat=own.thermal(robot),
+        heat=capabilities.thermal(robot),
         travels="distance_m" not in idle,
         **named(robot, robot_name),
     )  # fmt: skip
@@ -112,7 +112,8 @@ def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         {"words": words, "value": f"{value:.{digits}f} {unit}", "limit": f"{limit:.{digits}f} {unit}",
          "percent": 100 * value / limit}
         for words, value, limit, unit, digits in asked
-        if np.isfinite(value) and limit < UNLIMITED and not (words == "hottest winding" and not own.thermal(robot))
+        if np.isfinite(value) and limit < UNLIMITED
+        and (words != "hottest winding" or capabilities.thermal(robot))
     ]  # fmt: skip
     low, cutoff = float(run["cell_low_V"]), float(battery.voltage_cutoff)
     if np.isfinite(low):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax.channels import MM, RPM
-from sweeps import figures_power, own, words
+from sweeps import capabilities, figures_power, words
 from sweeps.imposed import UNLIMITED
 from sweeps.report import Album, columns, conditions, first_rows, label, named, render, statuses
 
@@ -58,7 +58,7 @@ def write(
         picked = {key: value[chain] for key, value in runs.items()}
         album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain], robot.on_shaft))
     single = len(names) == 1
-    shown = own.of(robot, runs)
+    shown = capabilities.of(robot, runs)
     return render(
         folder,
         "runs.html.j2",
@@ -75,7 +75,7 @@ def write(
         columns=columns(robot.channels),
         about=conditions(runs, mass=True),
         further={c: about for c, about in FURTHER.items() if c in shown},
-        heat=own.thermal(robot),
+        heat=capabilities.thermal(robot),
         on_shaft=robot.on_shaft,
         **known,
         **named(robot, robot_name),
@@ -127,7 +127,7 @@ def _histories(
 
 def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
     """How much of each limit a run uses: words, its value, the limit, and the share of it [%]."""
-    idle = own.idle_columns(robot)
+    idle = capabilities.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
     rpm = RPM
     shaft = float(run["theoretical_speed_mm_s"]) * MM / radius * float(robot.gearbox.ratio) / rpm

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mmrjax.channels import Channel
-from sweeps import figures_sweep, own, words
+from sweeps import capabilities, figures_sweep, words
 from sweeps.report import Album, named, render, statuses
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Tabl
         of_channels=robot.channels,
         title=f"Sweep of {len(runs['status'])} runs",
         model=model,
-        counts=counts(own.of(robot, runs), robot.channels),
+        counts=counts(capabilities.of(robot, runs), robot.channels),
         volts_drawn=_drawn(runs),
         **named(robot, robot_name),
     )

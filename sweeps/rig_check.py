@@ -257,7 +257,7 @@ def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> Rig
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    robot = instruments.as_read(robot, runs)
+    robot = instruments.with_inferred_instruments(robot, runs)
     return dataclasses.replace(found, robot=robot, runs=runs, shown=_shown(runs, data), foresight=seen)
 
 

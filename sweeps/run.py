@@ -18,8 +18,8 @@ from mmrjax.fidelities.base import Run
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
+from sweeps import capabilities, words
 from sweeps import config as configuration
-from sweeps import own, words
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress as bar
 from sweeps.console import say
@@ -182,7 +182,7 @@ def leave(
     Args:
         folder: of the command; config: its configuration, with the robot's name.
     """
-    folder.write_table("runs.csv", own.of(result.robot, result.table))
+    folder.write_table("runs.csv", capabilities.of(result.robot, result.table))
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
     robot_file.write(result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
     folder.write_json("result.json", result.to_json())

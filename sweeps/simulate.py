@@ -19,8 +19,8 @@ from mmrjax.fidelities.base import History, Run
 from mmrjax.fidelities.result import result
 from mmrjax.robot import Robot
 from mmrjax.signals import BATTERY_EMPTY, STATUSES
+from sweeps import capabilities, run, uncertainty, words
 from sweeps import config as configuration
-from sweeps import own, run, uncertainty, words
 from sweeps.console import progress, say
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.store import RunFolder, open_folder
@@ -62,7 +62,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             table |= found.columns
-        print_runs({key: value[:_SHOWN] for key, value in own.of(robot, table).items()}, robot.channels)
+        print_runs({key: value[:_SHOWN] for key, value in capabilities.of(robot, table).items()}, robot.channels)
         for note in notes:
             say(note)
         if found is not None:
@@ -99,7 +99,7 @@ def _simulated(
         batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
         told(1.0)
     assert batch.history is not None  # the fidelity was asked for it
-    folder.write_table("history.csv", own.of(robot, history_table(robot, batch.history, runs)))
+    folder.write_table("history.csv", capabilities.of(robot, history_table(robot, batch.history, runs)))
     if batch.history.reactions is not None:
         folder.write_table("reactions.csv", reactions_table(batch.history, runs))
     return {**run.conditions(robot, runs), **over_time(robot, batch)}, batch
@@ -177,7 +177,7 @@ def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
                 f"{name}winding_hot: {limit:g} °C are reached after {float(times[k]):.3g} s at this "
                 f"current, from {ambient:g} °C"
             )
-        if np.isinf(table["winding_settled_C"][k]) and own.thermal(robot):
+        if np.isinf(table["winding_settled_C"][k]) and capabilities.thermal(robot):
             current = float(amperes(robot, table)[k])
             said.append(
                 f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "

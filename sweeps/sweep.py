@@ -36,7 +36,7 @@ def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool
 
         tell(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; the same "
              "command with --export csv writes it too")  # fmt: skip
-        return campaign.campaign(stated, where, out, force)
+        return campaign.store_sweep(stated, where, out, force)
     for note in notes:
         tell(note)
     runs = grid(config, robot, config.battery)

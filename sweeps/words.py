@@ -115,7 +115,7 @@ _FITS = {
 }  # fmt: skip
 
 
-def said_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
+def describe_rms(rms: Mapping[str, Mapping[str, float]]) -> str:
     """rms errors in the units of their channels, in a line; by fit and channel."""
     units = {c.name: (c.label, c.unit) for c in channels.EVERY}
     parts = [

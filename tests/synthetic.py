@@ -15,7 +15,7 @@ from calibration.data.runs import read as read_runs
 from calibration.discovery import discover
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, fit_base
-from calibration.discovery.discover import Traced
+from calibration.discovery.discover import LoopStages
 from calibration.discovery.outliers import Screening, screen
 from calibration.discovery.result import DiscoveryResult
 from calibration.discovery.settings import Settings, settings_for
@@ -65,7 +65,7 @@ class Analyst:
         """The base fitted to a table, rows that stand alone set aside."""
         return screen(self.base(runs), lambda base: discover.bases_at(runs, base), runs, self.settings)
 
-    def trace(self, runs: Runs) -> Traced:
+    def trace(self, runs: Runs) -> LoopStages:
         """The stages of the loop up to its verdict."""
         return discover.trace(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
 
@@ -74,7 +74,7 @@ class Analyst:
         return discover.discover_at(runs, robots.nominal(), known(runs), self.settings, self.stated, self.library)
 
 
-def parts(runs: Runs, traced: Traced) -> SimpleNamespace:
+def parts(runs: Runs, traced: LoopStages) -> SimpleNamespace:
     """What tests of the stages ask for, under short names."""
     base = traced.screened.base
     return SimpleNamespace(

@@ -14,7 +14,7 @@ from test_generator import SHAPES
 
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
-from calibration.discovery import experiments, foreseen, menu
+from calibration.discovery import experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
@@ -44,7 +44,7 @@ def conditions(made):
 CLIMBING = params.replace(robots.nominal(), g.CLIMBING)
 REACH = reach(CLIMBING, conditions(g.table8()), channels.USUAL)
 MENU = menu.menu(REACH)
-SPANS, BY = foreseen.spans(MENU), {e.name: e for e in MENU}
+SPANS, BY = predicted.spans(MENU), {e.name: e for e in MENU}
 SETTINGS = SETTLED.settings
 
 
@@ -55,7 +55,7 @@ SETTINGS = SETTLED.settings
 def shown():
     """Readings of the whole menu, and which exist, for constants and a term of the generator."""
     full = dataclasses.replace(CLIMBING, effects=tuple(BY_NAME[name]() for name in g.LIBRARY))
-    read, batch = eqx.filter_jit(foreseen.readings), foreseen.batch(MENU, channels.USUAL)
+    read, batch = eqx.filter_jit(predicted.readings), predicted.batch(MENU, channels.USUAL)
 
     def of(p, term=None):
         values = dict(p)
@@ -91,7 +91,9 @@ def test_agreement_can_fail(shown):
 
 def test_menu_and_generator_have_the_same_instruments():
     case = g.Case({}, {}, g.conditions(0, 1, 0, 0), g.CLIMBING, (), g.Instruments())
-    sd = foreseen.sds(MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True)))
+    sd = predicted.sds(
+        MENU, dict(zip(channels.USUAL, case.instruments.stated * [1.0, np.pi / 30, 1e-3], strict=True))
+    )
     for name, at in SPANS.items():
         np.testing.assert_allclose(case.carry_out(BY[name], 0)["sd"], sd[at], err_msg=name)
 
@@ -116,7 +118,7 @@ def seen():
         start = np.zeros(len(space.coordinates))
         fitted = fit_candidates(space, [(filled([name], SETTINGS), start) for name in pair], SETTINGS)
         answers[pair] = case, space, dict(zip(pair, fitted, strict=True))
-    return {p: (c, space, f, experiments.prospect(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
+    return {p: (c, space, f, experiments.predict(space, f, SETTINGS)) for p, (c, space, f) in answers.items()}
 
 
 @pytest.mark.slow
@@ -136,7 +138,7 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
 def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
     name = experiments.choose(foreseen).name
-    done = next(e for e in foreseen.experiments if e.name == name)
+    done = next(e for e in predicted.experiments if e.name == name)
     verdicts = [supported(foreseen, {name: case.carry_out(done, seed)}) for seed in range(10)]
     assert sum(v.resolved and v.best == pair[0] for v in verdicts) >= 8
     assert all(pair[0] in v.left for v in verdicts)
@@ -151,7 +153,9 @@ def foreseeing(sigma):
         value[:, SPANS[name].start] = at
     names = tuple("abcdefgh"[:members])
     half = np.zeros((members, readings, 1))
-    return experiments.Prospect(names, MENU, value, half, np.ones(readings), np.ones(readings, bool), SETTINGS)
+    return experiments.PredictedReadings(
+        names, MENU, value, half, np.ones(readings), np.ones(readings, bool), SETTINGS
+    )
 
 
 def test_less_effort_is_preferred_where_more_sigmas_are_no_gain():
@@ -222,7 +226,7 @@ def test_a_second_experiment_that_adds_nothing_is_not():
 def test_alternatives_that_agree_give_none(seen):
     _, space, fitted, _ = seen["series_resistance", "supply_sag"]
     same = next(iter(fitted.values()))
-    proposal = experiments.choose(experiments.prospect(space, {"one": same, "the other": same}, SETTINGS))
+    proposal = experiments.choose(experiments.predict(space, {"one": same, "the other": same}, SETTINGS))
     assert proposal.name == experiments.NONE
     assert proposal.expected_sigma == 0 and proposal.separates == ()
 
@@ -414,7 +418,7 @@ def test_only_levels_that_the_robot_manages_are_left():
 
 def test_steepest_slope_is_one_that_the_robot_climbs():
     slippery = params.replace(CLIMBING, {f"{c}.ground.friction.static": 0.40 for c in ("6T2A", "4W2T")})
-    found = eqx.filter_jit(foreseen.readings)(slippery, foreseen.batch(MENU, channels.USUAL))
+    found = eqx.filter_jit(predicted.readings)(slippery, predicted.batch(MENU, channels.USUAL))
     first = 0
     for run in runs_of(MENU):
         rows = slice(first, first := first + len(run.voltage))
@@ -469,12 +473,12 @@ def test_unknown_experiments_are_refused_with_the_choices():
 def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
     _, space, fitted, free = seen["series_resistance", "supply_sag"]
     barred = dataclasses.replace(SETTINGS, forbidden=("stall", "one motor", "4W2T"))
-    left = experiments.prospect(space, fitted, barred)
+    left = experiments.predict(space, fitted, barred)
     assert not {"stall", "one motor", "4W2T"} & {k for e in left.experiments for k in e.kinds}
     assert {e.name for e in left.experiments} < {e.name for e in free.experiments}
-    assert left.value.shape[1] == sum(foreseen.size(e) for e in left.experiments) == len(left.sd)
+    assert left.value.shape[1] == sum(predicted.size(e) for e in left.experiments) == len(left.sd)
     everything = dataclasses.replace(SETTINGS, forbidden=menu.KINDS)
-    nothing = experiments.choose(experiments.prospect(space, fitted, everything))
+    nothing = experiments.choose(experiments.predict(space, fitted, everything))
     assert nothing.name == experiments.NONE and "forbidden or beyond reach" in nothing.description
 
 

@@ -68,9 +68,9 @@ def test_what_the_data_do_not_narrow_is_held(seed, parameters, readings, dead, a
 def test_rule_is_a_ratio_of_sds_and_holds_what_is_not_known():
     assert HELD == 0.9
     np.testing.assert_array_equal(held_by_prior(np.array([0.0, 0.71, 0.9, 0.90001, 1.0, np.nan, np.inf])), [0, 0, 0, 1, 1, 1, 1])  # fmt: skip
-    assert identifiability.said_held([]) == []
-    assert identifiability.said_held(["a"]) == ["held by its prior (posterior sd above 0.9 of the prior's): a"]
-    assert identifiability.said_held(["a", "b"])[0].startswith("held by their priors (")
+    assert identifiability.describe_held([]) == []
+    assert identifiability.describe_held(["a"]) == ["held by its prior (posterior sd above 0.9 of the prior's): a"]
+    assert identifiability.describe_held(["a", "b"])[0].startswith("held by their priors (")
 
 
 def stated(noise):

@@ -41,7 +41,7 @@ def traced():
 def unnamed():
     """Their result; made once for all files."""
     found, runs = traced()
-    return discover.finished(found, runs, None, FEW.settings, FEW.library, lambda text: None)
+    return discover.assemble_result(found, runs, None, FEW.settings, FEW.library, lambda text: None)
 
 
 #: Who looks, and at which runs.

@@ -90,7 +90,7 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
     best = min((a["rise_chi2"] for a in d["implausible"]), default=0.0)
     assert best > -d["settings"]["same"] or "ruled out by size or sign alone" in got.page.text
     # one family-wise p on all of the page, each effect with a p of its own that is no larger than is allowed
-    p = findings.said_p(got.found.before.p_value)
+    p = findings.describe_p_value(got.found.before.p_value)
     assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["statement"]
     for e in got.found.effects:
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
@@ -226,11 +226,11 @@ def test_names_say_what_would_explain_more_than_they():
         return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
 
     near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert findings.said_ruled_out(of("named", near)) == "" == findings.said_ruled_out(of("unnamed"))
-    assert findings.said_ruled_out(of("class", near, better)) == (
+    assert findings.describe_ruled_out(of("named", near)) == "" == findings.describe_ruled_out(of("unnamed"))
+    assert findings.describe_ruled_out(of("class", near, better)) == (
         "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
     )
-    assert findings.said_ruled_out(of("unnamed", better, near)).startswith(
+    assert findings.describe_ruled_out(of("unnamed", better, near)).startswith(
         "a would explain as much as the curve, but is"
     )
 

@@ -113,7 +113,7 @@ def random_robot(robot):
 def followed():
     def one(robot, keep=KEEP):
         at = mm.Conditions(configuration=np.array([0]), battery=np.array([1.0]))
-        found = jax.device_get(missions.together(robot, at, HOUR, None, keep))
+        found = jax.device_get(missions.simulate_batch(robot, at, HOUR, None, keep))
         return jax.tree.map(lambda x: x[0], found)
 
     return one

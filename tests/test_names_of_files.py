@@ -23,7 +23,7 @@ import pytest
 from calibration.data import columns
 from mmrjax import channels, derived, missions, outputs, requirements
 from mmrjax.fidelities.resonance import SIGNALS
-from sweeps import cli, config, export, own
+from sweeps import capabilities, cli, config, export
 
 #: Ends of names, and the unit of each.
 UNITS = {
@@ -256,14 +256,19 @@ def test_options_are_called_as_what_they_state():
 
 
 def test_columns_that_a_rig_may_lack_and_those_of_exports_are_known():
-    lists = {*own.OF_GROUND, *own.OF_TRAVEL, *own.OF_HEAT, *(column for column, _ in export.COLUMNS.values())}
+    lists = {
+        *capabilities.OF_GROUND,
+        *capabilities.OF_TRAVEL,
+        *capabilities.OF_HEAT,
+        *(column for column, _ in export.COLUMNS.values()),
+    }
     assert {n for n in lists if END.search(n) and not known(n, {*registries(), *MORE})} == set()
     of_heat = {
         n
         for n in registries()
         if re.match(r"(winding|housing)_", n) and n in (*missions.names(), "winding_settled_C")
     }
-    assert of_heat <= set(own.OF_HEAT)
+    assert of_heat <= set(capabilities.OF_HEAT)
 
 
 def test_an_unknown_name_a_coulomb_and_a_twin_are_found(tmp_path):

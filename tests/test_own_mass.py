@@ -141,7 +141,7 @@ def test_comparison_can_fail(tmp_path):
     conditions = runs.conditions(robot)
     before, _ = jax.device_get(_swept(params.strong(robot), conditions))
     assert np.abs(written(robot)[0] / before - 1).max() > 0.02
-    np.testing.assert_allclose(written(own_mass.weighed(robot, runs))[0], before, rtol=1e-9)
+    np.testing.assert_allclose(written(own_mass.with_table_mass(robot, runs))[0], before, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -155,7 +155,7 @@ def test_robot_with_a_curve_is_written_as_it_was_fitted(name, curves):
 def curves(tmp_path_factory):
     """Readings of the nominal robot with a discrepancy without a name, and of the same through its file."""
     runs = table()
-    robot = own_mass.weighed(robots.nominal(), runs)
+    robot = own_mass.with_table_mass(robots.nominal(), runs)
     every = tuple(UNNAMED.values())
     written = Written(runs, tmp_path_factory.mktemp("curves"), every)
 
@@ -181,7 +181,7 @@ def test_mass_of_the_table_is_taken_and_said(robot):
     assert own_mass.remarks(robot, runs) == [
         "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg; 13.1 kg is fitted with and written"
     ]
-    taken = own_mass.weighed(robot, runs)
+    taken = own_mass.with_table_mass(robot, runs)
     assert float(taken.configurations["4W2T"].mass) == 13.1 and float(taken.configurations["6T2A"].mass) == 13.1
     # Of a sum of floats the rounding is neither written nor said, and what is taken is not taken again.
     assert own_mass.remarks(taken, runs) == []
@@ -189,7 +189,7 @@ def test_mass_of_the_table_is_taken_and_said(robot):
 
 def test_a_table_without_masses_leaves_the_robots(robot):
     runs = unweighed(table())
-    assert own_mass.weighed(robot, runs) is robot or own_mass.stated_masses(robot, runs) == {}
+    assert own_mass.with_table_mass(robot, runs) is robot or own_mass.stated_masses(robot, runs) == {}
     assert own_mass.remarks(robot, runs) == []
 
 
@@ -201,7 +201,7 @@ def test_a_mass_that_varies_is_said_and_its_median_written(robot):
         "6T2A: total_mass_kg less payload_kg varies from 14.2 to 14.6 kg: the fit used the table's, row by row; "
         "14.35 kg, their median, is written, and with it rows of another mass are not as fitted"
     )
-    assert float(own_mass.weighed(robot, runs).configurations["6T2A"].mass) == 14.35
+    assert float(own_mass.with_table_mass(robot, runs).configurations["6T2A"].mass) == 14.35
 
 
 def test_a_total_without_its_payload_is_suspected(robot):
@@ -224,7 +224,7 @@ def test_a_mass_that_no_robot_has_is_refused(robot):
     runs = table({"6T2A": 0.003, "4W2T": 13.1})
     says = r"runs\.csv row 1, total_mass_kg: got 0\.003 with a payload of 0 kg; expected a robot of 0\.01 to 10000 kg without"
     with pytest.raises(BadData, match=says):
-        own_mass.weighed(robot, runs)
+        own_mass.with_table_mass(robot, runs)
 
 
 def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):

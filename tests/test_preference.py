@@ -44,7 +44,7 @@ def test_an_error_that_rises_is_listed_and_said():
     readings["voltage"][1][:, 1] = 4.72
     found = preference.worse(readings, errors)
     assert found == (Worse("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
-    assert preference.said_worse(found, by) == (
+    assert preference.describe_worse(found, by) == (
         "Held out, what was found predicts worse: by voltage motor speed 4.3 → 4.7 %."
     )
 
@@ -52,7 +52,7 @@ def test_an_error_that_rises_is_listed_and_said():
 def test_an_error_that_falls_or_stays_is_not_said():
     readings, by = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1], readings["voltage"][1][:, 2] = 4.0, 4.3 * 1.005
-    assert preference.worse(readings, errors) == () and preference.said_worse((), by) == ""
+    assert preference.worse(readings, errors) == () and preference.describe_worse((), by) == ""
 
 
 def test_errors_are_of_the_rows_that_both_predict():
@@ -65,18 +65,18 @@ def test_errors_are_of_the_rows_that_both_predict():
     by = {"voltage": (errors(before), errors(after))}
     found = preference.worse(readings, errors)
     assert [(w.rows, w.before, w.after) for w in found] == [(8, 4.0, 5.0)]
-    assert preference.said_worse(found, by).endswith(
+    assert preference.describe_worse(found, by).endswith(
         "by voltage total current 4.0 → 5.0 % (of the 8 rows that both predict)."
     )
     swapped = {"slope": (by["voltage"][1], by["voltage"][0])}
-    assert preference.said_worse((), swapped) == (
+    assert preference.describe_worse((), swapped) == (
         "Held out, what was found predicts worse: by slope 2 rows fewer predicted."
     )
 
 
 def test_numbers_that_differ_are_shown_to_differ():
     readings, by = held_out(0.141, 0.149)
-    assert "0.14 → 0.15 %" in preference.said_worse(preference.worse(readings, errors), by)
+    assert "0.14 → 0.15 %" in preference.describe_worse(preference.worse(readings, errors), by)
 
 
 # --- among alternatives ---------------------------------------------------------------------------------
@@ -135,7 +135,7 @@ def trace():
 
 
 def finished(traced):
-    return discover.finished(traced, RUNS, None, SETTINGS, SETTLED.library, lambda text: None)
+    return discover.assemble_result(traced, RUNS, None, SETTINGS, SETTLED.library, lambda text: None)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.inference import priors
-from calibration.inference.foreign import foreign_priors
+from calibration.inference.foreign import inherited_priors
 from mmrjax import params, robots
 from mmrjax.effects import ALL
 
@@ -174,7 +174,7 @@ def read(tmp_path, text):
 
 def test_friction_left_in_from_another_robot_is_said(tmp_path):
     text = 'configurations = ["rover"]\n[rover]\nlike = "4W2T"\nmass = 3.0\n[motor]\ntorque_constant = 0.012\n'
-    motor, rover = foreign_priors(read(tmp_path, text))
+    motor, rover = inherited_priors(read(tmp_path, text))
     assert motor == (
         "motor is not the nominal robot's (torque_constant 0.012 for 0.0259), but its motor.friction_coulomb, "
         "motor.friction_viscous still are: those priors come from another robot; state yours in the robot's file or "
@@ -186,18 +186,18 @@ def test_friction_left_in_from_another_robot_is_said(tmp_path):
 
 def test_friction_that_the_file_or_a_prior_states_is_not_another_robots(tmp_path):
     stated = "[motor]\nresistance = 1.2\nfriction_coulomb = 1e-3\nfriction_viscous = 1e-6\n"
-    assert foreign_priors(read(tmp_path, stated)) == []
+    assert inherited_priors(read(tmp_path, stated)) == []
     half = "[motor]\nresistance = 1.2\nfriction_coulomb = 1e-3\n"
-    (said,) = foreign_priors(read(tmp_path, half))
+    (said,) = inherited_priors(read(tmp_path, half))
     assert "its motor.friction_viscous still is: that prior comes from another robot" in said
-    assert foreign_priors(read(tmp_path, half), ["motor.friction_viscous"]) == []
+    assert inherited_priors(read(tmp_path, half), ["motor.friction_viscous"]) == []
 
 
 def test_robots_of_the_paper_and_small_changes_are_their_own(tmp_path):
-    assert [foreign_priors(make()) for make in robots.ROBOTS.values()] == [[], [], []]
-    assert foreign_priors(read(tmp_path, "[motor]\nresistance = 0.7\n[4W2T]\nmass = 13.1\n")) == []
+    assert [inherited_priors(make()) for make in robots.ROBOTS.values()] == [[], [], []]
+    assert inherited_priors(read(tmp_path, "[motor]\nresistance = 0.7\n[4W2T]\nmass = 13.1\n")) == []
 
 
 def test_heavier_robot_on_tracks_is_compared_with_the_tracks_it_is_like(tmp_path):
-    (said,) = foreign_priors(read(tmp_path, "[6T2A]\nmass = 30.0\n"))
+    (said,) = inherited_priors(read(tmp_path, "[6T2A]\nmass = 30.0\n"))
     assert said.startswith("6T2A is not the nominal robot's (mass 30 for 13.1)") and "6T2A.track.guide_share" in said

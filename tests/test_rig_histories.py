@@ -124,7 +124,7 @@ def test_beginnings_are_measured_by_the_first_samples(tmp_path):
         runs = records.read(table, robot=robot)
         kind = observers.kind(runs)
         known = noise.of(runs, kind.sizes(runs), "output_speed=1rpm,output_angle=1deg")
-        begun = kind.begun(robot, runs, known)
+        begun = kind.with_initial_states(robot, runs, known)
         assert begun.rig.begins.names == ("begin_",)
         begin = begun.rig.begins.members[0]
         assert float(begin.motor_speed) == pytest.approx(60 * channels.RPM * 16, rel=1e-9)

@@ -21,7 +21,7 @@ from calibration.sensitivity import inputs as room
 from calibration.sensitivity import shapley
 from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.local import inert, local
-from calibration.sensitivity.methods import by_shapley, correlated
+from calibration.sensitivity.methods import correlated, shapley_effects
 from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
@@ -179,9 +179,9 @@ def test_overall_shapley_effects_keep_their_intervals_where_one_point_loses_pair
             yield k, {"speed": np.where((k == 1) & (values[:, 1] > edge), np.nan, y)}
 
     monkeypatch.setattr(two, "sample", sample)
-    whole = by_shapley(two, np.ones(2, bool), 6000, 0)["speed"]
+    whole = shapley_effects(two, np.ones(2, bool), 6000, 0)["speed"]
     edge = 2.2 * float(inputs.parameters.at(inputs.parameters.mean)[1])
-    some = by_shapley(two, np.ones(2, bool), 6000, 0)["speed"]
+    some = shapley_effects(two, np.ones(2, bool), 6000, 0)["speed"]
     assert 0 < some.lost[1] < 0.1 and some.lost[0] == 0
     width = [np.ptp([p.overall["shapley"].low, p.overall["shapley"].high], axis=0) for p in (whole, some)]
     np.testing.assert_allclose(

@@ -530,8 +530,9 @@ def test_front_door_loads_nothing_heavy():
 
 #: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
 INNER = {
-    "as_read", "separated", "of_surfaces", "weighed", "begun", "with_begins", "check_start", "assumed", "library_for",
-    "settings_for", "without_copies", "pose", "fit_base", "trace", "discover_at",
+    "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
+    "with_initial_states", "with_begins", "check_start", "assumed", "library_for", "settings_for", "without_copies",
+    "pose", "fit_base", "trace", "discover_at",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
 CALLED: dict[tuple[str, str], str] = {
@@ -539,9 +540,9 @@ CALLED: dict[tuple[str, str], str] = {
     ("loop_baselines", "fit_base"): "the same",
     ("calibrate", "pose"): "coverage about a known truth: problems without a table of their own",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
-    ("05_your_rig", "separated"): "an effect of the rig's size, shown by itself before it is calibrated as users do",
+    ("05_your_rig", "with_surface_configurations"): "an effect of the rig's size, shown by itself before it is calibrated as users do",
     ("05_your_rig", "library_for"): "the same",
-    ("track_table", "weighed"): "the same rows, searched by members and not by `calibrate`",
+    ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }
 
 
@@ -557,7 +558,7 @@ def inner_calls(source: str) -> Iterator[tuple[int, str]]:
 
 def test_campaigns_and_notebooks_take_the_way_of_users():
     """A campaign that prepares a table by itself measures a program that nobody runs."""
-    own = {"fastsim_comparison": {"trace"}, "track_table": {"begun"}}  # a driving trace, searches that have begun
+    own = {"fastsim_comparison": {"trace"}}  # a driving trace
     found = {
         (file.stem, name)
         for folder in ("benchmarks", "notebooks")
@@ -581,7 +582,7 @@ def test_a_campaign_of_its_own_way_is_found():
 
 def test_one_preparation_serves_all():
     """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
-    inner = {"as_read", "separated", "begun", "check_start"}
+    inner = {"with_inferred_instruments", "with_surface_configurations", "with_initial_states", "check_start"}
     allowed = {
         "calibration/inference/preparation.py",
         "sweeps/compare.py",

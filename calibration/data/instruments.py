@@ -40,7 +40,9 @@ def step_of(readings: np.ndarray) -> float:
     return found
 
 
-def read_off(instruments: tuple[Instrument, ...], columns: Mapping[str, np.ndarray]) -> tuple[Instrument, ...]:
+def infer_instruments(
+    instruments: tuple[Instrument, ...], columns: Mapping[str, np.ndarray]
+) -> tuple[Instrument, ...]:
     """Instruments with nothing free: one shows magnitude alone where none of its readings is negative and some runs
     go backward, and its step is that of its readings.
 
@@ -61,7 +63,7 @@ def read_off(instruments: tuple[Instrument, ...], columns: Mapping[str, np.ndarr
     return tuple(found)
 
 
-def as_read(robot: Robot, runs: Runs) -> Robot:
+def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     """`robot` with the instruments that its table shows."""
     if not any(i.free for i in robot.rig.instruments):
         return robot

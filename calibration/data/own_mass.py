@@ -72,7 +72,7 @@ def stated_masses(robot: Robot, runs: Runs) -> dict[str, StatedMass]:
     return found
 
 
-def weighed(robot: Robot, runs: Runs) -> Robot:
+def with_table_mass(robot: Robot, runs: Runs) -> Robot:
     """`robot` with the own mass that a table states for each configuration, the median over its rows.
 
     Raises:
@@ -87,7 +87,7 @@ def remarks(robot: Robot, runs: Runs) -> list[str]:
     """What the table states otherwise than the robot, and what follows for the robot that is written.
 
     Args:
-        robot: as given, before `weighed`.
+        robot: as given, before `with_table_mass`.
     """
     said = []
     for name, stated in stated_masses(robot, runs).items():

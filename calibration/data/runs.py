@@ -113,7 +113,7 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
             columns[meaning.column] = np.array(
                 [_cell(at, meaning, cell, layout) for at, cell in zip(where, cells, strict=True)]
             )
-    layout = dataclasses.replace(layout, instruments=instruments.read_off(layout.instruments, columns))
+    layout = dataclasses.replace(layout, instruments=instruments.infer_instruments(layout.instruments, columns))
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
     _check_mass(name, columns)

@@ -67,7 +67,7 @@ def scaled(robot: Robot, configurations: np.ndarray, labels: np.ndarray) -> np.n
     return np.array([of_table5[pair] for pair in pairs], bool)
 
 
-def separated(robot: Robot, runs: Runs) -> Robot:
+def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
     """`robot` with a configuration for each surface of the table that is not of Table 5 (of a blank robot: each).
 
     A configuration without rows elsewhere gives way to those of its surfaces, unless it has but one. Priors that the
@@ -109,7 +109,7 @@ def of_surfaces(stated: Mapping[str, V], robot: Robot, runs: Runs) -> dict[str, 
     """What is stated of configurations by parameter, those that gave way to their surfaces' replaced by them.
 
     Args:
-        robot: as from `separated`.
+        robot: as from `with_surface_configurations`.
     """
     found: dict[str, V] = {}
     for name, value in stated.items():

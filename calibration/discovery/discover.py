@@ -38,12 +38,12 @@ from calibration.discovery.result import (
 from calibration.discovery.score_tests import bootstrap
 from calibration.discovery.search import Search, fewest, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
-from calibration.discovery.standing import Standing, standing
+from calibration.discovery.standing import NameSupport, standing
 from calibration.inference import bases as bases_room
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors
 from calibration.inference.bases import Bases, in_words
-from calibration.inference.identifiability import said_held
+from calibration.inference.identifiability import describe_held
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
@@ -111,7 +111,7 @@ def discover(
         if silent:
             progress(f"the verdict with {' and '.join(f'{f:g}' for f in FACTORS)} times the assumed noise, beside:")
         verdicts = {f: others.submit(ready.trace, sd) for f, sd in sds.items()}
-        found = finished(traced, distinct, ready.numbers, ready.settings, ready.library, progress)
+        found = assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, progress)
         sensitivity = [in_short(f, verdict.result()) for f, verdict in verdicts.items()]
     if silent:
         usual = noise_room.default(known.channels)
@@ -141,7 +141,7 @@ class LoopInput:
     notes: tuple[str, ...]
     foreign: tuple[str, ...]
 
-    def trace(self, noise: Noise | None = None, progress: Callable[[str], None] = lambda text: None) -> Traced:
+    def trace(self, noise: Noise | None = None, progress: Callable[[str], None] = lambda text: None) -> LoopStages:
         """The stages up to a verdict, with this noise or another."""
         sds = self.noise if noise is None else noise
         return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress)
@@ -197,7 +197,7 @@ def discover_at(
         numbers: of the rows, as messages call them; None counts from 1.
     """
     traced = trace(runs, robot, noise, settings, stated, library, progress)
-    return finished(traced, runs, numbers, settings, library, progress)
+    return assemble_result(traced, runs, numbers, settings, library, progress)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Sds:
 
 
 @dataclasses.dataclass(frozen=True)
-class Traced:
+class LoopStages:
     """What the stages up to a verdict found.
 
     Attributes:
@@ -235,7 +235,7 @@ class Traced:
     searched: Search | None = None
     alike: Classes | None = None
     where: Location | None = None
-    standing: Standing | None = None
+    standing: NameSupport | None = None
     held_out: tuple[HeldOutAlternative, ...] = ()
 
     @property
@@ -297,7 +297,7 @@ def trace(
     stated: Mapping[str, tuple[float, float]] | None = None,
     library: Library = effects.BY_NAME,
     progress: Callable[[str], None] = lambda text: None,
-) -> Traced:
+) -> LoopStages:
     """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`.
 
     Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
@@ -324,7 +324,7 @@ def trace(
         progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
         left = diagnosis_of_base(screened, settings)
         if not left.test.rejected and screened.cluster is None:
-            return Traced("none", screened, left, sds)
+            return LoopStages("none", screened, left, sds)
         progress("something is missing: fitting every effect that could explain it")
         searched = search(space, base, left, bases, settings, progress)
         best, after = searched.best, searched.diagnosis
@@ -346,18 +346,18 @@ def trace(
             best, after = searched.best, searched.diagnosis
     if best is None or after is None or not stood.stands:
         where = locate(left, bases, space.included)
-        return Traced("unnamed", screened, left, sds, searched, where=where, standing=stood)
+        return LoopStages("unnamed", screened, left, sds, searched, where=where, standing=stood)
 
     progress(f"what else explains as much as {' and '.join(best.effects)}?")
     alike = classes(space, base, best, searched.ladder, left, settings)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress("which of those predicts best what a fit has not seen?")
-        searched, alike, compared = preference.by_held_out(space, runs, searched, alike, bases, settings)
+        searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
     verdict = "named" if alike.single else "class"
     remains = locate(after, bases, space.included) if after.test.rejected_with_margin else None
-    return Traced(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
+    return LoopStages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
 
 
 # --- the stages that are no room of their own -----------------------------------------------------------
@@ -377,7 +377,7 @@ def pose(
     counts for nothing. A mass that the table states takes the place of the robot's own, and the ground may be any
     surface whose friction is not stated: its own prior, of another surface, would pull on what depends on slip.
     """
-    robot = own_mass.weighed(robot, runs)
+    robot = own_mass.with_table_mass(robot, runs)
     kind = observers.kind(runs)
     index, real = padded(len(runs), kind.sizes_padded)
     names = priors.free_names(robot, runs.configurations_named(robot), *kind.free())
@@ -464,14 +464,14 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [said]
 
 
-def in_short(factor: float, traced: Traced) -> Sensitivity:
+def in_short(factor: float, traced: LoopStages) -> Sensitivity:
     """What the loop says with another noise."""
     said = _statement(traced)
     adequate = not traced.ends.test.rejected_with_margin
     return Sensitivity(factor, traced.verdict, said, traced.members, adequate)
 
 
-def _statement(traced: Traced) -> str:
+def _statement(traced: LoopStages) -> str:
     space, alike, p = traced.screened.base.space, traced.alike, traced.left.test.p_value
     if alike is None:
         said = findings.statement(traced.verdict, p, traced.where)
@@ -495,8 +495,8 @@ def _statement(traced: Traced) -> str:
 # --- the result -----------------------------------------------------------------------------------------
 
 
-def finished(
-    traced: Traced,
+def assemble_result(
+    traced: LoopStages,
     runs: Runs,
     numbers: np.ndarray | None,
     settings: Settings,
@@ -623,7 +623,7 @@ def _residuals(
     )
 
 
-def _proposal(space: CandidateSpace, traced: Traced, settings: Settings) -> Proposal | None:
+def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
     """What to do next; None where nothing is left to tell apart."""
     if traced.verdict == "unnamed" and traced.where is not None:
         return denser(space, traced.where, settings)
@@ -663,7 +663,7 @@ def remarks(found: DiscoveryResult) -> tuple[str, ...]:
     for name, p in found.base_shift.items():
         if abs(p.shift_after) > 3:
             said.append(f"{name} lies {abs(p.shift_after):.1f} prior sds from its prior: it stands in for something")
-    said += said_held(found.held_by_prior)
+    said += describe_held(found.held_by_prior)
     said += [c.statement for c in found.residual_clusters]
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:

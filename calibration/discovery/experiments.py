@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.special import ndtr
 
-from calibration.discovery import foreseen, menu
+from calibration.discovery import menu, predicted
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
@@ -43,7 +43,7 @@ NONE = "none on this menu"
 
 
 @dataclasses.dataclass(frozen=True)
-class Prospect:
+class PredictedReadings:
     """What every alternative foresees of every reading of the menu.
 
     Attributes:
@@ -66,7 +66,7 @@ class Prospect:
 
     def apart(self, a: int, b: int, *experiments: str) -> float:
         """Expected separation of two alternatives by experiments, all carried out [σ]."""
-        where = foreseen.spans(self.experiments)
+        where = predicted.spans(self.experiments)
         spans = [where[e] for e in experiments]
         at = np.concatenate([np.flatnonzero(self.there[k]) + k.start for k in spans])
         d = self.value[a, at] - self.value[b, at]
@@ -163,24 +163,24 @@ def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dic
 
 
 @compiled
-def _foreseen(
-    problem: Problem, other: priors.Coordinates | None, batch: foreseen.Batch, which: Array, z: Array
-) -> tuple[foreseen.Foreseen, Array]:
+def _predicted(
+    problem: Problem, other: priors.Coordinates | None, batch: predicted.Batch, which: Array, z: Array
+) -> tuple[predicted.Predicted, Array]:
     """Readings of the menu, and ½ of what the fit leaves of their covariance, by alternative.
 
     `other` are coordinates of what the table does not show at all, known by their priors alone.
     """
     rows = informing(problem.data)
 
-    def one(w: Array, z: Float[Array, " coordinates"]) -> tuple[foreseen.Foreseen, Array]:
+    def one(w: Array, z: Float[Array, " coordinates"]) -> tuple[predicted.Predicted, Array]:
         here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(w))
 
         def residual(x: Array) -> Array:
             return jnp.concatenate([here.misfit(x, here.data), x - here.data.centre])
 
-        def reading(x: Array) -> tuple[Array, foreseen.Foreseen]:
+        def reading(x: Array) -> tuple[Array, predicted.Predicted]:
             base = here.base if other is None else other.robot(here.base, x[z.size :])
-            found = foreseen.readings(here.coordinates.robot(base, x[: z.size]), batch)
+            found = predicted.readings(here.coordinates.robot(base, x[: z.size]), batch)
             return found.value, found
 
         informed = jax.jacfwd(residual)(z)[rows]
@@ -194,7 +194,7 @@ def _foreseen(
     return jax.vmap(one)(which, z)
 
 
-def prospect(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> Prospect:
+def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
     """What these alternatives foresee of the menu, with instruments as good as those of the table.
 
     The menu holds what is within reach of the table, what the robots of all alternatives manage, and what is not
@@ -210,17 +210,17 @@ def prospect(space: CandidateSpace, candidates: Mapping[str, Candidate], setting
     z = jnp.asarray(np.stack([c.z for c in those]))
     within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
     everything, shown = menu.menu(within), channels.names(space.bare.channels)
-    found, half = jax.device_get(_foreseen(space.equipped, other, foreseen.batch(everything, shown), active, z))
+    found, half = jax.device_get(_predicted(space.equipped, other, predicted.batch(everything, shown), active, z))
     found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
     experiments, kept = _possible(everything, found, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)
-    sd = foreseen.sds(experiments, dict(zip(shown, medians, strict=True)))
+    sd = predicted.sds(experiments, dict(zip(shown, medians, strict=True)))
     value, half = np.nan_to_num(found.value[:, kept]), np.nan_to_num(half[:, kept])
-    return Prospect(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
+    return PredictedReadings(tuple(names), experiments, value, half, sd, np.all(found.exists, 0)[kept], settings)
 
 
 def _possible(
-    experiments: Sequence[menu.Experiment], found: foreseen.Foreseen, within: Reach, settings: Settings
+    experiments: Sequence[menu.Experiment], found: predicted.Predicted, within: Reach, settings: Settings
 ) -> tuple[tuple[menu.Experiment, ...], np.ndarray]:
     """What of a menu is possible and not forbidden, and whether each reading of the whole menu is of that.
 
@@ -232,7 +232,7 @@ def _possible(
     left: list[menu.Experiment] = []
     kept: list[np.ndarray] = []
     for e in experiments:
-        rows = np.ones(foreseen.size(e), bool)
+        rows = np.ones(predicted.size(e), bool)
         if isinstance(e, menu.Run):
             at = slice(ends[e.name] - len(e.voltage), ends[e.name])
             grips = np.abs(found.grip[:, at]) < np.where(np.asarray(e.slope) > e.beyond, menu.GRIP, np.inf)
@@ -252,7 +252,7 @@ def _possible(
 # --- the choice -------------------------------------------------------------------------------------
 
 
-def _ranked(seen: Prospect, *experiments: str) -> Ranked:
+def _ranked(seen: PredictedReadings, *experiments: str) -> Ranked:
     pairs = itertools.combinations(range(len(seen.names)), 2)
     sigma = tuple(seen.apart(a, b, *experiments) for a, b in pairs)
     others = zip(seen.names[1:], sigma, strict=False)  # the pairs of the best fit come first
@@ -264,13 +264,13 @@ def _use(r: Ranked) -> tuple[bool, float]:
     return bool(r.told), float(np.sum(np.minimum(r.chances, r.settings.enough)))
 
 
-def ranked(seen: Prospect) -> tuple[Ranked, ...]:
+def ranked(seen: PredictedReadings) -> tuple[Ranked, ...]:
     """The whole menu by the number of pairs that an experiment is expected to tell apart; of those that tell as many
     by `Settings.enough`, in the menu's order, the least effort first."""
     return tuple(sorted((_ranked(seen, e.name) for e in seen.experiments), key=_use, reverse=True))
 
 
-def choose(seen: Prospect) -> Proposal:
+def choose(seen: PredictedReadings) -> Proposal:
     """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
     table = ranked(seen)
     if not table:
@@ -298,10 +298,10 @@ SERIES, REPEATS = 15, 3
 def _steps(variable: str, within: Reach) -> str | None:
     """How the variable of a curve is covered more densely, within reach of the table; None for a wave."""
     volts = within.voltages
-    low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.near(0.5 * volts[0]), volts[0])
+    low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
     payload = max(u.payloads[-1] for u in within.used)
-    step, angle, mass = (menu.near(x / (SERIES - 1), 1) for x in (high - low, slope, payload))
+    step, angle, mass = (menu.round_significant(x / (SERIES - 1), 1) for x in (high - low, slope, payload))
     load = [f"a payload up to {payload:g} kg"] * (payload > 0) + [f"a slope up to {slope:g} deg"] * (slope > 0)
     loaded = " and ".join(load) or "a brake or a drawbar pull"
     if variable in bases.ORDERS:
@@ -372,8 +372,8 @@ def _of_rig(variable: str, within: Reach, slope: float, payload: float) -> str |
 def _steady_speeds(variable: str, within: Reach) -> str:
     """How a wave is followed from speed to speed."""
     volts = within.voltages
-    low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.near(0.5 * volts[0]), volts[0])
-    three = [f"{menu.near(v):g}" for v in (low, 0.5 * (low + high), high)]
+    low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
+    three = [f"{menu.round_significant(v):g}" for v in (low, 0.5 * (low + high), high)]
     return (
         f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "
         f"and {three[2]} V with at least 20 samples a wave: what keeps its {variable} at every speed turns with that "
@@ -404,4 +404,4 @@ def denser(space: CandidateSpace, where: Location, settings: Settings) -> Propos
 def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:
     """What tells the alternatives of a class apart; None where each effect has one name."""
     left = alternatives(best, found)
-    return choose(prospect(space, left, settings)) if len(left) > 1 else None
+    return choose(predict(space, left, settings)) if len(left) > 1 else None

@@ -408,7 +408,7 @@ def statement(
         over = shown_over(where.variable) + (f" (as well {', '.join(well)})" if well else "")
         return (
             f"Something is missing in the {place}{also}, {over}{what}; no effect of the library explains it "
-            f"(family-wise p {said_p(p)})."
+            f"(family-wise p {describe_p_value(p)})."
         )
     names = []
     for k, words in enumerate(classes):
@@ -420,10 +420,10 @@ def statement(
             said = f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
         names.append(said)
     left = "" if where is None else f" Something remains in the {bases_room.in_words(where.place)}."
-    return f"Missing: {'; '.join(names)} (family-wise p {said_p(p)}).{left}"
+    return f"Missing: {'; '.join(names)} (family-wise p {describe_p_value(p)}).{left}"
 
 
-def said_ruled_out(found: DiscoveryResult) -> str:
+def describe_ruled_out(found: DiscoveryResult) -> str:
     """What would explain the data as well as what is proposed, or better, but for its size; empty for nothing.
 
     Beside names it is said of what would explain more than they do alone.
@@ -443,7 +443,7 @@ def said_ruled_out(found: DiscoveryResult) -> str:
     )
 
 
-def said_hidden(found: DiscoveryResult) -> str:
+def describe_hidden(found: DiscoveryResult) -> str:
     """Which effects what was found could hide, and what would show them, in a sentence; empty for none."""
     if not found.hidden:
         return ""
@@ -455,7 +455,7 @@ def said_hidden(found: DiscoveryResult) -> str:
     return f"Could be hidden behind what was found: {', '.join(each)}."
 
 
-def said_standing(found: DiscoveryResult) -> str:
+def describe_standing(found: DiscoveryResult) -> str:
     """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
     if not found.standing:
         return ""
@@ -500,7 +500,7 @@ def shown_over(variable: str) -> str:
     return f"in the runs at {happens.words}"
 
 
-def said_p(p: float) -> str:
+def describe_p_value(p: float) -> str:
     """A p-value in words; a small one, of which the bootstrap knows little, as a bound rounded up."""
     if p > 0.01:
         return f"= {p:.2g}"

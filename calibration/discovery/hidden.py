@@ -94,7 +94,7 @@ def _shown(space: CandidateSpace, best: Candidate, what: Hidden, after: Diagnosi
     move = what.amplitude / settings.width - joint.z[k]
     z = joint.z + covariance[:, k] / covariance[k, k] * move
     moved = dataclasses.replace(joint, z=z, cost=joint.cost + 0.5 * move**2 / covariance[k, k])
-    seen = experiments.prospect(space, {"without": best, "with": moved}, settings)
+    seen = experiments.predict(space, {"without": best, "with": moved}, settings)
     if not seen.experiments:
         return what
     first = experiments.ranked(seen)[0]

@@ -106,7 +106,7 @@ class Run:
         level = self.imposed != "voltage" and not any(self.slope)
         where = "" if self.setup in setups.WEIGHTLESS or level else f" {_slopes(self.slope)}"
         read = _both([channels.of(c).label for c in self.channels])
-        turning = [near(v / RPM) for v in self.voltage]
+        turning = [round_significant(v / RPM) for v in self.voltage]
         at = _amounts(self.voltage, "V") if self.imposed == "voltage" else _amounts(turning, "rpm of the motor")
         text = f"{self.doing}{where} at {at}; read {read}"
         return f"{text}. Watch {self.watch}" if self.watch else text
@@ -135,21 +135,21 @@ def _slopes(slopes: Sequence[float]) -> str:
     return _both(words)
 
 
-def near(value: float, digits: int = 2) -> float:
+def round_significant(value: float, digits: int = 2) -> float:
     """A number with so many digits, as a person sets it."""
     return float(f"{value:.{digits - 1}e}")
 
 
-def below(value: float) -> float:
+def floor_significant(value: float) -> float:
     """The largest number of two digits that does not exceed a positive one."""
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return near(math.floor(value / step + 1e-9) * step)
+    return round_significant(math.floor(value / step + 1e-9) * step)
 
 
-def spread(least: float, most: float, count: int) -> tuple[float, ...]:
+def spaced_settings(least: float, most: float, count: int) -> tuple[float, ...]:
     """Evenly from one to the other, of two digits each and never more than the latter."""
-    top = below(most)
-    return tuple(sorted({min(near(v), top) for v in np.linspace(least, top, count).tolist() if v > 0}))
+    top = floor_significant(most)
+    return tuple(sorted({min(round_significant(v), top) for v in np.linspace(least, top, count).tolist() if v > 0}))
 
 
 # --- acts -------------------------------------------------------------------------------------------
@@ -184,13 +184,13 @@ def acts(reach: Reach) -> tuple[Act, ...]:
     """The calibration acts, the least effort first; none of an instrument that the table's bench lacks."""
     several = len(reach.used) > 1
     each = ("in both configurations, " if len(reach.used) == 2 else "in each configuration, ") if several else ""
-    payload = near(max(u.payloads[-1] for u in reach.used))
+    payload = round_significant(max(u.payloads[-1] for u in reach.used))
     loads = (0.0, payload) if payload > 0 else (0.0,)
     laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
     total = reach.current * reach.motors
-    amperes = near(0.15 * total, 1), near(0.75 * total, 1)
-    turning = near(0.25 * reach.motor_speed), near(0.65 * reach.motor_speed)
-    paces = near(0.35 * reach.speed), near(0.8 * reach.speed)
+    amperes = round_significant(0.15 * total, 1), round_significant(0.75 * total, 1)
+    turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
+    paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
     weighing = Act(
         "weigh", ("weigh",),
         f"Weigh the robot {each}{laden}on scales that are good to 20 g; read the total mass, and take the stated one "
@@ -262,14 +262,14 @@ def _runs(
 
 def other_voltages(reach: Reach, used: tuple[float, ...]) -> tuple[float, ...]:
     """Four voltages that a table lacks: below its lowest, in its widest gaps, above if the motors are rated so."""
-    found = [near(0.55 * used[0])]
+    found = [round_significant(0.55 * used[0])]
     if reach.voltage > used[-1]:
-        found.append(below(reach.voltage))
+        found.append(floor_significant(reach.voltage))
     levels = [0.55 * used[0], *used] if len(used) == 1 else list(used)
     while len(found) < 4:
         low, high = max(itertools.pairwise(levels), key=lambda gap: gap[1] - gap[0])
         levels = sorted([*levels, 0.5 * (low + high)])
-        found.append(near(0.5 * (low + high)))
+        found.append(round_significant(0.5 * (low + high)))
     return tuple(sorted(set(found)))
 
 
@@ -280,7 +280,7 @@ def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
     ends, three = (volts[0], volts[-1]), (volts[0], volts[len(volts) // 2], volts[-1])
     inclines = sorted({abs(s) for s in used.slopes if s}) or [0.0]
     some, more, most = inclines[(len(inclines) - 1) // 2], inclines[max(len(inclines) - 2, 0)], inclines[-1]
-    air, payload = spread(0.2 * reach.geared, reach.geared, 5), near(used.payload)
+    air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
     runs = functools.partial(_runs, reach, at=used)
     found = [
         runs("reverse", "travel backwards", setups.reversed_, voltages=ends, slopes=(0.0, -some)),
@@ -294,7 +294,7 @@ def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
         runs("other voltages", "travel", voltages=other_voltages(reach, volts), slopes=(0.0, more)),
         runs("steepest slope", "travel", voltages=three, steepest=True,
              slopes=[round(2 * most * share) / 2 for share in (SLOPE, (1 + SLOPE) / 2)]),
-        runs("crawl", "travel", voltages=[near(share * volts[0]) for share in (0.15, 0.2, 0.27)]),
+        runs("crawl", "travel", voltages=[round_significant(share * volts[0]) for share in (0.15, 0.2, 0.27)]),
     ]  # fmt: skip
     lacks = {
         "downhill": most == 0, "steepest slope": most == 0, "payload": payload == 0, "one motor": reach.motors == 1,
@@ -308,9 +308,11 @@ def _others(reach: Reach) -> str:
 
 def _alone(reach: Reach) -> tuple[Run, ...]:
     """Runs of the motors without the robot."""
-    volts = spread(0.2 * reach.alone, reach.alone, 5)
-    stalling = spread(0.5 * reach.current * reach.resistance, min(reach.current * reach.resistance, reach.voltage), 2)
-    brake = near(0.6 * reach.torque_constant * reach.current, 1)
+    volts = spaced_settings(0.2 * reach.alone, reach.alone, 5)
+    stalling = spaced_settings(
+        0.5 * reach.current * reach.resistance, min(reach.current * reach.resistance, reach.voltage), 2
+    )
+    brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
     shafts = {1: "the motor's shaft", 2: "both motor shafts"}.get(reach.motors, f"all {reach.motors} motor shafts")
     gears = "gearbox" if reach.motors == 1 else "gearboxes"
     found = [
@@ -321,8 +323,8 @@ def _alone(reach: Reach) -> tuple[Run, ...]:
         _runs(reach, "stall, one motor", f"Hold one motor's shaft in a vice, {_others(reach)}, and switch on for a "
               "moment,", setups.blocked, kinds=("stall", "one motor"), voltages=stalling, read=STANDING, sides=1),
         _runs(reach, "braked motor", f"Uncouple the {gears} and put a brake of {1e3 * brake:g} mN·m on each motor "
-              "shaft, and run", setups.braked, voltages=spread(0.4 * reach.alone, reach.alone, 3), read=TURNING,
-              brake=brake),
+              "shaft, and run", setups.braked, voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3),
+              read=TURNING, brake=brake),
     ]  # fmt: skip
     return tuple(r for r in found if reach.motors > 1 or r.sides is None)
 
@@ -343,8 +345,16 @@ def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
     """Runs of a load on a shaft, or of motors whose speed is imposed: at other levels, and the other way round."""
     speeds = reach.imposed == "motor_speed"
     levels = reach.speeds if speeds else used.voltages
-    sizes = tuple(sorted({near(abs(x)) for x in levels if x})) or (1.0,)
-    others = tuple(sorted({near(0.4 * sizes[0]), near(0.5 * (sizes[0] + sizes[-1])), near(1.3 * sizes[-1])}))
+    sizes = tuple(sorted({round_significant(abs(x)) for x in levels if x})) or (1.0,)
+    others = tuple(
+        sorted(
+            {
+                round_significant(0.4 * sizes[0]),
+                round_significant(0.5 * (sizes[0] + sizes[-1])),
+                round_significant(1.3 * sizes[-1]),
+            }
+        )
+    )
     both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     found = [
         _runs(reach, "other speeds" if speeds else "other voltages", "run", kinds=("other voltages",), at=used,

@@ -47,7 +47,7 @@ def worse(
     return tuple(found)
 
 
-def said_worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]]) -> str:
+def describe_worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]]) -> str:
     """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
 
     Args:
@@ -134,7 +134,7 @@ def _draw(a: HeldOutAlternative, b: HeldOutAlternative) -> bool:
     return not a.rms_sigma > (1 + TOLD) * b.rms_sigma
 
 
-def by_held_out(
+def prefer_by_held_out(
     space: CandidateSpace, runs: Runs, searched: Search, alike: Classes, bases: Bases, settings: Settings
 ) -> tuple[Search, Classes, tuple[HeldOutAlternative, ...]]:
     """The search and its classes, led by the alternative that predicts data held out best, see `_order`.

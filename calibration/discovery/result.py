@@ -16,7 +16,7 @@ from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.identifiability import said_held
+from calibration.inference.identifiability import describe_held
 from calibration.inference.residual_clusters import ResidualCluster
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
@@ -591,7 +591,7 @@ class DiscoveryResult:
         write_table(folder / "rows.csv", self.rows_table())
         start = f" from {robot_name}" if robot_name else ""
         note = f"found by the loop{start} with {self.runs.source}: {self.statement}"
-        note = "\n".join([note, *said_held(self.held_by_prior)])
+        note = "\n".join([note, *describe_held(self.held_by_prior)])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         posterior.write(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:

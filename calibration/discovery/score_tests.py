@@ -192,7 +192,7 @@ def family_columns(linear: Linearization, bases: Bases, chosen: int) -> np.ndarr
     raise IndexError(chosen)
 
 
-def widened(linear: Linearization, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def augment_with_columns(linear: Linearization, extra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Jacobian and residuals of a fit with further columns, each of prior mean 0 and sd 1, fitted beside.
 
     Args:
@@ -217,7 +217,7 @@ def beside_columns(
         extra: columns over the readings, shape (readings, columns); of: their places.
     """
     filled = np.pad(extra, ((0, 0), (0, -extra.shape[1] % FILLED)))  # to few sizes: each is compiled
-    wide: tuple[Any, Any] = widened(linear, filled)
+    wide: tuple[Any, Any] = augment_with_columns(linear, filled)
     linear = jax.tree.map(np.asarray, linear)
     padded = dataclasses.replace(linear, jacobian=wide[0], residual=wide[1])
     scores = _score_tests(padded, bases)

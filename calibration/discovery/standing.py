@@ -20,7 +20,7 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.projection import Projection
-from calibration.discovery.score_tests import beside_columns, family_columns, widened
+from calibration.discovery.score_tests import augment_with_columns, beside_columns, family_columns
 from calibration.discovery.search import Search
 from calibration.discovery.settings import Settings
 from calibration.discovery.smooth import smooth, surface
@@ -47,7 +47,7 @@ def equation(place: str) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Standing:
+class NameSupport:
     """Whether the names of a candidate stand.
 
     Attributes:
@@ -60,7 +60,7 @@ class Standing:
 
 def standing(
     space: CandidateSpace, base: Candidate, searched: Search, left: Diagnosis, bases: Bases, settings: Settings
-) -> Standing:
+) -> NameSupport:
     """Whether the effects of the best candidate of a search may be named.
 
     Args:
@@ -68,10 +68,10 @@ def standing(
     """
     best, after = searched.best, searched.diagnosis
     if best is None or after is None:
-        return Standing(False, "no effect of the library that explains it is of a plausible size")
+        return NameSupport(False, "no effect of the library that explains it is of a plausible size")
     other = _ruled_out(space, base, best, searched.ladder, settings)
     if other is not None:
-        return Standing(False, f"{' and '.join(other.effects)} would explain more, but not at a plausible size")
+        return NameSupport(False, f"{' and '.join(other.effects)} would explain more, but not at a plausible size")
     if after.test.rejected_with_margin:
         return _beside_curves(space, base, best, left, after, bases, settings)
     return _against_curves(space, base, best, left.linear, bases, settings)
@@ -110,21 +110,21 @@ def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, s
 
 def _against_curves(
     space: CandidateSpace, base: Candidate, best: Candidate, linear: Linearization, bases: Bases, settings: Settings
-) -> Standing:
+) -> NameSupport:
     """Names against one smooth curve of one variable, or of two, in the balance of several of them or anywhere."""
     equations = [equation(space.library[e].channel or space.library[e].balance) for e in best.effects]
     places = {place for place, _ in bases_room.names(bases)}
     crowded = {e for e in equations if equations.count(e) > 1 and e in places}
     tried = _curves(space, linear, bases, crowded)
     if not tried:
-        return Standing(True)
+        return NameSupport(True)
     curve, word = max(tried)
     # Curves are linear at the base: names are weighed by the better of their fit and what they explain there too.
     fall = max(2 * (base.cost - best.cost), _linearly(space, best, linear, settings))
     names = fall - cost_of_names(space, best, settings)
     if curve - 2 * math.log(len(tried)) > names + settings.preferred:
-        return Standing(False, f"one smooth {word} is the better explanation than {' and '.join(best.effects)}")
-    return Standing(True)
+        return NameSupport(False, f"one smooth {word} is the better explanation than {' and '.join(best.effects)}")
+    return NameSupport(True)
 
 
 def _curves(space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]) -> list[tuple[float, str]]:
@@ -179,7 +179,7 @@ def _beside_curves(
     after: Diagnosis,
     bases: Bases,
     settings: Settings,
-) -> Standing:
+) -> NameSupport:
     """Names beside the best smooth curves, as many as leave nothing: each has to keep its significance, and what is
     left with both has to be noise.
 
@@ -190,27 +190,27 @@ def _beside_curves(
     for k in _strongest(left, names):
         found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
         if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
-            return Standing(False, f"one smooth curve in the {_over(*names[k])} leaves nothing")
+            return NameSupport(False, f"one smooth curve in the {_over(*names[k])} leaves nothing")
     own = {equation(space.library[e].channel or space.library[e].balance) for e in best.effects}
     chosen, test = _curves_beside(after.linear, after, bases, own, CURVES, settings)
     if test.rejected_with_margin:
         chosen, test = _curves_beside(after.linear, after, bases, set(), CURVES, settings)
     if test.rejected_with_margin:
-        return Standing(False, f"the fit with {' and '.join(best.effects)} is not adequate")
+        return NameSupport(False, f"the fit with {' and '.join(best.effects)} is not adequate")
     columns = np.concatenate([family_columns(after.linear, bases, k) for k in chosen], 1)
     significance = _significance(space, best, after.linear, columns)
     needed = after.test.threshold("single")
     lost = [e for e, t in zip(best.effects, significance, strict=True) if abs(t) < needed]
     words = ", ".join(_over(*names[k]) for k in chosen)
     if lost:
-        return Standing(False, f"beside smooth curves ({words}) {' and '.join(lost)} would explain nothing")
+        return NameSupport(False, f"beside smooth curves ({words}) {' and '.join(lost)} would explain nothing")
     where = locate(left, bases, space.included)
     if equation(where.place) in own & {equation(names[k][0]) for k in chosen}:
         # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
         if not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
-            return Standing(False, f"one smooth curve in the {_over(where.place, where.variable)} leaves nothing")
-    return Standing(True, f"beside smooth curves ({words})")
+            return NameSupport(False, f"one smooth curve in the {_over(where.place, where.variable)} leaves nothing")
+    return NameSupport(True, f"beside smooth curves ({words})")
 
 
 def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
@@ -247,7 +247,7 @@ def _curves_beside(
 
 def _significance(space: CandidateSpace, best: Candidate, linear: Linearization, columns: np.ndarray) -> list[float]:
     """Amplitude of each effect over its sd, with columns fitted beside (of prior sd 1 each)."""
-    jacobian, residual = widened(linear, columns)
+    jacobian, residual = augment_with_columns(linear, columns)
     normal = jacobian.T @ jacobian
     step = -np.linalg.solve(normal, jacobian.T @ residual)
     sd = np.sqrt(np.diag(np.linalg.inv(normal)))

@@ -279,7 +279,7 @@ def _searched(
             f"--population: none of {len(everyone.z)} members can be run in every row (members with a row that ends "
             f"so: {said or 'none'}); begin from another robot, or free less"
         )
-    posed, shares = multistart.noisier_at(posed, known, everyone, at)
+    posed, shares = multistart.reestimate_noise_at(posed, known, everyone, at)
     tell("population done; now derivatives against differences at the best")
     about = identifiability.analyse(posed, jnp.asarray(everyone.z[at]))
     off = population.apart(posed, members, everyone.z[at], about.jacobian, about.sd)

@@ -19,7 +19,7 @@ CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
 DIFFERS = 0.2
 
 
-def foreign_priors(robot: Robot, stated: Collection[str] = ()) -> list[str]:
+def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[str]:
     """A sentence for each part that is not the nominal robot's while friction of it still is.
 
     None of a rig that starts from nothing.

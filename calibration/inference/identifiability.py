@@ -34,7 +34,7 @@ def held_by_prior(sd: np.ndarray) -> np.ndarray:
     return ~(np.asarray(sd) <= HELD)
 
 
-def said_held(names: Iterable[str]) -> list[str]:
+def describe_held(names: Iterable[str]) -> list[str]:
     """Which parameters are held by their priors, in a sentence; none for none."""
     names = list(names)
     whose = "its prior" if len(names) == 1 else "their priors"

@@ -206,7 +206,7 @@ def at_best(
     return Found(posed, best, ended, shares, searched)
 
 
-def noisier_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
+def reestimate_noise_at(posed: Problem, noise: Noise, searched: Population, at: int) -> tuple[Problem, np.ndarray]:
     """The problem with the noise that is most probable for a member, and the shares that it is of readings."""
     shares = most_probable(posed, noise, searched.reading[at])
     return _noisier(posed, noise, shares), shares

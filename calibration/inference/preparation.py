@@ -14,7 +14,7 @@ from calibration.data import instruments, own_mass, robot_file, surfaces
 from calibration.data.runs import Runs
 from calibration.inference import checks, observers
 from calibration.inference import noise as noise_room
-from calibration.inference.foreign import foreign_priors
+from calibration.inference.foreign import inherited_priors
 from calibration.inference.noise import Noise
 from calibration.inference.observers import Observer
 from mmrjax.robot import Robot
@@ -66,15 +66,15 @@ def prepare(
         BadConfiguration: a noise or a prior that is none, what `choose` raises.
     """
     observe = observers.kind(runs)
-    robot = surfaces.separated(instruments.as_read(robot, runs), runs)
+    robot = surfaces.with_surface_configurations(instruments.with_inferred_instruments(robot, runs), runs)
     former: list[str] = []
     priors = surfaces.of_surfaces(stated or {}, robot, runs)
     priors = robot_file.current_values(priors, robot, "--prior", former)
     own_mass.check_priors(priors, robot, runs)
     as_stated, weighed = robot, own_mass.remarks(robot, runs)
-    robot = own_mass.weighed(robot, runs)
+    robot = own_mass.with_table_mass(robot, runs)
     known = (noise_room.assumed if assume else noise_room.of)(runs, observe.sizes(runs), noise)
-    robot = observe.begun(robot, runs, known)
+    robot = observe.with_initial_states(robot, runs, known)
     found = Prepared(robot, observe, known, priors, (), tuple(former), (), (), (), tuple(weighed))
     names = tuple(choose(found))
     # Its masses are compared with those of the file, which the table's have not yet replaced there.
@@ -83,7 +83,7 @@ def prepare(
     return dataclasses.replace(
         found,
         names=names,
-        foreign=tuple(foreign_priors(robot, priors)),
+        foreign=tuple(inherited_priors(robot, priors)),
         checked=tuple(checked),
         begins=tuple(begins),
     )

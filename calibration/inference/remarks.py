@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.inference import blocks, priors
-from calibration.inference.identifiability import Z95, said_held
+from calibration.inference.identifiability import Z95, describe_held
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
@@ -70,7 +70,7 @@ def _statuses(found: CalibrationResult) -> list[str]:
 
 
 def _parameters(found: CalibrationResult) -> list[str]:
-    said = said_held(found.held_by_prior)
+    said = describe_held(found.held_by_prior)
     said += [
         f"{name} lies {abs(p.shift):.1f} prior sds from its prior: the prior or the model is wrong"
         for name, p in found.parameters.items()

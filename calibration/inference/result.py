@@ -11,7 +11,7 @@ import numpy as np
 
 from calibration.data import posterior, writing
 from calibration.data.posterior import Posterior
-from calibration.inference.identifiability import Identifiability, said_held
+from calibration.inference.identifiability import Identifiability, describe_held
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
 from calibration.inference.population import Searched
@@ -396,7 +396,7 @@ class CalibrationResult:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         note = f"calibrated from {robot_name} with {self.source}; the free parameters: {', '.join(self.parameters)}"
-        note = "\n".join([note, *said_held(self.held_by_prior)])
+        note = "\n".join([note, *describe_held(self.held_by_prior)])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows())

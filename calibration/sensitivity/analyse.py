@@ -12,7 +12,14 @@ from calibration.data.errors import BadConfiguration
 from calibration.inference.identifiability import Z95
 from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.local import Local, directions, inert, local
-from calibration.sensitivity.methods import Part, by_derivative, by_morris, by_shapley, by_sobol, correlated
+from calibration.sensitivity.methods import (
+    Part,
+    correlated,
+    derivative_bounds,
+    morris_screening,
+    shapley_effects,
+    sobol_indices,
+)
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.next_runs import Candidates, next_runs
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
@@ -76,7 +83,7 @@ def analyse(
     if method == "derivative":
         spent = study.evaluations, study.seconds, dict(study.sampled)
         study.tell("Sobol indices of the same points, to compare the bounds with")
-        comparison = _compared(study, parts, by_sobol(study, ~idle, evaluations, seed, second=False))
+        comparison = _compared(study, parts, sobol_indices(study, ~idle, evaluations, seed, second=False))
         study.evaluations, study.seconds, study.sampled = spent
     outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
     if method != "local" and not any(s.studied.any() for s in outputs.values()):
@@ -105,12 +112,12 @@ def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, 
         return {}
     study.tell(f"{METHODS[method]}, over {len(study.points)} operating points")
     if method == "sobol":
-        return by_sobol(study, moving, evaluations, seed)
+        return sobol_indices(study, moving, evaluations, seed)
     if method == "morris":
-        return by_morris(study, moving, evaluations, seed)
+        return morris_screening(study, moving, evaluations, seed)
     if method == "derivative":
-        return by_derivative(study, moving, seed)
-    return by_shapley(study, moving, evaluations, seed)
+        return derivative_bounds(study, moving, seed)
+    return shapley_effects(study, moving, evaluations, seed)
 
 
 def _described(inputs: Inputs, idle: np.ndarray) -> dict[str, Input]:

@@ -79,7 +79,9 @@ def _put(into: Estimate, k: int, found: Estimate) -> None:
     into.value[k], into.low[k], into.high[k] = found.value, found.low, found.high
 
 
-def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, second: bool = True) -> dict[str, Part]:
+def sobol_indices(
+    study: Study, moving: np.ndarray, evaluations: int, seed: int, second: bool = True
+) -> dict[str, Part]:
     """First, total and second-order indices at every point, and over all of them."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
@@ -128,7 +130,7 @@ def by_sobol(study: Study, moving: np.ndarray, evaluations: int, seed: int, seco
     return answer
 
 
-def by_morris(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
+def morris_screening(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
     """Elementary effects over the 95 % range of every input, at every point."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
@@ -184,7 +186,7 @@ def by_morris(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> 
     return answer
 
 
-def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part]:
+def derivative_bounds(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part]:
     """Bounds of first-order and total indices from exact gradients, at every point."""
     points, d = len(study.points), len(study.inputs)
     names = [o.name for o in study.model.outputs]
@@ -225,7 +227,7 @@ def by_derivative(study: Study, moving: np.ndarray, seed: int) -> dict[str, Part
     return answer
 
 
-def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
+def shapley_effects(study: Study, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
     """Shapley effects at every point, and over all of them.
 
     Inputs that do nothing at a point are drawn with those that they are correlated with; the others have no effect.
@@ -266,7 +268,7 @@ def by_shapley(study: Study, moving: np.ndarray, evaluations: int, seed: int) ->
         if not studied.any():
             answer[name] = Part({}, {}, None, None, None, (), lost[name], studied)
             continue
-        overall = shapley.effects(shapley.together(widened))
+        overall = shapley.effects(shapley.of_vector(widened))
         answer[name] = Part(
             {"shapley": overall},
             {"shapley": shown},

@@ -124,7 +124,7 @@ def terms(design: Design, values: np.ndarray) -> Terms | None:
     return Terms(variance, parts, float(1 - np.isfinite(values).mean()))
 
 
-def together(found: Sequence[Terms]) -> Terms:
+def of_vector(found: Sequence[Terms]) -> Terms:
     """Of several outputs, as of a vector (Gamboa et al., Electron. J. Stat. 8 (2014)), whose pairs of orders are the
     same, row by row.
 

@@ -114,7 +114,7 @@ class Observer(eqx.Module):
         """
 
     @classmethod
-    def begun(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
+    def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
         """`robot` with the beginnings of runs that do not begin at rest; as it is where runs are settled."""
         return robot
 

@@ -213,7 +213,7 @@ class Histories(Observer):
         return _stops(runs)
 
     @classmethod
-    def begun(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
+    def with_initial_states(cls, robot: Robot, runs: Runs, noise: Noise) -> Robot:
         return with_begins(robot, runs, noise)
 
     @classmethod

@@ -47,7 +47,7 @@ class Batch(eqx.Module):
     order: tuple[int, ...] = eqx.field(static=True)
 
 
-class Foreseen(eqx.Module):
+class Predicted(eqx.Module):
     """What a robot shows in a batch.
 
     Attributes:
@@ -92,7 +92,7 @@ def _conditions(run: Run) -> Conditions:
     return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass)
 
 
-def readings(robot: Robot, experiments: Batch) -> Foreseen:
+def readings(robot: Robot, experiments: Batch) -> Predicted:
     """What the robot shows in every experiment."""
     shown = [(value := act(robot, at), jnp.ones(value.shape, bool)) for act, at in zip(
         experiments.acts, experiments.at, strict=True
@@ -118,7 +118,7 @@ def readings(robot: Robot, experiments: Batch) -> Foreseen:
         shown.append((value.ravel(), jnp.broadcast_to(does[rows, None], value.shape).ravel()))
     values, exists = zip(*(shown[k] for k in experiments.order), strict=True)
     speed = jnp.where(jnp.asarray(held), 0.0, result.reading["motor_speed"])
-    return Foreseen(
+    return Predicted(
         jnp.concatenate(values), jnp.concatenate(exists), does, jnp.asarray(result.adhesion_used),
         jnp.asarray(result.winding_settled), speed,
     )  # fmt: skip
