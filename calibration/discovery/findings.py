@@ -294,7 +294,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
 
 
 def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings) -> tuple[EffectScore, ...]:
-    """Every effect at its best shape and plausible size, strongest first."""
+    """Every effect at its best shape and plausible size, strongest first; by name where equal to rounding."""
     listed = []
     for effect in space.library.effects:
         amplitude, explained = _plausible_score(space, effect, scores, settings)
@@ -308,7 +308,7 @@ def effect_scores(space: CandidateSpace, scores: ScoreTable, settings: Settings)
                 sigmas_per_prior_sd=float(scores.left[m]),
             )
         )
-    return tuple(sorted(listed, key=lambda s: -s.score))
+    return tuple(sorted(listed, key=lambda s: (-round(s.score, 9), s.name)))
 
 
 def _plausible_score(

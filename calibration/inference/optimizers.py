@@ -1,4 +1,4 @@
-"""Maximum a posteriori by Levenberg-Marquardt with exact Jacobians, from many starts at once; L-BFGS beside it."""
+"""Maximum a posteriori by Levenberg-Marquardt with exact Jacobians, from many starts at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from calibration.inference.normal_equations import backward, cholesky, forward
@@ -30,8 +29,12 @@ DECREMENT, DECREMENT_SHARE = 1e-3, 1e-6
 PATIENCE = 12
 #: Shares of the predicted fall of the objective below which a step is rejected and above which the next may be
 #: longer, and by what the length of the next is then multiplied.
-LITTLE, NEARLY_ALL = 0.01, 0.99
+LITTLE, NEARLY_ALL = 0.01, 0.75
 SHORTER, LONGER = 0.25, 3.5
+#: Turns in which the penalties that count at the end of a step are found, at most.
+TURNS = 8
+#: Largest step, in prior deviations, that is mixed with the last one, and most of the last one that is mixed in.
+NEAR, MIXED_MOST = 0.3, 10.0
 TOLERANCE, TOLERANCE_LONG = 1e-6, 1e-3
 #: How many times the decrease that its linearisation predicts a search of rollouts is given the hope of.
 HOPELESS = 10.0
@@ -114,20 +117,77 @@ def residuals(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], Array]:
     return with_jacobian(function)
 
 
+def penalties(data: Data) -> slice:
+    """Which residuals are penalties on adhesion, one a row, between readings and priors."""
+    return slice(data.measured.size, data.measured.size + data.measured.shape[0])
+
+
 def informing(data: Data) -> np.ndarray:
     """Indices of the residuals that carry information: readings and priors, not the penalty on adhesion."""
-    readings, rows = data.measured.size, data.measured.shape[0]
-    return np.r_[:readings, readings + rows : readings + rows + data.centre.size]
+    held = penalties(data)
+    return np.r_[: held.start, held.stop : held.stop + data.centre.size]
+
+
+def _signed(problem: Problem, seen: Observation, data: Data) -> Array:
+    """Residuals of readings and penalties; that of a row which leaves some of its adhesion's margin is negative."""
+    return jnp.concatenate([problem.whitened(seen, data)[: data.measured.size], problem.excess(seen, data)])
+
+
+def counted(r: Array, jacobian: Array, held: slice) -> tuple[Array, Array]:
+    """Residuals and Jacobian as they count: penalties only where they are positive."""
+    counts = jnp.ones(r.shape, bool).at[held].set(r[held] > 0)
+    return jnp.where(counts, r, 0.0), jnp.where(counts[:, None], jacobian, 0.0)
+
+
+def _cost(r: Array, held: slice) -> Array:
+    return 0.5 * jnp.sum(r.at[held].set(jnp.maximum(r[held], 0.0)) ** 2)
+
+
+def stride_of(r: Array, jacobian: Array, held: slice, damping: Array | float) -> Array:
+    """Step to the optimum of a linearisation whose penalties count where they are positive.
+
+    min_d ½ Σ (r + J d)² + ½ damping |d|², over readings and priors, and over the penalties that are positive at its
+    end, which are found by turns (a semismooth Newton method). The step that knows only the penalties which are
+    positive where it begins leads, from just inside the limit of adhesion, across it, and predicts a gain that is not
+    there; a search then goes along the limit in steps of 1e-4.
+
+    Args:
+        r, jacobian: residuals and slopes, of penalties too where they are negative; held: which are penalties.
+    """
+    free = jacobian.at[held].set(0.0)
+    normal = free.T @ free + damping * jnp.eye(jacobian.shape[1])
+    gradient, edge, height = free.T @ r, jacobian[held], r[held]
+
+    def value(d: Array) -> Array:
+        return _cost(r + jacobian @ d, held) + 0.5 * damping * jnp.sum(d**2)
+
+    def again(carry: tuple) -> tuple:
+        turns, active, _, best, lowest = carry
+        counts = edge * active[:, None]
+        lower = cholesky(normal + counts.T @ counts)
+        d = -backward(lower, forward(lower, gradient + counts.T @ height))
+        beyond, here = height + edge @ d > 0, value(d)
+        better = here < lowest
+        return turns + 1, beyond, active, jnp.where(better, d, best), jnp.where(better, here, lowest)
+
+    still = jnp.zeros(jacobian.shape[1])
+
+    def differs(carry: tuple) -> Array:
+        turns, active, before, _, _ = carry
+        return (turns == 0) | (turns < TURNS) & jnp.any(active != before)
+
+    start = jnp.asarray(0), height > 0, height > 0, still, jnp.asarray(jnp.inf)
+    return jax.lax.while_loop(differs, again, start)[3]
 
 
 def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Array, Array, Observation]]:
-    """Residuals (misfit, then prior), their Jacobian, and what the model says of every row, as a function of z: one
-    evaluation serves all three."""
+    """Residuals (readings, penalties with their signs, then prior), their Jacobian, and what the model says of every
+    row, as a function of z: one evaluation serves all three."""
 
     def function(x: Z) -> tuple[Array, tuple[Array, Observation]]:
         seen = problem.observation(pin.apply(x))
         prior = jnp.where(pin.held, x - pin.at, x - data.centre)
-        r = jnp.concatenate([problem.whitened(seen, data), prior])
+        r = jnp.concatenate([_signed(problem, seen, data), prior])
         return r, (r, seen)
 
     def at(z: Z) -> tuple[Array, Array, Observation]:
@@ -138,14 +198,15 @@ def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Ar
 
 
 def _optimum(jacobian: Array, r: Array, z: Array, data: Data, pin: Pin, steps: Array) -> Optimum:
+    held_rows = penalties(data)
     informed = jacobian[informing(data)]
     lower = cholesky(informed.T @ informed)
     half = forward(lower, jnp.eye(z.shape[0]))
     sd = jnp.linalg.norm(half, axis=0)
-    lower = cholesky(jacobian.T @ jacobian)
-    decrement = 0.5 * jnp.sum(forward(lower, jacobian.T @ r) ** 2)
+    ahead = r + jacobian @ stride_of(r, jacobian, held_rows, 0.0)
+    decrement = _cost(r, held_rows) - _cost(ahead, held_rows)
     held = jnp.where(pin.held, pin.at - data.centre, 0.0)
-    cost = 0.5 * (jnp.sum(r**2) + jnp.sum(held**2))
+    cost = _cost(r, held_rows) + 0.5 * jnp.sum(held**2)
     return Optimum(pin.apply(z), sd, half.T @ half, cost, decrement, _small(decrement, cost), steps)
 
 
@@ -164,16 +225,17 @@ class Progress(eqx.Module):
 
     Attributes:
         y: the best point so far; found: residuals and Jacobian there, and what the model says.
-        normal, gradient: J^T J and J^T r there.
-        ahead: where the model is to be evaluated next; size: of the step to it, 1 / damping.
+        stride: the step of the linearisation there.
+        ahead: where the model is to be evaluated next; mixed: whether `mixed_step` leads there; size: of the step of
+            the linearisation, 1 / damping.
         steps: evaluations so far; rejected: those since y was found; over: whether the search has ended.
     """
 
     y: Z
     found: tuple[Float[Array, " residuals"], Float[Array, "residuals parameters"], Any]
-    normal: Float[Array, "parameters parameters"]
-    gradient: Z
+    stride: Z
     ahead: Z
+    mixed: Bool[Array, ""]
     size: Float[Array, ""]
     steps: Int[Array, ""]
     rejected: Int[Array, ""]
@@ -186,42 +248,61 @@ def begin_at(start: Z, nowhere: tuple[Array, Array, Any]) -> Progress:
     Args:
         nowhere: of the shapes of what it will find, all 0.
     """
-    n, none = start.shape[0], jnp.asarray(0)
-    return Progress(
-        start, nowhere, jnp.zeros((n, n)), jnp.zeros(n), start, jnp.asarray(1.0), none, none, jnp.asarray(False)
-    )
+    none, no = jnp.asarray(0), jnp.asarray(False)
+    return Progress(start, nowhere, jnp.zeros_like(start), start, no, jnp.asarray(1.0), none, none, no)
 
 
-def step(at: Progress, found: tuple[Array, Array, Any], tolerance: float) -> Progress:
-    """One step of Levenberg-Marquardt, d = -(J^T J + I / size)^-1 J^T r, from what was found where the last one led.
+def mixed_step(stride: Z, moved: Z, changed: Z) -> Z:
+    """A step that takes into account how the last one changed the step of the linearisation.
+
+    Where residuals are large beside their curvature, Gauss-Newton steps shrink by the same factor for as long as one
+    likes. Anderson's mixing (D. G. Anderson, J. ACM 12 (1965)) of depth one is a secant in that direction:
+    d - θ (Δy + Δd), θ = d·Δd / |Δd|².
+
+    Args:
+        stride: d, the step of the linearisation at y; moved: Δy, from the point before; changed: Δd, from the stride
+            there.
+    """
+    share = stride @ changed / jnp.maximum(changed @ changed, jnp.finfo(stride.dtype).tiny)
+    return stride - jnp.clip(share, -MIXED_MOST, MIXED_MOST) * (moved + changed)
+
+
+def step(at: Progress, found: tuple[Array, Array, Any], held: slice, tolerance: float) -> Progress:
+    """One step of Levenberg-Marquardt (`stride_of`, damped by 1 / size), from what was found where the last one led.
 
     A step by which the objective falls by less than `LITTLE` of what the linearisation predicts is rejected and the
     next one shortened; one by which it falls by `NEARLY_ALL` of it lets the next one be longer (Conn, Gould, Toint
-    2000, alg. 6.1.1, with the numbers of optimistix 0.1). A search ends where an accepted step changes neither z nor
-    any residual by more than the tolerance, and after `PATIENCE` steps in a row that were rejected: each is a quarter
-    of the one before, so nothing is left to gain but rounding (or, of a rollout, the integrator's tolerance);
-    `Optimum.converged` says whether that place is an optimum.
+    2000, alg. 6.1.1, with the numbers of optimistix 0.1). A step that is `mixed_step` has to leave the same penalties
+    in force, and where it is rejected that of the linearisation alone is tried next. A search ends where an accepted
+    step changes neither z nor any residual by more than the tolerance, and after `PATIENCE` steps in a row that were
+    rejected: each is a quarter of the one before, so nothing is left to gain but rounding (or, of a rollout, the
+    integrator's tolerance); `Optimum.converged` says whether that place is an optimum.
+
+    Args:
+        found: residuals, penalties with their signs, their Jacobian, and what else the evaluation gave; held: which
+            of them are penalties.
     """
     (r, jacobian, _), (r_old, jacobian_old, _) = found, at.found
-    moved, changed, first = at.ahead - at.y, r - r_old, at.steps == 0
-    fall = 0.5 * (jnp.sum(r**2) - jnp.sum(r_old**2))
-    predicted = 0.5 * (jnp.sum((jacobian_old @ moved + r_old) ** 2) - jnp.sum(r_old**2))
-    accepted = first | (fall <= LITTLE * predicted)
+    moved, first = at.ahead - at.y, at.steps == 0
+    fall = _cost(r, held) - _cost(r_old, held)
+    predicted = _cost(r_old + jacobian_old @ moved, held) - _cost(r_old, held)
+    alike = jnp.all((r[held] > 0) == (r_old[held] > 0))
+    accepted = first | ((fall <= LITTLE * jnp.minimum(predicted, 0.0)) & (alike | ~at.mixed))
     good = ~first & (predicted < 0) & (fall < NEARLY_ALL * predicted)
-    size = at.size * jnp.where(accepted, jnp.where(good, LONGER, 1.0), SHORTER)
+    size = at.size * jnp.where(accepted, jnp.where(good, LONGER, 1.0), jnp.where(at.mixed, 1.0, SHORTER))
+    changed = counted(r, jacobian, held)[0] - counted(r_old, jacobian_old, held)[0]
     ended = jnp.all(jnp.abs(moved) < tolerance * (1 + jnp.abs(at.ahead)))
     ended &= accepted & jnp.all(jnp.abs(changed) < tolerance * (1 + jnp.abs(r)))
 
-    new = at.ahead, found, jacobian.T @ jacobian, jacobian.T @ r
-    old = at.y, at.found, at.normal, at.gradient
-    y, best, normal, gradient = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, old)
+    y, best = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), (at.ahead, found), (at.y, at.found))
     tiny = jnp.finfo(size.dtype)
     damping = jnp.where(size > tiny.eps, 1 / jnp.maximum(size, tiny.eps), tiny.max)
-    lower = cholesky(normal + damping * jnp.eye(y.shape[0]))
-    ahead = y - backward(lower, forward(lower, gradient))
+    stride = stride_of(best[0], best[1], held, damping)
+    mixed = accepted & alike & (at.steps > 1) & (jnp.max(jnp.abs(stride)) < NEAR)
+    ahead = y + jnp.where(mixed, mixed_step(stride, moved, stride - at.stride), stride)
     rejected = jnp.where(accepted, 0, at.rejected + 1)
     over = ended | (rejected >= PATIENCE)
-    return Progress(y, best, normal, gradient, ahead, size, at.steps + 1, rejected, over)
+    return Progress(y, best, stride, ahead, mixed, size, at.steps + 1, rejected, over)
 
 
 def _begin(problem: Problem, start: Z, data: Data) -> Progress:
@@ -236,7 +317,7 @@ def _advance(problem: Problem, at: Progress, data: Data, pin: Pin, max_steps: in
     """One step of a search. The model is evaluated in one place of the program, at the start of a step: what was
     accepted there is what the search returns, with its residuals, Jacobian and observation."""
     found = _evaluated(problem, data, pin)(at.ahead)
-    new = step(at, found, TOLERANCE_LONG if problem.observe.long else TOLERANCE)
+    new = step(at, found, penalties(data), TOLERANCE_LONG if problem.observe.long else TOLERANCE)
     over = new.over | (new.steps >= max_steps) | ~jnp.all(jnp.isfinite(new.y))
     return dataclasses.replace(new, over=over)
 
@@ -356,66 +437,28 @@ def searches_refilled(problem: Problem, members: Member, max_steps: int, places:
 
 
 def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """All that is asked of a rollout at z, in one program: residuals (misfit, then prior), Jacobian, observation.
+    """All that is asked of a rollout at z, in one program: residuals (misfit, then prior), Jacobian, observation."""
+    r, jacobian, seen = linearised_signed(problem, z, data)
+    return *counted(r, jacobian, penalties(data)), seen
+
+
+@compiled
+def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    """`linearised` with the signs of penalties, and their slopes where they are negative too.
 
     Where a rollout's step is too long for its friction law (V_s small beside μ_s) the run shakes and its
     derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
     """
-    r, jacobian, seen = _linearised(problem, z, data)
-    return *_counted(r, jacobian, data), seen
-
-
-@compiled
-def _linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    # Of a row that leaves some of its adhesion's margin the penalty is negative here, and has its slope.
     counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + z.size, bool)])
 
     def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
         seen = problem.observation(z)
-        readings = problem.whitened(seen, data)[: data.measured.size]
-        r = jnp.concatenate([readings, problem.excess(seen, data), z - data.centre])
+        r = jnp.concatenate([_signed(problem, seen, data), z - data.centre])
         return r, (r, seen)
 
     jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
     known = jnp.all(jnp.isfinite(jacobian), axis=1)
     return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0), seen
-
-
-def _penalties(data: Data) -> Bool[Array, " residuals"]:
-    readings, rows = data.measured.size, data.measured.shape[0]
-    return jnp.zeros(readings + rows + data.centre.size, bool).at[readings : readings + rows].set(True)
-
-
-def _counted(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
-    counted = ~_penalties(data) | (r > 0)
-    return jnp.where(counted, r, 0.0), jnp.where(counted[:, None], jacobian, 0.0)
-
-
-def step_ahead(
-    residual: Float[np.ndarray, " residuals"],
-    jacobian: Float[np.ndarray, "residuals parameters"],
-    penalty: Bool[np.ndarray, " residuals"],
-) -> tuple[Float[np.ndarray, " parameters"], float]:
-    """Step to the optimum of a linearisation whose penalties count where they are positive, and its gain.
-
-    min_d ½ Σ (r + J d)² over readings and priors + ½ Σ max(0, r + J d)² over penalties, by their active set. The
-    Gauss-Newton step knows those penalties alone that are positive where it begins: from just inside the limit of
-    adhesion it leads across it, and predicts a gain that is not there.
-    """
-
-    def objective(d: np.ndarray) -> float:
-        ahead = residual + jacobian @ d
-        return 0.5 * float(np.sum(np.where(penalty, np.maximum(ahead, 0.0), ahead) ** 2))
-
-    best, active = np.zeros(jacobian.shape[1]), ~penalty | (residual > 0)
-    for _ in range(2 * int(penalty.sum()) + 2):
-        j, r = jacobian[active], residual[active]
-        d = -np.linalg.solve(j.T @ j, j.T @ r)
-        best = min(best, d, key=objective)
-        before, active = active, ~penalty | (residual + jacobian @ d > 0)
-        if (active == before).all():
-            break
-    return best, objective(np.zeros_like(best)) - objective(best)
 
 
 def evaluated(problem: Problem, z: Z, data: Data) -> Array:
@@ -424,9 +467,9 @@ def evaluated(problem: Problem, z: Z, data: Data) -> Array:
     return jnp.concatenate([problem.whitened(seen, data), z - data.centre])
 
 
-@jax.jit
-def _stepped(at: Progress, found: tuple[Array, Array, Any]) -> Progress:
-    return step(at, found, TOLERANCE_LONG)
+@functools.partial(jax.jit, static_argnames=("held_from", "held_to"))
+def _stepped(at: Progress, found: tuple[Array, Array, Any], held_from: int, held_to: int) -> Progress:
+    return step(at, found, slice(held_from, held_to), TOLERANCE_LONG)
 
 
 def search_long(
@@ -439,53 +482,38 @@ def search_long(
     Returns:
         Where the search ended, and what the model says where it started and where it ended.
     """
-    pin = no_pin(start.shape[0])
+    pin, held = no_pin(start.shape[0]), penalties(data)
     search: Progress | None = None
-    accepted = True
-    first: Observation | None = None
-    best: tuple[Optimum, Observation] | None = None
-
-    def judged(z: Z, steps: int, r: Array, jacobian: Array) -> tuple[Optimum, np.ndarray]:
-        ahead, gain = step_ahead(np.asarray(r), np.asarray(jacobian), np.asarray(_penalties(data)))
-        found = _optimum(*_counted(r, jacobian, data)[::-1], z, data, pin, jnp.asarray(steps))
-        return dataclasses.replace(found, decrement=jnp.asarray(gain), converged=_small(gain, found.cost)), ahead
-
+    first = last = None
+    best: Optimum | None = None
     for steps in range(1, max_steps + 1):
         at = start if search is None else search.ahead
         # A step that follows a rejected one is often rejected too; that takes no Jacobian, so the last one stays.
-        r = None if accepted else evaluated(problem, at, data)
-        if r is None or best is None or 0.5 * jnp.sum(r**2) < best[0].cost:
-            signed, slope, seen = _linearised(problem, at, data)
-            r, jacobian = _counted(signed, slope, data)
+        r = None if search is None or search.rejected == 0 else evaluated(problem, at, data)
+        if r is None or best is None or 0.5 * jnp.sum(r**2) < best.cost:
+            r, jacobian, seen = linearised_signed(problem, at, data)
         if search is None:
             search, first = begin_at(start, jax.tree.map(jnp.zeros_like, (r, jacobian, None))), seen
-        search = _stepped(search, (r, jacobian, None))
-        accepted, done = bool(search.rejected == 0), bool(search.over)
-        if accepted:
-            found, ahead = judged(search.y, steps, signed, slope)
-            best = found, seen
-            done |= bool(found.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost))
+        search = _stepped(search, (r, jacobian, None), held.start, held.stop)
+        done = bool(search.over)
+        if search.rejected == 0:
+            best, last = _optimum(jacobian, r, search.y, data, pin, jnp.asarray(steps)), seen
+            done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
-        tell(f"step {steps}: objective {float(best[0].cost):.4f}")
+        tell(f"step {steps}: objective {float(best.cost):.4f}")
         if done:
             break
-    assert best is not None and first is not None
-    # The steps above see the limit of adhesion only once they have crossed it; these go along it.
-    while not best[0].converged and (steps := steps + 1) <= max_steps:
-        at = best[0].z + ahead
-        if not 0.5 * jnp.sum(evaluated(problem, at, data) ** 2) < best[0].cost:
-            break
-        signed, slope, seen = _linearised(problem, at, data)
-        found, ahead = judged(at, steps, signed, slope)
-        best = found, seen
-        tell(f"step {steps}: objective {float(found.cost):.4f}")
-    return best[0], first, best[1]
+    assert best is not None and first is not None and last is not None
+    return best, first, last
 
 
 Evaluate = Callable[[Array], tuple[Array, Array, Observation]]
 
 
-_steps = jax.jit(jax.vmap(lambda at, found: step(at, found, TOLERANCE_LONG)))
+@functools.partial(jax.jit, static_argnames=("held_from", "held_to"))
+def _steps(at: Progress, found: tuple[Array, Array, Any], held_from: int, held_to: int) -> Progress:
+    held = slice(held_from, held_to)
+    return jax.vmap(lambda at, found: step(at, found, held, TOLERANCE_LONG))(at, found)
 
 
 @eqx.filter_jit
@@ -503,8 +531,8 @@ def searches_long(
     """A batch of `levenberg_marquardt` with the steps taken from outside, so that rollouts are compiled once in all.
 
     Args:
-        evaluate: residuals, their Jacobian and the observation of every member at its z, compiled; leading axis the
-            batch.
+        evaluate: residuals, penalties with their signs, their Jacobian and the observation of every member at its z,
+            compiled; leading axis the batch.
         starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, channels).
         rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
             lower, and those that cannot come down to it (by `HOPELESS` times what their step predicts) before.
@@ -513,12 +541,12 @@ def searches_long(
         Where each search ended, and what the model says there.
     """
     starts = jnp.asarray(starts)
-    found = evaluate(starts)
+    found, held = evaluate(starts), penalties(data)
     at = jax.vmap(begin_at)(starts, jax.tree.map(jnp.zeros_like, found))
     over, taken = np.zeros(len(starts), bool), np.zeros(len(starts), int)
     for steps in range(1, max_steps + 1):
         # A step judges what was found where the last one led; what is accepted becomes y.
-        new = _steps(at, found)
+        new = _steps(at, found, held.start, held.stop)
         moved, done = np.asarray(new.rejected == 0), np.asarray(new.over)
         at = _where(over, at, new)
         taken = np.where(over, taken, steps)
@@ -540,35 +568,6 @@ def searches_long(
 @jax.jit
 def _where(which: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
-
-
-def quasi_newton(problem: Problem, start: Z, data: Data, max_steps: int = 2000) -> Optimum:
-    """One search of the same objective by `optax.lbfgs`; its gradient is Jᵀr with the forward Jacobian.
-
-    For many parameters, or where the Jacobian is too large to factorise.
-    """
-    pin = no_pin(start.shape[0])
-    function = residuals(problem, data, pin)
-
-    def cost(z: Z) -> Array:
-        return 0.5 * jnp.sum(function(z) ** 2)
-
-    solver = optax.lbfgs(memory_size=20)
-    value_and_grad = optax.value_and_grad_from_state(cost)
-
-    def step(carry: tuple) -> tuple:
-        z, state, k, _ = carry
-        value, gradient = value_and_grad(z, state=state)
-        updates, state = solver.update(gradient, state, z, value=value, grad=gradient, value_fn=cost)
-        return optax.apply_updates(z, updates), state, k + 1, jnp.max(jnp.abs(gradient))
-
-    def go_on(carry: tuple) -> Array:
-        return (carry[2] < max_steps) & (carry[3] > 1e-5)
-
-    carry = (start, solver.init(start), jnp.asarray(0), jnp.asarray(jnp.inf))
-    z, _, k, _ = jax.lax.while_loop(go_on, step, carry)
-    r, jacobian, _ = _evaluated(problem, data, pin)(z)
-    return _optimum(jacobian, r, z, data, pin, k)
 
 
 @compiled

@@ -32,7 +32,7 @@ from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import backward, cholesky, forward
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
-from calibration.inference.optimizers import Numbers, Optimum, linearised, searches_long
+from calibration.inference.optimizers import Numbers, Optimum, linearised, linearised_signed, searches_long
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
@@ -830,6 +830,6 @@ def _evaluate(problem: Problem, z: Array, weights: Array, active: Array | None) 
         here = problem
         if which is not None:
             here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(which))
-        return linearised(here, z, dataclasses.replace(problem.data, weight=weight))
+        return linearised_signed(here, z, dataclasses.replace(problem.data, weight=weight))
 
     return jax.vmap(one)(z, weights, active)
