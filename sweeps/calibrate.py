@@ -25,7 +25,7 @@ def calibrate(
 
     0 done; 3 done, but the search did not converge, or a row or a fit without a block did not.
     """
-    robot = load_robot(config)
+    robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     with open_folder("calibrate", config, robot, out, force, runs) as folder:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from calibration.data import rig_file
 from calibration.data.columns import Layout
+from calibration.data.robot_file import RobotFile
 from mmrjax import params
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
@@ -84,39 +81,23 @@ def of(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {column: values for column, values in table.items() if column not in gone}
 
 
-def _keys(table: dict[str, Any], before: str = "") -> set[str]:
-    found: set[str] = set()
-    for key, value in table.items():
-        found |= _keys(value, f"{before}{key}.") if isinstance(value, dict) else {before + key}
-    return found
-
-
-def parameters(robot: Robot, robot_name: str) -> list[dict[str, str]]:
-    """Parameters of a rig: those that its file states, and all else that is not the same as nothing; with the source.
-
-    Args:
-        robot_name: its file.
-    """
-    path = Path(robot_name)
-    try:
-        stated = _keys(tomllib.loads(path.read_text(encoding="utf-8"))) if path.suffix == ".toml" else set()
-    except OSError:
-        stated = set()
-    of_unit = set(rig_file.LINEAR) - {"inertia"}
-    linear = {key.partition(".")[0] for key in stated if key.rpartition(".")[2] in of_unit}
+def parameters(file: RobotFile) -> list[dict[str, str]]:
+    """Parameters of a rig: those that its file states, and all else that is not as nothing is; with the source."""
+    robot = file.robot
     travels = not robot.on_shaft or "speed" in robot.rig.channels
     usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
     found = []
     for p in params.walk(robot):
-        load = p.name.partition(".")[0] in robot.configurations
-        own = p.name in stated
+        head = p.name.partition(".")[0]
+        load = head in robot.configurations
+        own = p.name in file.stated and head not in file.linear
         moved = p.name not in usual or float(p.value) != usual[p.name]
         if not own and not moved and not (load and float(p.value) != 0):
             continue
         if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not travels)):
             continue
-        of_file = own or p.name.partition(".")[0] in linear
-        source = f"stated in {path.name}" if of_file else "default" if not moved or load else "changed"
+        of_file = own or head in file.linear
+        source = f"stated in {file.name}" if of_file else "default" if not moved or load else "changed"
         found.append(
             {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{float(p.value):.6g}"}
             | {"source": source}

@@ -32,13 +32,13 @@ Summary = dict[str, dict[str, dict[str, Any]]]
 
 def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
     """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
-    robot = load_robot(config)
-    stated = runs = read_runs(source, robot, measured=True)
-    robot = instruments.with_inferred_instruments(robot, runs)
+    file = load_robot(config)
+    stated = runs = read_runs(source, file.robot, measured=True)
+    robot = instruments.with_inferred_instruments(file.robot, runs)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     said = check_ranges(runs, robot)
-    drawn = None if config.posterior is None else beside_robot(config, robot)
+    drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)
         comparison, summary = compared(stated, table, robot)
@@ -58,7 +58,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
             from sweeps import report_comparison
 
             report_comparison.write(
-                folder.partial, robot=robot, robot_name=config.robot, model=config.model, data_name=runs.source,
+                folder.partial, dataclasses.replace(file, robot=robot), model=config.model, data_name=runs.source,
                 table=comparison, summary=summary, notes=notes,
             )  # fmt: skip
         further = {"errors": summary, "notes": notes}

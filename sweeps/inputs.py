@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, ON_GROUND, Layout
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
+from calibration.data.robot_file import RobotFile
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH
 from sweeps import imposed
@@ -26,7 +28,7 @@ OPTIONS = {
 VOLTAGE = 33.0
 
 
-def load_robot(config: RobotPart) -> Robot:
+def load_robot(config: RobotPart) -> RobotFile:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
 
     Former names of parameters are taken, and said on stderr.
@@ -35,28 +37,27 @@ def load_robot(config: RobotPart) -> Robot:
         BadConfiguration: no such robot, a file or a change that is refused.
     """
     notes: list[str] = []
-    robot = robot_file.load(config.robot, effect_file.library(config.effects), notes)
-    robot = robot_file.change(robot, config.set, where="--set", notes=notes)
+    file = robot_file.find(config.robot, effect_file.library(config.effects), notes)
+    robot = robot_file.change(file.robot, config.set, where="--set", notes=notes)
     for note in notes:
         tell(note)
-    return robot
+    return dataclasses.replace(file, robot=robot)
 
 
-def beside_robot(config: RobotPart, robot: Robot) -> Posterior:
+def beside_robot(file: RobotFile) -> Posterior:
     """The posterior that lies beside the file of a calibrated robot.
 
     Raises:
         BadConfiguration: the robot is none of a file.
         BadData: there is none, it cannot be read, or it is of another robot.
     """
-    file = Path(config.robot)
-    if file.suffix != ".toml":
+    if Path(file.source).suffix != ".toml":
         raise BadConfiguration(
-            f"--posterior: {config.robot} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
+            f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
-    path = file.with_name(posterior.FILE)
+    path = Path(file.source).with_name(posterior.FILE)
     found = posterior.read(path)
-    found.check(robot, str(path))
+    found.check(file.robot, str(path))
     return found
 
 

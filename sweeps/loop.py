@@ -29,7 +29,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
     0 done; 3 done, but rows could not be simulated, or the fit that is proposed did not converge.
     """
     began = time.monotonic()
-    robot = load_robot(config)
+    robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
 

@@ -58,7 +58,8 @@ def simulate(
         BadData: a wrong profile or table of runs.
     """
     assert config.profile is not None
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     _check_robot(robot)
     source = profiles.read(config.profile)
     _check_acting(robot, source)
@@ -87,7 +88,7 @@ def simulate(
         if config.report:
             from sweeps import report_mission
 
-            report_mission.write(folder.partial, robot=robot, robot_name=config.robot, found=found)
+            report_mission.write(folder.partial, file, found)
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
         return run.leave(folder, config, result)
 

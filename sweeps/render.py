@@ -35,7 +35,7 @@ def render(
         raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
     if not file.parent.is_dir():
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
-    robot = load_robot(config)
+    robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)

@@ -14,6 +14,7 @@ from sweeps.imposed import UNLIMITED
 from sweeps.report import Album, columns, conditions, first_rows, label, named, render, statuses
 
 if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
     from mmrjax.fidelities.base import Run
     from mmrjax.robot import Robot
 
@@ -29,9 +30,8 @@ HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
 
 def write(
     folder: Path,
+    file: RobotFile,
     *,
-    robot: Robot,
-    robot_name: str,
     model: str,
     runs: dict[str, np.ndarray],
     histories: Run | None = None,
@@ -40,7 +40,7 @@ def write(
 
     Args:
         folder: an existing run folder.
-        robot: the robot that was simulated; robot_name: its name or file.
+        file: of the robot that was simulated.
         model: fidelity.
         runs: the finished table of runs.
         histories: the same as a batch with its history, of a fidelity that keeps it.
@@ -48,7 +48,7 @@ def write(
     Returns:
         The path of the page.
     """
-    album = Album(folder)
+    album, robot = Album(folder), file.robot
     names = labels(runs)
     known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": []}
     if histories is not None:
@@ -78,7 +78,7 @@ def write(
         heat=capabilities.thermal(robot),
         on_shaft=robot.on_shaft,
         **known,
-        **named(robot, robot_name),
+        **named(file),
     )
 
 

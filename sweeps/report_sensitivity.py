@@ -13,18 +13,18 @@ from sweeps import figures_sensitivity
 from sweeps.report import Album, named, number, render
 
 if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+    from calibration.data.robot_file import RobotFile
 
 #: Pairs of a table of interactions.
 PAIRS = 5
 
 
-def write(folder: Path, found: SensitivityResult, *, robot: Robot, robot_name: str) -> Path:
+def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a finished study; returns the path of the page.
 
     Args:
         folder: an existing run folder.
-        robot: that was studied; robot_name: its name or file.
+        file: of the robot that was studied.
     """
     album = Album(folder)
     album.add("overview", partial(figures_sensitivity.overview, found))
@@ -62,7 +62,7 @@ def write(folder: Path, found: SensitivityResult, *, robot: Robot, robot_name: s
         negligible=100 * NEGLIGIBLE,
         ranges=_ranges(found),
         bounds=_bounds(found),
-        **named(robot, robot_name),
+        **named(file),
     )
 
 

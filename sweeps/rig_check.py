@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import instruments, rig_facts, robot_file
+from calibration.data import rig_facts
 from calibration.data.columns import ON_GROUND, SUPPLY
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
@@ -93,9 +93,9 @@ class RigCheck:
     def channels(self) -> list[dict[str, Any]]:
         """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
         theirs = {mine: column for mine, column, _ in self.robot.rig.columns}
-        found = []
+        shown, found = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
-            instrument = self.robot.rig.instrument(channel.name)
+            instrument = shown.instrument(channel.name)
             usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
             found.append(
                 {
@@ -247,18 +247,15 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool)
 
 def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> RigCheck:
     """What there is to say of a rig's file, and of a table beside it."""
-    robot = load_robot(RobotPart(robot=str(file), effects=effects))
-    lines = file.read_text(encoding="utf-8").splitlines()
+    rig = load_robot(RobotPart(robot=str(file), effects=effects))
+    lines, robot = rig.text.splitlines(), rig.robot
     examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
-    stated, linear = robot_file.parameters_stated(file)
-    origins = tuple(rig_facts.origins(robot, stated, linear))
-    found = RigCheck(file.name, robot, examples, origins, tuple(rig_facts.facts(robot)))
+    found = RigCheck(rig.name, robot, examples, tuple(rig_facts.origins(rig)), tuple(rig_facts.facts(robot)))
     if data is None:
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    robot = instruments.with_inferred_instruments(robot, runs)
-    return dataclasses.replace(found, robot=robot, runs=runs, shown=_shown(runs, data), foresight=seen)
+    return dataclasses.replace(found, runs=runs, shown=_shown(runs, data), foresight=seen)
 
 
 def _shown(runs: Runs, data: str) -> dict[str, str]:

@@ -10,6 +10,7 @@ from rich.table import Table
 from calibration.data import robot_file
 from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration
+from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from calibration.inference import noise
 from calibration.sensitivity import inputs as room
@@ -56,13 +57,14 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
 
     0 done; 3 done, but some operating points have no numbers.
     """
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     if config.method not in METHODS:
         raise BadConfiguration(f"option method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
     outputs = chosen_outputs(config.outputs, robot)
     ranges = _ranges(config.vary)
     runs = _operating_points(config, robot, ranges)
-    inputs = _inputs(config, robot, runs, ranges)
+    inputs = _inputs(config, file, runs, ranges)
     candidates = _candidates(config, robot, runs)
     conditions = runs.conditions(robot)
     refuse(robot, conditions, config)
@@ -79,7 +81,7 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
         if config.report:
             from sweeps import report_sensitivity
 
-            report_sensitivity.write(folder.partial, found, robot=robot, robot_name=config.robot)
+            report_sensitivity.write(folder.partial, found, file)
         path = folder.finish({"seed": found.seed, "statuses": found.statuses}, runs)
         say(str(path))
         return DONE if found.studied else SOME_NOT_CONVERGED
@@ -144,13 +146,13 @@ def words_of(name: str) -> str:
 
 
 def _inputs(
-    config: configuration.Sensitivity, robot: Robot, runs: Runs, ranges: dict[str, tuple[float, float]]
+    config: configuration.Sensitivity, file: RobotFile, runs: Runs, ranges: dict[str, tuple[float, float]]
 ) -> Inputs:
-    present = tuple(dict.fromkeys(map(str, runs["configuration"])))
+    robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
             raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
-        return room.of_posterior(robot, beside_robot(config, robot), ranges)
+        return room.of_posterior(robot, beside_robot(file), ranges)
     names = config.parameters or room.default_names(robot, present, config.battery, config.model)
     return room.of_priors(robot, names, ranges)
 

@@ -44,7 +44,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     Raises:
         BadConfiguration: more runs than histories can be kept of.
     """
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     if isinstance(given, str):
         runs = read_runs(given, robot, measured=False, battery=config.battery)
     else:
@@ -53,7 +54,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
-    drawn = None if config.posterior is None else beside_robot(config, robot)
+    drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         table, histories = _simulated(folder, robot, runs, config)
         table[PERMISSIBLE] = permissible(robot, table)
@@ -74,7 +75,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             from sweeps import report_runs
 
             report_runs.write(
-                folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
+                folder.partial, file, model=config.model, runs=table,
                 histories=histories,
             )  # fmt: skip
         further: dict[str, Any] = {"notes": notes}

@@ -540,7 +540,10 @@ CALLED: dict[tuple[str, str], str] = {
     ("loop_baselines", "fit_base"): "the same",
     ("calibrate", "pose"): "coverage about a known truth: problems without a table of their own",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
-    ("05_your_rig", "with_surface_configurations"): "an effect of the rig's size, shown by itself before it is calibrated as users do",
+    (
+        "05_your_rig",
+        "with_surface_configurations",
+    ): "an effect of the rig's size, shown by itself before it is calibrated as users do",
     ("05_your_rig", "library_for"): "the same",
     ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }
@@ -583,11 +586,7 @@ def test_a_campaign_of_its_own_way_is_found():
 def test_one_preparation_serves_all():
     """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
     inner = {"with_inferred_instruments", "with_surface_configurations", "with_initial_states", "check_start"}
-    allowed = {
-        "calibration/inference/preparation.py",
-        "sweeps/compare.py",
-        "sweeps/rig_check.py",
-    }  # two that fit nothing
+    allowed = {"calibration/inference/preparation.py", "sweeps/compare.py"}  # which fits nothing
     found = {
         path.relative_to(ROOT).as_posix()
         for layer in ("calibration", "sweeps")
@@ -646,6 +645,17 @@ def test_a_circle_of_imports_is_found(found, tmp_path):
     guard = "pass" if found else "if TYPE_CHECKING:\n    from sweeps.a import f"
     (tmp_path / "sweeps" / "b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
     assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
+
+
+def test_toml_is_read_in_one_place():
+    """But for the comments at the top of a profile, each of which is a line of TOML."""
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for layer in LAYERS
+        for path in (ROOT / layer).rglob("*.py")
+        if "tomllib" in dict(imports(ast.parse(path.read_text(encoding="utf-8")), ""))
+    }
+    assert found == {"calibration/data/errors.py", "calibration/data/profiles.py"}
 
 
 def test_reference_implementation_imports_nothing_of_ours():

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 from calibration.data import rig_file
 from calibration.data.errors import rounded
+from calibration.data.robot_file import RobotFile
 from mmrjax import params
 from mmrjax.channels import RPM
 from mmrjax.robot import Robot
@@ -186,12 +187,9 @@ class Origin:
     why: str
 
 
-def origins(robot: Robot, stated: set[str], linear: set[str]) -> list[Origin]:
-    """Where the numbers of a robot come from, those that its file leaves open last of each part.
-
-    Args:
-        stated: parameters that its file states; linear: configurations that it states as linear units.
-    """
+def origins(file: RobotFile) -> list[Origin]:
+    """Where the numbers of a robot come from, those that its file leaves open last of each part."""
+    robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     found = []
     for p in params.walk(robot):
@@ -204,7 +202,7 @@ def origins(robot: Robot, stated: set[str], linear: set[str]) -> list[Origin]:
         if not shown and not assumed:
             continue
         if p.name in stated:
-            why = "the file, by mass and travel of the linear unit" if head in linear else "the file"
+            why = "the file, by mass and travel of the linear unit" if head in file.linear else "the file"
         elif not robot.rig.blank:
             why = "its base"
         else:
