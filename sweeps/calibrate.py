@@ -11,7 +11,7 @@ from calibration.inference.calibrate import calibrate as run
 from calibration.inference.result import CalibrationResult
 from sweeps import config as configuration
 from sweeps import words
-from sweeps.capabilities import is_rig
+from sweeps.capabilities import crosses_zero
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import rms
@@ -70,7 +70,7 @@ def print_calibration(found: CalibrationResult) -> None:
         cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
-    if is_rig(found.robot):
+    if crosses_zero(found.robot):
         say(words.describe_rms(rms(found.rows(), found.channels, ("before", "after", "held_out"))))
     say(found.starts.statement())
     for note in found.notes:

@@ -29,33 +29,38 @@ OF_HEAT = (
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
 
 
-def is_rig(robot: Robot) -> bool:
-    """Whether it is a rig, in whose tables a reading may cross zero, and not the packaged robot or one like it."""
-    return not Layout.of(robot).usual
+def crosses_zero(robot: Robot) -> bool:
+    """Whether its readings may cross zero, see `Layout`."""
+    return Layout.of(robot).crosses_zero
 
 
 def stated(robot: Robot, prefix: str) -> bool:
     """Whether any parameter whose name begins so is another than that of a rig of which nothing is known."""
-    usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
-    return any(float(p.value) != usual[p.name] for p in params.walk(robot) if p.name.startswith(prefix))
+    nothing = _nothing(robot)
+    return any(float(p.value) != nothing[p.name] for p in params.walk(robot) if p.name.startswith(prefix))
+
+
+def _nothing(robot: Robot) -> dict[str, float]:
+    """Parameters of a rig of which nothing is known but its loads."""
+    return {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
 
 
 def thermal(robot: Robot) -> bool:
     """Whether it is known how heat leaves the windings."""
     sheet = Motor()
-    return not robot.rig.blank or any(
+    return robot.rig.inherits or any(
         float(getattr(robot.motor, name)) != float(getattr(sheet, name)) for name in _THERMAL
     )
 
 
 def battery(robot: Robot) -> bool:
     """Whether it has a battery of its own."""
-    if not robot.rig.blank:
+    if robot.rig.inherits:
         return True
-    usual, other = Battery(), "current_other"  # `rig_file.DEFAULTS` states that one
+    nothing, other = Battery(), "current_other"  # `rig_file.DEFAULTS` states that one
     same = [
         float(getattr(robot.battery, name)) == float(value)
-        for name, value in vars(usual).items()
+        for name, value in vars(nothing).items()
         if name != other and isinstance(value, int | float)
     ]
     return not all(same)
@@ -64,8 +69,10 @@ def battery(robot: Robot) -> bool:
 def idle_columns(robot: Robot) -> set[str]:
     """Columns of runs and histories that mean nothing for a robot."""
     found: set[str] = set()
-    if robot.on_shaft:
-        found |= {*OF_GROUND, *(() if "speed" in robot.rig.channels else OF_TRAVEL)}
+    if not robot.has_ground:
+        found |= {*OF_GROUND}
+    if not robot.shows_travel:
+        found |= {*OF_TRAVEL}
     if not thermal(robot):
         found |= {*OF_HEAT}
     if not battery(robot):
@@ -84,17 +91,15 @@ def of(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def parameters(file: RobotFile) -> list[dict[str, str]]:
     """Parameters of a rig: those that its file states, and all else that is not as nothing is; with the source."""
     robot = file.robot
-    travels = not robot.on_shaft or "speed" in robot.rig.channels
-    usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
-    found = []
+    nothing, found = _nothing(robot), []
     for p in params.walk(robot):
         head = p.name.partition(".")[0]
         load = head in robot.configurations
         own = p.name in file.stated and head not in file.linear
-        moved = p.name not in usual or float(p.value) != usual[p.name]
+        moved = p.name not in nothing or float(p.value) != nothing[p.name]
         if not own and not moved and not (load and float(p.value) != 0):
             continue
-        if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not travels)):
+        if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not robot.shows_travel)):
             continue
         of_file = own or head in file.linear
         source = f"stated in {file.name}" if of_file else "default" if not moved or load else "changed"

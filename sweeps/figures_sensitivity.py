@@ -153,17 +153,17 @@ def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np
         mine = np.flatnonzero(names[order] == kind)
         if mine[0]:
             ax.axvline(mine[0] - 0.5, color="white", linewidth=4)
-        levels = points.imposed[1] if points.on_shaft else points.slope_deg
+        levels = points.slope_deg if points.has_ground else points.imposed[1]
         for level in np.unique(levels[order][mine]):
             at = mine[levels[order][mine] == level]
             ticks.append(at.mean())
-            labels.append(f"{level:g}" + ("" if points.on_shaft else "°"))
+            labels.append(f"{level:g}" + ("°" if points.has_ground else ""))
             if at[0] != mine[0]:
                 ax.axvline(at[0] - 0.5, color="white", linewidth=1.5)
         ax.text(mine.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
     ax.set_xticks(ticks, labels, fontsize=8.5)
     word, own, unit = points.imposed
-    if points.on_shaft:
+    if not points.has_ground:
         ax.set_xlabel(f"{word} [{unit}]; grey: no index there", fontsize=8.5)
         return
     other = ((word, own, unit), ("payload", points.payload, "kg"))

@@ -9,7 +9,7 @@ from typing import Any
 
 from calibration.data import effect_file, posterior, robot_file
 from calibration.data import runs as records
-from calibration.data.columns import IMPOSED, ON_GROUND, Layout
+from calibration.data.columns import IMPOSED, Layout
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
@@ -24,8 +24,6 @@ OPTIONS = {
     "supply_voltage_V": "--voltage", "motor_speed_rpm": "--motor-speed", "payload_kg": "--payload",
     "slope_deg": "--slope", "total_mass_kg": "--mass", "surface": "--surface",
 }  # fmt: skip
-#: Supply voltage of one run where none is stated [V], the highest of Table 8.
-VOLTAGE = 33.0
 
 
 def load_robot(config: RobotPart) -> RobotFile:
@@ -125,14 +123,13 @@ def one_run(
     column = layout.imposed_column
     for other in (c for c, _ in IMPOSED.values() if c != column and c in given):
         raise BadConfiguration(imposed.refused(robot, OPTIONS[other], OPTIONS[column]))
-    for key in (key for key in given if layout.on_shaft and key in (*ON_GROUND, "surface")):
-        raise BadConfiguration(imposed.on_shaft(OPTIONS[key]))
+    imposed.check_acting(robot, (OPTIONS[key] for key in given if key in layout.idle))
     if battery:
         imposed.check_battery(robot)
     elif column not in given:
         rest = 0.0 if column in elsewhere else None
-        given[column] = VOLTAGE if layout.usual else imposed.default(robot, OPTIONS[column]) if rest is None else rest
-    if not layout.on_shaft:
-        bench = {} if layout.blank else {"surface": BENCH}
+        given[column] = imposed.default(robot, OPTIONS[column]) if rest is None else rest
+    if robot.has_ground:
+        bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
     return records.single({**given, "configuration": name}, layout)

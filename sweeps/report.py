@@ -53,7 +53,7 @@ def named(file: RobotFile) -> dict[str, Any]:
     from mmrjax.robots import ROBOTS
 
     robot, name = file.robot, file.name
-    if robot.rig.blank:
+    if not robot.rig.inherits:
         return {"robot": name, "changed": [], "own": capabilities.parameters(file)}
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
         name = f"{name}, changed"

@@ -39,7 +39,7 @@ def write(
         The path of the page.
     """
     album, robot = Album(folder), file.robot
-    sized = not Layout.of(robot).usual
+    sized = Layout.of(robot).crosses_zero
     album.add("parity", lambda: figures_comparison.parity(table, robot.channels, band=not sized))
     album.add("errors", lambda: figures_comparison.errors_over(table, robot.channels, in_units=sized))
     known = named(file)

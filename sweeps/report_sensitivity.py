@@ -143,8 +143,9 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
             }
             for k in range(len(points))
         ],
-        "heading": "supply [V]" if points.motor_speed is None else "motor speed [rpm]", "on_shaft": points.on_shaft,
-        "candidates": n.candidates, "source": n.source, "noise": n.noise, "outputs": outputs,
+        "heading": "supply [V]" if points.motor_speed is None else "motor speed [rpm]",
+        "has_ground": points.has_ground, "candidates": n.candidates, "source": n.source, "noise": n.noise,
+        "outputs": outputs,
     }  # fmt: skip
 
 
@@ -157,7 +158,7 @@ def _ranges(found: SensitivityResult) -> str:
     p = found.points
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
     _, own, symbol = p.imposed
-    ground = () if p.on_shaft else ((p.payload, " kg"), (p.slope_deg, "°"))
+    ground = ((p.payload, " kg"), (p.slope_deg, "°")) if p.has_ground else ()
     for x, unit in ((own, f" {symbol}"), *ground):
         on_battery = unit == " V" and np.isnan(x).all()
         parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)

@@ -13,7 +13,7 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data import rig_facts
-from calibration.data.columns import ON_GROUND, SUPPLY
+from calibration.data.columns import SUPPLY, Layout
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
@@ -75,7 +75,7 @@ class RigCheck:
     def remarks(self) -> list[str]:
         """What should be looked at, a sentence each."""
         said = []
-        if not self.robot.rig.blank:
+        if self.robot.rig.inherits:
             said.append(
                 'what the file does not state is its base\'s, a packaged robot (base = "none" starts from nothing)'
             )
@@ -84,7 +84,7 @@ class RigCheck:
             said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [o.name for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value != 0]
-        if loose and self.robot.rig.blank:
+        if loose and not self.robot.rig.inherits:
             said.append(f"without ±, so with the program's: {', '.join(loose)}")
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
             said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
@@ -135,9 +135,8 @@ class RigCheck:
 
     def _means_nothing(self, column: str) -> bool:
         """Whether a column that the table lacks says nothing of this rig: of a ground, or what is not imposed."""
-        if self.robot.on_shaft and column in ON_GROUND:
-            return True
-        return column == SUPPLY and self.robot.rig.imposed != "voltage"
+        idle = Layout.of(self.robot).idle
+        return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
 
     def unused(self) -> list[str]:
         """Of each column that is not used, why."""

@@ -156,7 +156,7 @@ def shares(advance: Callable[[float], None], count: int) -> Callable[[float], No
 def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
     """The condition columns of a table, the total mass taken from the robot where none is stated."""
     columns = {key: runs[key] for key in ("configuration", runs.layout.imposed_column)}
-    if not robot.on_shaft:
+    if robot.has_ground:
         if runs.has("total_mass_kg"):
             columns["total_mass_kg"] = runs["total_mass_kg"]
         else:

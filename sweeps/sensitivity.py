@@ -109,13 +109,12 @@ def _operating_points(
 ) -> Runs:
     """The grid of operating points; an axis that varies has one value, the middle of its range."""
     layout = Layout.of(robot)
-    usual: dict[str, tuple[float, ...]] = {}
-    if layout.usual:
-        usual = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
-    axes = {key: getattr(config, key) or usual.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
+    table8: dict[str, tuple[float, ...]] = {}
+    if layout.table8:
+        table8 = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+    axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
-        if layout.on_shaft and name in axes_room.ON_GROUND:
-            raise BadConfiguration(imposed.on_shaft(f"--vary {name}"))
+        imposed.check_acting(robot, [f"--vary {name}"] if name in axes_room.ON_GROUND else [])
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
                 f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
@@ -162,7 +161,7 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs) -
     if config.candidates:
         runs = read_runs(config.candidates, robot, measured=False)
         source = runs.source
-    elif not Layout.of(robot).usual:
+    elif not Layout.of(robot).table8:
         runs, source = points, "the operating points"
     else:
         runs = grid(GridPart(surface=config.surface), robot)

@@ -79,7 +79,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
                 histories=histories,
             )  # fmt: skip
         further: dict[str, Any] = {"notes": notes}
-        if histories is not None and not robot.on_shaft:
+        if histories is not None and robot.has_ground:
             further["starts"] = starts(robot, histories, runs)
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
@@ -202,7 +202,7 @@ def _names(runs: records.Runs) -> np.ndarray:
 def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
-    of_rig = {*robot.rig.channels, *(OF_SHAFT if robot.on_shaft else OF_VEHICLE)}
+    of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
     shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),

@@ -35,13 +35,13 @@ class Loads:
     """The loads of a robot file, before the parameters that it states.
 
     Attributes:
-        by_name: in order; on_shaft: whether they are shafts, else vehicles.
+        by_name: in order; travels: whether they travel, as vehicles and linear units do.
         linear: names of those that are linear units.
         missing: parameters without default that the file does not state.
     """
 
     by_name: dict[str, Load]
-    on_shaft: bool
+    travels: bool
     linear: frozenset[str]
     missing: tuple[str, ...]
 
@@ -102,7 +102,7 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
         raise BadConfiguration(
             f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; expected loads of one kind, one file each"
         )
-    return Loads(by_name, bool(shafts), frozenset(linear), tuple(missing))
+    return Loads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
 
 
 def resolved_likes(content: dict[str, Any], where: str) -> None:

@@ -42,7 +42,7 @@ def facts(robot: Robot) -> list[Fact]:
 
 def _has(robot: Robot, name: str) -> bool:
     """Whether a robot's file has to state a parameter; of one with a base, all are."""
-    return not robot.rig.blank or name in rig_file.needed(robot.rig)
+    return robot.rig.inherits or name in rig_file.needed(robot.rig)
 
 
 def _within(value: float, low: float, high: float, why: str) -> str:
@@ -196,28 +196,28 @@ def origins(file: RobotFile) -> list[Origin]:
         head, _, rest = p.name.partition(".")
         mine = head in robot.configurations
         shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
-        assumed = robot.rig.blank and (
+        assumed = not robot.rig.inherits and (
             p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
         )
         if not shown and not assumed:
             continue
         if p.name in stated:
             why = "the file, by mass and travel of the linear unit" if head in file.linear else "the file"
-        elif not robot.rig.blank:
+        elif robot.rig.inherits:
             why = "its base"
         else:
-            why = _default(p.name, rest if mine else "", robot.on_shaft)
+            why = _default(p.name, rest if mine else "")
         found.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return found
 
 
-def _default(name: str, rest: str, on_shaft: bool) -> str:
+def _default(name: str, rest: str) -> str:
     if name == "motor.inductance":
         return rig_file.WINDING_WHY
     if name in rig_file.DEFAULTS:
         return rig_file.DEFAULTS[name][1]
     if rest == rig_file.DYNAMIC:
         return rig_file.DYNAMIC_WHY
-    if rest and not on_shaft:
+    if rest in rig_file.VEHICLE:
         return rig_file.VEHICLE[rest][1]
     return "not stated: travel is the angle" if rest == "radius" else "not stated: none"

@@ -169,13 +169,9 @@ def _without_parameters(
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.taken_apart(tables, where)
     found = loads(base, content, sds, where)
-    shared = {"on_shaft": found.on_shaft, "linear": bool(found.linear)}
+    rig = rig_file.rig(content, where, list(found.by_name), travels=found.travels, inherits=base is not None)
     if base is not None:
-        robot = dataclasses.replace(base, configurations=Configurations(found.by_name))
-        changed = found.on_shaft or any(key in content for key in rig_file.KEYS)
-        rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=False) if changed else robot.rig
-        return dataclasses.replace(robot, rig=rig), sds, found.linear
-    rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=True)
+        return dataclasses.replace(base, configurations=Configurations(found.by_name), rig=rig), sds, found.linear
     robot = robots.blank(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
@@ -187,7 +183,7 @@ def _without_parameters(
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
     missing = [name for name in rig_file.needed(rig) if name not in given]
-    if found.on_shaft and not found.linear and "speed" in rig.channels:
+    if not found.travels and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
     rig_file.refuse_missing([*missing, *found.missing], known, where, given)
     return robot, sds, found.linear
@@ -312,8 +308,6 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
 
 def _with_backlash(robot: Robot, where: str) -> Robot:
     """`robot` that keeps the two sides of a backlash apart, where a load states one."""
-    if not robot.on_shaft:
-        return robot
     loose = {name: load for name, load in robot.configurations.items() if float(load.backlash) > 0}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
@@ -391,16 +385,15 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
 
     Of a robot that starts from nothing, what it leaves open is left out.
     """
-    blank = robot.rig.blank
-    nothing = _start(robot)
-    pack = blank and robot.battery.cells == nothing.battery.cells
+    whole, nothing = robot.rig.inherits, _start(robot)
+    pack = not whole and robot.battery.cells == nothing.battery.cells
     tables: dict[str, list[str]] = {
         "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
         "motor": [],
         "gearbox": [],
     }
     head, more = rig_file.lines(robot.rig)
-    if rig_file.same_rig(robot.rig) and not blank and not robot.on_shaft:
+    if rig_file.same_rig(robot.rig) and whole and robot.has_ground:
         head, more = [], {}
     for name, load in robot.configurations.items():
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
@@ -418,29 +411,29 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
             continue
         was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
-        if same and (blank or head_ == "rig"):
+        if same and (not whole or head_ == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
         origin = f"; {spec.source}" if value == was else origin
         text = rig_file.value_text(parameter.name, value, robot.rig)
         line = f"{key} = {text}  # [{spec.unit}] {spec.meaning}"
-        tables.setdefault(head_, []).append(line if blank else f"{line}{origin}")
+        tables.setdefault(head_, []).append(f"{line}{origin}" if whole else line)
     for name, (_, _, unit, what) in RATINGS.items():
         part, _, key = name.partition(".")
         rating = getattr(getattr(robot, part), key)
-        if rating is not None and not (blank and rating == getattr(getattr(nothing, part), key)):
-            tables[part].append(f"{key} = {rating!r}  # [{unit}] {what.partition(';')[0] if blank else what}")
+        if rating is not None and (whole or rating != getattr(getattr(nothing, part), key)):
+            tables[part].append(f"{key} = {rating!r}  # [{unit}] {what if whole else what.partition(';')[0]}")
     for name, what in SWITCHES.items():
         part, _, key = name.partition(".")
         switch = getattr(getattr(robot, part), key)
-        if not (blank and switch == getattr(getattr(nothing, part), key)):
+        if whole or switch != getattr(getattr(nothing, part), key):
             tables.setdefault(part, []).append(f"{key} = {str(switch).lower()}  # {what}")
     lines = [f"# {line}" for line in note.splitlines()]
-    lines += [f'schema = "{SCHEMA}"', f'base = "{rig_file.NONE if blank else "nominal"}"']
+    lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if whole else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors driven alike", *head]
     lines.append(f"configurations = {json.dumps(list(robot.configurations))}")
     for title, table in {**tables, **more}.items():
-        if blank and not table and title not in robot.configurations:
+        if not (whole or table or title in robot.configurations):
             continue
         lines += ["", f"[{title}]", *table]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -448,7 +441,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
 
 def _start(robot: Robot) -> Robot:
     """What the file of a robot starts from."""
-    if not robot.rig.blank:
+    if robot.rig.inherits:
         return robots.nominal()
     nothing = robots.blank(robot.configurations)
     return params.replace(nothing, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})

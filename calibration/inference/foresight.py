@@ -73,7 +73,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
     names = tuple(n for n in names if n not in fidelities.unread("steady", names)) if not observe.axis else names
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
-    coordinates = priors.coordinates(robot, names, any_surface=not robot.rig.blank)
+    coordinates = priors.coordinates(robot, names, any_surface=robot.rig.inherits)
     posed = observers.pose(runs, robot, coordinates, known.sd)
     z = jnp.zeros(len(names))
     seen = fit.observation(posed, z)

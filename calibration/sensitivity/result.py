@@ -31,7 +31,7 @@ class Points:
 
     Attributes:
         motor_speed: imposed [rpm], in the place of the voltage, which is 0 then; None where the voltage is imposed.
-        on_shaft: whether their load is a shaft, which has neither payload nor slope (0).
+        has_ground: whether payload and slope act, which are 0 else.
     """
 
     configuration: np.ndarray
@@ -39,7 +39,7 @@ class Points:
     payload: np.ndarray
     slope_deg: np.ndarray
     motor_speed: np.ndarray | None = None
-    on_shaft: bool = False
+    has_ground: bool = True
 
     def __len__(self) -> int:
         return len(self.voltage)
@@ -53,17 +53,17 @@ class Points:
         return cls(
             runs["configuration"],
             nothing if turned else imposed,
-            nothing if layout.on_shaft else runs["payload_kg"],
-            nothing if layout.on_shaft else runs["slope_deg"],
+            runs["payload_kg"] if layout.has_ground else nothing,
+            runs["slope_deg"] if layout.has_ground else nothing,
             imposed if turned else None,
-            layout.on_shaft,
+            layout.has_ground,
         )
 
     def at(self, rows: np.ndarray) -> Points:
         """Some of them, by a mask or an index."""
         speed = None if self.motor_speed is None else self.motor_speed[rows]
         voltage, payload, slope = (x[rows] for x in (self.voltage, self.payload, self.slope_deg))
-        return Points(self.configuration[rows], voltage, payload, slope, speed, self.on_shaft)
+        return Points(self.configuration[rows], voltage, payload, slope, speed, self.has_ground)
 
     @property
     def imposed(self) -> tuple[str, np.ndarray, str]:
@@ -76,7 +76,7 @@ class Points:
         """A point in words."""
         _, imposed, unit = self.imposed
         supply = "battery" if np.isnan(imposed[k]) else f"{imposed[k]:g} {unit}"
-        ground = "" if self.on_shaft else f", {self.payload[k]:g} kg, {self.slope_deg[k]:g}°"
+        ground = f", {self.payload[k]:g} kg, {self.slope_deg[k]:g}°" if self.has_ground else ""
         return f"{self.configuration[k]}, {supply}{ground}"
 
     def columns(self) -> dict[str, np.ndarray]:
@@ -84,7 +84,7 @@ class Points:
         own = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
         )
-        ground = {} if self.on_shaft else {"payload_kg": self.payload, "slope_deg": self.slope_deg}
+        ground = {"payload_kg": self.payload, "slope_deg": self.slope_deg} if self.has_ground else {}
         return {"configuration": self.configuration, **own, **ground}
 
 
