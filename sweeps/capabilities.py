@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.data import rig_file
-from calibration.data.columns import Layout
 from calibration.data.robot_file import RobotFile
 from mmrjax import params
 from mmrjax.motor import Motor
@@ -27,11 +26,6 @@ OF_HEAT = (
     "winding_end_C", "housing_end_C",
 )  # fmt: skip
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
-
-
-def crosses_zero(robot: Robot) -> bool:
-    """Whether its readings may cross zero, see `Layout`."""
-    return Layout.of(robot).crosses_zero
 
 
 def stated(robot: Robot, prefix: str) -> bool:

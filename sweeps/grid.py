@@ -92,9 +92,8 @@ def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tup
         "configuration": configurations(config, robot),
         layout.imposed_column: (math.nan,) if battery else getattr(config, AXIS[layout.imposed]),
     }
-    if robot.has_ground:
-        found |= {"payload_kg": config.payloads_kg or (), "slope_deg": config.slopes_deg or ()}
-    return found
+    ground = {"payload_kg": config.payloads_kg, "slope_deg": config.slopes_deg}
+    return found | {column: values for column, values in ground.items() if values}
 
 
 def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:

@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.table import Table
 
 from calibration.data import effect_file
+from calibration.data.columns import Layout
 from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
@@ -16,7 +17,6 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks, priors
 from sweeps import config as configuration
 from sweeps import words
-from sweeps.capabilities import crosses_zero
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import rms
@@ -111,7 +111,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
-    if crosses_zero(found.robot):
+    if Layout.of(found.robot).crosses_zero:
         say(
             words.describe_rms(
                 rms(found.rows_table(), found.channels, ("before", "after", "held_out_before", "held_out_after"))

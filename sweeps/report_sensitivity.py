@@ -158,8 +158,7 @@ def _ranges(found: SensitivityResult) -> str:
     p = found.points
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
     _, own, symbol = p.imposed
-    ground = ((p.payload, " kg"), (p.slope_deg, "°")) if p.has_ground else ()
-    for x, unit in ((own, f" {symbol}"), *ground):
+    for _, x, unit in (("", own, f" {symbol}"), *p.ground):
         on_battery = unit == " V" and np.isnan(x).all()
         parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
     return "; ".join(parts)

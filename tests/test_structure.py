@@ -647,6 +647,20 @@ def test_a_circle_of_imports_is_found(found, tmp_path):
     assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
 
 
+def test_nobody_asks_what_a_load_is():
+    """What a load can do it states; which it is ask its balances, and what reads, writes and describes its file."""
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for layer in LAYERS
+        for path in (ROOT / layer).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance"
+        if {"Shaft", "Chassis"} & {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
+    }
+    data = {f"calibration/data/{name}.py" for name in ("configuration_tables", "rig_facts", "robot_file")}
+    assert found == {"mmrjax/balances.py", "sweeps/rig_check.py", *data}
+
+
 def test_toml_is_read_in_one_place():
     """But for the comments at the top of a profile, each of which is a line of TOML."""
     found = {

@@ -29,10 +29,7 @@ class BadData(InputError):
 
 
 def toml_text(path: Path, where: str | Path) -> str:
-    """Text of a TOML file.
-
-    Args:
-        where: opens the message of an error.
+    """Text of a TOML file; `where` opens the message of an error.
 
     Raises:
         BadConfiguration: a file that cannot be read.
@@ -44,10 +41,7 @@ def toml_text(path: Path, where: str | Path) -> str:
 
 
 def toml_content(text: str, where: str | Path) -> dict[str, Any]:
-    """Keys and tables of the text of a TOML file.
-
-    Args:
-        where: opens the message of an error.
+    """Keys and tables of such a text; `where` opens the message of an error.
 
     Raises:
         BadConfiguration: it is no TOML.

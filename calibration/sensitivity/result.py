@@ -48,13 +48,14 @@ class Points:
     def of(cls, runs: Runs) -> Points:
         """Those of a table of runs."""
         layout, nothing = runs.layout, np.zeros(len(runs))
+        payload, slope = (runs[c] if c in runs.axes else nothing for c in ("payload_kg", "slope_deg"))
         imposed = runs[layout.imposed_column]
         turned = layout.imposed == "motor_speed"
         return cls(
             runs["configuration"],
             nothing if turned else imposed,
-            runs["payload_kg"] if layout.has_ground else nothing,
-            runs["slope_deg"] if layout.has_ground else nothing,
+            payload,
+            slope,
             imposed if turned else None,
             layout.has_ground,
         )
@@ -72,20 +73,24 @@ class Points:
             return "voltage", self.voltage, "V"
         return "motor speed", self.motor_speed, "rpm"
 
+    @property
+    def ground(self) -> tuple[tuple[str, np.ndarray, str], ...]:
+        """What acts by the ground: columns, values, units; nothing where there is none."""
+        found = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
+        return found if self.has_ground else ()
+
     def label(self, k: int) -> str:
         """A point in words."""
         _, imposed, unit = self.imposed
         supply = "battery" if np.isnan(imposed[k]) else f"{imposed[k]:g} {unit}"
-        ground = f", {self.payload[k]:g} kg, {self.slope_deg[k]:g}°" if self.has_ground else ""
-        return f"{self.configuration[k]}, {supply}{ground}"
+        return ", ".join((f"{self.configuration[k]}, {supply}", *(f"{x[k]:g}{unit}" for _, x, unit in self.ground)))
 
     def columns(self) -> dict[str, np.ndarray]:
         """As in tables of runs."""
         own = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
         )
-        ground = {"payload_kg": self.payload, "slope_deg": self.slope_deg} if self.has_ground else {}
-        return {"configuration": self.configuration, **own, **ground}
+        return {"configuration": self.configuration, **own, **{column: x for column, x, _ in self.ground}}
 
 
 @dataclasses.dataclass(frozen=True)
