@@ -156,10 +156,10 @@ def shares(advance: Callable[[float], None], count: int) -> Callable[[float], No
 def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
     """The condition columns of a table, the total mass taken from the robot where none is stated."""
     columns = dict(runs.columns)
-    if "total_mass_kg" in runs.axes and "total_mass_kg" not in columns:
+    if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
         own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
         columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
-    return {key: columns[key] for key in ("configuration", *runs.axes, "surface", "run_id") if key in columns}
+    return {key: columns[key] for key in ("configuration", *runs.layout.axes, "surface", "run_id") if key in columns}
 
 
 def counts(table: dict[str, np.ndarray]) -> dict[str, int]:
