@@ -40,15 +40,16 @@ BALANCES = {
 def absent(robot: Robot) -> frozenset[str]:
     """Balances that a robot has not, or that nothing of it shows: the ground's of a load on a shaft, those of the
     voltage where the motors' speed is imposed."""
-    ground = {"ground", "slip", "mass"} if robot.on_shaft else set()
     supply = set() if robot.rig.imposed == "voltage" else {"supply"}
     winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
-    return frozenset(ground | supply | winding)
+    return robot.lacks | supply | winding
 
 
 def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
     """What the robot's effects add to a balance (and in `sensor` to a channel), in its unit; an effect adds nothing
-    in configurations on which it does not act."""
+    in configurations on which it does not act, none where its load lacks the balance."""
+    if balance in robot.lacks:
+        return 0.0
     entering = [e for e in robot.effects if e.balance == balance and e.channel == channel]
     terms = [
         e.term(robot, signals) if e.acts_everywhere else e.acts(robot, signals) * e.term(robot, signals)
@@ -159,10 +160,7 @@ def travel(robot: Robot, chassis: Load, signals: Signals) -> Signals:
 
 
 def slip(robot: Robot, signals: Signals) -> Signals:
-    """Speed at which the contact patch slides over the ground [m/s]; a shaft has none."""
-    if robot.on_shaft:
-        still = jnp.zeros_like(signals.speed)
-        return _fill(signals, speed_slip_terms=still, speed_sliding=signals.speed_theoretical - signals.speed)
+    """Speed at which the contact patch slides over the ground [m/s]."""
     terms = added(robot, signals, "slip")
     return _fill(signals, speed_slip_terms=terms, speed_sliding=signals.speed_theoretical - signals.speed - terms)
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import equinox as eqx
 
-from mmrjax.ground import Ground
+from mmrjax.ground import Ground, force_gravity
 from mmrjax.params import Scalar, as_float, parameter
+from mmrjax.signals import GRAVITY
 from mmrjax.track import Track
 from mmrjax.trigonometry import cosine
 
@@ -15,8 +18,13 @@ class Chassis(eqx.Module):
 
     Attributes:
         on_tracks: 1 on tracks, 0 on wheels [-].
+        lacks: balances that it has not; torque_constant, torque_gravity, backlash: of a `Shaft`, none here.
     """
 
+    lacks: ClassVar[frozenset[str]] = frozenset()
+    torque_constant: ClassVar[float] = 0.0
+    torque_gravity: ClassVar[float] = 0.0
+    backlash: ClassVar[float] = 0.0
     track: Track
     ground: Ground
     on_tracks: Scalar = eqx.field(converter=as_float)
@@ -46,6 +54,15 @@ class Chassis(eqx.Module):
     def speed_still(self) -> Scalar:
         """Speed within which friction at rest is not resolved [m/s]."""
         return self.ground.friction.speed_rest
+
+    @property
+    def speed_grip(self) -> Scalar:
+        """Sliding speed V_s up to which the movers grip [m/s]."""
+        return self.ground.friction.speed_static
+
+    def torque_weight(self, mass: Scalar, slope: Scalar) -> Scalar:
+        """Torque of gravity at rest against forward travel, at the driving wheel of one side of this mass [N·m]."""
+        return force_gravity(mass, slope, GRAVITY) * self.radius
 
 
 def inertia_reduced(inertia_motor: Scalar, ratio: Scalar, efficiency: Scalar, inertia_wheel: Scalar) -> Scalar:

@@ -108,7 +108,7 @@ def walk(component: eqx.Module, prefix: str = "") -> Iterator[Parameter]:
     configurations) by those names alone: `6T2A.mass`.
     """
     rig = getattr(component, "rig", None)
-    if rig is None or not rig.blank:
+    if rig is None or rig.inherits:
         yield from _walk(component, prefix)
         return
     stated = {name for name, _, _ in rig.priors}

@@ -101,7 +101,7 @@ class Rig(eqx.Module):
         start: of histories: `rest`, `measured` (by the first samples) or `free`, which those are the prior of.
         begins: of histories that do not begin at rest, once their table is known.
         surfaces: (configuration, another from which it differs by its ground alone).
-        blank: whether it starts from nothing, so that nothing in it is another robot's.
+        inherits: whether what its file leaves open is a packaged robot's; if not, nothing in it is another robot's.
         loose: whether the load on the shaft has backlash, which histories then follow as a state.
     """
 
@@ -122,7 +122,7 @@ class Rig(eqx.Module):
     priors: tuple[tuple[str, float, float], ...] = eqx.field(default=(), static=True)
     start: str = eqx.field(default="rest", static=True)
     surfaces: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
-    blank: bool = eqx.field(default=False, static=True)
+    inherits: bool = eqx.field(default=True, static=True)
     loose: bool = eqx.field(default=False, static=True)
 
     def for_equations(self) -> Rig:
@@ -174,6 +174,11 @@ class Rig(eqx.Module):
     def exact(self) -> frozenset[str]:
         """Parameters that the file states as exactly known; no fit frees them."""
         return frozenset(name for name, _, sd in self.priors if sd == 0)
+
+    @property
+    def scales_adhesion(self) -> bool:
+        """Whether labels of Table 5 scale its adhesion to the bench's; else each surface is a ground of its own."""
+        return self.inherits
 
     @property
     def shows_voltage(self) -> bool:

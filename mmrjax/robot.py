@@ -110,14 +110,24 @@ class Robot(eqx.Module):
         return channels.rows(self.rig.channels)
 
     @property
-    def on_shaft(self) -> bool:
-        """Whether its load is a shaft, else a vehicle."""
-        return isinstance(self.configurations.members[0], Shaft)
+    def lacks(self) -> frozenset[str]:
+        """Balances that its loads have not."""
+        return frozenset(self.configurations.members[0].lacks)
+
+    @property
+    def has_ground(self) -> bool:
+        """Whether a ground carries it, on which slope, payload and adhesion act and its movers can slip."""
+        return "ground" not in self.lacks
+
+    @property
+    def shows_travel(self) -> bool:
+        """Whether anything shows how far it travels: a ground, or a channel of what turns with its shaft."""
+        return self.has_ground or "speed" in self.rig.channels
 
     @property
     def loose(self) -> bool:
         """Whether its load can turn within a backlash, as a body of its own."""
-        return self.on_shaft and self.rig.loose
+        return self.rig.loose
 
     def chassis(self, configuration: Index) -> Any:
         """The load of the configuration with this index; traceable and batchable."""

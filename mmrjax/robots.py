@@ -97,7 +97,7 @@ def blank(configurations: Configurations, sides: float = 1.0, rig: Rig | None = 
     """
     motor = dataclasses.replace(Motor(), speed_limit=_UNLIMITED, temperature_limit=_UNLIMITED)
     gearbox = dataclasses.replace(Gearbox(), speed_limit=_UNLIMITED, torque_limit=None)
-    rig = dataclasses.replace(rig or Rig(), blank=True)
+    rig = dataclasses.replace(rig or Rig(), inherits=False)
     return params.replace(Robot(Battery(), motor, gearbox, configurations, sides=sides, rig=rig), _NOTHING)
 
 

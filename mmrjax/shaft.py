@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -21,8 +24,14 @@ class Shaft(eqx.Module):
 
     Attributes:
         speed_rest: of the output, within which friction is smoothed through rest [rad/s].
+        lacks: balances that it has not, as no ground carries it; on_tracks: neither on tracks nor on wheels;
+            mass: of a robot; speed_grip: nothing slides.
     """
 
+    lacks: ClassVar[frozenset[str]] = frozenset({"ground", "slip", "mass"})
+    on_tracks: ClassVar[float] = 0.0
+    mass: ClassVar[float] = 0.0
+    speed_grip: ClassVar[float] = math.inf
     inertia: Scalar = parameter(
         unit="kg·m^2",
         meaning="inertia J of all that turns with the output of one drive",
@@ -94,16 +103,6 @@ class Shaft(eqx.Module):
         """Speed within which friction at rest is not resolved [m/s]."""
         return self.radius * self.speed_rest
 
-    @property
-    def on_tracks(self) -> Scalar:
-        """Neither on tracks nor on wheels: 0."""
-        return 0.0
-
-    @property
-    def mass(self) -> Scalar:
-        """Of a robot; none here [kg]."""
-        return 0.0
-
     def torque_loss(self, speed: Scalar, direction: Scalar) -> Scalar:
         """Friction torque M_0 sign ω + K ω [N·m] at `speed` [rad/s] and its `direction` (-1..1)."""
         return self.loss_coulomb * direction + self.loss_viscous * speed
@@ -129,6 +128,10 @@ class Shaft(eqx.Module):
         push = jnp.maximum(omega**2 * inertia * ahead + damping * jnp.minimum(ahead / full, 1.0), 0.0)
         pull = jnp.minimum(omega**2 * inertia * behind + damping * jnp.minimum(-behind / full, 1.0), 0.0)
         return push + pull
+
+    def torque_weight(self, mass: Scalar, slope: Scalar) -> Scalar:
+        """Torque of gravity at rest against forward rotation [N·m], whatever the mass and slope of a vehicle."""
+        return self.torque_load(0.0)
 
     def torque_load(self, angle: Scalar) -> Scalar:
         """Torque that acts against forward rotation M_c + m g l sin(θ - θ_0) [N·m]."""

@@ -89,7 +89,7 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
         )
     _acting({*fixed, *design.names}, robot, where, surface)
     own = AXIS[robot.rig.imposed]
-    if robot.rig.blank and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
+    if not robot.rig.inherits and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
         level = imposed.default(robot, f"{where}, conditions.{own}")
         fixed[own] = level if own == "voltage" else level * RPM
     if surface is not None and "adhesion" in {*fixed, *design.names}:
@@ -109,9 +109,8 @@ def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> N
             f"{AXIS[robot.rig.imposed]} instead"
         )
     ground = {*names, *([SURFACE] if surface is not None else [])} & {*ON_GROUND, SURFACE}
-    if robot.on_shaft and ground:
-        raise BadConfiguration(imposed.on_shaft(f"{where}, {min(ground)}"))
-    if robot.rig.blank and surface is not None:
+    imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)))
+    if surface is not None and not robot.rig.scales_adhesion:
         raise BadConfiguration(
             f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations of its own "
             f"({', '.join(robot.configurations)}); vary or state configuration"
@@ -226,7 +225,7 @@ def _fixed(stated: Mapping[str, Any], robot: Robot, where: str) -> tuple[dict[st
         if name not in allowed:
             raise BadConfiguration(f"{place}: no such condition; {choices(name, allowed)}")
         if name == SURFACE:
-            if not isinstance(value, str) or (value not in SURFACES and not robot.rig.blank):
+            if not isinstance(value, str) or (value not in SURFACES and robot.rig.scales_adhesion):
                 raise BadConfiguration(f"{place}: got {value!r}; {choices(str(value), SURFACES)}")
             surface = str(value)
         elif name == CONFIGURATION:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from rich.table import Table
 
+from calibration.data.columns import Layout
 from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
 from calibration.inference.result import CalibrationResult
 from sweeps import config as configuration
 from sweeps import words
-from sweeps.capabilities import is_rig
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import rms
@@ -25,7 +25,7 @@ def calibrate(
 
     0 done; 3 done, but the search did not converge, or a row or a fit without a block did not.
     """
-    robot = load_robot(config)
+    robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
     with open_folder("calibrate", config, robot, out, force, runs) as folder:
@@ -70,7 +70,7 @@ def print_calibration(found: CalibrationResult) -> None:
         cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
     say(errors)
-    if is_rig(found.robot):
+    if Layout.of(found.robot).crosses_zero:
         say(words.describe_rms(rms(found.rows(), found.channels, ("before", "after", "held_out"))))
     say(found.starts.statement())
     for note in found.notes:

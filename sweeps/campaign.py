@@ -19,6 +19,7 @@ from rich.table import Table
 
 from calibration.data import profiles, robot_file, writing
 from calibration.data.errors import BadConfiguration, InputError
+from calibration.data.robot_file import RobotFile
 from mmrjax import __version__, channels, fidelities, missions, outputs
 from mmrjax.errors import UsageError
 from mmrjax.profile import Profile
@@ -59,7 +60,8 @@ def store_sweep(
         config: the configuration; where: its file, for messages; out: the run folder; force: replace one.
         wanted: outputs, in place of those of the configuration.
     """
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     if isinstance(config, Sweep):
         notes: list[str] = []
         stated = config.configurations
@@ -98,7 +100,7 @@ def store_sweep(
         try:
             if not store.finished:
                 simulate(store, job, options, pool)
-            return finish(store, config, job, same, options)
+            return finish(store, config, file, job, same, options)
         except (InputError, KeyboardInterrupt):
             if options.shard is None:
                 store.abandon()
@@ -336,12 +338,12 @@ class DiskFull(InputError):
     """No space left in the middle of a sweep, which can be taken up again."""
 
 
-def finish(store: SweepStore, config: Campaign, job: scale.Job, same: Identity, options: How) -> int:
+def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: How) -> int:
     """Write what a whole sweep leaves, and move it into place; say how far it is where it is not whole."""
     if not store.finished:
         with store.last() as last:
             if last:
-                leave(store, config, job, same)
+                leave(store, config, file, job, same)
                 store.move_into_place()
     done = store.done()
     if not store.finished:
@@ -359,7 +361,7 @@ def finish(store: SweepStore, config: Campaign, job: scale.Job, same: Identity, 
     return DONE if words.settled(counts) == job.plan.design.points else SOME_NOT_CONVERGED
 
 
-def leave(store: SweepStore, config: Campaign, job: scale.Job, same: Identity) -> None:
+def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
     """Everything of a run folder beside the store."""
     folder, done = store.partial, store.done()
     (folder / "config.resolved.toml").write_text(configuration.as_toml(config), encoding="utf-8")
@@ -369,7 +371,7 @@ def leave(store: SweepStore, config: Campaign, job: scale.Job, same: Identity) -
     if config.report:
         from sweeps import report_campaign
 
-        report_campaign.write(folder, job.robot, config.robot, store.layout, found)
+        report_campaign.write(folder, file, store.layout, found)
     hashes = {"robot": digest((folder / "robot.toml").read_bytes()), **same["data"]}
     about = {**provenance(), "statuses": found["statuses"], "seed": config.samples.get("seed", 0), "hashes": hashes}
     writing.write_json(folder / "manifest.json", about)

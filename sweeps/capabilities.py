@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from calibration.data import rig_file
-from calibration.data.columns import Layout
+from calibration.data.robot_file import RobotFile
 from mmrjax import params
 from mmrjax.motor import Motor
 from mmrjax.power import Battery
@@ -32,33 +28,33 @@ OF_HEAT = (
 _THERMAL = ("resistance_thermal_winding", "resistance_thermal_housing")
 
 
-def is_rig(robot: Robot) -> bool:
-    """Whether it is a rig, in whose tables a reading may cross zero, and not the packaged robot or one like it."""
-    return not Layout.of(robot).usual
-
-
 def stated(robot: Robot, prefix: str) -> bool:
     """Whether any parameter whose name begins so is another than that of a rig of which nothing is known."""
-    usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
-    return any(float(p.value) != usual[p.name] for p in params.walk(robot) if p.name.startswith(prefix))
+    nothing = _nothing(robot)
+    return any(float(p.value) != nothing[p.name] for p in params.walk(robot) if p.name.startswith(prefix))
+
+
+def _nothing(robot: Robot) -> dict[str, float]:
+    """Parameters of a rig of which nothing is known but its loads."""
+    return {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
 
 
 def thermal(robot: Robot) -> bool:
     """Whether it is known how heat leaves the windings."""
     sheet = Motor()
-    return not robot.rig.blank or any(
+    return robot.rig.inherits or any(
         float(getattr(robot.motor, name)) != float(getattr(sheet, name)) for name in _THERMAL
     )
 
 
 def battery(robot: Robot) -> bool:
     """Whether it has a battery of its own."""
-    if not robot.rig.blank:
+    if robot.rig.inherits:
         return True
-    usual, other = Battery(), "current_other"  # `rig_file.DEFAULTS` states that one
+    nothing, other = Battery(), "current_other"  # `rig_file.DEFAULTS` states that one
     same = [
         float(getattr(robot.battery, name)) == float(value)
-        for name, value in vars(usual).items()
+        for name, value in vars(nothing).items()
         if name != other and isinstance(value, int | float)
     ]
     return not all(same)
@@ -67,8 +63,10 @@ def battery(robot: Robot) -> bool:
 def idle_columns(robot: Robot) -> set[str]:
     """Columns of runs and histories that mean nothing for a robot."""
     found: set[str] = set()
-    if robot.on_shaft:
-        found |= {*OF_GROUND, *(() if "speed" in robot.rig.channels else OF_TRAVEL)}
+    if not robot.has_ground:
+        found |= {*OF_GROUND}
+    if not robot.shows_travel:
+        found |= {*OF_TRAVEL}
     if not thermal(robot):
         found |= {*OF_HEAT}
     if not battery(robot):
@@ -84,39 +82,21 @@ def of(robot: Robot, table: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {column: values for column, values in table.items() if column not in gone}
 
 
-def _keys(table: dict[str, Any], before: str = "") -> set[str]:
-    found: set[str] = set()
-    for key, value in table.items():
-        found |= _keys(value, f"{before}{key}.") if isinstance(value, dict) else {before + key}
-    return found
-
-
-def parameters(robot: Robot, robot_name: str) -> list[dict[str, str]]:
-    """Parameters of a rig: those that its file states, and all else that is not the same as nothing; with the source.
-
-    Args:
-        robot_name: its file.
-    """
-    path = Path(robot_name)
-    try:
-        stated = _keys(tomllib.loads(path.read_text(encoding="utf-8"))) if path.suffix == ".toml" else set()
-    except OSError:
-        stated = set()
-    of_unit = set(rig_file.LINEAR) - {"inertia"}
-    linear = {key.partition(".")[0] for key in stated if key.rpartition(".")[2] in of_unit}
-    travels = not robot.on_shaft or "speed" in robot.rig.channels
-    usual = {p.name: float(p.value) for p in params.walk(blank(robot.configurations, rig=robot.rig))}
-    found = []
+def parameters(file: RobotFile) -> list[dict[str, str]]:
+    """Parameters of a rig: those that its file states, and all else that is not as nothing is; with the source."""
+    robot = file.robot
+    nothing, found = _nothing(robot), []
     for p in params.walk(robot):
-        load = p.name.partition(".")[0] in robot.configurations
-        own = p.name in stated
-        moved = p.name not in usual or float(p.value) != usual[p.name]
+        head = p.name.partition(".")[0]
+        load = head in robot.configurations
+        own = p.name in file.stated and head not in file.linear
+        moved = p.name not in nothing or float(p.value) != nothing[p.name]
         if not own and not moved and not (load and float(p.value) != 0):
             continue
-        if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not travels)):
+        if not own and (p.name in rig_file.DEFAULTS or (p.name.endswith(".radius") and not robot.shows_travel)):
             continue
-        of_file = own or p.name.partition(".")[0] in linear
-        source = f"stated in {path.name}" if of_file else "default" if not moved or load else "changed"
+        of_file = own or head in file.linear
+        source = f"stated in {file.name}" if of_file else "default" if not moved or load else "changed"
         found.append(
             {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{float(p.value):.6g}"}
             | {"source": source}

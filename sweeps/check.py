@@ -23,7 +23,8 @@ SHOWN = 3
 def check(config: configuration.Check, out: Path | None, force: bool) -> int:
     """Hold a robot against requirements and leave a run folder; returns the exit code: 3 where one is missed."""
     asked = requirements.load(Path(config.requirements))
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     sheet.refuse(robot, asked)
     with open_folder("check", config, robot, out, force) as folder:
         found = CheckResult(asked, robot, sheet.check(robot, asked, changes=config.changes))
@@ -32,7 +33,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
         if config.report:
             from sweeps import report_check
 
-            report_check.write(folder.partial, found, robot_name=config.robot)
+            report_check.write(folder.partial, found, file)
         path = folder.finish({"seed": None, **sheet.counts(found.outcomes)})
         say(str(path))
         return SOME_NOT_CONVERGED if found.missed else DONE

@@ -32,19 +32,19 @@ Summary = dict[str, dict[str, dict[str, Any]]]
 
 def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
     """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
-    robot = load_robot(config)
-    stated = runs = read_runs(source, robot, measured=True)
-    robot = instruments.with_inferred_instruments(robot, runs)
+    file = load_robot(config)
+    stated = runs = read_runs(source, file.robot, measured=True)
+    robot = instruments.with_inferred_instruments(file.robot, runs)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
     said = check_ranges(runs, robot)
-    drawn = None if config.posterior is None else beside_robot(config, robot)
+    drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)
         comparison, summary = compared(stated, table, robot)
         folder.write_table("comparison.csv", comparison)
         notes = [*missing(comparison, stated.channels), *said]
-        print_comparison(comparison, summary, stated.channels, notes, sized=not runs.layout.usual)
+        print_comparison(comparison, summary, stated.channels, notes, sized=runs.layout.crosses_zero)
         if drawn is not None and config.posterior is not None:
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             uncertainty.say_intervals(table, found)
@@ -58,7 +58,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
             from sweeps import report_comparison
 
             report_comparison.write(
-                folder.partial, robot=robot, robot_name=config.robot, model=config.model, data_name=runs.source,
+                folder.partial, dataclasses.replace(file, robot=robot), model=config.model, data_name=runs.source,
                 table=comparison, summary=summary, notes=notes,
             )  # fmt: skip
         further = {"errors": summary, "notes": notes}
@@ -74,14 +74,15 @@ def compared(
     A reading that is missing is NaN in its row; it weighs nothing and is counted as `missing`.
     """
     table = {key: simulated[key] for key in ("configuration", *measured.layout.axes)}
-    if not measured.layout.usual and measured.has("surface"):
+    if not measured.layout.complete and measured.has("surface"):
         table["surface"] = measured["surface"]
     nothing = np.full(len(measured), np.nan)
     for channel in measured.channels:
         table[channel.column] = measured.columns.get(channel.column, nothing)
         table[f"simulated_{channel.column}"] = simulated[channel.column]
-        error = residual.relative_error if measured.layout.usual else residual.sized_error
-        table[f"error_{channel.name}_percent"] = error(simulated[channel.column], table[channel.column])
+        table[f"error_{channel.name}_percent"] = residual.percent_error(
+            simulated[channel.column], table[channel.column], crosses_zero=measured.layout.crosses_zero
+        )
     table["status"] = simulated["status"]
     groups = {"all": np.ones(len(measured), bool)}
     names = measured["configuration"] if robot is None else measured.configurations_named(robot)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -12,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from pydantic_core import PydanticCustomError
 
 from calibration.data.columns import CONDITIONS
-from calibration.data.errors import BadConfiguration, choices
+from calibration.data.errors import BadConfiguration, choices, toml_content, toml_text
 from mmrjax import channels, fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SURFACES
 
@@ -400,10 +399,7 @@ def read_toml(file: Path) -> dict[str, Any]:
     Raises:
         BadConfiguration: the file cannot be read.
     """
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadConfiguration(f"{file}: not a readable TOML file ({error})") from error
+    return toml_content(toml_text(file, file), file)
 
 
 def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:

@@ -47,11 +47,11 @@ def drawable(runs: dict[str, np.ndarray]) -> np.ndarray:
 ON_SHAFT = {"track and slip": "load"}
 
 
-def chain(runs: dict[str, np.ndarray], names: list[str], on_shaft: bool = False) -> Figure:
+def chain(runs: dict[str, np.ndarray], names: list[str], has_ground: bool = True) -> Figure:
     """A bar a run [W], from the motor's losses to the power that lifts the robot, or that the load takes."""
     fig, grid = figure(1, 1, 1.15 + 0.42 * len(names))
     axes, parts = grid[0, 0], split(runs)
-    said = ON_SHAFT if on_shaft else {}
+    said = {} if has_ground else ON_SHAFT
     supply, slope = sources(runs)
     total = supply + slope
     left = np.zeros(len(names))

@@ -149,27 +149,24 @@ def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np
     _cells(ax, study.share[order][:, top].T, 24)
     ax.set_yticks([])
     ticks, labels = [], []
+    word, own, unit = points.imposed
+    along, levels, mark = ("slope", points.slope_deg, "°") if points.has_ground else (f"{word} [{unit}]", own, "")
     for kind in kinds:
         mine = np.flatnonzero(names[order] == kind)
         if mine[0]:
             ax.axvline(mine[0] - 0.5, color="white", linewidth=4)
-        levels = points.imposed[1] if points.on_shaft else points.slope_deg
         for level in np.unique(levels[order][mine]):
             at = mine[levels[order][mine] == level]
             ticks.append(at.mean())
-            labels.append(f"{level:g}" + ("" if points.on_shaft else "°"))
+            labels.append(f"{level:g}{mark}")
             if at[0] != mine[0]:
                 ax.axvline(at[0] - 0.5, color="white", linewidth=1.5)
         ax.text(mine.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
     ax.set_xticks(ticks, labels, fontsize=8.5)
-    word, own, unit = points.imposed
-    if points.on_shaft:
-        ax.set_xlabel(f"{word} [{unit}]; grey: no index there", fontsize=8.5)
-        return
     other = ((word, own, unit), ("payload", points.payload, "kg"))
-    inner = [f"{word} {_range(x)} {unit}" for word, x, unit in other if np.unique(x).size > 1]
+    inner = [f"{word} {_range(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1]
     within = f"; within each {' and '.join(inner)}" if inner else ""
-    ax.set_xlabel(f"slope{within}; grey: no index there", fontsize=8.5)
+    ax.set_xlabel(f"{along}{within}; grey: no index there", fontsize=8.5)
 
 
 def _range(values: np.ndarray) -> str:

@@ -12,7 +12,7 @@ from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import Runs
 from mmrjax.robot import Robot
-from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
+from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
 from sweeps import imposed
 from sweeps.config import GridPart
 from sweeps.inputs import check_configurations
@@ -51,9 +51,9 @@ def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | 
     if battery:
         imposed.check_battery(robot)
     elif getattr(config, own) is None:
-        update[own] = VOLTAGES_V if layout.usual else imposed.levels(robot, OPTIONS[own], notes)
-    if not layout.on_shaft:
-        table8 = not layout.blank
+        update[own] = imposed.levels(robot, OPTIONS[own], notes)
+    if robot.has_ground:
+        table8 = robot.rig.inherits
         update |= {
             "payloads_kg": config.payloads_kg or (PAYLOADS_KG if table8 else (0.0,)),
             "slopes_deg": config.slopes_deg or (SLOPES_DEG if table8 else (0.0,)),
@@ -72,11 +72,9 @@ def check(config: GridPart, robot: Robot) -> None:
     for key in AXIS.values():
         if key != AXIS[layout.imposed] and getattr(config, key) is not None:
             raise BadConfiguration(imposed.refused(robot, OPTIONS[key], OPTIONS[AXIS[layout.imposed]]))
-    for key in ON_GROUND:
-        if layout.on_shaft and getattr(config, key) is not None:
-            raise BadConfiguration(imposed.on_shaft(OPTIONS[key]))
+    imposed.check_acting(robot, (OPTIONS[key] for key in ON_GROUND if getattr(config, key) is not None))
     surface = config.surface
-    if surface is not None and not layout.blank and surface not in SURFACES:
+    if surface is not None and robot.rig.scales_adhesion and surface not in SURFACES:
         raise BadConfiguration(f"option surface: got {surface!r}; {choices(surface, SURFACES)}")
 
 
@@ -94,9 +92,8 @@ def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tup
         "configuration": configurations(config, robot),
         layout.imposed_column: (math.nan,) if battery else getattr(config, AXIS[layout.imposed]),
     }
-    if not layout.on_shaft:
-        found |= {"payload_kg": config.payloads_kg or (), "slope_deg": config.slopes_deg or ()}
-    return found
+    ground = {"payload_kg": config.payloads_kg, "slope_deg": config.slopes_deg}
+    return found | {column: values for column, values in ground.items() if values}
 
 
 def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
+from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration
 from mmrjax.channels import RPM
 from mmrjax.robot import Robot
+from mmrjax.tables import VOLTAGES_V
 from sweeps import capabilities
 
 #: A limit from which on there is none (`robots.blank`).
 UNLIMITED = 1e8
+#: Supply voltage of one run where none is stated [V], the highest of Table 8.
+VOLTAGE = 33.0
 #: Levels of a grid, as shares of the limit.
 SHARES = (1 / 3, 2 / 3, 1.0)
 
@@ -32,11 +37,13 @@ def _digits(value: float) -> float:
 
 
 def default(robot: Robot, option: str) -> float:
-    """What a single run has imposed where nothing is stated: the limit.
+    """What a single run has imposed where nothing is stated: the limit, of the paper's robot `VOLTAGE`.
 
     Raises:
         BadConfiguration: the file states none.
     """
+    if Layout.of(robot).table8:
+        return VOLTAGE
     most = limit(robot)
     if most is None:
         raise BadConfiguration(_missing(robot, option, "12" if robot.rig.imposed == "voltage" else "3000"))
@@ -44,7 +51,7 @@ def default(robot: Robot, option: str) -> float:
 
 
 def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[float, ...]:
-    """What a grid has imposed where nothing is stated: a third, two thirds and all of the limit.
+    """What a grid has imposed where nothing is stated: a third, two thirds and all of the limit, or Table 8's.
 
     Args:
         notes: is given a sentence that says so.
@@ -52,6 +59,8 @@ def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[f
     Raises:
         BadConfiguration: the file states none.
     """
+    if Layout.of(robot).table8:
+        return VOLTAGES_V
     most = limit(robot)
     if most is None:
         raise BadConfiguration(_missing(robot, option, "6,12,24" if robot.rig.imposed == "voltage" else "1000,2000"))
@@ -81,9 +90,19 @@ def refused(robot: Robot, option: str, instead: str) -> str:
     return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
 
 
-def on_shaft(option: str) -> str:
-    """Why an option of the ground is refused."""
-    return f"{option}: the robot's load is a shaft, on which no slope, payload, mass or surface acts; leave it out"
+def check_acting(robot: Robot, stated: Iterable[str]) -> None:
+    """Refuse conditions of the ground for a load that has none.
+
+    Args:
+        stated: options or places that state one.
+
+    Raises:
+        BadConfiguration: the first of them.
+    """
+    for option in () if robot.has_ground else stated:
+        raise BadConfiguration(
+            f"{option}: the robot's load is a shaft, on which no slope, payload, mass or surface acts; leave it out"
+        )
 
 
 def check_battery(robot: Robot) -> None:
@@ -106,7 +125,7 @@ def check_on_ground(robot: Robot, command: str) -> None:
     Raises:
         BadConfiguration: the load is a shaft.
     """
-    if robot.on_shaft:
+    if not robot.has_ground:
         raise BadConfiguration(
             f"{command}: the robot's load is a shaft, which has no wheels or tracks on a ground; simulate, sweep, "
             "compare, calibrate, loop and sensitivity take it"

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 from calibration.data import effect_file, posterior, robot_file
 from calibration.data import runs as records
-from calibration.data.columns import IMPOSED, ON_GROUND, Layout
+from calibration.data.columns import IMPOSED, Layout
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
+from calibration.data.robot_file import RobotFile
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH
 from sweeps import imposed
@@ -22,11 +24,9 @@ OPTIONS = {
     "supply_voltage_V": "--voltage", "motor_speed_rpm": "--motor-speed", "payload_kg": "--payload",
     "slope_deg": "--slope", "total_mass_kg": "--mass", "surface": "--surface",
 }  # fmt: skip
-#: Supply voltage of one run where none is stated [V], the highest of Table 8.
-VOLTAGE = 33.0
 
 
-def load_robot(config: RobotPart) -> Robot:
+def load_robot(config: RobotPart) -> RobotFile:
     """The robot that a configuration names, with its changes; its effects may be the user's own.
 
     Former names of parameters are taken, and said on stderr.
@@ -35,28 +35,27 @@ def load_robot(config: RobotPart) -> Robot:
         BadConfiguration: no such robot, a file or a change that is refused.
     """
     notes: list[str] = []
-    robot = robot_file.load(config.robot, effect_file.library(config.effects), notes)
-    robot = robot_file.change(robot, config.set, where="--set", notes=notes)
+    file = robot_file.find(config.robot, effect_file.library(config.effects), notes)
+    robot = robot_file.change(file.robot, config.set, where="--set", notes=notes)
     for note in notes:
         tell(note)
-    return robot
+    return dataclasses.replace(file, robot=robot)
 
 
-def beside_robot(config: RobotPart, robot: Robot) -> Posterior:
+def beside_robot(file: RobotFile) -> Posterior:
     """The posterior that lies beside the file of a calibrated robot.
 
     Raises:
         BadConfiguration: the robot is none of a file.
         BadData: there is none, it cannot be read, or it is of another robot.
     """
-    file = Path(config.robot)
-    if file.suffix != ".toml":
+    if Path(file.source).suffix != ".toml":
         raise BadConfiguration(
-            f"--posterior: {config.robot} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
+            f"--posterior: {file.source} has none; expected --robot FOLDER/robot.toml of calibrate or loop"
         )
-    path = file.with_name(posterior.FILE)
+    path = Path(file.source).with_name(posterior.FILE)
     found = posterior.read(path)
-    found.check(robot, str(path))
+    found.check(file.robot, str(path))
     return found
 
 
@@ -124,14 +123,13 @@ def one_run(
     column = layout.imposed_column
     for other in (c for c, _ in IMPOSED.values() if c != column and c in given):
         raise BadConfiguration(imposed.refused(robot, OPTIONS[other], OPTIONS[column]))
-    for key in (key for key in given if layout.on_shaft and key in (*ON_GROUND, "surface")):
-        raise BadConfiguration(imposed.on_shaft(OPTIONS[key]))
+    imposed.check_acting(robot, (OPTIONS[key] for key in given if key in layout.idle))
     if battery:
         imposed.check_battery(robot)
     elif column not in given:
         rest = 0.0 if column in elsewhere else None
-        given[column] = VOLTAGE if layout.usual else imposed.default(robot, OPTIONS[column]) if rest is None else rest
-    if not layout.on_shaft:
-        bench = {} if layout.blank else {"surface": BENCH}
+        given[column] = imposed.default(robot, OPTIONS[column]) if rest is None else rest
+    if robot.has_ground:
+        bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
     return records.single({**given, "configuration": name}, layout)

@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.table import Table
 
 from calibration.data import effect_file
+from calibration.data.columns import Layout
 from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
@@ -16,7 +17,6 @@ from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks, priors
 from sweeps import config as configuration
 from sweeps import words
-from sweeps.capabilities import is_rig
 from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.report import rms
@@ -29,7 +29,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
     0 done; 3 done, but rows could not be simulated, or the fit that is proposed did not converge.
     """
     began = time.monotonic()
-    robot = load_robot(config)
+    robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
 
@@ -65,7 +65,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
 def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person."""
     say(f"{found.verdict}: {found.statement}")
-    if found.robot.on_shaft and found.verdict != "none":
+    if not found.robot.has_ground and found.verdict != "none":
         say("The balance track of a shaft is what its load loses.")
     for said in (findings.describe_standing(found), findings.describe_ruled_out(found)):
         if said:
@@ -111,7 +111,7 @@ def print_discovery(found: DiscoveryResult) -> None:
         cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
         errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
     say(errors)
-    if is_rig(found.robot):
+    if Layout.of(found.robot).crosses_zero:
         say(
             words.describe_rms(
                 rms(found.rows_table(), found.channels, ("before", "after", "held_out_before", "held_out_after"))

@@ -58,7 +58,8 @@ def simulate(
         BadData: a wrong profile or table of runs.
     """
     assert config.profile is not None
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     _check_robot(robot)
     source = profiles.read(config.profile)
     _check_acting(robot, source)
@@ -87,7 +88,7 @@ def simulate(
         if config.report:
             from sweeps import report_mission
 
-            report_mission.write(folder.partial, robot=robot, robot_name=config.robot, found=found)
+            report_mission.write(folder.partial, file, found)
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
         return run.leave(folder, config, result)
 
@@ -103,7 +104,7 @@ def _check_robot(robot: Robot) -> None:
             "--profile: a profile does not follow a backlash; set it to 0, or simulate over time with --model drive"
         )
     for name, load in robot.configurations.items():
-        if robot.on_shaft and float(load.torque_gravity) > 0:
+        if float(load.torque_gravity) > 0:
             raise BadConfiguration(
                 f"--profile: {name} is an arm on which gravity acts with its angle, which a profile does not follow; "
                 "simulate it over time with --model drive"
@@ -111,13 +112,10 @@ def _check_robot(robot: Robot) -> None:
 
 
 def _check_acting(robot: Robot, source: ProfileTable) -> None:
-    """Refuse a profile that states what does not act on a shaft."""
-    if not robot.on_shaft:
-        return
-    for column in ("slope_deg", "payload_kg", "surface"):
-        if column in source.stated:
-            raise BadConfiguration(imposed.on_shaft(f"{source.source}, {column}"))
-    if "speed" in source.modes and "speed" not in robot.rig.channels:
+    """Refuse a profile that states what does not act on the robot's load."""
+    ground = ("slope_deg", "payload_kg", "surface")
+    imposed.check_acting(robot, (f"{source.source}, {column}" for column in ground if column in source.stated))
+    if "speed" in source.modes and not robot.shows_travel:
         raise BadConfiguration(
             f"{source.source}, speed_mm_s: the robot's load is a shaft, of which no channel shows a travel; demand "
             "motor_speed_rpm or duty"
@@ -272,7 +270,7 @@ def _course(
     left = 1 - signals.discharge / float(robot.battery.capacity)
     demanded = source.demanded(segment, elapsed, per_speed)
     turning = {}
-    if robot.on_shaft:
+    if not robot.has_ground:
         turning = {
             "motor_speed_rpm": np.asarray(reading["motor_speed"]) / channels.RPM,
             "demanded_motor_speed_rpm": demanded * per_speed / channels.RPM,

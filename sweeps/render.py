@@ -35,11 +35,11 @@ def render(
         raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
     if not file.parent.is_dir():
         raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
-    robot = load_robot(config)
+    robot = load_robot(config).robot
     imposed.check_on_ground(robot, "render")
     conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
     run.refuse(robot, conditions, config)
-    if robot.rig.blank and not capabilities.stated(robot, "running_gear."):
+    if not robot.rig.inherits and not capabilities.stated(robot, "running_gear."):
         tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     with progress(1, quiet=False) as advance:
         told = run.shares(advance, 1)

@@ -18,6 +18,7 @@ from sweeps import capabilities, words
 from sweeps.figures_style import style, svg
 
 if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
     from mmrjax.robot import Robot
 
 ROWS = 200  # of a table on a page
@@ -43,21 +44,17 @@ class Album:
         return numbers[0] if numbers else None
 
 
-def named(robot: Robot, robot_name: str) -> dict[str, Any]:
+def named(file: RobotFile) -> dict[str, Any]:
     """What a page says of the robot: the `robot`'s name, and the parameters `changed` from the nominal one's.
 
-    Of a rig that starts from nothing its `own`, with where each comes from.
-
-    Args:
-        robot: the one that was simulated.
-        robot_name: its name or file; of a file only the last part is shown, and a changed packaged robot is said to
-            be one.
+    Of a rig that starts from nothing its `own`, with where each comes from. A changed packaged robot is said to be
+    one.
     """
     from mmrjax.robots import ROBOTS
 
-    name = Path(robot_name).name
-    if robot.rig.blank:
-        return {"robot": name, "changed": [], "own": capabilities.parameters(robot, robot_name)}
+    robot, name = file.robot, file.name
+    if not robot.rig.inherits:
+        return {"robot": name, "changed": [], "own": capabilities.parameters(file)}
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
         name = f"{name}, changed"
     return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]()), "own": []}

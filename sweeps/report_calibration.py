@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from calibration.data.columns import Layout
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
-from sweeps import capabilities, figures_calibration, figures_clusters, figures_comparison
+from sweeps import figures_calibration, figures_clusters, figures_comparison
 from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
 
@@ -28,7 +29,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
     if found.axis:
         album.add("histories", lambda: figures_calibration.histories(table, found.channels))
     along = {found.axis: "time [s]"} if found.axis else {}
-    sized = capabilities.is_rig(found.robot)
+    sized = Layout.of(found.robot).crosses_zero
     album.add("parity", lambda: figures_comparison.parity(table, found.channels, band=not sized))
     album.add("residuals", lambda: figures_comparison.errors_over(table, found.channels, sized, along))
     if found.residual_clusters:
@@ -47,7 +48,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         conditions=conditions(table),
         columns=columns(found.channels),
         sized=sized,
-        on_shaft=found.robot.on_shaft,
+        has_ground=found.robot.has_ground,
         rms=rms(table, found.channels, ("before", "after", "held_out")),
         held=HELD,
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",

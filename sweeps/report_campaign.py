@@ -16,17 +16,17 @@ from sweeps.report import Album, named, render
 from sweeps.zarr_store import STORE, Layout
 
 if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+    from calibration.data.robot_file import RobotFile
 
 #: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
 THINNED, CHUNKS, DRAWN = 200_000, 100, 6
 
 
-def write(folder: Path, robot: Robot, robot_name: str, layout: Layout, result: dict[str, Any]) -> Path:
+def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any]) -> Path:
     """Write `report.html` and `figures/` for a store whose every chunk is done.
 
     Args:
-        folder: that holds the store; robot: that was varied; robot_name: its name or file.
+        folder: that holds the store; file: of the robot that was varied.
         result: `result.json`.
     """
     values, found = thinned(folder / STORE, layout)
@@ -68,7 +68,7 @@ def write(folder: Path, robot: Robot, robot_name: str, layout: Layout, result: d
         varied=_varied(layout, values),
         outputs=rows,
         thinned=len(values),
-        **named(robot, robot_name),
+        **named(file),
     )
 
 

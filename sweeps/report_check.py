@@ -11,10 +11,11 @@ from sweeps import check_result, figures_check
 from sweeps.report import Album, named, render
 
 if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
     from sweeps.check_result import CheckResult
 
 
-def write(folder: Path, found: CheckResult, *, robot_name: str) -> Path:
+def write(folder: Path, found: CheckResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a check; returns the path of the page."""
     album = Album(folder)
     album.add("margins", partial(figures_check.margins, found))
@@ -30,7 +31,7 @@ def write(folder: Path, found: CheckResult, *, robot_name: str) -> Path:
             {"label": f"{check_result.label(o)} {check_result.wanted(o)}", "changes": [_change(c) for c in o.change]}
             for o in found.missed
         ],
-        **named(found.robot, robot_name),
+        **named(file),
     )
 
 

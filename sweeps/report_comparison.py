@@ -12,14 +12,13 @@ from sweeps import figures_comparison
 from sweeps.report import Album, columns, conditions, first_rows, named, render, statuses
 
 if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+    from calibration.data.robot_file import RobotFile
 
 
 def write(
     folder: Path,
+    file: RobotFile,
     *,
-    robot: Robot,
-    robot_name: str,
     model: str,
     data_name: str,
     table: dict[str, np.ndarray],
@@ -30,7 +29,7 @@ def write(
 
     Args:
         folder: an existing run folder.
-        robot: the robot that was simulated; robot_name: its name or file; model: fidelity.
+        file: of the robot that was simulated; model: fidelity.
         data_name: of the table; of a file only the last part is shown.
         table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
         summary: group (`all`, each configuration) → channel → rows, rms_percent, max_percent, r2.
@@ -39,11 +38,11 @@ def write(
     Returns:
         The path of the page.
     """
-    album = Album(folder)
-    sized = not Layout.of(robot).usual
+    album, robot = Album(folder), file.robot
+    sized = Layout.of(robot).crosses_zero
     album.add("parity", lambda: figures_comparison.parity(table, robot.channels, band=not sized))
     album.add("errors", lambda: figures_comparison.errors_over(table, robot.channels, in_units=sized))
-    known = named(robot, robot_name)
+    known = named(file)
     return render(
         folder,
         "comparison.html.j2",

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from calibration.data.columns import Layout
 from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
-from sweeps import capabilities, figures_clusters, figures_loop
+from sweeps import figures_clusters, figures_loop
 from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
 Section = Callable[[Album, DiscoveryResult], None]
@@ -19,7 +20,7 @@ Section = Callable[[Album, DiscoveryResult], None]
 def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
     """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
     table = found.rows_table()
-    if capabilities.is_rig(found.robot):
+    if Layout.of(found.robot).crosses_zero:
         table["configuration"] = found.runs.configurations_named(found.robot)
     return table
 
@@ -27,7 +28,7 @@ def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
 def _run_by_run(album: Album, found: DiscoveryResult) -> None:
     table = rows_of(found)
     album.add("before_after", lambda: figures_loop.before_after(table, found.channels, found.verdict))
-    album.add("defects", lambda: figures_loop.defects(table, found.verdict, capabilities.is_rig(found.robot)))
+    album.add("defects", lambda: figures_loop.defects(table, found.verdict, Layout.of(found.robot).crosses_zero))
 
 
 def _over_time(album: Album, found: DiscoveryResult) -> None:
@@ -59,7 +60,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         The path of the page.
     """
     album = Album(Path(folder))
-    table, sized = rows_of(found), capabilities.is_rig(found.robot)
+    table, sized = rows_of(found), Layout.of(found.robot).crosses_zero
     SECTIONS[type(found.detail)](album, found)
     if found.residual_clusters:
         album.add("clusters", lambda: figures_clusters.clusters(found.residual_clusters))
@@ -88,7 +89,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         conditions=conditions(rows_of(found)),
         columns=columns(found.channels),
         sized=sized,
-        on_shaft=found.robot.on_shaft,
+        has_ground=found.robot.has_ground,
         closed=figures_loop.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
         rms=rms(table, found.channels, ("before", "after", "held_out_before", "held_out_after")),
         shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",

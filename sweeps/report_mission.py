@@ -15,6 +15,7 @@ from sweeps.report import ROWS, Album, named, render, statuses
 from sweeps.report_runs import labels
 
 if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
     from mmrjax.robot import Robot
     from sweeps.missions_result import Missions
 
@@ -22,18 +23,18 @@ if TYPE_CHECKING:
 SEGMENTS = 60
 
 
-def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Path:
+def write(folder: Path, file: RobotFile, found: Missions) -> Path:
     """Write `report.html` and `figures/` for finished missions; in detail the first run.
 
     Args:
-        folder: an existing run folder; robot: that was simulated; robot_name: its name or file.
+        folder: an existing run folder; file: of the robot that was simulated.
 
     Returns:
         The path of the page.
     """
     album = Album(folder)
     runs, source = found.table, found.source
-    first = {key: value[0] for key, value in runs.items()}
+    first, robot = {key: value[0] for key, value in runs.items()}, file.robot
     name = found.segments["run_id"][0]
     rows = {key: value[found.course["run_id"] == name] for key, value in capabilities.of(robot, found.course).items()}
     idle = capabilities.idle_columns(robot)
@@ -66,7 +67,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, found: Missions) -> Pa
         whole=found.whole,
         heat=capabilities.thermal(robot),
         travels="distance_m" not in idle,
-        **named(robot, robot_name),
+        **named(file),
     )  # fmt: skip
 
 

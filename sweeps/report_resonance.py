@@ -14,10 +14,11 @@ from sweeps import figures_resonance, words
 from sweeps.report import Album, named, render
 
 if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
     from sweeps.resonance_result import ResonanceResult
 
 
-def write(folder: Path, found: ResonanceResult, *, robot_name: str) -> Path:
+def write(folder: Path, found: ResonanceResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a map; returns the path of the page."""
     album = Album(folder)
     if found.read.any():
@@ -35,7 +36,7 @@ def write(folder: Path, found: ResonanceResult, *, robot_name: str) -> Path:
         periods=PERIODS,
         tail=100 * TAIL,
         matters=100 * MATTERS,
-        **named(found.robot, robot_name),
+        **named(file),
     )
 
 

@@ -14,6 +14,7 @@ from sweeps.imposed import UNLIMITED
 from sweeps.report import Album, columns, conditions, first_rows, label, named, render, statuses
 
 if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
     from mmrjax.fidelities.base import Run
     from mmrjax.robot import Robot
 
@@ -29,9 +30,8 @@ HISTORIES, CHAINS, GEARS = 4, 12, 2  # runs that a figure has room for
 
 def write(
     folder: Path,
+    file: RobotFile,
     *,
-    robot: Robot,
-    robot_name: str,
     model: str,
     runs: dict[str, np.ndarray],
     histories: Run | None = None,
@@ -40,7 +40,7 @@ def write(
 
     Args:
         folder: an existing run folder.
-        robot: the robot that was simulated; robot_name: its name or file.
+        file: of the robot that was simulated.
         model: fidelity.
         runs: the finished table of runs.
         histories: the same as a batch with its history, of a fidelity that keeps it.
@@ -48,7 +48,7 @@ def write(
     Returns:
         The path of the page.
     """
-    album = Album(folder)
+    album, robot = Album(folder), file.robot
     names = labels(runs)
     known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": []}
     if histories is not None:
@@ -56,7 +56,7 @@ def write(
     chain = np.flatnonzero(figures_power.drawable(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
     if chain.size:
         picked = {key: value[chain] for key, value in runs.items()}
-        album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain], robot.on_shaft))
+        album.add("power", lambda: figures_power.chain(picked, [names[k] for k in chain], robot.has_ground))
     single = len(names) == 1
     shown = capabilities.of(robot, runs)
     return render(
@@ -76,9 +76,9 @@ def write(
         about=conditions(runs, mass=True),
         further={c: about for c, about in FURTHER.items() if c in shown},
         heat=capabilities.thermal(robot),
-        on_shaft=robot.on_shaft,
+        has_ground=robot.has_ground,
         **known,
-        **named(robot, robot_name),
+        **named(file),
     )
 
 
@@ -96,7 +96,7 @@ def _histories(
     which = [robot.configurations.index(str(c)) for c in runs["configuration"]]
     history, status = histories.history, np.asarray(histories.result.status)
     assert history is not None  # the fidelity was asked for it
-    if robot.on_shaft:
+    if not robot.has_ground:
         if not any(c.over_time for c in robot.channels):
             return {}
         shown = figures_history.courses(robot.channels, history, status, names[:HISTORIES])
@@ -138,7 +138,7 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         else math.nan
     )
     cell = math.nan if "voltage_cell_V" in idle else float(run["voltage_cell_V"]) or math.nan  # 0: none feeds it
-    gear = "gearbox torque at its output" if robot.on_shaft else "gearbox torque at the driving wheel"
+    gear = f"gearbox torque at {'the driving wheel' if robot.has_ground else 'its output'}"
     asked = [
         ("adhesion", math.nan if "adhesion_used" in idle else float(run["adhesion_used"]), 1.0, "{:.2f}", ""),
         ("motor speed", shaft, float(robot.motor.speed_limit) / rpm, "{:.0f}", " rpm"),

@@ -13,18 +13,18 @@ from sweeps import figures_sensitivity
 from sweeps.report import Album, named, number, render
 
 if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+    from calibration.data.robot_file import RobotFile
 
 #: Pairs of a table of interactions.
 PAIRS = 5
 
 
-def write(folder: Path, found: SensitivityResult, *, robot: Robot, robot_name: str) -> Path:
+def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a finished study; returns the path of the page.
 
     Args:
         folder: an existing run folder.
-        robot: that was studied; robot_name: its name or file.
+        file: of the robot that was studied.
     """
     album = Album(folder)
     album.add("overview", partial(figures_sensitivity.overview, found))
@@ -62,7 +62,7 @@ def write(folder: Path, found: SensitivityResult, *, robot: Robot, robot_name: s
         negligible=100 * NEGLIGIBLE,
         ranges=_ranges(found),
         bounds=_bounds(found),
-        **named(robot, robot_name),
+        **named(file),
     )
 
 
@@ -143,8 +143,9 @@ def _next_runs(found: SensitivityResult) -> dict[str, Any] | None:
             }
             for k in range(len(points))
         ],
-        "heading": "supply [V]" if points.motor_speed is None else "motor speed [rpm]", "on_shaft": points.on_shaft,
-        "candidates": n.candidates, "source": n.source, "noise": n.noise, "outputs": outputs,
+        "heading": "supply [V]" if points.motor_speed is None else "motor speed [rpm]",
+        "has_ground": points.has_ground, "candidates": n.candidates, "source": n.source, "noise": n.noise,
+        "outputs": outputs,
     }  # fmt: skip
 
 
@@ -157,8 +158,7 @@ def _ranges(found: SensitivityResult) -> str:
     p = found.points
     parts = [", ".join(dict.fromkeys(map(str, p.configuration)))]
     _, own, symbol = p.imposed
-    ground = () if p.on_shaft else ((p.payload, " kg"), (p.slope_deg, "°"))
-    for x, unit in ((own, f" {symbol}"), *ground):
+    for _, x, unit in (("", own, f" {symbol}"), *p.ground):
         on_battery = unit == " V" and np.isnan(x).all()
         parts.append("battery" if on_battery else ", ".join(f"{v:g}" for v in np.unique(x)) + unit)
     return "; ".join(parts)

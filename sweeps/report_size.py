@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from calibration.data.robot_file import RobotFile
 from calibration.sizing.chart import chart, extent
 from calibration.sizing.design import OBJECTIVES
 from calibration.sizing.search import Found
@@ -15,11 +17,11 @@ from sweeps.report import Album, named, render, words_shown
 from sweeps.size_result import SizeResult, missed
 
 
-def write(folder: Path, found: SizeResult, *, robot_name: str) -> Path:
+def write(folder: Path, found: SizeResult, file: RobotFile) -> Path:
     """Write `report.html` and `figures/` of a sizing; returns the path of the page."""
     album, best = Album(folder), found.sizing.best
     most = extent(found.asked)
-    charts = {f"as it is: {words_shown(Path(robot_name).name)}": chart(found.robot, found.asked, most)}
+    charts = {f"as it is: {words_shown(file.name)}": chart(found.robot, found.asked, most)}
     if best is not None:
         charts = {
             f"best: {best.drive.motor.name}, ratio {best.ratio:.4g}": chart(best.robot, found.asked, most),
@@ -50,7 +52,7 @@ def write(folder: Path, found: SizeResult, *, robot_name: str) -> Path:
             }
             for o in found.outcomes
         ],
-        **named(found.robot if best is None else best.robot, robot_name),
+        **named(file if best is None else dataclasses.replace(file, robot=best.robot)),
     )
 
 

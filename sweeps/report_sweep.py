@@ -14,7 +14,7 @@ from sweeps import capabilities, figures_sweep, words
 from sweeps.report import Album, named, render, statuses
 
 if TYPE_CHECKING:
-    from mmrjax.robot import Robot
+    from calibration.data.robot_file import RobotFile
 
 Table = dict[str, np.ndarray]
 _AXES = {
@@ -26,19 +26,19 @@ _AXES = {
 }
 
 
-def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Table) -> Path:
+def write(folder: Path, file: RobotFile, *, model: str, runs: Table) -> Path:
     """Write `report.html` and `figures/` for a finished sweep.
 
     Args:
         folder: an existing run folder.
-        robot: the robot that was simulated; robot_name: its name or file.
+        file: of the robot that was simulated.
         model: fidelity.
         runs: the finished table of runs, any grid.
 
     Returns:
         The path of the page.
     """
-    album = Album(folder)
+    album, robot = Album(folder), file.robot
     for channel in robot.channels:
         album.add(f"sweep_{channel.name}", partial(figures_sweep.sweep, runs, channel))
     return render(
@@ -50,7 +50,7 @@ def write(folder: Path, *, robot: Robot, robot_name: str, model: str, runs: Tabl
         model=model,
         counts=counts(capabilities.of(robot, runs), robot.channels),
         volts_drawn=_drawn(runs),
-        **named(robot, robot_name),
+        **named(file),
     )
 
 

@@ -17,11 +17,12 @@ from sweeps.store import DONE, open_folder
 
 def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) -> int:
     """Write the paper's figures and tables for a robot into a run folder; returns the exit code."""
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     runs = records.read("measured")
     gear = "track.guide_share" in fidelities.facts(config.model).computes
     with open_folder("reproduce", config, robot, out, force) as folder:
-        _, rows = report.write(folder.partial, robot=robot, robot_name=config.robot, model=config.model, gear=gear)
+        _, rows = report.write(folder.partial, file, model=config.model, gear=gear)
         result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
         if rows is None:
             tell(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")

@@ -50,7 +50,8 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
 
     0 done; 3 done, but some runs did not settle, or slid, tipped or failed.
     """
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     imposed.check_on_ground(robot, "resonance")
     name = config.configuration or robot.configurations.names[0]
     check_configurations(robot, (name,), "--configuration")
@@ -85,7 +86,7 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
         if config.report:
             from sweeps import report_resonance
 
-            report_resonance.write(folder.partial, found, robot_name=config.robot)
+            report_resonance.write(folder.partial, found, file)
         path = folder.finish({"seed": None, "statuses": found.statuses}, runs)
         say(str(path))
         return DONE if found.statuses["converged"] == len(runs) else SOME_NOT_CONVERGED

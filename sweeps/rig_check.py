@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from calibration.data import instruments, rig_facts, robot_file
-from calibration.data.columns import ON_GROUND, SUPPLY
+from calibration.data import rig_facts
+from calibration.data.columns import SUPPLY, Layout
 from calibration.data.errors import BadConfiguration
 from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
@@ -75,7 +75,7 @@ class RigCheck:
     def remarks(self) -> list[str]:
         """What should be looked at, a sentence each."""
         said = []
-        if not self.robot.rig.blank:
+        if self.robot.rig.inherits:
             said.append(
                 'what the file does not state is its base\'s, a packaged robot (base = "none" starts from nothing)'
             )
@@ -84,7 +84,7 @@ class RigCheck:
             said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
         loose = [o.name for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value != 0]
-        if loose and self.robot.rig.blank:
+        if loose and not self.robot.rig.inherits:
             said.append(f"without ±, so with the program's: {', '.join(loose)}")
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
             said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
@@ -93,9 +93,9 @@ class RigCheck:
     def channels(self) -> list[dict[str, Any]]:
         """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
         theirs = {mine: column for mine, column, _ in self.robot.rig.columns}
-        found = []
+        shown, found = (self if self.foresight is None else self.foresight).robot.rig, []
         for k, channel in enumerate(self.robot.channels):
-            instrument = self.robot.rig.instrument(channel.name)
+            instrument = shown.instrument(channel.name)
             usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
             found.append(
                 {
@@ -135,9 +135,8 @@ class RigCheck:
 
     def _means_nothing(self, column: str) -> bool:
         """Whether a column that the table lacks says nothing of this rig: of a ground, or what is not imposed."""
-        if self.robot.on_shaft and column in ON_GROUND:
-            return True
-        return column == SUPPLY and self.robot.rig.imposed != "voltage"
+        idle = Layout.of(self.robot).idle
+        return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
 
     def unused(self) -> list[str]:
         """Of each column that is not used, why."""
@@ -247,18 +246,15 @@ def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool)
 
 def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> RigCheck:
     """What there is to say of a rig's file, and of a table beside it."""
-    robot = load_robot(RobotPart(robot=str(file), effects=effects))
-    lines = file.read_text(encoding="utf-8").splitlines()
+    rig = load_robot(RobotPart(robot=str(file), effects=effects))
+    lines, robot = rig.text.splitlines(), rig.robot
     examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
-    stated, linear = robot_file.parameters_stated(file)
-    origins = tuple(rig_facts.origins(robot, stated, linear))
-    found = RigCheck(file.name, robot, examples, origins, tuple(rig_facts.facts(robot)))
+    found = RigCheck(rig.name, robot, examples, tuple(rig_facts.origins(rig)), tuple(rig_facts.facts(robot)))
     if data is None:
         return found
     runs = read_runs(data, robot, measured=True, series=True)
     seen = foresight.foresee(runs, robot)
-    robot = instruments.with_inferred_instruments(robot, runs)
-    return dataclasses.replace(found, robot=robot, runs=runs, shown=_shown(runs, data), foresight=seen)
+    return dataclasses.replace(found, runs=runs, shown=_shown(runs, data), foresight=seen)
 
 
 def _shown(runs: Runs, data: str) -> dict[str, str]:

@@ -155,16 +155,11 @@ def shares(advance: Callable[[float], None], count: int) -> Callable[[float], No
 
 def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
     """The condition columns of a table, the total mass taken from the robot where none is stated."""
-    columns = {key: runs[key] for key in ("configuration", runs.layout.imposed_column)}
-    if not robot.on_shaft:
-        if runs.has("total_mass_kg"):
-            columns["total_mass_kg"] = runs["total_mass_kg"]
-        else:
-            own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
-            columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
-        columns |= {key: runs[key] for key in ("payload_kg", "slope_deg")}
-    columns |= {key: runs[key] for key in ("surface", "run_id") if runs.has(key)}
-    return columns
+    columns = dict(runs.columns)
+    if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
+        own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
+        columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
+    return {key: columns[key] for key in ("configuration", *runs.layout.axes, "surface", "run_id") if key in columns}
 
 
 def counts(table: dict[str, np.ndarray]) -> dict[str, int]:

@@ -10,6 +10,7 @@ from rich.table import Table
 from calibration.data import robot_file
 from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration
+from calibration.data.robot_file import RobotFile
 from calibration.data.runs import Runs
 from calibration.inference import noise
 from calibration.sensitivity import inputs as room
@@ -56,13 +57,14 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
 
     0 done; 3 done, but some operating points have no numbers.
     """
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     if config.method not in METHODS:
         raise BadConfiguration(f"option method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
     outputs = chosen_outputs(config.outputs, robot)
     ranges = _ranges(config.vary)
     runs = _operating_points(config, robot, ranges)
-    inputs = _inputs(config, robot, runs, ranges)
+    inputs = _inputs(config, file, runs, ranges)
     candidates = _candidates(config, robot, runs)
     conditions = runs.conditions(robot)
     refuse(robot, conditions, config)
@@ -79,7 +81,7 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
         if config.report:
             from sweeps import report_sensitivity
 
-            report_sensitivity.write(folder.partial, found, robot=robot, robot_name=config.robot)
+            report_sensitivity.write(folder.partial, found, file)
         path = folder.finish({"seed": found.seed, "statuses": found.statuses}, runs)
         say(str(path))
         return DONE if found.studied else SOME_NOT_CONVERGED
@@ -107,13 +109,12 @@ def _operating_points(
 ) -> Runs:
     """The grid of operating points; an axis that varies has one value, the middle of its range."""
     layout = Layout.of(robot)
-    usual: dict[str, tuple[float, ...]] = {}
-    if layout.usual:
-        usual = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
-    axes = {key: getattr(config, key) or usual.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
+    table8: dict[str, tuple[float, ...]] = {}
+    if layout.table8:
+        table8 = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+    axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
     for name in ranges:
-        if layout.on_shaft and name in axes_room.ON_GROUND:
-            raise BadConfiguration(imposed.on_shaft(f"--vary {name}"))
+        imposed.check_acting(robot, [f"--vary {name}"] if name in axes_room.ON_GROUND else [])
         if name in grid_room.AXIS and name != layout.imposed:
             raise BadConfiguration(
                 f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
@@ -144,13 +145,13 @@ def words_of(name: str) -> str:
 
 
 def _inputs(
-    config: configuration.Sensitivity, robot: Robot, runs: Runs, ranges: dict[str, tuple[float, float]]
+    config: configuration.Sensitivity, file: RobotFile, runs: Runs, ranges: dict[str, tuple[float, float]]
 ) -> Inputs:
-    present = tuple(dict.fromkeys(map(str, runs["configuration"])))
+    robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
     if config.posterior:
         if config.parameters:
             raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
-        return room.of_posterior(robot, beside_robot(config, robot), ranges)
+        return room.of_posterior(robot, beside_robot(file), ranges)
     names = config.parameters or room.default_names(robot, present, config.battery, config.model)
     return room.of_priors(robot, names, ranges)
 
@@ -160,7 +161,7 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs) -
     if config.candidates:
         runs = read_runs(config.candidates, robot, measured=False)
         source = runs.source
-    elif not Layout.of(robot).usual:
+    elif not Layout.of(robot).table8:
         runs, source = points, "the operating points"
     else:
         runs = grid(GridPart(surface=config.surface), robot)

@@ -44,7 +44,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     Raises:
         BadConfiguration: more runs than histories can be kept of.
     """
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     if isinstance(given, str):
         runs = read_runs(given, robot, measured=False, battery=config.battery)
     else:
@@ -53,7 +54,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         raise BadConfiguration(
             f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
         )
-    drawn = None if config.posterior is None else beside_robot(config, robot)
+    drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         table, histories = _simulated(folder, robot, runs, config)
         table[PERMISSIBLE] = permissible(robot, table)
@@ -74,11 +75,11 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             from sweeps import report_runs
 
             report_runs.write(
-                folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table,
+                folder.partial, file, model=config.model, runs=table,
                 histories=histories,
             )  # fmt: skip
         further: dict[str, Any] = {"notes": notes}
-        if histories is not None and not robot.on_shaft:
+        if histories is not None and robot.has_ground:
             further["starts"] = starts(robot, histories, runs)
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
@@ -201,7 +202,7 @@ def _names(runs: records.Runs) -> np.ndarray:
 def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
     """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
     signals = history.signals
-    of_rig = {*robot.rig.channels, *(OF_SHAFT if robot.on_shaft else OF_VEHICLE)}
+    of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
     shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
     return {
         "run_id": np.repeat(_names(runs), history.time.shape[-1]),

@@ -23,7 +23,8 @@ from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder, open_folder
 def size(config: configuration.Size, out: Path | None, force: bool) -> int:
     """Search, and leave a run folder; returns the exit code: 3 where the best misses something or there is none."""
     asked = requirements.load(Path(config.requirements))
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     objectives = config.pareto or (config.objective,)
     for name in objectives:
         if name not in OBJECTIVES:
@@ -45,7 +46,7 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
         if config.report:
             from sweeps import report_size
 
-            report_size.write(folder.partial, found, robot_name=config.robot)
+            report_size.write(folder.partial, found, file)
         path = folder.finish({"seed": config.seed, "feasible": sizing.best is not None})
         say(str(path))
         return DONE if outcomes and all(o.met for o in outcomes) else SOME_NOT_CONVERGED

@@ -26,7 +26,8 @@ def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool
     Args:
         config: the configuration; where: its file, for messages; out: the run folder; force: replace one.
     """
-    robot = load_robot(config)
+    file = load_robot(config)
+    robot = file.robot
     notes: list[str] = []
     stated = config
     config = resolved(stated, robot, stated.battery, notes)
@@ -40,7 +41,7 @@ def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool
     for note in notes:
         tell(note)
     runs = grid(config, robot, config.battery)
-    drawn = None if config.posterior is None else beside_robot(config, robot)
+    drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("sweep", config, robot, out, force) as folder:
         table = run.evaluate(robot, runs, config, folder)
         print_counts(table)
@@ -51,7 +52,7 @@ def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool
         if config.report:
             from sweeps import report_sweep
 
-            report_sweep.write(folder.partial, robot=robot, robot_name=config.robot, model=config.model, runs=table)
+            report_sweep.write(folder.partial, file, model=config.model, runs=table)
         return run.leave(folder, config, run.SimulationResult("sweep", config.model, robot, runs, table))
 
 

@@ -81,9 +81,9 @@ def bench(tmp_path):
 
 def calibrated(runs, robot):
     """A calibration's result of these runs, without the fit: what is written of readings is read from it."""
-    observe, measured, sd = observers.kind(runs), runs.measured(), runs.deviations()
+    observe, measured, sd = observers.kind(runs).of(runs, robot), runs.measured(), runs.deviations()
     known = {
-        "robot": robot, "channels": runs.channels, "held_out": {}, "conditions": estimates.conditions(observe, runs),
+        "robot": robot, "channels": runs.channels, "held_out": {}, "conditions": estimates.conditions(type(observe), runs),
         "readings": estimates.readings(observe, runs.channels, measured, sd, measured, measured),
         "status": np.full(len(runs), "converged"),
     }  # fmt: skip

@@ -16,6 +16,7 @@ import pytest
 from pages import Tables, drawn, outside
 
 from calibration.data import runs as records
+from calibration.data.robot_file import RobotFile
 from mmrjax import channels, fidelities, outputs, params
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
@@ -56,7 +57,7 @@ def _runs(configuration, voltage, payload, slope):
 
 def _write(folder, runs, robot=None, name="nominal", room=report_sweep):
     robot = ROBOTS["nominal"]() if robot is None else robot
-    path = room.write(folder, robot=robot, robot_name=name, model="steady", runs=runs)
+    path = room.write(folder, RobotFile(robot, name), model="steady", runs=runs)
     return path, path.read_text(encoding="utf-8")
 
 
@@ -222,7 +223,7 @@ def driven(robot, tmp_path_factory):
     })  # fmt: skip
     table = {**run.conditions(robot, runs), **run.ended(robot, batch)}
     folder = tmp_path_factory.mktemp("driven")
-    report_runs.write(folder, robot=robot, robot_name="nominal", model="drive", runs=table, histories=batch)
+    report_runs.write(folder, RobotFile(robot, "nominal"), model="drive", runs=table, histories=batch)
     return folder, (folder / "report.html").read_text(), batch
 
 
@@ -241,8 +242,7 @@ def test_report_shows_the_runs_own_history_with_its_peak(driven):
 def test_report_escapes_a_title(tmp_path):
     path = report_comparison.write(
         tmp_path,
-        robot=ROBOTS["nominal"](),
-        robot_name="<b>x.toml",
+        RobotFile(ROBOTS["nominal"](), "<b>x.toml"),
         model="steady",
         data_name="a&b.csv",
         **_comparison(),
@@ -260,7 +260,7 @@ def _comparison():
 def test_comparison_shows_its_summary_and_rows(tmp_path):
     given = _comparison()
     path = report_comparison.write(
-        tmp_path, robot=ROBOTS["nominal"](), robot_name="nominal", model="steady", data_name="measured", **given
+        tmp_path, RobotFile(ROBOTS["nominal"](), "nominal"), model="steady", data_name="measured", **given
     )
     page = path.read_text()
     assert drawn(page) == {"parity", "errors"} and outside(tmp_path) == []

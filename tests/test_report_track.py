@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
+from calibration.data.robot_file import RobotFile
 from mmrjax import fidelities, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.stability import largest_step
@@ -26,7 +27,7 @@ SECONDS = 0.9  # of a run; both configurations are under way after 0.5 s
 
 
 def page(folder, robot):
-    path, _ = report.write(folder, robot=robot, robot_name="nominal", model="track", gear=True)
+    path, _ = report.write(folder, RobotFile(robot, "nominal"), model="track", gear=True)
     return path.read_text(encoding="utf-8")
 
 
@@ -166,6 +167,6 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
                                  ("short", short, {"history", "power"})):  # fmt: skip
         table = {**simulation.conditions(robot, runs), **simulation.ended(robot, batch)}
         path = report_runs.write(
-            tmp_path / name, robot=robot, robot_name="nominal", model="track", runs=table, histories=shown
+            tmp_path / name, RobotFile(robot, "nominal"), model="track", runs=table, histories=shown
         )
         assert set(re.findall(r'<figure id="([^"]+)">', path.read_text())) == figures

@@ -91,7 +91,7 @@ load = "linear"
 @pytest.mark.parametrize("kind", KINDS)
 def test_template_reads_as_written_and_back(tmp_path, kind):
     robot = read(tmp_path, rig_new.template(kind))
-    assert robot.rig.blank and robot.rig.priors and robot.on_shaft == (kind not in ("tracked", "wheeled"))
+    assert not robot.rig.inherits and robot.rig.priors and robot.has_ground == (kind in ("tracked", "wheeled"))
     assert same(again(tmp_path, robot), robot)
 
 
@@ -190,7 +190,7 @@ def test_written_rig_keeps_the_prior_of_what_a_fit_left_alone(tmp_path):
 
 def test_nominal_robot_with_a_rig_of_its_own_is_read_back(tmp_path):
     robot = read(tmp_path, 'imposed = "motor_speed"\n[6T2A]\nmass = "12 ± 1 %"\n')
-    assert robot.rig.channels == ("total_current", "speed") and not robot.rig.blank
+    assert robot.rig.channels == ("total_current", "speed") and robot.rig.inherits
     assert robot.rig.priors == (("6T2A.mass", 12.0, 0.12),)
     assert same(again(tmp_path, robot), robot)
 
@@ -198,7 +198,7 @@ def test_nominal_robot_with_a_rig_of_its_own_is_read_back(tmp_path):
 def test_nominal_drive_on_a_bench(tmp_path):
     robot = read(tmp_path, 'configurations = ["b"]\n[b]\nload = "shaft"\ninertia = 0.01\nloss_coulomb = 0.1\n')
     assert (
-        robot.on_shaft
+        not robot.has_ground
         and float(robot.motor.resistance) == 0.611
         and robot.rig.channels == ("total_current", "motor_speed")
     )
@@ -268,7 +268,7 @@ def test_inductance_that_is_not_stated_follows_the_resistance(tmp_path):
     robot = read(tmp_path, ROVER.replace("resistance = 1.0", "resistance = 3.0"))
     assert float(robot.motor.inductance) == pytest.approx(6e-4, rel=1e-12)
     assert same(again(tmp_path, robot), robot)
-    found = {o.name: o for o in rig_facts.origins(robot, *robot_file.parameters_stated(tmp_path / "rig.toml"))}
+    found = {o.name: o for o in rig_facts.origins(robot_file.parse(tmp_path / "rig.toml"))}
     assert found["motor.inductance"].why == "not stated: assumed, 0.2 ms of the resistance"
     stated = read(tmp_path, ROVER.replace("[gearbox]", "inductance = 1e-3\n[gearbox]"))
     assert float(stated.motor.inductance) == 1e-3
@@ -388,7 +388,7 @@ def test_packaged_robot_is_as_it_was(tmp_path):
 def test_rig_new_writes_a_file_that_reads(mmrjax, tmp_path, kind):
     code, out, err = mmrjax("rig", "new", "my-rig.toml", "--kind", kind)
     assert (code, err) == (0, "") and "mmrjax rig check my-rig.toml" in out
-    assert robot_file.load(str(tmp_path / "my-rig.toml")).rig.blank
+    assert not robot_file.load(str(tmp_path / "my-rig.toml")).rig.inherits
 
 
 def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
@@ -397,7 +397,7 @@ def test_rig_new_keeps_a_file_unless_forced(mmrjax, tmp_path):
     assert code == 2 and "my-rig.toml: there already; --force replaces it" in err
     assert (tmp_path / "my-rig.toml").read_text() == "mine"
     assert mmrjax("rig", "new", "my-rig.toml", "--force")[0] == 0
-    assert robot_file.load(str(tmp_path / "my-rig.toml")).on_shaft
+    assert not robot_file.load(str(tmp_path / "my-rig.toml")).has_ground
 
 
 def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
@@ -543,5 +543,5 @@ EXAMPLES = (
 @pytest.mark.parametrize("text", [e.split("```")[0] for e in EXAMPLES], ids=lambda text: text[2:].split(":")[0])
 def test_example_of_the_page_reads(tmp_path, text):
     robot = read(tmp_path, text)
-    assert robot.rig.blank and not [f for f in rig_facts.facts(robot) if f.odd]
+    assert not robot.rig.inherits and not [f for f in rig_facts.facts(robot) if f.odd]
     assert same(again(tmp_path, robot), robot)

@@ -247,3 +247,20 @@ def test_ratings_are_stated_written_and_checked(tmp_path):
         robot_file.change(robot, {"motor.voltage_limit": -3}, where="--set")
     with pytest.raises(BadConfiguration, match=r"motor.speed_limit: got 'fast'; expected a number, 1 to 1"):
         robot_file.change(robot, {"motor.speed_limit": "fast"}, where="mine.toml")
+
+
+def test_robot_file_knows_what_it_states(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        'base = "none"\nchannels = ["total_current"]\n[motor]\nresistance = "1.0 ± 5 %"\ntorque_constant = 0.05\n'
+        "[gearbox]\nratio = 10\nefficiency_load = 0.8  # example: yours\n"
+        '[screw]\nload = "linear"\nmass_kg = 2\nlead_mm = 5\n[twice]\nlike = "screw"\nmass_kg = 4\n'
+    )
+    found = robot_file.parse(path)
+    assert found.name == "rig.toml" and found.text == path.read_text()
+    assert found.linear == {"screw", "twice"}  # what another table states of it is stated
+    assert {"motor.resistance", "gearbox.ratio", "screw.inertia", "twice.inertia"} <= found.stated
+    assert not found.stated & {"motor.inertia", "screw.mass_kg", "base", "channels"}
+    assert values(found.robot) == values(robot_file.load(str(path)))
+    packaged = robot_file.find("sm1")
+    assert not packaged.stated and packaged.name == "sm1" and values(packaged.robot) == values(robots.sm1())

@@ -10,13 +10,14 @@ import pytest
 
 from mmrjax import balances, params, robots
 from mmrjax.conditions import Conditions
+from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.drive import drive_batch
 from mmrjax.fidelities.histories import grid, histories
 from mmrjax.fidelities.steady import steady_batch, steady_outputs
 from mmrjax.rig import Begin, Begins, Instrument, Rig
 from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
-from mmrjax.signals import STATUSES, State
+from mmrjax.signals import STATUSES, Signals, State
 
 DRIVE = {
     "gearbox.ratio": 16.0, "gearbox.efficiency_load": 0.8, "motor.torque_constant": 0.05, "motor.resistance": 3.0,
@@ -177,3 +178,22 @@ def test_power_of_a_shaft_adds_up():
         stored = float(2e-6 * s.speed_motor * s.acceleration_wheel * 16 + 0.01 * s.speed_wheel * s.acceleration_wheel)
         taken = float((s.torque_track_loss + 0.3) * s.speed_wheel)
         assert given - stored - taken > -1e-9  # the gearbox never adds power
+
+
+def test_loads_state_what_they_can_do():
+    """Each says of the other's what it has none of, so that nobody has to ask which it is."""
+    shaft, vehicle = bench(torque_constant=0.3, torque_gravity=0.2, angle_zero=-np.pi / 2), robots.nominal()
+    load, chassis = shaft.configurations["bench"], vehicle.configurations["6T2A"]
+    assert not shaft.has_ground and vehicle.has_ground and balances.absent(shaft) >= {"ground", "slip", "mass"}
+    assert load.mass == 0 and load.on_tracks == 0 and load.speed_grip == np.inf  # nothing slides
+    assert chassis.torque_constant == chassis.torque_gravity == chassis.backlash == 0
+    assert float(load.torque_weight(5.0, 0.1)) == pytest.approx(0.5)  # whatever a vehicle's mass and slope
+    assert float(chassis.torque_weight(5.0, 0.1)) == pytest.approx(
+        5.0 * 9.80665 * np.sin(0.1) * float(chassis.radius)
+    )
+    assert vehicle.shows_travel and not bench(Rig(channels=("total_current",))).shows_travel
+
+
+def test_an_effect_of_the_ground_adds_nothing_to_a_shaft():
+    slipping = dataclasses.replace(bench(), effects=(dataclasses.replace(BY_NAME["load_slip"](), amplitude=0.1),))
+    assert balances.added(slipping, Signals(), "slip") == 0.0

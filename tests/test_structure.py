@@ -586,11 +586,7 @@ def test_a_campaign_of_its_own_way_is_found():
 def test_one_preparation_serves_all():
     """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
     inner = {"with_inferred_instruments", "with_surface_configurations", "with_initial_states", "check_start"}
-    allowed = {
-        "calibration/inference/preparation.py",
-        "sweeps/compare.py",
-        "sweeps/rig_check.py",
-    }  # two that fit nothing
+    allowed = {"calibration/inference/preparation.py", "sweeps/compare.py"}  # which fits nothing
     found = {
         path.relative_to(ROOT).as_posix()
         for layer in ("calibration", "sweeps")
@@ -649,6 +645,31 @@ def test_a_circle_of_imports_is_found(found, tmp_path):
     guard = "pass" if found else "if TYPE_CHECKING:\n    from sweeps.a import f"
     (tmp_path / "sweeps" / "b.py").write_text(f"{guard}\n{'from sweeps.a import f' if found else ''}")
     assert set(circle(tmp_path)) == ({"sweeps.a", "sweeps.b"} if found else set())
+
+
+def test_nobody_asks_what_a_load_is():
+    """What a load can do it states; which it is ask its balances, and what reads, writes and describes its file."""
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for layer in LAYERS
+        for path in (ROOT / layer).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance"
+        if {"Shaft", "Chassis"} & {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
+    }
+    data = {f"calibration/data/{name}.py" for name in ("configuration_tables", "rig_facts", "robot_file")}
+    assert found == {"mmrjax/balances.py", "sweeps/rig_check.py", *data}
+
+
+def test_toml_is_read_in_one_place():
+    """But for the comments at the top of a profile, each of which is a line of TOML."""
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for layer in LAYERS
+        for path in (ROOT / layer).rglob("*.py")
+        if "tomllib" in dict(imports(ast.parse(path.read_text(encoding="utf-8")), ""))
+    }
+    assert found == {"calibration/data/errors.py", "calibration/data/profiles.py"}
 
 
 def test_reference_implementation_imports_nothing_of_ours():

@@ -113,9 +113,9 @@ class Layout:
 
     Attributes:
         imposed: on its motors, one of `rig.IMPOSED`.
-        on_shaft: whether its load is a shaft, on which no ground, slope or payload acts.
+        has_ground: whether a ground carries it, see `Robot.has_ground`.
         weight: whether a constant torque acts on it, which may drive its motors either way.
-        blank: whether it is a rig that starts from nothing.
+        inherits: whether what its file leaves open is a packaged robot's.
         configurations: its names.
         instruments: of channels, where more is known than that they are there.
         mapped: (column as this program calls it, column of the file, factor from its unit).
@@ -123,9 +123,9 @@ class Layout:
     """
 
     imposed: str = "voltage"
-    on_shaft: bool = False
+    has_ground: bool = True
     weight: bool = False
-    blank: bool = False
+    inherits: bool = True
     configurations: tuple[str, ...] = ()
     instruments: tuple[Instrument, ...] = ()
     mapped: tuple[tuple[str, str, float], ...] = ()
@@ -137,16 +137,31 @@ class Layout:
         if robot is None:
             return cls()
         rig = robot.rig
-        weight = robot.on_shaft and any(float(load.torque_constant) != 0 for load in robot.configurations.members)
+        weight = any(float(load.torque_constant) != 0 for load in robot.configurations.members)
         names = robot.configurations.names
         return cls(
-            rig.imposed, robot.on_shaft, weight, rig.blank, names, rig.instruments, rig.columns, robot.channels
+            rig.imposed, robot.has_ground, weight, rig.inherits, names, rig.instruments, rig.columns, robot.channels
         )
 
     @property
-    def usual(self) -> bool:
-        """Whether tables have to state every condition, as the packaged robot's."""
-        return not self.blank and not self.on_shaft and self.imposed == "voltage"
+    def table8(self) -> bool:
+        """Whether it is driven as the paper's robot is, so that the conditions of Table 8 are conditions of it."""
+        return self.inherits and self.has_ground and self.imposed == "voltage"
+
+    @property
+    def complete(self) -> bool:
+        """Whether tables have to state every condition; else what they leave open is as it mostly is."""
+        return self.table8
+
+    @property
+    def crosses_zero(self) -> bool:
+        """Whether readings may cross zero, so that errors are percent of a channel's size and not of the reading."""
+        return not self.table8
+
+    @property
+    def idle(self) -> tuple[str, ...]:
+        """Columns of conditions that do not act on its load."""
+        return () if self.has_ground else (*ON_GROUND, "surface")
 
     @property
     def imposed_column(self) -> str:
@@ -156,8 +171,7 @@ class Layout:
     @property
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that a run of it has, what is imposed first."""
-        on_ground = () if self.on_shaft else ON_GROUND
-        return (self.imposed_column, *on_ground)
+        return (self.imposed_column, *(c for c in ON_GROUND if c not in self.idle))
 
     @property
     def measured_columns(self) -> tuple[str, ...]:
@@ -180,13 +194,12 @@ class Layout:
     def known(self) -> tuple[str, ...]:
         """Every column that means something."""
         driven = DRIVING if self.imposed == "voltage" else ()
-        of_ground = () if self.on_shaft else ("surface",)
-        named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns)
-        return tuple(dict.fromkeys((*named, *of_ground, "run_id", "time_s", *driven, *ORDER)))
+        named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns, "surface")
+        return tuple(dict.fromkeys(c for c in (*named, "run_id", "time_s", *driven, *ORDER) if c not in self.idle))
 
     def required(self, *, measured: bool, battery: bool) -> tuple[str, ...]:
         """Columns that a table has to have, besides channels."""
-        if self.usual:
+        if self.complete:
             own = (() if measured else OWN) + ((SUPPLY,) if battery else ())
             return tuple(c for c in REQUIRED if c not in own)
         imposed = () if battery and self.imposed == "voltage" else (self.imposed_column,)
@@ -235,7 +248,7 @@ class Layout:
 
     def _by_name(self) -> Mapping[str, Meaning]:
         """Every name of a column, in any unit, with what it means."""
-        known = (*self.known(), *(ON_GROUND if self.on_shaft else ()))
+        known = (*self.known(), *ON_GROUND)
         quantities = self.quantities()
         found = {
             name: Meaning(column, name, quantity, unit)

@@ -35,14 +35,14 @@ class Loads:
     """The loads of a robot file, before the parameters that it states.
 
     Attributes:
-        by_name: in order; on_shaft: whether they are shafts, else vehicles.
-        linear: whether one is a linear unit.
+        by_name: in order; travels: whether they travel, as vehicles and linear units do.
+        linear: names of those that are linear units.
         missing: parameters without default that the file does not state.
     """
 
     by_name: dict[str, Load]
-    on_shaft: bool
-    linear: bool
+    travels: bool
+    linear: frozenset[str]
     missing: tuple[str, ...]
 
 
@@ -78,7 +78,7 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
             )
     by_name: dict[str, Load] = {}
     missing: list[str] = []
-    linear = False
+    linear: set[str] = set()
     for name in names:
         table, here = content.get(name, {}), f"{where}, {name}"
         if not isinstance(table, dict):
@@ -86,7 +86,7 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
         kind = _kind(table, here)
         if kind == "linear":
             rig_file.linear(table, name, here, sds, _sides(content, base))
-            linear = True
+            linear.add(name)
         if kind in ("linear", "shaft"):
             by_name[name], lacking = _shaft(table)
         elif base is None:
@@ -102,7 +102,7 @@ def loads(base: Robot | None, content: dict[str, Any], sds: dict[str, float], wh
         raise BadConfiguration(
             f"{where}: {shafts[0]} is a shaft and {vehicles[0]} a vehicle; expected loads of one kind, one file each"
         )
-    return Loads(by_name, bool(shafts), linear, tuple(missing))
+    return Loads(by_name, not shafts or bool(linear), frozenset(linear), tuple(missing))
 
 
 def resolved_likes(content: dict[str, Any], where: str) -> None:

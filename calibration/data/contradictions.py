@@ -35,7 +35,7 @@ def check(runs: Runs, robot: Robot) -> None:
 
 
 def _mass(runs: Runs, robot: Robot) -> None:
-    if robot.on_shaft or runs.has("total_mass_kg"):
+    if not robot.has_ground or runs.has("total_mass_kg"):
         return
     for name in np.unique(runs.configurations_named(robot)):
         if name in robot.configurations and float(robot.configurations[str(name)].mass) <= 0:

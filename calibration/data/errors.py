@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import tomllib
+from pathlib import Path
 from typing import Any
 
 from mmrjax.errors import choices as choices
@@ -24,6 +26,30 @@ class BadData(InputError):
     """A wrong table of runs (exit code 4)."""
 
     exit_code = 4
+
+
+def toml_text(path: Path, where: str | Path) -> str:
+    """Text of a TOML file; `where` opens the message of an error.
+
+    Raises:
+        BadConfiguration: a file that cannot be read.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadConfiguration(f"{where}: not a readable TOML file ({error})") from error
+
+
+def toml_content(text: str, where: str | Path) -> dict[str, Any]:
+    """Keys and tables of such a text; `where` opens the message of an error.
+
+    Raises:
+        BadConfiguration: it is no TOML.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BadConfiguration(f"{where}: not a readable TOML file ({error})") from error
 
 
 def number(value: float) -> str:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import tomllib
 from collections.abc import Iterable, Mapping
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from calibration.data.errors import BadConfiguration, choices, stated_number
+from calibration.data.errors import BadConfiguration, choices, stated_number, toml_content, toml_text
 from mmrjax.requirements import QUANTITIES, Quantity
 from mmrjax.tables import BENCH, CONDITION_LIMITS, SURFACES
 
@@ -134,11 +133,7 @@ def load(path: Path | None) -> Requirements:
         return read(packaged.read_text("utf-8"), f"{PAPER}.toml")
     if not path.is_file():
         raise BadConfiguration(f"{path}: no such file; expected a TOML file of requirements (docs/requirements.md)")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadConfiguration(f"{path}: not a readable TOML file ({error})") from error
-    return read(text, path.name)
+    return read(toml_text(path, path), path.name)
 
 
 def read(text: str, where: str) -> Requirements:
@@ -155,10 +150,7 @@ def read(text: str, where: str) -> Requirements:
         BadConfiguration: not TOML; no requirement; an unknown key, or one without its unit; no finite number; an
             empty range; requirements that contradict one another or the envelope.
     """
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BadConfiguration(f"{where}: not a readable TOML file ({error})") from error
+    content = toml_content(text, where)
     schema = content.pop("schema", SCHEMA)
     if schema != SCHEMA:
         raise BadConfiguration(f"{where}, schema: got {schema!r}; expected {SCHEMA}")

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 from calibration.data import rig_file
 from calibration.data.errors import rounded
+from calibration.data.robot_file import RobotFile
 from mmrjax import params
 from mmrjax.channels import RPM
 from mmrjax.robot import Robot
@@ -41,7 +42,7 @@ def facts(robot: Robot) -> list[Fact]:
 
 def _has(robot: Robot, name: str) -> bool:
     """Whether a robot's file has to state a parameter; of one with a base, all are."""
-    return not robot.rig.blank or name in rig_file.needed(robot.rig)
+    return robot.rig.inherits or name in rig_file.needed(robot.rig)
 
 
 def _within(value: float, low: float, high: float, why: str) -> str:
@@ -186,40 +187,37 @@ class Origin:
     why: str
 
 
-def origins(robot: Robot, stated: set[str], linear: set[str]) -> list[Origin]:
-    """Where the numbers of a robot come from, those that its file leaves open last of each part.
-
-    Args:
-        stated: parameters that its file states; linear: configurations that it states as linear units.
-    """
+def origins(file: RobotFile) -> list[Origin]:
+    """Where the numbers of a robot come from, those that its file leaves open last of each part."""
+    robot, stated = file.robot, file.stated
     priors = {name: sd for name, _, sd in robot.rig.priors}
     found = []
     for p in params.walk(robot):
         head, _, rest = p.name.partition(".")
         mine = head in robot.configurations
         shown = p.name in stated or mine or p.name.startswith(("motor.friction", "gearbox."))
-        assumed = robot.rig.blank and (
+        assumed = not robot.rig.inherits and (
             p.name == "motor.inertia" or (p.name == "motor.inductance" and "motor.resistance" in stated)
         )
         if not shown and not assumed:
             continue
         if p.name in stated:
-            why = "the file, by mass and travel of the linear unit" if head in linear else "the file"
-        elif not robot.rig.blank:
+            why = "the file, by mass and travel of the linear unit" if head in file.linear else "the file"
+        elif robot.rig.inherits:
             why = "its base"
         else:
-            why = _default(p.name, rest if mine else "", robot.on_shaft)
+            why = _default(p.name, rest if mine else "")
         found.append(Origin(p.name, float(p.value), p.spec.unit, priors.get(p.name), why))
     return found
 
 
-def _default(name: str, rest: str, on_shaft: bool) -> str:
+def _default(name: str, rest: str) -> str:
     if name == "motor.inductance":
         return rig_file.WINDING_WHY
     if name in rig_file.DEFAULTS:
         return rig_file.DEFAULTS[name][1]
     if rest == rig_file.DYNAMIC:
         return rig_file.DYNAMIC_WHY
-    if rest and not on_shaft:
+    if rest in rig_file.VEHICLE:
         return rig_file.VEHICLE[rest][1]
     return "not stated: travel is the angle" if rest == "radius" else "not stated: none"

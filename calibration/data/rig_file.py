@@ -132,15 +132,12 @@ def vehicle_defaults(on_tracks: bool, static: Any) -> dict[str, float]:
     return found | {DYNAMIC: DYNAMIC_SHARE * static if isinstance(static, int | float) else 0.0}
 
 
-def rig(
-    content: dict[str, Any], where: str, loads: Sequence[str], *, on_shaft: bool, linear: bool, blank: bool
-) -> Rig:
+def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: bool, inherits: bool) -> Rig:
     """The rig that a file's content states; takes the `KEYS` out of it.
 
     Args:
-        loads: names of the configurations; on_shaft: whether they are shafts.
-        linear: whether one is a linear unit, whose travel can be measured.
-        blank: whether the robot starts from nothing.
+        loads: names of the configurations; travels: whether their travel can be measured.
+        inherits: whether the robot has a base.
 
     Raises:
         BadConfiguration: an unknown word, channel or column, a channel that is imposed, or an instrument of a channel
@@ -148,7 +145,7 @@ def rig(
     """
     imposed = _one_of(content.pop("imposed", IMPOSED[0]), IMPOSED, f"{where}, imposed")
     start = _one_of(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
-    usual = [name for name in channels.USUAL if linear or not on_shaft or name != "speed"]
+    usual = [name for name in channels.USUAL if travels or name != "speed"]
     names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
     if imposed in names:
         raise BadConfiguration(
@@ -162,7 +159,7 @@ def rig(
         columns=_columns(content.pop("columns", {}), where),
         start=start,
         surfaces=_surfaces(content.pop("surfaces", {}), loads, where),
-        blank=blank,
+        inherits=inherits,
     )
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import difflib
 import json
 import math
-import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,7 +15,7 @@ import jax.numpy as jnp
 from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
-from calibration.data.errors import BadConfiguration, choices, is_number, number
+from calibration.data.errors import BadConfiguration, choices, is_number, number, toml_content, toml_text
 from mmrjax import effects, params, power, robots
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
@@ -55,26 +54,59 @@ SWITCHES = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class RobotFile:
+    """A robot and what is known of where it comes from.
+
+    Attributes:
+        robot: with all that is said of it elsewhere too, as on the command line.
+        source: path of its file, or name of a packaged robot, whose file states nothing.
+        stated: names of the parameters that the file states, in place of a linear unit's those of its shaft.
+        linear: configurations that it states as linear units; text: of the file.
+    """
+
+    robot: Robot
+    source: str
+    stated: frozenset[str] = frozenset()
+    linear: frozenset[str] = frozenset()
+    text: str = ""
+
+    @property
+    def name(self) -> str:
+        """Of a file the last part of its path."""
+        return Path(self.source).name
+
+
 def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
+    """The robot alone of `find`."""
+    return find(name_or_path, library, notes).robot
+
+
+def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
+    """The robot alone of `parse`."""
+    return parse(path, library, notes).robot
+
+
+def find(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> RobotFile:
     """A robot by its name (`nominal`, `sm1`, `sm2`) or from a TOML file, with effects of `library`.
 
     Args:
         notes: is given a sentence for each former name that stands for a new one.
 
     Raises:
-        BadConfiguration: no such name or file, or what `read` raises.
+        BadConfiguration: no such name or file, or what `parse` raises.
     """
     if name_or_path in robots.ROBOTS:
-        return robots.ROBOTS[name_or_path]()
+        return RobotFile(robots.ROBOTS[name_or_path](), name_or_path)
     path = Path(name_or_path)
     if not path.is_file():
         raise BadConfiguration(
             f"--robot: got {name_or_path}, no such file and no known robot; {choices(name_or_path, robots.ROBOTS)}"
         )
-    return read(path, library, notes)
+    return parse(path, library, notes)
 
 
-def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
+def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> RobotFile:
     """Read a robot file; its effects are looked up in `library` (see `effect_file.library`) and among the curves.
 
     The file states, all optional:
@@ -91,16 +123,14 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
             on.
 
     Args:
-        notes: as for `load`.
+        notes: as for `find`.
 
     Raises:
         BadConfiguration: not TOML, an unknown key (with the choices), a value that is no number, not finite, or
             outside the field's bounds, or what `configured` and `with_effects` raise.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadConfiguration(f"{path.name}: not a readable TOML file ({error})") from error
+    text = toml_text(path, path.name)
+    content = toml_content(text, path.name)
     schema = content.pop("schema", SCHEMA)
     if schema not in SCHEMAS:
         raise BadConfiguration(f"{path.name}, schema: got {schema}; expected {SCHEMA}")
@@ -109,7 +139,9 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
         raise BadConfiguration(
             f"{path.name}, base: got {base}; {choices(str(base), (*robots.ROBOTS, rig_file.NONE))}"
         )
-    robot, sds = _without_parameters(None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name)
+    robot, sds, linear = _without_parameters(
+        None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name
+    )
     present = content.get("effects", {})
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
@@ -119,26 +151,15 @@ def read(path: Path, library: Library = effects.BY_NAME, notes: list[str] | None
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
     robot = with_effects(robot, tuple(present), library, acting, where=path.name)
-    robot = change(robot, dict(_flatten(content)), where=path.name, notes=notes)
-    return rig_file.with_priors(robot, sds, path.name)
+    parameters = dict(_flatten(content))
+    robot = rig_file.with_priors(change(robot, parameters, where=path.name, notes=notes), sds, path.name)
+    return RobotFile(robot, str(path), frozenset(parameters), linear, text)
 
 
-def parameters_stated(path: Path) -> tuple[set[str], set[str]]:
-    """Names of the parameters that a robot file states, and of the configurations that it states as linear units.
-
-    Raises:
-        BadConfiguration: as `read`.
-    """
-    content = tomllib.loads(path.read_text(encoding="utf-8"))
-    content.pop("schema", None)
-    base = content.pop("base", "nominal")
-    linear = {n for n, table in content.items() if isinstance(table, dict) and table.get("load") == "linear"}
-    _without_parameters(None if base == rig_file.NONE else robots.ROBOTS[base](), content, path.name)
-    return {name for name, _ in _flatten(content)}, linear
-
-
-def _without_parameters(base: Robot | None, content: dict[str, Any], where: str) -> tuple[Robot, dict[str, float]]:
-    """The robot of a file's content before the parameters that it states, and the sds stated of those.
+def _without_parameters(
+    base: Robot | None, content: dict[str, Any], where: str
+) -> tuple[Robot, dict[str, float], frozenset[str]]:
+    """The robot of a file's content before the parameters that it states, the sds stated of those, its linear units.
 
     Args:
         base: None starts from nothing; content: what is left of it are parameters.
@@ -148,13 +169,9 @@ def _without_parameters(base: Robot | None, content: dict[str, Any], where: str)
     tables = {key: value for key, value in content.items() if key not in rig_file.KEYS and isinstance(value, dict)}
     sds = stated.taken_apart(tables, where)
     found = loads(base, content, sds, where)
-    shared = {"on_shaft": found.on_shaft, "linear": found.linear}
+    rig = rig_file.rig(content, where, list(found.by_name), travels=found.travels, inherits=base is not None)
     if base is not None:
-        robot = dataclasses.replace(base, configurations=Configurations(found.by_name))
-        changed = found.on_shaft or any(key in content for key in rig_file.KEYS)
-        rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=False) if changed else robot.rig
-        return dataclasses.replace(robot, rig=rig), sds
-    rig = rig_file.rig(content, where, list(found.by_name), **shared, blank=True)
+        return dataclasses.replace(base, configurations=Configurations(found.by_name), rig=rig), sds, found.linear
     robot = robots.blank(Configurations(found.by_name), rig=rig)
     robot = params.replace(robot, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})
     given = dict(_flatten(content))
@@ -166,10 +183,10 @@ def _without_parameters(base: Robot | None, content: dict[str, Any], where: str)
         if "." not in name and name not in COUNTS:
             raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
     missing = [name for name in rig_file.needed(rig) if name not in given]
-    if found.on_shaft and not found.linear and "speed" in rig.channels:
+    if not found.travels and "speed" in rig.channels:
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
     rig_file.refuse_missing([*missing, *found.missing], known, where, given)
-    return robot, sds
+    return robot, sds, found.linear
 
 
 def with_effects(
@@ -247,10 +264,10 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     """The robot with parameters replaced, each checked; `sides`, `battery.cells`, RATINGS and SWITCHES too.
 
     Args:
-        values: by dotted name [SI]; where: opens the message of an error; notes: as for `load`.
+        values: by dotted name [SI]; where: opens the message of an error; notes: as for `find`.
 
     Raises:
-        BadConfiguration: as `read`.
+        BadConfiguration: as `parse`.
     """
     stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
@@ -291,8 +308,6 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
 
 def _with_backlash(robot: Robot, where: str) -> Robot:
     """`robot` that keeps the two sides of a backlash apart, where a load states one."""
-    if not robot.on_shaft:
-        return robot
     loose = {name: load for name, load in robot.configurations.items() if float(load.backlash) > 0}
     for name, load in loose.items():
         if not (float(robot.motor.inertia) > 0 and float(load.inertia) > 0):
@@ -370,16 +385,15 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
 
     Of a robot that starts from nothing, what it leaves open is left out.
     """
-    blank = robot.rig.blank
-    nothing = _start(robot)
-    pack = blank and robot.battery.cells == nothing.battery.cells
+    whole, nothing = robot.rig.inherits, _start(robot)
+    pack = not whole and robot.battery.cells == nothing.battery.cells
     tables: dict[str, list[str]] = {
         "battery": [] if pack else [f"cells = {robot.battery.cells}  # in series"],
         "motor": [],
         "gearbox": [],
     }
     head, more = rig_file.lines(robot.rig)
-    if rig_file.same_rig(robot.rig) and not blank and not robot.on_shaft:
+    if rig_file.same_rig(robot.rig) and whole and robot.has_ground:
         head, more = [], {}
     for name, load in robot.configurations.items():
         moves = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
@@ -397,29 +411,29 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
             continue
         was = start.get(parameter.name, 0.0 if head_.startswith("effects.") else None)
         same = value == was and not parameter.name.startswith(always) and parameter.name not in needed
-        if same and (blank or head_ == "rig"):
+        if same and (not whole or head_ == "rig"):
             continue
         origin = f"; nominal {was:g}: {spec.source}" if was is not None and value != was else ""
         origin = f"; {spec.source}" if value == was else origin
         text = rig_file.value_text(parameter.name, value, robot.rig)
         line = f"{key} = {text}  # [{spec.unit}] {spec.meaning}"
-        tables.setdefault(head_, []).append(line if blank else f"{line}{origin}")
+        tables.setdefault(head_, []).append(f"{line}{origin}" if whole else line)
     for name, (_, _, unit, what) in RATINGS.items():
         part, _, key = name.partition(".")
         rating = getattr(getattr(robot, part), key)
-        if rating is not None and not (blank and rating == getattr(getattr(nothing, part), key)):
-            tables[part].append(f"{key} = {rating!r}  # [{unit}] {what.partition(';')[0] if blank else what}")
+        if rating is not None and (whole or rating != getattr(getattr(nothing, part), key)):
+            tables[part].append(f"{key} = {rating!r}  # [{unit}] {what if whole else what.partition(';')[0]}")
     for name, what in SWITCHES.items():
         part, _, key = name.partition(".")
         switch = getattr(getattr(robot, part), key)
-        if not (blank and switch == getattr(getattr(nothing, part), key)):
+        if whole or switch != getattr(getattr(nothing, part), key):
             tables.setdefault(part, []).append(f"{key} = {str(switch).lower()}  # {what}")
     lines = [f"# {line}" for line in note.splitlines()]
-    lines += [f'schema = "{SCHEMA}"', f'base = "{rig_file.NONE if blank else "nominal"}"']
+    lines += [f'schema = "{SCHEMA}"', f'base = "{"nominal" if whole else rig_file.NONE}"']
     lines += [f"sides = {int(robot.sides)}  # motors driven alike", *head]
     lines.append(f"configurations = {json.dumps(list(robot.configurations))}")
     for title, table in {**tables, **more}.items():
-        if blank and not table and title not in robot.configurations:
+        if not (whole or table or title in robot.configurations):
             continue
         lines += ["", f"[{title}]", *table]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -427,7 +441,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
 
 def _start(robot: Robot) -> Robot:
     """What the file of a robot starts from."""
-    if not robot.rig.blank:
+    if robot.rig.inherits:
         return robots.nominal()
     nothing = robots.blank(robot.configurations)
     return params.replace(nothing, {name: jnp.asarray(value) for name, (value, _) in rig_file.DEFAULTS.items()})

@@ -19,7 +19,6 @@ from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
     DUTY,
-    ON_GROUND,
     SUPPLY,
     TIME,
     WHEN,
@@ -69,7 +68,7 @@ def read(source: str | Path, *, measured: bool = True, battery: bool = False, ro
         if not path.exists():
             raise BadData(f"{source}: no such file and no packaged table; packaged: {', '.join(PACKAGED)}")
         runs = _read(path, path.name or str(source), measured, battery, layout, inferred=robot is None)
-    if robot is not None and not layout.usual:
+    if robot is not None:
         contradictions.check(runs, robot)
     return runs
 
@@ -106,7 +105,7 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
             if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
                 _refuse_stated(name, cells)
                 continue
-            if layout.on_shaft and meaning.column in ON_GROUND:
+            if meaning.column in layout.idle:
                 _refuse_ground(name, meaning, cells)
                 continue
             where = (f"{name} row {k}" for k in range(1, len(rows)))
@@ -158,7 +157,7 @@ def _only(name: str, columns: dict[str, np.ndarray], layout: Layout) -> str:
 
 def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) -> None:
     """Put in what a table of a rig need not state: its only configuration, and conditions as they mostly are."""
-    if layout.usual:
+    if layout.complete:
         return
     if "configuration" not in columns and layout.configurations:
         columns["configuration"] = np.full(rows, _only(name, columns, layout))
@@ -210,7 +209,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         if not channel.zero_at_rest and (layout.weight or "duty" in columns):
             continue  # gravity may drive a motor; a bridge that reverses the voltage reverses the supply's current
         doubt = _doubt(columns, channel)
-        wrong = np.flatnonzero(backward & (readings > (0.0 if layout.usual else doubt)))
+        wrong = np.flatnonzero(backward & (readings > (doubt if layout.crosses_zero else 0.0)))
         forward = (imposed > 0) & (columns["slope_deg"] >= 0) & (not channel.zero_at_rest)
         forward &= channel.name != "motor_voltage"  # which is held against the back-EMF
         against = np.flatnonzero(forward & (readings < -doubt))
@@ -224,7 +223,7 @@ def _check_signs(name: str, columns: dict[str, np.ndarray], layout: Layout) -> N
         if wrong.size:
             at = int(wrong[0])
             alone = f"; or signed = false for {channel.name} in the robot's file, if it shows magnitude alone"
-            hint = "" if layout.usual else alone
+            hint = alone if layout.crosses_zero else ""
             raise BadData(
                 f"{name} row {at + 1}, {channel.column}: got {number(readings[at])} at "
                 f"{number(imposed[at])} {unit}; expected readings with their signs, negative backward{hint}"
@@ -243,14 +242,14 @@ def _check_header(
 ) -> None:
     stated = {m.column for m in meanings if m is not None}
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
-    if not layout.usual:  # other channels' columns are not misspelt
+    if not layout.complete:  # other channels' columns are not misspelt
         strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
     required = layout.required(measured=measured, battery=battery)
-    if not layout.usual and "surface" in stated:  # which says the configuration too, where it has those of one
+    if not layout.complete and "surface" in stated:  # which says the configuration too, where it has those of one
         required = tuple(c for c in required if c != "configuration")
     for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
         close = difflib.get_close_matches(column, strange, 1, 0.6)
-        if column in required or (close and layout.usual):
+        if column in required or (close and layout.complete):
             got = f"; is {close[0]} meant?" if close else ""
             raise BadData(
                 f"{name}: column {layout.expected(column)} is missing{got} (required: {', '.join(required)})"

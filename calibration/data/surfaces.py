@@ -49,7 +49,7 @@ def common(configurations: Sequence[str], labels: Iterable[str]) -> str | None:
 
 def refused(label: str, layout: Layout) -> str:
     """What is allowed in place of a label, empty where it is fine."""
-    if layout.blank:
+    if not layout.inherits:
         return "" if label else "the name of a surface"
     if label in SURFACES:
         return ""
@@ -60,27 +60,29 @@ def refused(label: str, layout: Layout) -> str:
 def scaled(robot: Robot, configurations: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Whether a row's adhesion is the robot's times the ratio of Table 5, shape (rows,)."""
     pairs = list(zip(configurations.tolist(), labels.tolist(), strict=True))
+    labelled = SURFACES if robot.rig.scales_adhesion else ()
     of_table5 = {
-        (name, label): not robot.rig.blank and label in SURFACES and named(name, label) not in robot.configurations
+        (name, label): label in labelled and named(name, label) not in robot.configurations
         for name, label in set(pairs)
     }
     return np.array([of_table5[pair] for pair in pairs], bool)
 
 
 def with_surface_configurations(robot: Robot, runs: Runs) -> Robot:
-    """`robot` with a configuration for each surface of the table that is not of Table 5 (of a blank robot: each).
+    """`robot` with a configuration for each surface of the table that does not scale its adhesion.
 
     A configuration without rows elsewhere gives way to those of its surfaces, unless it has but one. Priors that the
     robot's file states become those of the new ones.
     """
-    if not runs.has("surface") or robot.on_shaft:
+    if not runs.has("surface") or not robot.has_ground:
         return robot
     pairs = list(dict.fromkeys(zip(runs["configuration"].tolist(), runs["surface"].tolist(), strict=True)))
     members = dict(robot.configurations.items())
+    labelled = SURFACES if robot.rig.scales_adhesion else ()
     leaders: dict[str, str] = {}
     for configuration in dict.fromkeys(c for c, _ in pairs):
         mine = [label for c, label in pairs if c == configuration]
-        own = [x for x in mine if robot.rig.blank or x not in SURFACES or named(configuration, x) in members]
+        own = [x for x in mine if x not in labelled or named(configuration, x) in members]
         there = [named(configuration, x) for x in own if named(configuration, x) in members]
         if not own or (len(mine) == 1 and not there) or (configuration not in members and not there):
             continue

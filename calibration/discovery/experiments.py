@@ -344,7 +344,7 @@ def _steps(variable: str, within: Reach) -> str | None:
 
 def _of_rig(variable: str, within: Reach, slope: float, payload: float) -> str | None:
     """`_steps` where the motors' speed is imposed, or the load is a shaft; None where they say nothing else."""
-    level = "Repeat" if within.on_shaft else "Repeat on the level, unladen,"
+    level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
     if within.imposed == "motor_speed":
         fastest = max(within.speeds, default=within.motor_speed) / RPM
         turning = f"with the motor speed in {SERIES} even steps up to {fastest:.0f} rpm"
@@ -355,10 +355,10 @@ def _of_rig(variable: str, within: Reach, slope: float, payload: float) -> str |
             "payload": f"Repeat at one motor speed and slope with the payload from 0 to {payload:g} kg",
             "time": "Record one motor speed from a cold start for ten minutes, and again at once while all is warm",
         }
-        if within.on_shaft:
+        if not within.has_ground:
             words["current"] = f"{level} at one motor speed with a brake that is raised in {SERIES} even steps"
         return words.get(variable)
-    if not within.on_shaft:
+    if within.has_ground:
         return None
     high = within.voltages[-1]
     return {

@@ -215,7 +215,7 @@ def acts(reach: Reach) -> tuple[Act, ...]:
         f"Time the robot by light gates over a distance measured with a tape, at {_amounts(paces, 'm/s')}; read the "
         "speed that the bench shows", _timed, _each(paces), 3e-3,
     )  # fmt: skip
-    found = [] if reach.on_shaft else [weighing]
+    found = [weighing] * reach.has_ground
     found += ammeter * ("total_current" in reach.measured)
     found += [strobe] * ("motor_speed" in reach.measured)
     found += [timing] * ("speed" in reach.measured)
@@ -334,7 +334,7 @@ def menu(reach: Reach) -> tuple[Experiment, ...]:
 
     What the robot cannot do (climb that slope, move at that voltage) only its readings show: see `possible`.
     """
-    if reach.imposed == "motor_speed" or reach.on_shaft:
+    if reach.imposed == "motor_speed" or not reach.has_ground:
         runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _turns(reach, used))
     else:
         runs = (*_alone(reach), *(r for used in reach.used for r in _travels(reach, used)))

@@ -65,7 +65,7 @@ class Reach:
         resistance [ohm], torque_constant [N·m/A]: of one.
         hot: temperature of a winding that is too hot [°C].
         imposed: on the motors, see `Rig`; speeds: of the motors that the table used [rad/s], where they are imposed.
-        on_shaft: whether the load is a shaft.
+        has_ground: whether a ground carries it.
     """
 
     used: tuple[Used, ...]
@@ -84,7 +84,7 @@ class Reach:
     hot: float
     imposed: str = "voltage"
     speeds: tuple[float, ...] = ()
-    on_shaft: bool = False
+    has_ground: bool = True
 
     @property
     def voltages(self) -> tuple[float, ...]:
@@ -131,7 +131,7 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     return Reach(
         used, measured, voltage, min(voltage, constant * geared), min(voltage, constant * alone), current,
         motor_speed, speed, geared, alone, motors, resistance, constant, motor.temperature_limit, robot.rig.imposed,
-        () if conditions.motor_speed is None else _levels(np.asarray(conditions.motor_speed)), robot.on_shaft,
+        () if conditions.motor_speed is None else _levels(np.asarray(conditions.motor_speed)), robot.has_ground,
     )  # fmt: skip
 
 

@@ -65,7 +65,7 @@ def library_for(robot: Robot, conditions: Conditions, library: Library) -> Libra
     Args:
         robot: of the rig; conditions: of its table, shape (runs,).
     """
-    if not robot.rig.blank:
+    if robot.rig.inherits:
         return library
     mine = _signals(robot, _steady(robot, conditions))
     nominal, theirs = _nominal()
@@ -79,7 +79,7 @@ def library_for(robot: Robot, conditions: Conditions, library: Library) -> Libra
 
 def present(kind: type[Effect], robot: Robot) -> bool:
     """Whether a rig has the balance that an effect enters, and what it needs there."""
-    if kind.balance in absent(robot) or (robot.on_shaft and (kind.movers or kind.needs_belt)):
+    if kind.balance in absent(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
         return False
     return kind.balance != "sensor" or kind.channel in robot.rig.channels
 

@@ -60,7 +60,7 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
     columns = [c for c in BLOCKS[by] if runs.has(c) and (c in NO_CONDITIONS or c in runs.axes)]
     if len(columns) < len(BLOCKS[by]):
         return {}
-    if by == "voltage_configuration" and not runs.layout.usual and len(np.unique(runs["configuration"])) == 1:
+    if by == "voltage_configuration" and not runs.layout.complete and len(np.unique(runs["configuration"])) == 1:
         return {}  # those of `voltage`
     values = {c: levels(runs[c]) if c == SPEED else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])

@@ -84,7 +84,7 @@ def _enough(runs: Runs, names: Sequence[str], noise: Noise) -> None:
 
 
 def _stuck(runs: Runs) -> None:
-    labels = () if runs.layout.usual else ("configuration", "surface")
+    labels = () if runs.layout.complete else ("configuration", "surface")
     columns = [c for c in (*observers.kind(runs).axes_of(runs), *labels) if runs.has(c)]
     varied = [np.unique(runs[c], return_inverse=True)[1] for c in columns]
     if len(np.unique(np.stack(varied, 1), axis=0)) < 2:
@@ -102,7 +102,7 @@ def _stuck(runs: Runs) -> None:
 
 def _constant_conditions(runs: Runs) -> list[str]:
     imposed = runs.layout.imposed_column
-    losses = "rolling resistance, guide friction" if runs.layout.usual else "rolling resistance"
+    losses = "rolling resistance, guide friction" if runs.layout.complete else "rolling resistance"
     says = {
         "slope_deg": f"{losses} and Coulomb losses act alike without slopes",
         imposed: "losses that grow with speed and those that do not act alike at one "

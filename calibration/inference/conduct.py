@@ -23,7 +23,7 @@ def conduct(runs: Runs, robot: Robot) -> list[str]:
     runs = runs.of(robot)
     kind = observers.kind(runs)
     ends, shown, lasts = kind.settled(runs)
-    if not kind.axis or not len(ends) or robot.on_shaft or "speed" not in robot.rig.channels:
+    if not kind.axis or not len(ends) or not robot.has_ground or "speed" not in robot.rig.channels:
         return []
     speed = shown[:, channels.index("speed", robot.channels)]
     names = ends["run_id"] if ends.has("run_id") else np.array(["(no run_id)"] * len(ends))

@@ -14,8 +14,8 @@ def relative_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     return 100.0 * (simulated - measured) / simulated
 
 
-#: What `sized_error` is of.
-OF_SIZE = "channel's root mean square"
+#: What errors in percent are of: eq. (35), and where readings cross zero.
+OF_READING, OF_SIZE = "simulated reading, eq. (35)", "channel's root mean square"
 
 
 def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
@@ -27,6 +27,12 @@ def sized_error(simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         size = np.sqrt(np.nanmean(np.square(simulated), 0))
         return np.asarray(100.0 * (simulated - measured) / size)
+
+
+def percent_error(simulated: np.ndarray, measured: np.ndarray, *, crosses_zero: bool) -> np.ndarray:
+    """Errors [%] of the channel's size where readings may cross zero, else of the reading; shape (rows, ...)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (sized_error if crosses_zero else relative_error)(simulated, measured)
 
 
 def summary(errors: np.ndarray) -> dict[str, float | int]:

@@ -131,7 +131,7 @@ def noise(posed: Problem, known: Noise, shares: np.ndarray, measured: np.ndarray
 
 
 def errors(
-    observe: type[Observer], shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
+    observe: Observer, shown: Sequence[Channel], simulated: np.ndarray, measured: np.ndarray, sd: np.ndarray
 ) -> Errors:
     """Errors by channel, in percent of what the observer says and in σ; arrays of shape (rows, channels)."""
     return _errors(shown, simulated, measured, sd, observe.percent(simulated, measured))
@@ -169,7 +169,7 @@ def _counted(rows: np.ndarray) -> tuple[int, ...]:
 
 
 def readings(
-    observe: type[Observer],
+    observe: Observer,
     shown: Sequence[Channel],
     measured: np.ndarray,
     sd: np.ndarray,

@@ -29,7 +29,7 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[str]:
     Args:
         stated: names of parameters whose priors the user states.
     """
-    if robot.rig.blank:  # nothing in it is another robot's
+    if not robot.rig.inherits:
         return []
     mine, nominal = ({name: float(p.value) for name, p in known(r).items()} for r in (robot, robots.nominal()))
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]

@@ -43,12 +43,14 @@ class Foresight:
         status: of each row with the numbers of the file.
         noise: of each channel: where its sd comes from.
         alike: pairs of parameters that these data hardly tell apart, with the correlation of their posterior.
+        robot: with what the table shows of it, see `preparation.prepare`.
     """
 
     parameters: tuple[Determined, ...]
     status: tuple[str, ...]
     noise: tuple[str, ...]
     alike: tuple[tuple[str, str, float], ...]
+    robot: Robot
 
 
 def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
@@ -71,7 +73,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
     names = tuple(n for n in names if n not in fidelities.unread("steady", names)) if not observe.axis else names
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
-    coordinates = priors.coordinates(robot, names, any_surface=not robot.rig.blank)
+    coordinates = priors.coordinates(robot, names, any_surface=robot.rig.inherits)
     posed = observers.pose(runs, robot, coordinates, known.sd)
     z = jnp.zeros(len(names))
     seen = fit.observation(posed, z)
@@ -85,6 +87,5 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
         Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
         for k, n in enumerate(names)
     )
-    return Foresight(
-        found, tuple(STATUSES[int(s)] for s in np.asarray(seen.status)), known.source, tuple(about.correlated())
-    )
+    statuses = tuple(STATUSES[int(s)] for s in np.asarray(seen.status))
+    return Foresight(found, statuses, known.source, tuple(about.correlated()), robot)

@@ -143,12 +143,12 @@ def known(robot: Robot) -> dict[str, Parameter]:
 
 
 def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
-    """The friction parameters of a configuration that are free by default: a load on a shaft has others, and what no
+    """The friction parameters of a configuration that are free by default, of those that its load has: what no
     channel can show or is zero is held."""
-    names = list(SHAFT if robot.on_shaft else FRICTION)
+    names = [*FRICTION, *SHAFT]
     if float(robot.configurations[configuration].on_tracks) > 0.5:
         names.insert(2, GUIDE_SHARE)
-    if robot.rig.blank and "speed" not in robot.rig.channels:
+    if not robot.rig.inherits and "speed" not in robot.rig.channels:
         names = [n for n in names if not n.startswith("ground.friction.")]
     return _uncertain(robot, (f"{configuration}.{name}" for name in names))
 
@@ -157,7 +157,8 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     """Those of a robot's parameters that are not held: what the rig's file states as exact is, and what is set to
     zero, unless the file says how sure that zero is."""
     fields, stated, exact = known(robot), robot.rig.stated, robot.rig.exact
-    return tuple(n for n in names if n not in exact and (float(fields[n].value) != 0.0 or n in stated))
+    mine = (n for n in names if n in fields and n not in exact)
+    return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
 
 
 def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
@@ -234,8 +235,7 @@ def _has(robot: Robot, configuration: str, name: str) -> bool:
 
 def _radius(robot: Robot, configuration: str) -> tuple[str, ...]:
     """The radius of a configuration, unless nothing shows the travel of what turns on a shaft."""
-    shown = not robot.on_shaft or "speed" in robot.rig.channels
-    return (f"{configuration}.radius",) if shown else ()
+    return (f"{configuration}.radius",) if robot.shows_travel else ()
 
 
 #: What of the drive acts on the voltage alone.
@@ -392,7 +392,7 @@ def coordinates(
     apart = {c for pair in robot.rig.surfaces for c in pair}
     of_surfaces = {n: SURFACE_OF_RIGS.get(n.split(".", 1)[-1]) for n in names if n.split(".")[0] in apart}
     wide |= {n: share for n, share in of_surfaces.items() if share is not None}
-    if robot.rig.blank:
+    if not robot.rig.inherits:
         wide = {n: RELATIVE_OF_RIGS for n in names if n.endswith(FRICTION_OF_RIGS)} | wide
     known_sds = {n: (float(fields[n].value), float(fields[n].value) * share) for n, share in wide.items()}
     known_sds |= {n: (mean, sd) for n, mean, sd in robot.rig.priors if n in names} | stated

@@ -49,9 +49,9 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
         return []
     _check_masses(runs, robot)
     runs, measured = runs.where(lasts >= UNDER_WAY), measured[lasts >= UNDER_WAY]
-    if not len(runs) or (robot.on_shaft and any(float(c.torque_gravity) > 0 for c in robot.configurations.members)):
+    if not len(runs) or any(float(c.torque_gravity) > 0 for c in robot.configurations.members):
         return []
-    if robot.rig.blank:
+    if not robot.rig.inherits:
         _check_gear(runs, measured, robot)
     conditions = runs.conditions(robot)
     possible = np.stack([operating_readings(_rubbing(robot, f), conditions) for f in FRICTION])
@@ -61,7 +61,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
     said = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
-        if off <= SAID or (robot.rig.blank and channel.name in OF_TORQUE):
+        if off <= SAID or (not robot.rig.inherits and channel.name in OF_TORQUE):
             continue
         units = _units(channel, measured[:, k], possible[:, :, k], robot)
         if not units and (kind.axis or _slips(robot, channel, factor)):  # what slides has speeds of its own
@@ -106,7 +106,7 @@ def _factor(measured: np.ndarray, possible: np.ndarray) -> float:
 def _units(channel: Channel, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> list[str]:
     """Units in which the readings would be possible, the likeliest first; the arguments as of `_factor`."""
     known = {unit: channel.factor / size for unit, size in channel.other_units}
-    if channel.name == "motor_speed" and not robot.on_shaft:
+    if channel.name == "motor_speed" and robot.has_ground:
         known["rpm of the driving wheel"] = 1 / float(robot.gearbox.ratio)
     left = {unit: abs(math.log(_factor(measured / f, possible))) for unit, f in known.items()}
     return sorted((u for u, x in left.items() if x < math.log(ALIKE)), key=left.__getitem__)
@@ -120,7 +120,7 @@ def _others(channel: Channel, factors: dict[Channel, float]) -> list[str]:
 
 def _slips(robot: Robot, channel: Channel, factor: float) -> bool:
     """Whether a vehicle's speed is low as its movers may slide, where nobody has stated the ground."""
-    return robot.rig.blank and not robot.on_shaft and channel.name == "speed" and factor < 1
+    return not robot.rig.inherits and robot.has_ground and channel.name == "speed" and factor < 1
 
 
 def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
@@ -180,7 +180,7 @@ def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot
     measured on what is possible is 1 where slopes are in degrees.
     """
     k = next((k for k, c in enumerate(robot.channels) if c.name in ("total_current", "motor_current")), None)
-    if k is None or robot.on_shaft:
+    if k is None or "slope_deg" not in runs.axes:
         return
     slope, there = runs["slope_deg"], np.isfinite(measured[:, k]) & np.isfinite(possible[:, k])
     columns = [

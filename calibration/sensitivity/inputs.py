@@ -114,7 +114,7 @@ def default_names(
     guides = {f"{name}.{g}" for name in wheels for g in (priors.GUIDE_SHARE, priors.GUIDE_FRICTION)}
     known = priors.known(robot)
     left_out = {*guides, *fidelities.unread(model, known), *robot.rig.exact}
-    if robot.rig.blank:  # what another robot has is none of its own
+    if not robot.rig.inherits:  # what another robot has is none of its own
         stated = {name for name, _, _ in robot.rig.priors}
         left_out |= {name for name in known if name.startswith(_OTHERS) and name not in stated}
     return tuple(

@@ -63,7 +63,7 @@ def known_outputs(robot: Robot) -> dict[str, OutputRow]:
 def default_outputs(robot: Robot) -> tuple[str, ...]:
     """Names of the outputs that are studied where none are named: every channel, and what the robot's load has."""
     beside: tuple[str, ...] = DEFAULT
-    if robot.on_shaft:
+    if not robot.has_ground:
         beside = ("power_supply",)
     elif robot.rig.imposed == "motor_speed":  # that stalls on no slope
         beside = tuple(name for name in DEFAULT if name != "steepest_slope")

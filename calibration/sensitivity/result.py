@@ -31,7 +31,7 @@ class Points:
 
     Attributes:
         motor_speed: imposed [rpm], in the place of the voltage, which is 0 then; None where the voltage is imposed.
-        on_shaft: whether their load is a shaft, which has neither payload nor slope (0).
+        has_ground: whether payload and slope act, which are 0 else.
     """
 
     configuration: np.ndarray
@@ -39,7 +39,7 @@ class Points:
     payload: np.ndarray
     slope_deg: np.ndarray
     motor_speed: np.ndarray | None = None
-    on_shaft: bool = False
+    has_ground: bool = True
 
     def __len__(self) -> int:
         return len(self.voltage)
@@ -48,22 +48,23 @@ class Points:
     def of(cls, runs: Runs) -> Points:
         """Those of a table of runs."""
         layout, nothing = runs.layout, np.zeros(len(runs))
+        payload, slope = (runs[c] if c in runs.axes else nothing for c in ("payload_kg", "slope_deg"))
         imposed = runs[layout.imposed_column]
         turned = layout.imposed == "motor_speed"
         return cls(
             runs["configuration"],
             nothing if turned else imposed,
-            nothing if layout.on_shaft else runs["payload_kg"],
-            nothing if layout.on_shaft else runs["slope_deg"],
+            payload,
+            slope,
             imposed if turned else None,
-            layout.on_shaft,
+            layout.has_ground,
         )
 
     def at(self, rows: np.ndarray) -> Points:
         """Some of them, by a mask or an index."""
         speed = None if self.motor_speed is None else self.motor_speed[rows]
         voltage, payload, slope = (x[rows] for x in (self.voltage, self.payload, self.slope_deg))
-        return Points(self.configuration[rows], voltage, payload, slope, speed, self.on_shaft)
+        return Points(self.configuration[rows], voltage, payload, slope, speed, self.has_ground)
 
     @property
     def imposed(self) -> tuple[str, np.ndarray, str]:
@@ -72,20 +73,24 @@ class Points:
             return "voltage", self.voltage, "V"
         return "motor speed", self.motor_speed, "rpm"
 
+    @property
+    def ground(self) -> tuple[tuple[str, np.ndarray, str], ...]:
+        """What acts by the ground: columns, values, units; nothing where there is none."""
+        found = ("payload_kg", self.payload, " kg"), ("slope_deg", self.slope_deg, "°")
+        return found if self.has_ground else ()
+
     def label(self, k: int) -> str:
         """A point in words."""
         _, imposed, unit = self.imposed
         supply = "battery" if np.isnan(imposed[k]) else f"{imposed[k]:g} {unit}"
-        ground = "" if self.on_shaft else f", {self.payload[k]:g} kg, {self.slope_deg[k]:g}°"
-        return f"{self.configuration[k]}, {supply}{ground}"
+        return ", ".join((f"{self.configuration[k]}, {supply}", *(f"{x[k]:g}{unit}" for _, x, unit in self.ground)))
 
     def columns(self) -> dict[str, np.ndarray]:
         """As in tables of runs."""
         own = (
             {"supply_voltage_V": self.voltage} if self.motor_speed is None else {"motor_speed_rpm": self.motor_speed}
         )
-        ground = {} if self.on_shaft else {"payload_kg": self.payload, "slope_deg": self.slope_deg}
-        return {"configuration": self.configuration, **own, **ground}
+        return {"configuration": self.configuration, **own, **{column: x for column, x, _ in self.ground}}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -118,7 +118,7 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
     rest = jnp.zeros_like(units).at[4].set(conditions.discharge / units[4])
     if conditions.motor_speed is not None:
         rest = rest.at[1].set(conditions.motor_speed / units[1])
-        if robot.on_shaft:
+        if not robot.has_ground:  # which it would have to grip first
             radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
             rest = rest.at[2].set(radius * conditions.motor_speed / units[2])
     if robot.rig.begins is not None and conditions.begin is not None:

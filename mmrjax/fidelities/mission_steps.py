@@ -222,10 +222,7 @@ def events_of(
     load = robot.chassis(asked.conditions.configuration)
     rolling = load.radius * state.speed_motor / robot.gearbox.ratio
     slow = 1 - jnp.abs(rolling) / load.speed_still
-    if robot.on_shaft:  # nothing slides
-        grips = jnp.ones_like(slow)
-    else:
-        grips = 1 - jnp.abs(rolling - state.speed) / load.ground.friction.speed_static
+    grips = 1 - jnp.abs(rolling - state.speed) / load.speed_grip
     near = stands | ((slow > -1) & (grips > -1))
 
     none = -jnp.ones_like(slow)

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mmrjax import balances, ground
+from mmrjax import balances
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.result import slips, travels
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import GRAVITY, NOT_SETTLED, SLIDES, STALLED, Signals, State
+from mmrjax.signals import NOT_SETTLED, SLIDES, STALLED, Signals, State
 
 #: Torque at the driving wheel that counts as much as the whole weight of a side [N·m].
 TORQUE = 1.0
@@ -34,10 +34,7 @@ def direction(robot: Robot, conditions: Conditions) -> Array:
     chassis = robot.chassis(conditions.configuration)
     mass = chassis.mass + conditions.payload if conditions.total_mass is None else conditions.total_mass
     stall = robot.motor.torque_electromagnetic(voltage_at_rest(robot, conditions) / robot.motor.resistance)
-    if robot.on_shaft:
-        weight = chassis.torque_load(0.0)
-    else:
-        weight = ground.force_gravity(mass * (1 / robot.sides), conditions.slope, GRAVITY) * chassis.radius
+    weight = chassis.torque_weight(mass * (1 / robot.sides), conditions.slope)
     return jax.lax.stop_gradient(jnp.where(robot.gearbox.ratio * stall >= weight, 1.0, -1.0))
 
 
@@ -54,8 +51,6 @@ def _carried(robot: Robot, conditions: Conditions, state: State, direction: Scal
     """Signals of shafts that turn in `direction`, or are about to, under a robot that stands: movers carry what the
     robot asks for, and no more than the ground holds."""
     signals = balances.settled(robot, conditions, state, direction)[0]
-    if robot.on_shaft:
-        return signals
     limit = signals.adhesion_limit
     carried = dataclasses.replace(signals, traction=jnp.clip(signals.demand, -limit, limit))
     return balances.gearbox(robot, robot.chassis(conditions.configuration), carried)
@@ -81,7 +76,7 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     still = _still(state)
     forward, backward = (_carried(robot, conditions, still, sense) for sense in (1.0, -1.0))
     shafts = jnp.minimum(-forward.torque_net, backward.torque_net) / TORQUE
-    return shafts if robot.on_shaft else jnp.minimum(shafts, _ground_margin(forward, backward))
+    return jnp.minimum(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
 
 
 def slides_in_place(robot: Robot, conditions: Conditions, state: State, sense: Scalar) -> Array:

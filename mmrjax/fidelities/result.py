@@ -87,10 +87,7 @@ def turned(status: Array) -> Array:
 
 def slips(robot: Robot, signals: Signals) -> Array:
     """Whether the movers slide over the ground faster than V_s."""
-    if robot.on_shaft:
-        return jnp.zeros_like(jnp.asarray(signals.speed), bool)
-    friction = robot.chassis(signals.configuration).ground.friction
-    return jnp.abs(signals.speed_sliding) > friction.speed_static
+    return jnp.abs(signals.speed_sliding) > robot.chassis(signals.configuration).speed_grip
 
 
 def _efficiency(out: Scalar, into: Scalar) -> Array:

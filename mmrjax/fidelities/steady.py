@@ -70,7 +70,7 @@ def _sound(robot: Robot, conditions: Conditions) -> tuple[Array, Conditions]:
     """
     stated = conditions.total_mass
     mass = robot.chassis(conditions.configuration).mass + conditions.payload if stated is None else stated
-    sound = jnp.asarray(mass) > 0 if not robot.on_shaft else jnp.asarray(True)
+    sound = jnp.asarray("mass" in robot.lacks) | (jnp.asarray(mass) > 0)
     for number in jax.tree.leaves(conditions):
         sound &= jnp.isfinite(number)
     conditions = jax.tree.map(lambda x: jnp.where(sound, x, jnp.ones_like(x)), conditions)
@@ -172,7 +172,7 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
     still |= sense * signals.speed_theoretical <= 1e-9
     # Ordered by what a person would say first.
     status = jnp.where(still, STALLED, travels(signals.speed, voltage))
-    if not robot.on_shaft:
+    if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
         at = jax.lax.stop_gradient((robot, conditions, state, sense))
         slides = rarely(beyond, slides_in_place, at, jnp.zeros_like(beyond))
@@ -267,8 +267,6 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
 
 def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
     """Refuse an arm that gravity pulls: it turns unevenly, or hangs where its friction lets it."""
-    if not robot.on_shaft:
-        return
     for k, (name, load) in enumerate(robot.configurations.items()):
         pulled = bool(jnp.any(jnp.asarray(load.torque_gravity) > 0))
         if pulled and bool(jnp.any(jnp.asarray(conditions.configuration) == k)):

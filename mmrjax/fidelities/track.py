@@ -219,7 +219,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
             ground; the step is above the largest stable one, which the message states; a load without ground, an
             imposed motor speed, movers without inertia, parts heavier than the robot or of more inertia than stated.
     """
-    if robot.on_shaft:
+    if not robot.has_ground:
         raise ValueError("the robot's load is a shaft, which has no running gear; steady and drive take it")
     if robot.rig.imposed == "motor_speed":
         raise ValueError(

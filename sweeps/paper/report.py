@@ -15,16 +15,16 @@ from sweeps.paper import components, data, runs, tables
 from sweeps.report import words_shown
 
 if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
     from mmrjax.robot import Robot
 
 
-def write(folder: Path, *, robot: Robot, robot_name: str, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
+def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Path, data.Rows | None]:
     """Write `report.html` and `figures/` for a robot and its nominal fellows.
 
     Args:
         folder: an existing run folder.
-        robot: any robot; one that has none of the paper's configurations is not set against the bench.
-        robot_name: its name or file.
+        file: of any robot; one that has none of the paper's configurations is not set against the bench.
         model: fidelity; gear: whether it resolves the running gear, so that there are Figs. 23-27 from it too.
 
     Returns:
@@ -32,8 +32,8 @@ def write(folder: Path, *, robot: Robot, robot_name: str, model: str, gear: bool
         configurations.
     """
     nominal = ROBOTS["nominal"]()
-    shown = report.named(robot, robot_name)
-    name = Path(robot_name).name if shown["robot"] == words_shown(Path(robot_name).name) else shown["robot"]
+    robot, shown = file.robot, report.named(file)
+    name = file.name if shown["robot"] == words_shown(file.name) else shown["robot"]
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
     album = report.Album(folder)
     known: dict[str, Any] = {"gear": None, "errors": [], "sliding": [], "measured": 0, "raised": ""}

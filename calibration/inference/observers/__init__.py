@@ -11,7 +11,7 @@ from calibration.data.errors import BadConfiguration, choices
 from calibration.data.runs import Runs
 from calibration.inference.observers.base import Observer
 from calibration.inference.observers.histories import Histories
-from calibration.inference.observers.settled import SettledRigRuns, SettledRuns
+from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem, data_of
 from mmrjax import fidelities, params
@@ -21,7 +21,7 @@ from mmrjax.robot import Robot
 __all__ = ["Histories", "Observer", "SettledRuns", "facts", "kind", "pose"]
 
 #: In the order in which they are asked whether a table is theirs.
-KINDS: tuple[type[Observer], ...] = (Histories, SettledRigRuns, SettledRuns)
+KINDS: tuple[type[Observer], ...] = (Histories, SettledRuns)
 
 
 def kind(runs: Runs) -> type[Observer]:

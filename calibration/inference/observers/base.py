@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from calibration.data.runs import Runs
 from calibration.inference.bases import Bases
 from calibration.inference.details import Detail
+from calibration.inference.errors import OF_READING, OF_SIZE, percent_error
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
 from calibration.inference.optimizers import Numbers, Optimum
@@ -53,7 +54,6 @@ class Observer(eqx.Module):
         sizes_padded: numbers of rows to which tables are padded, so that those of about one size share what is
             compiled; beyond the last to a multiple of that, and with none not at all.
         blocks: kinds of blocks to hold out, the most telling first.
-        percent_of: what errors in percent are of.
         policy: how fits are searched for.
         rows_tell: whether a single row shows a defect by itself.
         evidence: kinds of evidence that something is missing.
@@ -67,7 +67,6 @@ class Observer(eqx.Module):
     axis: ClassVar[str] = ""
     sizes_padded: ClassVar[tuple[int, ...]] = ()
     blocks: ClassVar[tuple[str, ...]]
-    percent_of: ClassVar[str]
     policy: ClassVar[SearchPolicy]
     rows_tell: ClassVar[bool]
     evidence: ClassVar[tuple[str, ...]]
@@ -147,10 +146,21 @@ class Observer(eqx.Module):
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Parameters that such data determine beside those that all do: of the drive, and of each chassis."""
 
-    @classmethod
+    # --- of errors
+
+    @property
     @abc.abstractmethod
-    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    def crosses_zero(self) -> bool:
+        """Whether readings may cross zero, so that errors are percent of a channel's size and not of the reading."""
+
+    @property
+    def percent_of(self) -> str:
+        """What errors in percent are of."""
+        return OF_SIZE if self.crosses_zero else OF_READING
+
+    def percent(self, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """Errors [%] of what `percent_of` says, shape (rows, channels)."""
+        return percent_error(simulated, measured, crosses_zero=self.crosses_zero)
 
     # --- of robots
 

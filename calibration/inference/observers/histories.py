@@ -26,7 +26,6 @@ from calibration.inference import bases as bases_room
 from calibration.inference import scans
 from calibration.inference.bases import Bases
 from calibration.inference.details import Memory, Strongest, TimeSide, TimeStatistics
-from calibration.inference.errors import OF_SIZE, sized_error
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import backward, cholesky, forward
@@ -142,7 +141,6 @@ class Histories(Observer):
     fewest: ClassVar[int] = 24
     axis: ClassVar[str] = "time_s"
     blocks: ClassVar[tuple[str, ...]] = ("slope", "voltage", "run")
-    percent_of: ClassVar[str] = OF_SIZE
     policy: ClassVar[SearchPolicy] = SearchPolicy(batch=8, steps=30, searches=8, one_by_one=False)
     rows_tell: ClassVar[bool] = False
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2", "white")
@@ -181,7 +179,7 @@ class Histories(Observer):
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
         index = [jnp.asarray(x) for x in (run, instant, rows, knots)]
         rig = robot.rig
-        delayed = rig.blank or DELAY in rig.stated or not rig.prompt
+        delayed = not rig.inherits or DELAY in rig.stated or not rig.prompt
         return cls(conditions, jnp.asarray(times), index[0], index[1], index[2], index[3], delayed=delayed)
 
     @classmethod
@@ -299,11 +297,6 @@ class Histories(Observer):
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
         return ("motor.inductance", "motor.inertia", DELAY), ("inertia", *SLIDING)
 
-    @classmethod
-    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-        """Of the channel's size: eq. (35) divides by readings, which begin at rest."""
-        return sized_error(simulated, measured)
-
     def defective(
         self, robot: Robot, probes: tuple[Effect, ...]
     ) -> Float[Array, "probes runs knots samples channels"]:
@@ -413,6 +406,10 @@ class Histories(Observer):
         """Of every row, what is there between the instants before and after it less the rig's delay."""
         return jax.vmap(lambda run, at: rig.late(self.times[run], every[run], at))(self.run, self.time)
 
+    @property
+    def crosses_zero(self) -> bool:
+        return True  # they begin at rest
+
     def __call__(self, robot: Robot) -> Observation:
         whole = self.whole(robot)
         if self.delayed:
@@ -509,7 +506,7 @@ class Histories(Observer):
             ]
             return jax.tree.map(lambda *x: np.concatenate(x), *jax.device_get(parts))
 
-        if problem.base.on_shaft or problem.base.rig.imposed != "voltage":  # no ground whose grip makes for valleys
+        if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip that makes for valleys
             return scans.placed(problem, super().starts(problem, random, count))
         draws = random.standard_normal((settled_ends.DRAWS, len(problem.coordinates)))
         return scans.placed(problem, settled_ends.starts(problem, draws, search)[:count])

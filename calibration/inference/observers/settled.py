@@ -18,7 +18,6 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
-from calibration.inference.errors import OF_SIZE, relative_error, sized_error
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -60,7 +59,7 @@ class SettledRuns(Observer):
     """Observer of settled rows: one run a row.
 
     Attributes:
-        fidelity: that simulates them.
+        fidelity: that simulates them; of_size: whether errors are percent of a channel's size, see `Layout`.
     """
 
     word: ClassVar[str] = "runs"
@@ -69,13 +68,13 @@ class SettledRuns(Observer):
     blocks: ClassVar[tuple[str, ...]] = (
         "slope", "voltage_configuration", "voltage", "speed", "payload", "configuration",
     )  # fmt: skip
-    percent_of: ClassVar[str] = "simulated reading, eq. (35)"
     policy: ClassVar[SearchPolicy] = SearchPolicy()
     rows_tell: ClassVar[bool] = True
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
 
     conditions: Conditions
     fidelity: str = eqx.field(static=True)
+    of_size: bool = eqx.field(default=False, static=True)
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -90,7 +89,7 @@ class SettledRuns(Observer):
                 chosen.check(robot, conditions, chosen.resolved())
             except ValueError as error:
                 raise BadConfiguration(f"{runs.source}, settled runs: {error}") from error
-        return cls(conditions, chosen.name)
+        return cls(conditions, chosen.name, runs.layout.crosses_zero)
 
     @classmethod
     def sizes(cls, runs: Runs) -> np.ndarray:
@@ -147,10 +146,9 @@ class SettledRuns(Observer):
     def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
         return (), ()
 
-    @classmethod
-    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return relative_error(simulated, measured)
+    @property
+    def crosses_zero(self) -> bool:
+        return self.of_size
 
     def __call__(self, robot: Robot) -> Observation:
         result = fidelities.get(self.fidelity).settled(robot, self.conditions)
@@ -288,17 +286,3 @@ def _drawn(clean: Array, sd: Array, z: Array, keys: Array) -> tuple[Array, Array
         return clean + sd * jax.random.normal(one, clean.shape), z + jax.random.normal(two, z.shape)
 
     return jax.vmap(one)(keys)
-
-
-class SettledRigRuns(SettledRuns):
-    """Of a rig, whose readings may cross zero: percent are of a channel's size."""
-
-    percent_of: ClassVar[str] = OF_SIZE
-
-    @classmethod
-    def observes(cls, runs: Runs) -> bool:
-        return super().observes(runs) and not runs.layout.usual
-
-    @classmethod
-    def percent(cls, simulated: np.ndarray, measured: np.ndarray) -> np.ndarray:
-        return sized_error(simulated, measured)
