@@ -14,9 +14,11 @@ from synthetic import SETTLED, known, table
 from calibration.data.errors import BadConfiguration
 from calibration.data.writing import finite
 from calibration.discovery import discover, preference
+from calibration.discovery.notes import DRAW
 from calibration.discovery.result import HeldOutAlternative, Worse
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.observers import SettledRuns
+from calibration.words import loop as words
 from mmrjax import channels, robots
 from sweeps import loop as room
 from sweeps import report_loop
@@ -44,15 +46,13 @@ def test_an_error_that_rises_is_listed_and_said():
     readings["voltage"][1][:, 1] = 4.72
     found = preference.worse(readings, errors)
     assert found == (Worse("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
-    assert preference.describe_worse(found, by) == (
-        "Held out, what was found predicts worse: by voltage motor speed 4.3 → 4.7 %."
-    )
+    assert words.worse(found, by) == ("Held out, what was found predicts worse: by voltage motor speed 4.3 → 4.7 %.")
 
 
 def test_an_error_that_falls_or_stays_is_not_said():
     readings, by = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1], readings["voltage"][1][:, 2] = 4.0, 4.3 * 1.005
-    assert preference.worse(readings, errors) == () and preference.describe_worse((), by) == ""
+    assert preference.worse(readings, errors) == () and words.worse((), by) == ""
 
 
 def test_errors_are_of_the_rows_that_both_predict():
@@ -65,18 +65,14 @@ def test_errors_are_of_the_rows_that_both_predict():
     by = {"voltage": (errors(before), errors(after))}
     found = preference.worse(readings, errors)
     assert [(w.rows, w.before, w.after) for w in found] == [(8, 4.0, 5.0)]
-    assert preference.describe_worse(found, by).endswith(
-        "by voltage total current 4.0 → 5.0 % (of the 8 rows that both predict)."
-    )
+    assert words.worse(found, by).endswith("by voltage total current 4.0 → 5.0 % (of the 8 rows that both predict).")
     swapped = {"slope": (by["voltage"][1], by["voltage"][0])}
-    assert preference.describe_worse((), swapped) == (
-        "Held out, what was found predicts worse: by slope 2 rows fewer predicted."
-    )
+    assert words.worse((), swapped) == ("Held out, what was found predicts worse: by slope 2 rows fewer predicted.")
 
 
 def test_numbers_that_differ_are_shown_to_differ():
     readings, by = held_out(0.141, 0.149)
-    assert "0.14 → 0.15 %" in preference.describe_worse(preference.worse(readings, errors), by)
+    assert "0.14 → 0.15 %" in words.worse(preference.worse(readings, errors), by)
 
 
 # --- among alternatives ---------------------------------------------------------------------------------
@@ -98,23 +94,25 @@ def test_order_of_alternatives(rms, lost, first):
 
 def test_it_is_said_by_what_the_leader_was_chosen():
     best, other = alternative("series_resistance", 3.0, leads=True), alternative("supply_sag", 2.0, rise=1.4)
-    (said,) = preference.remarks((best, other), "fit")
-    assert said == (
+    (note,) = preference.remarks((best, other), "fit")
+    assert (note.leader, note.best, note.by, note.prefer) == (0, 1, "fit", "fit")
+    assert words.led(note) == (
         "series_resistance comes first in its class by the fit to all rows; errors held out: series_resistance 3.00 σ, "
         "supply_sag 2.00 σ; supply_sag would come first by --prefer held-out, where adequate"
     )
     led = (dataclasses.replace(best, leads=False), dataclasses.replace(other, leads=True))
-    (said,) = preference.remarks(led, HELD_OUT)
-    assert said == (
+    (note,) = preference.remarks(led, HELD_OUT)
+    assert (note.leader, note.closest, note.by, note.rise_chi2) == (1, 0, HELD_OUT, 1.4)
+    assert words.led(note) == (
         "supply_sag comes first in its class by errors held out; errors held out: series_resistance 3.00 σ, "
         "supply_sag 2.00 σ; by the fit to all rows series_resistance would, by Δχ² 1.4"
     )
-    (said,) = preference.remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
-    assert said.startswith(
+    (note,) = preference.remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
+    assert note.by == DRAW and words.led(note).startswith(
         "series_resistance comes first in its class by the fit to all rows, as errors held out are"
     )
-    (said,) = preference.remarks((best, other), HELD_OUT)
-    assert said.endswith("supply_sag 2.00 σ; supply_sag is not as adequate")
+    (note,) = preference.remarks((best, other), HELD_OUT)
+    assert note.best != note.leader and words.led(note).endswith("supply_sag 2.00 σ; supply_sag is not as adequate")
     assert preference.remarks((), "fit") == []
 
 

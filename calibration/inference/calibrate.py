@@ -29,6 +29,7 @@ from calibration.inference import optimizers as fit
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
+from calibration.inference.notes import Note
 from calibration.inference.population import GENERATIONS, LEAST
 from calibration.inference.posterior import of_coordinates
 from calibration.inference.preparation import Prepared, prepare
@@ -130,7 +131,7 @@ def calibrate(
         present = {robot.configurations.names[k] for k in runs.configurations(robot)}
         base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
-    notes = [*ready.foreign, *ready.checked, *ready.weighed, *_of_product(of_product), *ready.begins]
+    notes: list[Note | str] = [*ready.foreign, *ready.checked, *ready.weighed, *_of_product(of_product), *ready.begins]
     posed = observers.pose(runs, base, coordinates, known.sd, model)
 
     if population is None:
@@ -213,9 +214,9 @@ def calibrate(
         residual_clusters=residual_clusters(left, seed),
         identifiability=about,
         posterior=of_coordinates(posed.coordinates, z, about.covariance),
-        notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
+        remarks=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
     )
-    return dataclasses.replace(result, notes=(*result.notes, *remarks(result)))
+    return dataclasses.replace(result, remarks=(*result.remarks, *remarks(result)))
 
 
 def _guided(

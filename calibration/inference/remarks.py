@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calibration.inference import blocks, priors
-from calibration.inference.identifiability import Z95, describe_held
+from calibration.inference.identifiability import Z95
+from calibration.inference.notes import HeldByPrior, Note
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
 from calibration.inference.result import CalibrationResult
@@ -15,7 +16,7 @@ from mmrjax.signals import DONE, STATUSES
 FAR = 3.0
 
 
-def remarks(found: CalibrationResult) -> list[str]:
+def remarks(found: CalibrationResult) -> list[Note | str]:
     """All remarks."""
     return [
         *_noise(found),
@@ -69,8 +70,8 @@ def _statuses(found: CalibrationResult) -> list[str]:
     ]
 
 
-def _parameters(found: CalibrationResult) -> list[str]:
-    said = describe_held(found.held_by_prior)
+def _parameters(found: CalibrationResult) -> list[Note | str]:
+    said: list[Note | str] = [HeldByPrior(found.held_by_prior)] * bool(found.held_by_prior)
     said += [
         f"{name} lies {abs(p.shift):.1f} prior sds from its prior: the prior or the model is wrong"
         for name, p in found.parameters.items()

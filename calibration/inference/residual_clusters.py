@@ -22,6 +22,7 @@ from scipy.special import fdtrc
 
 from calibration.data.runs import CONDITIONS, WHEN, Runs
 from calibration.inference.lack_of_fit import CLEAR, Residuals
+from calibration.inference.notes import Note
 from mmrjax import channels
 
 #: Family-wise error of reporting a cluster where there is none.
@@ -65,7 +66,7 @@ class LevelMean:
 
 
 @dataclasses.dataclass(frozen=True)
-class ResidualCluster:
+class ResidualCluster(Note):
     """Residuals of a channel that go with a column without a role.
 
     Attributes:
