@@ -430,7 +430,11 @@ def _stepped(at: Progress, found: tuple[Array, Array, Any]) -> Progress:
 
 
 def search_long(
-    problem: Problem, start: Z, data: Data, max_steps: int = 100, tell: Callable[[str], None] = lambda _: None
+    problem: Problem,
+    start: Z,
+    data: Data,
+    max_steps: int = 100,
+    tell: Callable[[int, float], None] = lambda steps, cost: None,
 ) -> tuple[Optimum, Observation, Observation]:
     """`levenberg_marquardt` with the steps taken from outside, so that a rollout is compiled once in all.
 
@@ -466,7 +470,7 @@ def search_long(
             best = found, seen
             done |= bool(found.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * found.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
-        tell(f"step {steps}: objective {float(best[0].cost):.4f}")
+        tell(steps, float(best[0].cost))
         if done:
             break
     assert best is not None and first is not None
@@ -478,7 +482,7 @@ def search_long(
         signed, slope, seen = _linearised(problem, at, data)
         found, ahead = judged(at, steps, signed, slope)
         best = found, seen
-        tell(f"step {steps}: objective {float(found.cost):.4f}")
+        tell(steps, float(found.cost))
     return best[0], first, best[1]
 
 

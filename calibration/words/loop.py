@@ -172,14 +172,17 @@ def standing(found: DiscoveryResult) -> str:
     return f"The names keep their significance {found.standing}."
 
 
+#: Why an effect is not plausible.
+RULED_OUT = {
+    "power": "{0.name} would put power in",
+    "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
+    "edge": "{0.name} is within an sd of the largest plausible size",
+}
+
+
 def why_ruled_out(reasons: Sequence[RuledOut]) -> str:
     """Why effects are not plausible, each."""
-    said = {
-        "power": "{0.name} would put power in",
-        "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
-        "edge": "{0.name} is within an sd of the largest plausible size",
-    }
-    return "; ".join(said[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
+    return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
 
 
 def ruled_out(found: DiscoveryResult) -> str:

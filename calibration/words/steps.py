@@ -20,6 +20,16 @@ STEPS = {
     "next": "the next experiment",
     "gear stated": "resolved: friction through the track model, its running gear as stated",
     "gear free": "resolved: the running gear free",
+    # a calibration
+    "optimum": "optimum found; now {}",
+    "steady": "the same with steady first, to begin from its optimum",
+    "derivatives": "population done; now derivatives against differences at the best",
+    "search": "  step {}: objective {:.4f}, {:.1f} min",
+    "round": "round {}: objective {:.4f} after {} steps, {:.1f} min",
+    "start": "start {} of {}: objective {:.4f} after {} steps, {:.1f} min",
+    "basin": "a lower basin of {}: objective {:.4f}",
+    "members": "generation {}: {} of {} members, {:.1f} min",
+    "generation": "generation {}: lowest objective {:.4g}, median {:.4g}, {} failed",
 }
 
 
