@@ -246,7 +246,7 @@ def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
         for r in proposal.table
     )
     return NextExperiment(
-        proposal.name, proposal.experiments, proposal.description, proposal.separates, proposal.expected_sigma,
+        proposal.name, proposal.experiments, proposal.instruction, proposal.separates, proposal.expected_sigma,
         proposal.settles, menu,
     )  # fmt: skip
 

@@ -10,6 +10,8 @@ from calibration.inference.notes import NoiseOff, Note
 if TYPE_CHECKING:
     from calibration.discovery.clusters import Cluster
     from calibration.discovery.discrepancy import Location
+    from calibration.discovery.menu import Experiment
+    from calibration.discovery.reach import Reach
 
 # --- the verdict ----------------------------------------------------------------------------------------
 
@@ -188,3 +190,96 @@ class TooFewReplicates(Note):
     """Bootstrap tables that do not do for every kind of evidence."""
 
     settled: int
+
+
+# --- what to do next ------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Heat:
+    """A winding that gets hot.
+
+    Attributes:
+        how: where it does: in a motor that is `held` or `braked`, or in a `run`.
+        temperature: after long running, infinite where none settles; allowed: None where nobody has stated it [°C].
+        current: of a motor that is held [A], else 0.
+    """
+
+    how: str
+    temperature: float
+    allowed: float | None
+    current: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Overspeed:
+    """Motors without load that turn about as fast as they may: speed and its limit [rad/s], at a voltage [V]."""
+
+    speed: float
+    limit: float
+    voltage: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Overvoltage:
+    """A supply beyond what the table used [V]."""
+
+    voltage: float
+    used: float
+
+
+Watch = Heat | Overspeed | Overvoltage
+
+
+@dataclasses.dataclass(frozen=True)
+class NothingPossible:
+    """Every experiment of the menu is forbidden or beyond reach."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NothingTells:
+    """No experiment of the menu tells alternatives apart by so much [σ]."""
+
+    names: tuple[str, ...]
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CarryOut:
+    """Experiments of the menu, all of them."""
+
+    experiments: tuple[Experiment, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class MoreRuns:
+    """More runs along the variable of a discrepancy in a place.
+
+    Attributes:
+        runs: of the series.
+        low, high: voltages that it goes between, top: the highest that the table used [V].
+        slope [deg], payload [kg]: up to which it may go; steps: of voltage, slope and payload.
+        within: reach of the table.
+    """
+
+    place: str
+    variable: str
+    runs: int
+    low: float
+    high: float
+    top: float
+    slope: float
+    payload: float
+    steps: tuple[float, float, float]
+    within: Reach
+
+
+@dataclasses.dataclass(frozen=True)
+class TooWeak:
+    """A series in a variable that would show what is missing by too little [σ]."""
+
+    variable: str
+    sigma: float
+
+
+Instruction = NothingPossible | NothingTells | CarryOut | MoreRuns | TooWeak

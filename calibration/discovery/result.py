@@ -14,11 +14,12 @@ from calibration.data.posterior import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
-from calibration.discovery.notes import Asked, NameSupport, RuledOut, Summary
+from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOut, Summary
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
 from calibration.inference.notes import HeldByPrior, Notes
 from calibration.inference.residual_clusters import ResidualCluster
+from calibration.words import experiments
 from calibration.words import loop as words
 from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
@@ -265,11 +266,21 @@ class NextExperiment:
 
     name: str
     experiments: tuple[str, ...]
-    description: str
+    instruction: Instruction
     separates: tuple[str, ...]
     expected_sigma: float
     settles: bool
     menu: tuple[RankedExperiment, ...]
+
+    @property
+    def description(self) -> str:
+        """What to do and what to read."""
+        return experiments.instruction(self.instruction)
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        kept = ("name", "experiments", "description", "separates", "expected_sigma", "settles")
+        return {**{n: getattr(self, n) for n in kept}, "menu": [dataclasses.asdict(e) for e in self.menu]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -532,7 +543,7 @@ class DiscoveryResult:
             "rows_outliers": list(self.outliers),
             "effects": [_effect(e) for e in self.effects]
             + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
-            "next_experiment": None if proposal is None else dataclasses.asdict(proposal),
+            "next_experiment": None if proposal is None else proposal.to_json(),
             "remains": None if self.remains is None else dataclasses.asdict(self.remains),
             "cannot_see": list(self.cannot_see),
             "needs_series": list(self.needs_histories),
