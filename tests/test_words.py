@@ -12,6 +12,7 @@ from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupp
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.notes import Note, Shown, Step
+from calibration.sensitivity import notes as of_study
 from calibration.words import fits, loop, steps, tables
 from calibration.words.notes import SAID, in_words, sentence
 
@@ -230,6 +231,31 @@ SAMPLES = [
         of_loop.TooFewReplicates(100),
         "100 bootstrap tables are too few for every kind of evidence to count; use 500 or more",
     ),
+    (of_study.Sampling("morris", 8), "screening by elementary effects, over 8 operating points"),
+    (
+        of_study.PointsLeftOut(2, 8, False, ("speed", "current")),
+        "2 of 8 operating points are left out, since the robot does not travel there (speed, current)",
+    ),
+    (
+        of_study.PointsLeftOut(2, 8, True, ("speed",)),
+        "2 of 8 operating points are left out, since too many robots of the sample do not travel there (speed)",
+    ),
+    (
+        of_study.SampleLeftOut(3, 0.0123, ("speed",)),
+        "at 3 operating points up to 1.2 % of the sample is left out, since the robot does not travel there: the "
+        "indices are of robots that do (speed)",
+    ),
+    (
+        of_study.Inert(("a", "b"), False),
+        "not sampled, since every derivative by them is exactly zero where one was taken: a, b",
+    ),
+    (
+        of_study.Inert(("a",), True),
+        "every derivative by them is exactly zero where one was taken, so that what effect they have is that of inputs "
+        "they are correlated with: a",
+    ),
+    (of_study.Tied(("a", "b")), "kept at their ratio to another input, and part of what it does: a, b"),
+    (Step("evaluations", (12345, 1234.6)), "12,345 model evaluations so far, 1,235 a second"),
     (Step("alike", (("a", "b"),)), "what else explains as much as a and b?"),
     (Step("round", (2, 3.25, 7, 1.26)), "round 2: objective 3.2500 after 7 steps, 1.3 min"),
 ]
@@ -247,7 +273,7 @@ def kinds():
     """Every kind of note that the rooms have."""
     return {
         kind
-        for room in (of_fit, of_loop)
+        for room in (of_fit, of_loop, of_study)
         for kind in vars(room).values()
         if isinstance(kind, type) and issubclass(kind, Note) and kind is not Note
     }
@@ -271,7 +297,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 def test_names_of_rows_are_those_of_the_code(kind, rows):
     """A name without a row would fail only where it is said, and a row without a name is never said."""
     used = set()
-    for room in ("inference", "discovery"):
+    for room in ("inference", "discovery", "sensitivity"):
         for file in (ROOT / "calibration" / room).rglob("*.py"):
             for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Call) and ast.unparse(node.func) == kind and node.args:

@@ -1,4 +1,4 @@
-"""One sentence for each kind of note, of a table, a fit or the loop."""
+"""One sentence for each kind of note, of a table, a fit, the loop or a study."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 from calibration.discovery import notes as of_loop
 from calibration.inference import notes as of_fit
 from calibration.inference.notes import Note
-from calibration.words import fits, loop, steps, tables
+from calibration.sensitivity import notes as of_study
+from calibration.words import fits, loop, sensitivity, steps, tables
 
 #: What is said of each kind of note; what is not among them has a `statement` of its own.
 SAID: dict[type, Callable[[Any], str]] = {
@@ -51,6 +52,11 @@ SAID: dict[type, Callable[[Any], str]] = {
     of_loop.Led: loop.led,
     of_loop.LostReplicates: loop.lost_replicates,
     of_loop.TooFewReplicates: loop.too_few_replicates,
+    of_study.Sampling: sensitivity.sampling,
+    of_study.PointsLeftOut: sensitivity.points_left_out,
+    of_study.SampleLeftOut: sensitivity.sample_left_out,
+    of_study.Inert: sensitivity.inert,
+    of_study.Tied: sensitivity.tied,
 }
 
 

@@ -20,6 +20,10 @@ STEPS = {
     "next": "the next experiment",
     "gear stated": "resolved: friction through the track model, its running gear as stated",
     "gear free": "resolved: the running gear free",
+    # a sensitivity study
+    "points": "derivatives at every operating point",
+    "sobol": "Sobol indices of the same points, to compare the bounds with",
+    "evaluations": "{:,} model evaluations so far, {:,.0f} a second",
     # a calibration
     "optimum": "optimum found; now {}",
     "steady": "the same with steady first, to begin from its optimum",
