@@ -9,6 +9,7 @@ import pytest
 
 from calibration.discovery import notes as of_loop
 from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, RuledOut, Summary
+from calibration.discovery.result import Formula
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.notes import Note, Shown, Step
@@ -358,6 +359,11 @@ def test_verdict_lists_what_cannot_be_told_apart():
     assert loop.statement(Summary("named", 0.002, None, (Missing(("a",), (), ("x",)),))) == (
         "Missing: a (family-wise p ≤ 0.002)."
     )
+
+
+def test_a_formula_without_terms_says_so():
+    assert Formula("", "mark", (), (), 0.0, 9).formula == "none: no term shows in these data"
+    assert Formula("ΔU = 1 V", "mark", (1.0,), (0.1,), 3.0, 9).to_json()["formula"] == "ΔU = 1 V"
 
 
 def test_why_an_effect_is_ruled_out():

@@ -100,12 +100,23 @@ class FoundEffect:
 class Formula:
     """A formula proposed for a curve; see `formula.Proposal`."""
 
-    formula: str
+    expression: str
     mark: str
     coefficients: tuple[float, ...]
     sds: tuple[float, ...]
     bic_gain_over_curve: float
     tried: int
+
+    @property
+    def formula(self) -> str:
+        """Its expression, or that there is none."""
+        return self.expression or words.NO_FORMULA
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {
+            n: getattr(self, n) for n in ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -679,7 +690,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "effect": d.effect,
         "score_free_in_each_run": d.score_free_in_each_run,
         "curve": curve,
-        "proposal": dataclasses.asdict(d.proposal),
+        "proposal": d.proposal.to_json(),
     }
 
 

@@ -128,6 +128,9 @@ def header(found: DiscoveryResult, robot_name: str) -> str:
     return f"found by the loop{start} with {found.runs.source}: {found.statement}"
 
 
+#: In the place of a formula.
+NO_FORMULA = "none: no term shows in these data"
+
 # --- whether names stand --------------------------------------------------------------------------------
 
 #: Why names do not stand, or beside what they do.
