@@ -224,21 +224,6 @@ def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
     assert 'id="hidden"' not in report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
 
 
-def test_names_say_what_would_explain_more_than_they():
-    def of(verdict, *ruled_out):
-        return SimpleNamespace(verdict=verdict, implausible=ruled_out, settings=SETTLED.settings)
-
-    def candidate(rise, *names):
-        return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
-
-    near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert words.ruled_out(of("named", near)) == "" == words.ruled_out(of("unnamed"))
-    assert words.ruled_out(of("class", near, better)) == (
-        "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
-    )
-    assert words.ruled_out(of("unnamed", better, near)).startswith("a would explain as much as the curve, but is")
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, name):
     seen = shown(name, capsys)

@@ -4,12 +4,13 @@ import ast
 import dataclasses
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from calibration.discovery import notes as of_loop
 from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, RuledOut, Summary
-from calibration.discovery.result import Formula
+from calibration.discovery.result import Formula, Worse
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.notes import Note, Shown, Step
@@ -372,6 +373,42 @@ def test_why_an_effect_is_ruled_out():
         "a would put power in; b at 2.9 times its largest plausible size; check x and y; c is within an sd of the "
         "largest plausible size"
     )
+
+
+def test_names_say_what_would_explain_more_than_they():
+    def of(verdict, *ruled_out):
+        return SimpleNamespace(verdict=verdict, implausible=ruled_out, settings=SimpleNamespace(same=6.0))
+
+    def candidate(rise, *names):
+        return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
+
+    near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
+    assert loop.ruled_out(of("named", near)) == "" == loop.ruled_out(of("unnamed"))
+    assert loop.ruled_out(of("class", near, better)) == (
+        "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
+    )
+    assert loop.ruled_out(of("unnamed", better, near)).startswith("a would explain as much as the curve, but is")
+
+
+def errors(rows, rms):
+    return {"motor_speed": {"rows": rows, "rms_percent": rms}}
+
+
+@pytest.mark.parametrize(
+    ("found", "before", "after", "said"),
+    [
+        ((4.3, 4.72), errors(10, 4.3), errors(10, 4.72), "motor speed 4.3 → 4.7 %"),
+        ((0.141, 0.149), errors(10, 0.141), errors(10, 0.149), "motor speed 0.14 → 0.15 %"),
+        ((4.0, 5.0), errors(8, 4.0), errors(10, 12.0), "motor speed 4.0 → 5.0 % (of the 8 rows that both predict)"),
+        (None, errors(10, 4.0), errors(8, 3.0), "2 rows fewer predicted"),
+        (None, errors(10, 4.0), errors(9, 3.0), "1 row fewer predicted"),
+        (None, errors(10, 4.0), errors(10, 3.0), ""),
+    ],
+)
+def test_what_is_predicted_worse_is_said_with_its_rows(found, before, after, said):
+    worse = () if found is None else (Worse("voltage", "motor_speed", before["motor_speed"]["rows"], *found),)
+    whole = f"Held out, what was found predicts worse: by voltage {said}."
+    assert loop.worse(worse, {"voltage": (before, after)}) == (whole if said else "")
 
 
 @pytest.mark.parametrize(
