@@ -118,7 +118,8 @@ def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
         (("supply_sag",), 2.0),
     ]
     assert [(tuple(a.effects), a.rise_chi2) for a in ruled_out] == [(("series_resistance",), -4.0)]
-    assert "2 times its largest plausible size" in ruled_out[0].why
+    (reason,) = ruled_out[0].reasons
+    assert (reason.name, reason.why, reason.size) == ("series_resistance", "size", 2.0)
 
 
 # --- weak companions ------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from calibration.discovery import notes as of_loop
@@ -14,6 +15,7 @@ from calibration.discovery.result import Formula, Worse
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.notes import Note, Shown, Step
+from calibration.inference.residual_clusters import LevelMean, ResidualCluster
 from calibration.sensitivity import notes as of_study
 from calibration.words import fits, loop, steps, tables
 from calibration.words.notes import SAID, in_words, sentence
@@ -458,6 +460,47 @@ def test_what_the_track_model_is_asked_about(about, said):
 def test_adequacy_is_said(found, said):
     assert found.statement == said and found.to_json()["statement"] == said
     assert found.to_json()["shown_by"] == fits.shown_by(found.shown_by)
+
+
+def clustered(levels, **other):
+    """Residuals of speed that go with a column; levels: means by name."""
+    means = tuple(LevelMean(name, "", mean, 9) for name, mean in levels.items())
+    known = dict(
+        column="wheel", channel="speed", unit="mm/s", within="", reversing=False, levels=means, correlation=None, p=2e-7,
+        alike=(), coarser=(), at=np.zeros(0), residual=np.zeros(0),
+    )  # fmt: skip
+    return ResidualCluster(**{**known, **other})
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (
+            clustered({"1": -14.42, "2": 3.6}, alike=("direction_deg",)),
+            "residuals of speed cluster by wheel (simulated less measured at levels 1: -14 mm/s, 2: +3.6 mm/s; p = 2e-07), "
+            "a column without a role (as well by direction_deg): give each level its own configuration, or find what "
+            "differs",
+        ),
+        (
+            clustered({"1": -1.0, "2": 1.0}, reversing=True, within="configuration", coarser=(("axle", 0.91),)),
+            "residuals of speed cluster by wheel within configuration, with opposite signs in the two directions of travel "
+            "(simulated less measured at levels 1: -1 mm/s, 2: +1 mm/s; p = 2e-07), a column without a role (axle alone "
+            "91% of it): give each level its own configuration, or find what differs",
+        ),
+        (
+            clustered({}, correlation=-0.456),
+            "residuals of speed go with wheel (rank correlation -0.46; p = 2e-07), a column without a role: find what "
+            "differs with it",
+        ),
+    ],
+)
+def test_what_residuals_cluster_by_is_said(found, said):
+    assert found.statement == said == sentence(found) == found.to_json()["statement"]
+
+
+def test_six_levels_that_are_furthest_off_are_listed():
+    said = clustered({str(k): k - 5.0 for k in range(1, 10)}).statement
+    assert [int(k) for k in re.findall(r"(\d): [+-]", said)] == [1, 2, 3, 7, 8, 9] and ", ...;" in said
 
 
 def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
