@@ -210,6 +210,7 @@ def discover_at(
 
     Args:
         numbers: of the rows, as messages call them; None counts from 1.
+        progress: is given notes, not sentences.
     """
     traced = trace(runs, robot, noise, settings, stated, library, progress)
     return assemble_result(traced, runs, numbers, settings, library, progress)
