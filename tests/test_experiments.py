@@ -139,7 +139,7 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
 def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
     name = experiments.choose(foreseen).name
-    done = next(e for e in predicted.experiments if e.name == name)
+    done = next(e for e in foreseen.experiments if e.name == name)
     verdicts = [supported(foreseen, {name: case.carry_out(done, seed)}) for seed in range(10)]
     assert sum(v.resolved and v.best == pair[0] for v in verdicts) >= 8
     assert all(pair[0] in v.left for v in verdicts)
