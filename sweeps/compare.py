@@ -14,6 +14,7 @@ from calibration.data import instruments
 from calibration.data import runs as records
 from calibration.inference import errors as residual
 from calibration.inference.ranges import check_ranges
+from calibration.words.notes import sentences
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 from sweeps import config as configuration
@@ -37,7 +38,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
     robot = instruments.with_inferred_instruments(file.robot, runs)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
-    said = check_ranges(runs, robot)
+    said = sentences(check_ranges(runs, robot))
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("compare", config, robot, out, force, runs) as folder:
         table = run.evaluate(robot, runs, config, folder)

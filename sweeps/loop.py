@@ -10,11 +10,11 @@ from rich.table import Table
 
 from calibration.data import effect_file
 from calibration.data.columns import Layout
-from calibration.discovery import findings, preference
 from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks, priors
+from calibration.words import loop as said_of
 from sweeps import config as configuration
 from sweeps import words
 from sweeps.console import say, tell
@@ -67,10 +67,10 @@ def print_discovery(found: DiscoveryResult) -> None:
     say(f"{found.verdict}: {found.statement}")
     if not found.robot.has_ground and found.verdict != "none":
         say("The balance track of a shaft is what its load loses.")
-    for said in (findings.describe_standing(found), findings.describe_ruled_out(found)):
+    for said in (said_of.standing(found), said_of.ruled_out(found)):
         if said:
             say(said)
-    rise = preference.describe_worse(found.held_out_worse, found.errors_held_out)
+    rise = said_of.worse(found.held_out_worse, found.errors_held_out)
     if rise:
         say(rise)
     if found.effects:
@@ -82,12 +82,12 @@ def print_discovery(found: DiscoveryResult) -> None:
             a = e.parameters["amplitude"]
             shown.add_row(
                 e.name, ", or ".join(e.families), f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", f"{e.score:.0f}",
-                f"{e.p_value:.2g}", findings.alike_said(e) or "-",
+                f"{e.p_value:.2g}", said_of.alike(e) or "-",
             )  # fmt: skip
         say(shown)
         say("explains: rise of χ² without it, all else fitted again; own p: among the strongest of the library")
     if found.hidden:
-        say(findings.describe_hidden(found))
+        say(said_of.hidden(found))
     if found.unnamed is not None:
         say(f"{found.unnamed.proposal.formula} ({found.unnamed.proposal.mark})")
     if found.resolved is not None:

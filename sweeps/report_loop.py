@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from calibration.data.columns import Layout
-from calibration.discovery import findings, preference
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
+from calibration.words import loop as words
 from sweeps import figures_clusters, figures_loop
 from sweeps.report import Album, columns, conditions, first_rows, render, rms, words_shown
 
@@ -46,7 +46,7 @@ def alike(found: DiscoveryResult) -> list[str]:
     """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
     if found.unnamed is not None:
         return [", ".join(b for b in found.unnamed.balances_alike if b != found.unnamed.balance)]
-    return [findings.alike_said(e) for e in found.effects]
+    return [words.alike(e) for e in found.effects]
 
 
 def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
@@ -79,12 +79,12 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         of_channels=found.channels,
         title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
         document=found.to_json(),
-        p=findings.describe_p_value(found.before.p_value),
-        cluster=str(found.cluster or ""),
-        standing=findings.describe_standing(found),
-        ruled_out=findings.describe_ruled_out(found),
+        p=words.p_value(found.before.p_value),
+        cluster="" if found.cluster is None else words.cluster(found.cluster),
+        standing=words.standing(found),
+        ruled_out=words.ruled_out(found),
         alike=alike(found),
-        worse=preference.describe_worse(found.held_out_worse, found.errors_held_out),
+        worse=words.worse(found.held_out_worse, found.errors_held_out),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
         columns=columns(found.channels),

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.sensitivity.result import METHODS, NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
+from calibration.sensitivity.result import NEGLIGIBLE, OutputStudy, SensitivityResult, interactions
+from calibration.words import sensitivity as words
 from sweeps import figures_sensitivity
 from sweeps.report import Album, named, number, render
 
@@ -55,7 +56,7 @@ def write(folder: Path, found: SensitivityResult, file: RobotFile) -> Path:
         album,
         title="Which parameters matter",
         found=found,
-        method=METHODS[found.method],
+        method=words.METHODS[found.method],
         sections=sections,
         inputs=_inputs(found),
         runs=_next_runs(found),

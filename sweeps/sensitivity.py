@@ -20,6 +20,7 @@ from calibration.sensitivity.model import chosen_outputs
 from calibration.sensitivity.next_runs import Candidates
 from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
 from calibration.sensitivity.study import Study, Supply
+from calibration.words import sensitivity as words
 from mmrjax.channels import RPM
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
@@ -178,7 +179,7 @@ def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs) -
 def print_sensitivity(found: SensitivityResult) -> None:
     """What decides which output, what does not matter, what to measure next; for a person."""
     say(found.statement())
-    title = f"{METHODS[found.method]}, {len(found.points)} operating points"
+    title = f"{words.METHODS[found.method]}, {len(found.points)} operating points"
     shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for heading in ("", "first", "second", "third"):
         shown.add_column(heading)

@@ -13,6 +13,7 @@ from calibration.data.runs import Runs
 from calibration.inference import checks
 from calibration.inference.calibrate import calibrate
 from calibration.inference.conduct import conduct
+from calibration.inference.notes import EndsEarly, Fact, NeverGrips, NoiseOff, Shown
 from mmrjax import params, robots
 
 CLIMBING = params.replace(robots.nominal(), g.CLIMBING)
@@ -63,6 +64,9 @@ def short():
     return started(duration=0.0101, every=5e-4)
 
 
+RUNS = tuple(f"start{k}" for k in range(6))
+
+
 def written(path, runs):
     with path.open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file)
@@ -77,30 +81,26 @@ def test_histories_that_grip_have_nothing_said(histories):
 
 def test_histories_that_never_grip_are_said(sliding, histories):
     which, none = conduct(sliding, CLIMBING)
-    assert which.startswith(
-        "runs start0, start1, start2, start3, start4, start5 never grip: in the end the robot travels"
-    )
-    assert "what the ground holds before it slides is not measured there" in which
-    assert none == "no run grips: static friction, and slip below it, are known by their priors alone"
+    assert which == NeverGrips(RUNS, which.share) and 0 <= which.share < 0.7 and none == Fact("no grip")
     half = {c: np.concatenate([sliding[c][sliding["run_id"] == "start0"], histories[c][histories["run_id"] != "start0"]])
             for c in histories.columns}  # fmt: skip
     (said,) = conduct(Runs("runs.csv", half), CLIMBING)
-    assert said.startswith("run start0 never grips: ")
+    assert said == NeverGrips(("start0",), said.share)
 
 
 def test_runs_of_ten_milliseconds_are_said(short):
     (said,) = conduct(short, CLIMBING)
-    assert said.startswith("runs start0, start1, start2, start3, start4, start5 end after 0.01 s at the latest, at ")
-    assert "before the robot is under way" in said and "record until the speed is steady" in said
+    assert isinstance(said, EndsEarly) and said.runs == RUNS
+    assert said.lasts == pytest.approx(0.01, rel=0.1) and 0 < said.share < 0.7
     bare = Runs("runs.csv", {c: x for c, x in short.columns.items() if not c.startswith("speed")})
     (said,) = conduct(bare, CLIMBING)
-    assert "end after 0.01 s at the latest: before" in said
+    assert isinstance(said, EndsEarly) and said.runs == RUNS and np.isnan(said.share)
 
 
 def test_loop_and_calibrate_say_both(sliding, short):
     """Both ask `checks.check` before they fit, and keep what it says."""
-    for runs, words in ((sliding, "never grip"), (short, "before the robot is under way")):
-        assert any(words in s for s in checks.check(runs, CLIMBING, (), known(runs)))
+    for runs, kind in ((sliding, NeverGrips), (short, EndsEarly)):
+        assert any(isinstance(note, kind) for note in checks.check(runs, CLIMBING, (), known(runs)))
 
 
 #: A table or histories, and what is said of it by every command that fits.
@@ -148,20 +148,18 @@ def tenth(case):
     return Runs("runs.csv", columns)
 
 
-SAYS = "times the stated sds in every channel and everywhere alike: are the sds right?"
-
-
 @pytest.mark.slow
 def test_calibrate_says_that_sds_are_ten_times_too_small():
     runs = tenth(g.case(seed=3, free=g.FRICTION))
     found = calibrate(runs, CLIMBING, starts=2, profiles=False, blocks=())
-    (said,) = [n for n in found.notes if SAYS in n]
-    assert 9.0 < float(said.split()[2]) < 11.0
-    assert found.adequacy.adequate is False and found.adequacy.shown_by == "the residuals exceed the stated noise"
+    (off,) = [n for n in found.remarks if isinstance(n, NoiseOff)]
+    assert 9.0 < off.factor < 11.0 and off.channel == "" and off.source == "stated"
+    assert found.adequacy.adequate is False and found.adequacy.shown_by == Shown(what="stated")
 
 
 @pytest.mark.slow
 def test_loop_says_that_sds_are_ten_times_too_small():
     found = SETTLED.discover(tenth(g.case(seed=3)))
-    assert SAYS in found.notes[0] and 9.0 < float(found.notes[0].split()[2]) < 11.0
-    assert not any("the stated sds" in n for n in SETTLED.discover(table(g.case(seed=3))).notes)
+    off = found.remarks[0]
+    assert off == NoiseOff("", off.factor, "stated") and 9.0 < off.factor < 11.0
+    assert not any(isinstance(n, NoiseOff) for n in SETTLED.discover(table(g.case(seed=3))).remarks)

@@ -25,6 +25,7 @@ from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
+from calibration.inference.notes import Constant, Unmeasured
 from calibration.inference.observers import SettledRuns
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
@@ -199,8 +200,8 @@ def test_a_stuck_channel_is_refused(measured):
 def test_a_constant_condition_is_said(measured):
     flat = measured.where((measured["slope_deg"] == 10) | (measured["slope_deg"] == 5))
     level = changed(flat, slope_deg=np.full(8, 5.0), supply_voltage_V=flat["supply_voltage_V"])
-    notes = quick(level.where(np.arange(8) % 2 == 0), noise="current=30%,motor_speed=9%,speed=9%").notes
-    assert any(n.startswith("slope_deg is 5 in every row: rolling resistance") for n in notes)
+    notes = quick(level.where(np.arange(8) % 2 == 0), noise="current=30%,motor_speed=9%,speed=9%").remarks
+    assert Constant("slope_deg", 5.0, "guides") in notes
 
 
 def test_contradictory_replicates_are_refused(measured):
@@ -261,9 +262,9 @@ def test_what_a_fidelity_does_not_read_is_not_freed(measured):
 @pytest.mark.slow
 def test_a_parameter_that_nothing_measures_is_said_with_what_would(measured):
     made = quick(measured, free=["default", "motor.inductance", "6T2A.mass"])
-    said = " ".join(made.notes)
-    assert "motor.inductance: nothing in these data measures it" in said and "start-up current" in said
-    assert "6T2A.mass: nothing in these data measures it" in said and "a scale" in said
+    assert {Unmeasured("motor.inductance"), Unmeasured("6T2A.mass")} <= {
+        n for n in made.remarks if isinstance(n, Unmeasured)
+    }
     entry = made.parameters["motor.inductance"]
     assert entry.held_by_prior and not entry.measured_by_data
     assert entry.variance_ratio == pytest.approx(1.0)

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from calibration.data import runs as records
-from calibration.inference import checks, observers, priors
 from calibration.inference import noise as noise_room
+from calibration.inference import observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
+from calibration.inference.notes import BesideSteady, PriorOfProduct
 from calibration.inference.priors import GUIDED
+from calibration.words import tables
 from mmrjax import channels, fidelities, params, robots
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.fidelities.track import track
@@ -61,7 +63,7 @@ def test_in_track_the_guide_friction_stands_for_the_product(base):
     assert float(fields[GUIDE_SHARE].value) == GUIDED
     assert mean * GUIDED == pytest.approx(0.2 * 0.3)  # of the nominal robot in the other fidelities
     assert priors.known(base)[GUIDE_SHARE].value == 0.3
-    assert "free guide_friction there" in checks.would_measure(GUIDE_SHARE)
+    assert "free guide_friction there" in tables.would_measure(GUIDE_SHARE)
 
 
 @pytest.fixture(scope="module")
@@ -102,11 +104,12 @@ def test_track_calibration_recovers_the_guide_friction(found, made, told):
     assert answer.value == pytest.approx(TRUTH, rel=0.01)
     assert answer.interval[0] < TRUTH < answer.interval[1]
     assert abs(answer.with_steady.apart_in_sd) < 1.96
-    assert "its product with the share of the guides" in answer.prior.source
+    assert answer.prior.source == "product"
     assert not found.profiled and not found.held_out  # minutes each, so only when asked for
     assert any("round 1" in t for t in told) and any("start 2 of 2" in t for t in told)
-    said = " ".join(found.notes)
-    assert "the track model puts 98% of the weight on them" in said and "2 of 2 parameters lie within" in said
+    (product,) = [n for n in found.remarks if isinstance(n, PriorOfProduct)]
+    (beside,) = [n for n in found.remarks if isinstance(n, BesideSteady)]
+    assert f"{product.share:.0%}" == "98%" and (beside.inside, beside.of) == (2, 2)
 
 
 @pytest.mark.slow

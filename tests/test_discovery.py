@@ -134,7 +134,7 @@ def test_effect_outside_the_library_gets_no_name():
     found = SETTLED.trace(table(g.case(*OUTSIDE)))
     where = found.where
     assert found.verdict == "unnamed" and found.members == () and found.left.test.rejected
-    assert found.searched is not None and not found.standing.stands and found.standing.reason
+    assert found.searched is not None and not found.standing.stands and found.standing.why
     assert where.balance == "electrical" and {"electrical", "supply"} <= set(where.alike)
     assert where.variable in bases.VARIABLES and found.families == (where.family,)
 

@@ -121,7 +121,7 @@ def test_wave_outside_the_library_gets_its_balance_and_order_but_no_name(oval):
     space, left, searched = oval.space, oval.left, oval.searched
     assert left.test.rejected
     stood = standing(space, oval.base, searched, left, oval.bases, ANALYST.settings)
-    assert not stood.stands and stood.reason
+    assert not stood.stands and stood.why
     where = locate(left, oval.bases, space.included)
     assert {"track", "gearbox", "motor"} <= {where.balance, *where.alike}
     assert where.variable == "order 2 of the driving shaft"

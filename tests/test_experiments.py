@@ -18,6 +18,7 @@ from calibration.discovery import experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
+from calibration.discovery.notes import Heat, NothingPossible, Overspeed, Overvoltage
 from calibration.discovery.reach import reach
 from calibration.discovery.stated_values import Shift
 from mmrjax import channels, params, robots
@@ -138,7 +139,7 @@ def test_proposal_is_what_an_engineer_would_do(pair, seen):
 def test_proposal_carried_out_resolves_the_class(pair, seen):
     case, _, _, foreseen = seen[pair]
     name = experiments.choose(foreseen).name
-    done = next(e for e in predicted.experiments if e.name == name)
+    done = next(e for e in foreseen.experiments if e.name == name)
     verdicts = [supported(foreseen, {name: case.carry_out(done, seed)}) for seed in range(10)]
     assert sum(v.resolved and v.best == pair[0] for v in verdicts) >= 8
     assert all(pair[0] in v.left for v in verdicts)
@@ -212,7 +213,8 @@ def test_a_second_experiment_is_proposed_where_one_leaves_two_together():
     )
     assert set(proposal.experiments) == {"stall", "weigh"} and proposal.settles
     assert proposal.expected_sigma == pytest.approx(7.0) and proposal.separates == ("b", "c")
-    assert "scales" in proposal.description and "vice" in proposal.description and proposal.name.count(" and ") == 1
+    assert proposal.name.count(" and ") == 1
+    assert [e.name for e in proposal.instruction.experiments] == list(proposal.experiments)
 
 
 def test_a_second_experiment_that_adds_nothing_is_not():
@@ -285,12 +287,13 @@ def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
     runs = int(space.included.sum())
     where = Location("track", "speed", ("track",), (), 60.0, 60.0)
     proposal = experiments.denser(space, where, SETTINGS)
-    assert "speed" in proposal.name and "track" in proposal.description
+    assert "speed" in proposal.name and proposal.instruction.place == "track"
     assert proposal.expected_sigma == pytest.approx(np.sqrt(60 * 45 / runs)) and runs == 90
     weak = experiments.denser(space, dataclasses.replace(where, strongest=4.0), SETTINGS)
+    assert weak.instruction.variable == "speed"
     assert weak.name == experiments.NONE and weak.expected_sigma == 0
     wave = experiments.denser(space, dataclasses.replace(where, variable="order 2 of the driving shaft"), SETTINGS)
-    assert wave.name == "steady speeds for order 2 of the driving shaft" and "from the mark" in wave.description
+    assert wave.name == "steady speeds for order 2 of the driving shaft"
 
 
 # --- what is within reach ---------------------------------------------------------------------------
@@ -332,12 +335,12 @@ def runs_of(table):
 def test_menu_stays_within_the_reach_of_a_small_robot(rover):
     made = menu.menu(reach(rover, ROVERS_TABLE, channels.USUAL))
     runs = runs_of(made)
-    assert {r.configuration for r in runs} == {0} and not any("6T2A" in e.description for e in made)
+    assert {r.configuration for r in runs} == {0} and {r.where for r in runs} == {"", "rover"}
     assert max(max(r.voltage) for r in runs) <= 12.0 and min(min(r.voltage) for r in runs) > 0
     assert max(max(r.payload) for r in runs) == 1.5 and max(max(r.slope) for r in runs) <= 9.5
     assert min(min(r.slope) for r in runs) == -8.0
     weigh = next(e for e in made if e.name == "weigh")
-    assert "payload of 1 kg" in weigh.description and weigh.at == ((0.0, 0.0), (0.0, 1.0))
+    assert weigh.at == ((0.0, 0.0), (0.0, 1.0))
     stall = next(e for e in runs if e.name == "stall")
     assert max(stall.voltage) / 1.2 < 3.0  # of the current of steady travel, not of 12 V / 1.2 ohm
 
@@ -345,7 +348,7 @@ def test_menu_stays_within_the_reach_of_a_small_robot(rover):
 def test_configurations_without_rows_are_not_on_the_menu():
     wheels_alone = g.table8(configurations=(1,))
     made = menu.menu(reach(CLIMBING, conditions(wheels_alone), channels.USUAL))
-    assert not any("6T2A" in f"{e.name} {e.description}" for e in made)
+    assert not any("6T2A" in e.name for e in made) and {r.where for r in runs_of(made)} == {"", "4W2T"}
     assert {r.configuration for r in runs_of(made) if "4W2T" in r.kinds} == {1}
     assert next(e for e in made if e.name == "weigh").at == ((1.0, 0.0), (1.0, 8.0))
 
@@ -355,7 +358,7 @@ def test_level_table_without_payload_asks_for_neither_slope_nor_payload(rover):
     runs = runs_of(made)
     assert all(set(r.slope) <= {0.0, -0.0} and set(r.payload) == {0.0} for r in runs)
     assert not {"downhill", "steepest slope", "payload"} & {k for r in runs for k in r.kinds}
-    assert "unladen, on scales" in made[0].description
+    assert made[0].name == "weigh" and {m for _, m in made[0].at} == {0.0}
     assert max(max(r.voltage) for r in runs) <= 12.0
 
 
@@ -365,7 +368,7 @@ def test_higher_voltage_needs_a_rating_and_is_watched(rover):
     run = next(r for r in runs_of(menu.menu(within)) if r.name == "other voltages, rover")
     assert max(run.voltage) == 18.0
     shown = menu.carried_out(run, *plain(run), within)
-    assert "the supply: 18 V is more than the table's 12 V" in shown.description
+    assert Overvoltage(18.0, 12.0) in shown.watch
 
 
 def plain(run, temperature=40.0, speed=100.0):
@@ -385,7 +388,7 @@ def test_robot_with_one_motor_is_not_told_to_disconnect_the_other(rover):
     one = dataclasses.replace(rover, sides=jnp.asarray(1.0))
     made = menu.menu(reach(one, ROVERS_TABLE, channels.USUAL))
     assert not any("one motor" in e.kinds for e in made)
-    assert "the motor's shaft" in next(e for e in made if e.name == "stall").description
+    assert {r.motors for r in runs_of(made)} == {1}
 
 
 def test_voltages_without_load_stay_below_the_permissible_speed():
@@ -429,31 +432,27 @@ def test_steepest_slope_is_one_that_the_robot_climbs():
 
 
 @pytest.mark.parametrize(
-    ("name", "temperature", "speed", "says"),
+    ("name", "temperature", "speed", "watch"),
     [
-        ("stall", 90.0, 0.0, "current × time"),
-        ("braked motor", 90.0, 900.0, "the brake and the winding's temperature"),
-        ("lifted, 6T2A", 40.0, 1250.0, "rpm without load at 32 V, and no more than 12"),
-        ("payload 12 kg, 6T2A", 118.0, 500.0, "would reach 118 °C (125 °C is allowed); keep the runs short"),
+        ("stall", 90.0, 0.0, Heat("held", 90.0, 125.0, max(BY["stall"].voltage) / REACH.resistance)),
+        ("braked motor", 90.0, 900.0, Heat("braked", 90.0, 125.0)),
+        (
+            "lifted, 6T2A",
+            40.0,
+            1250.0,
+            Overspeed(1250.0, REACH.limit_geared, max(BY["lifted, 6T2A"].voltage)),
+        ),
+        ("payload 12 kg, 6T2A", 118.0, 500.0, Heat("run", 118.0, 125.0)),
     ],
 )
-def test_what_can_do_damage_says_what_to_watch(name, temperature, speed, says):
+def test_what_can_do_damage_is_to_be_watched(name, temperature, speed, watch):
     run = BY[name]
-    shown = menu.carried_out(run, *plain(run, temperature, speed), REACH)
-    assert ". Watch " in shown.description and says in shown.description
+    assert watch in menu.carried_out(run, *plain(run, temperature, speed), REACH).watch
 
 
 def test_harmless_run_has_nothing_to_watch():
     run = BY["crawl, 6T2A"]
-    assert menu.carried_out(run, *plain(run), REACH).watch == ""
-
-
-def test_description_follows_the_conditions():
-    run = BY["payload 12 kg, 4W2T"]
-    assert run.description == (
-        "4W2T: travel with 12 kg on the level and up 10 and 20 deg at 15 and 33 V; read total current, motor speed "
-        "and speed"
-    )
+    assert menu.carried_out(run, *plain(run), REACH).watch == ()
 
 
 def test_every_kind_is_on_the_packaged_menu_and_no_other():
@@ -479,18 +478,13 @@ def test_forbidden_and_impossible_experiments_are_not_proposed(seen):
     assert left.value.shape[1] == sum(predicted.size(e) for e in left.experiments) == len(left.sd)
     everything = dataclasses.replace(SETTINGS, forbidden=menu.KINDS)
     nothing = experiments.choose(experiments.predict(space, fitted, everything))
-    assert nothing.name == experiments.NONE and "forbidden or beyond reach" in nothing.description
+    assert nothing.name == experiments.NONE and nothing.instruction == NothingPossible()
 
 
 def test_finer_steps_are_within_the_tables_ranges(rover):
     within = reach(rover, ROVERS_TABLE, channels.USUAL)
-    said = {v: experiments._steps(v, within) for v in ("voltage", "slope", "payload", "current", "time", "humidity")}
-    assert "from 6 to 12 V in steps of 0.4 V" in said["voltage"]
-    assert "from 0 to 8 deg in steps of 0.6 deg" in said["slope"]
-    assert "from 0 to 1 kg in steps of 0.07 kg" in said["payload"]
-    assert "at 12 V with a payload up to 1 kg and a slope up to 8 deg" in said["current"]
-    assert "125 °C is allowed" in said["time"] and "humidity in even small steps" in said["humidity"]
-    assert "6, 9 and 12 V" in experiments._steady_speeds("order 2 of the driving shaft", within)
-    level = reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL)
-    assert "a brake or a drawbar pull" in experiments._steps("current", level)
-    assert "from 6 to 12 V" in experiments._steps("voltage", level)
+    series = experiments.more_runs("slip", "voltage", within)
+    assert (series.low, series.high, series.slope, series.payload) == (6.0, 12.0, 8.0, 1.0)
+    assert series.steps == (0.4, 0.6, 0.07)
+    level = experiments.more_runs("slip", "current", reach(rover, grid([12.0], [0.0], [0.0]), channels.USUAL))
+    assert (level.low, level.high, level.slope, level.payload) == (6.0, 12.0, 0.0, 0.0)

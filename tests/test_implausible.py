@@ -70,7 +70,7 @@ def test_heating_of_a_plausible_size_is_named():
 
 
 def test_heating_three_times_too_large_is_unnamed_and_said(hot):
-    assert hot.verdict == "unnamed" and hot.members == () and "winding_heating" in hot.standing.reason
+    assert hot.verdict == "unnamed" and hot.members == () and "winding_heating" in hot.standing.effects
     least = min(c.cost for c in hot.searched.ladder)
     plausible, ruled_out = listed(hot, least)
     assert plausible == ()
@@ -91,7 +91,7 @@ def test_companions_that_explain_nothing_are_not_listed(hot):
     assert len(pairs) > 3  # there were some
     space = hot.screened.base.space
     for c in pairs:
-        why = findings._alternative(space, c, 0.0, SETTLED.settings).why
+        why = {r.name for r in findings._alternative(space, c, 0.0, SETTLED.settings).reasons}
         for name, size in zip(c.effects, c.size, strict=False):
             if 0 < size < 0.3 and not (space.library[name].dissipative and c.amplitude[c.active.index(name)] <= 0):
                 assert name not in why
@@ -118,7 +118,8 @@ def test_a_pair_is_listed_where_it_explains_more_than_noise(hot):
         (("supply_sag",), 2.0),
     ]
     assert [(tuple(a.effects), a.rise_chi2) for a in ruled_out] == [(("series_resistance",), -4.0)]
-    assert "2 times its largest plausible size" in ruled_out[0].why
+    (reason,) = ruled_out[0].reasons
+    assert (reason.name, reason.why, reason.size) == ("series_resistance", "size", 2.0)
 
 
 # --- weak companions ------------------------------------------------------------------------------------

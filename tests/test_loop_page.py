@@ -16,10 +16,11 @@ from test_loop_command import commanded
 from test_stated_values import made as leads
 
 from calibration.data.writing import finite
-from calibration.discovery import findings
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.notes import Asked, CurveOver, NameSupport, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.inference.identifiability import HELD
+from calibration.words import loop as words
 from sweeps import loop as room
 from sweeps import report_loop
 
@@ -90,15 +91,15 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
     best = min((a["rise_chi2"] for a in d["implausible"]), default=0.0)
     assert best > -d["settings"]["same"] or "ruled out by size or sign alone" in got.page.text
     # one family-wise p on all of the page, each effect with a p of its own that is no larger than is allowed
-    p = findings.describe_p_value(got.found.before.p_value)
+    p = words.p_value(got.found.before.p_value)
     assert f"family-wise p {p}" in got.page.text and f"(family-wise p {p})" in d["statement"]
     for e in got.found.effects:
         assert e.p_value <= d["bootstrap"]["family_wise_error"]
         fall = got.found.chi2[0] - got.found.chi2[1]
         assert e.score == pytest.approx(fall, abs=0.1) or len(got.found.effects) > 1
     assert got.text.count('id="definitions"') == 1
-    for words in ("Explains:", "Family-wise p:", "Rise of χ²:", "Score:"):
-        assert got.page.text.count(words) == 1
+    for heading in ("Explains:", "Family-wise p:", "Rise of χ²:", "Score:"):
+        assert got.page.text.count(heading) == 1
 
 
 @pytest.mark.slow
@@ -134,10 +135,13 @@ def test_class_with_a_stated_value_is_listed_and_said(shown, capsys, tmp_path):
 
 
 def test_what_is_ruled_out_by_its_size_is_on_the_page(shown, capsys, tmp_path):
-    why = "winding_heating at 2.9 times its largest plausible size; check motor.resistance_thermal_housing"
+    reasons = (RuledOut("winding_heating", "size", 2.9, ("motor.resistance_thermal_housing",)),)
+    why = words.why_ruled_out(reasons)
     alone = {"winding_heating": 0.9}
     found = shown("hot", capsys).found
-    found = dataclasses.replace(found, implausible=(Alternative(alone, alone, {"winding_heating": 2.9}, 1.0, why),))
+    found = dataclasses.replace(
+        found, implausible=(Alternative(alone, alone, {"winding_heating": 2.9}, 1.0, reasons),)
+    )
     jsonschema.validate(finite(found.to_json()), SCHEMA)
     said = f"winding_heating would explain as much as the curve, but is ruled out by size or sign alone: {why}."
     text = report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
@@ -185,15 +189,17 @@ def test_what_happens_for_a_while_has_a_window(shown, capsys):
 def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_path):
     found = shown("churning", capsys).found
     cluster = Cluster("time", 0.6, 0.7, "", 12, 13, 1e-5)
-    found = dataclasses.replace(found, cluster=cluster, standing="beside smooth curves (slip over slope)")
+    found = dataclasses.replace(
+        found, cluster=cluster, support=NameSupport(True, "beside", curves=(CurveOver("slip", ("slope",)),))
+    )
     document = finite(found.to_json())
     jsonschema.validate(document, SCHEMA)
     assert document["cluster"] == {
         "axis": "time", "low": 0.6, "high": 0.7, "level": "", "inside": 12, "of": 13, "p": 1e-5
     }  # fmt: skip
     page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
-    assert str(cluster) in page.text
-    assert "The names keep their significance beside smooth curves (slip over slope)." in page.text
+    assert words.cluster(cluster) in page.text
+    assert "The names keep their significance beside smooth curves (balance slip over slope)." in page.text
 
 
 def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
@@ -216,23 +222,6 @@ def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
     )
     found = dataclasses.replace(found, hidden=())
     assert 'id="hidden"' not in report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
-
-
-def test_names_say_what_would_explain_more_than_they():
-    def of(verdict, *ruled_out):
-        return SimpleNamespace(verdict=verdict, implausible=ruled_out, settings=SETTLED.settings)
-
-    def candidate(rise, *names):
-        return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
-
-    near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
-    assert findings.describe_ruled_out(of("named", near)) == "" == findings.describe_ruled_out(of("unnamed"))
-    assert findings.describe_ruled_out(of("class", near, better)) == (
-        "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
-    )
-    assert findings.describe_ruled_out(of("unnamed", better, near)).startswith(
-        "a would explain as much as the curve, but is"
-    )
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -265,13 +254,13 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
 def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside, settled, says):
     found = shown("churning", capsys).found
     resolved = Resolved(
-        asked="what is missing in the balance slip over slope", rows=10, robot=found.robot,
+        asked=Asked("missing", "slip", "slope"), rows=10, robot=found.robot,
         constants={
             "running_gear.guide_recess": Estimate(3.1e-4, 4e-5, "m", False), "x.static": Estimate(0.58, 0.02, "-", True)
         },
         alike=(("a", "b", -0.95),),
         outside=outside, settled=settled, fall=61.0, p=p,
-        chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)}, slip_rms=(3.3, 0.6), notes=("said too",),
+        chi2=(90.0, 29.0), readings=30, rms_percent={"speed": (4.0, 1.2)}, slip_rms=(3.3, 0.6), remarks=("said too",),
     )  # fmt: skip
     found = dataclasses.replace(found, resolved=resolved)
     document = finite(found.to_json())

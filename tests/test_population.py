@@ -13,6 +13,15 @@ from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.inference import identifiability, noise, observers, population, priors
 from calibration.inference.calibrate import calibrate
+from calibration.inference.notes import (
+    Edge,
+    EndedAtEdge,
+    FarFromPrior,
+    Generations,
+    LostRows,
+    MembersJump,
+    ReadFromMembers,
+)
 from calibration.inference.observers.settled import SettledRuns
 from calibration.inference.population import Members, Rows
 from calibration.inference.problem import Observation
@@ -212,9 +221,9 @@ def test_parameter_across_whose_threshold_differences_lead_is_named(posed, found
 def test_statements_say_whether_it_settled_and_what_derivatives_are_worth(found):
     at = int(found.order[0])
     calm = population.Searched(found, at, (), None, np.nan)
-    assert "the last gained nothing that counts" in calm.statements()[0] or not found.settled
+    assert calm.remarks()[0] == Generations(len(found.z), len(found.generations), found.settled)
     torn = population.Searched(dataclasses.replace(found, generations=found.generations[:2]), at, ("a",), None, 0.4)
-    assert "still gained" in torn.statements()[0] and "by a are not those of its differences" in torn.statements()[-1]
+    assert not torn.remarks()[0].settled and torn.remarks()[-1] == ReadFromMembers(("a",), 0.4)
     assert calm.to_json()["regression_rms_sd"] is None and torn.to_json()["derivatives_apart"] == ["a"]
 
 
@@ -225,9 +234,7 @@ def test_parameter_at_the_edge_of_its_prior_or_at_a_bound_is_named(posed):
     assert population.edges(coordinates, np.array([2.4, -2.4, 0.0, 0.0])) == {}
     said = population.edges(coordinates, np.array([2.6, -3.0, 0.0, 9.0]))
     assert list(said) == [NAMES[0], NAMES[1], NAMES[3]]
-    assert said[NAMES[0]] == "2.6 prior sd above the middle of its prior"
-    assert said[NAMES[1]] == "3.0 prior sd below the middle of its prior"
-    assert said[NAMES[3]] == "at its upper bound"
+    assert [*said.values()] == [Edge("", 2.6), Edge("", -3.0), Edge("upper", 9.0)]
 
 
 def test_what_members_did_is_counted_and_said(found):
@@ -236,14 +243,13 @@ def test_what_members_did_is_counted_and_said(found):
     status[:3, 0], status[3, 1], status[4:6, 0] = TIPS, FAILED, SLIDES
     flags[[at, 7], 1] = 1 << FLAGS.index("jumps")
     told = population.Searched(
-        dataclasses.replace(found, status=status, flags=flags), at, (), None, np.nan, {"a": "at its upper bound"}
+        dataclasses.replace(found, status=status, flags=flags), at, (), None, np.nan, {"a": Edge("upper", 9.0)}
     )
     assert told.to_json()["outcomes"] == {"tips": 3, "failed": 1, "slides": 2, "jumps": 2}
     assert told.to_json()["at_edge"] == {"a": "at its upper bound"}
-    said = " ".join(told.statements())
-    assert "2 slide, 3 turn over, 1 leave the ground for good or cannot be computed" in said
-    assert "2 of the members jump in some row" in said and "the best in rows 2" in said
-    assert "the search ended at the edge of what was allowed: its best member has a at its upper bound" in said
+    assert told.remarks()[1:] == [
+        LostRows({"slides": 2, "tips": 3, "failed": 1}), MembersJump(2, (2,)), EndedAtEdge({"a": Edge("upper", 9.0)})
+    ]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -257,10 +263,10 @@ def test_search_that_ends_at_the_edge_of_a_prior_says_so_in_the_result(runs):
     best = found.searched.found.z[found.searched.at]
     assert abs(best[0]) > population.EDGE and abs(found.parameters[name].shift) > population.EDGE
     assert list(found.searched.edge) == [name]
-    assert found.to_json()["optimizer"]["population"]["at_edge"] == found.searched.edge
-    said = [n for n in found.notes if name in n]
-    assert any("its best member has" in n and "prior sd above" in n for n in said)
-    assert any("its prior" in n and "prior sds from" in n for n in said)
+    assert list(found.to_json()["optimizer"]["population"]["at_edge"]) == [name]
+    (ended,) = [n for n in found.remarks if isinstance(n, EndedAtEdge)]
+    assert list(ended.edge) == [name] and ended.edge[name].sds > 0
+    assert any(isinstance(n, FarFromPrior) and n.name == name for n in found.remarks)
     assert np.isfinite(found.posterior.covariance).all()
 
 

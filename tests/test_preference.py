@@ -14,6 +14,7 @@ from synthetic import SETTLED, known, table
 from calibration.data.errors import BadConfiguration
 from calibration.data.writing import finite
 from calibration.discovery import discover, preference
+from calibration.discovery.notes import DRAW, Led
 from calibration.discovery.result import HeldOutAlternative, Worse
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.observers import SettledRuns
@@ -34,49 +35,31 @@ def errors(sigma):
 
 
 def held_out(before, after, kind="voltage"):
-    """Ten rows with these errors in every channel, and their errors by kind of block."""
-    readings = {kind: tuple(np.full((10, len(NAMES)), x) for x in (before, after))}
-    return readings, {k: tuple(map(errors, v)) for k, v in readings.items()}
+    """Ten rows with these errors in every channel, by kind of block."""
+    return {kind: tuple(np.full((10, len(NAMES)), x) for x in (before, after))}
 
 
 def test_an_error_that_rises_is_listed_and_said():
-    readings, by = held_out(4.3, 4.3)
+    readings = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1] = 4.72
     found = preference.worse(readings, errors)
     assert found == (Worse("voltage", "motor_speed", 10, pytest.approx(4.3), pytest.approx(4.72)),)
-    assert preference.describe_worse(found, by) == (
-        "Held out, what was found predicts worse: by voltage motor speed 4.3 → 4.7 %."
-    )
 
 
 def test_an_error_that_falls_or_stays_is_not_said():
-    readings, by = held_out(4.3, 4.3)
+    readings = held_out(4.3, 4.3)
     readings["voltage"][1][:, 1], readings["voltage"][1][:, 2] = 4.0, 4.3 * 1.005
-    assert preference.worse(readings, errors) == () and preference.describe_worse((), by) == ""
+    assert preference.worse(readings, errors) == ()
 
 
 def test_errors_are_of_the_rows_that_both_predict():
     """A fit that predicts two hard rows more is not worse for them; one that predicts fewer is said to."""
-    readings, _ = held_out(4.0, 4.0)
+    readings = held_out(4.0, 4.0)
     before, after = readings["voltage"]
     before[:2], after[:2] = np.nan, 40.0
     assert preference.worse(readings, errors) == ()
     after[2:, 0] = 5.0
-    by = {"voltage": (errors(before), errors(after))}
-    found = preference.worse(readings, errors)
-    assert [(w.rows, w.before, w.after) for w in found] == [(8, 4.0, 5.0)]
-    assert preference.describe_worse(found, by).endswith(
-        "by voltage total current 4.0 → 5.0 % (of the 8 rows that both predict)."
-    )
-    swapped = {"slope": (by["voltage"][1], by["voltage"][0])}
-    assert preference.describe_worse((), swapped) == (
-        "Held out, what was found predicts worse: by slope 2 rows fewer predicted."
-    )
-
-
-def test_numbers_that_differ_are_shown_to_differ():
-    readings, by = held_out(0.141, 0.149)
-    assert "0.14 → 0.15 %" in preference.describe_worse(preference.worse(readings, errors), by)
+    assert [(w.rows, w.before, w.after) for w in preference.worse(readings, errors)] == [(8, 4.0, 5.0)]
 
 
 # --- among alternatives ---------------------------------------------------------------------------------
@@ -98,23 +81,16 @@ def test_order_of_alternatives(rms, lost, first):
 
 def test_it_is_said_by_what_the_leader_was_chosen():
     best, other = alternative("series_resistance", 3.0, leads=True), alternative("supply_sag", 2.0, rise=1.4)
-    (said,) = preference.remarks((best, other), "fit")
-    assert said == (
-        "series_resistance comes first in its class by the fit to all rows; errors held out: series_resistance 3.00 σ, "
-        "supply_sag 2.00 σ; supply_sag would come first by --prefer held-out, where adequate"
-    )
+    names = ("series_resistance", "supply_sag")
+    (note,) = preference.remarks((best, other), "fit")
+    assert note == Led(names, (3.0, 2.0), 0, 0, 1, "fit", "fit", preference.TOLD, 0.0)
     led = (dataclasses.replace(best, leads=False), dataclasses.replace(other, leads=True))
-    (said,) = preference.remarks(led, HELD_OUT)
-    assert said == (
-        "supply_sag comes first in its class by errors held out; errors held out: series_resistance 3.00 σ, "
-        "supply_sag 2.00 σ; by the fit to all rows series_resistance would, by Δχ² 1.4"
-    )
-    (said,) = preference.remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
-    assert said.startswith(
-        "series_resistance comes first in its class by the fit to all rows, as errors held out are"
-    )
-    (said,) = preference.remarks((best, other), HELD_OUT)
-    assert said.endswith("supply_sag 2.00 σ; supply_sag is not as adequate")
+    (note,) = preference.remarks(led, HELD_OUT)
+    assert note == Led(names, (3.0, 2.0), 1, 0, 1, HELD_OUT, HELD_OUT, preference.TOLD, 1.4)
+    (note,) = preference.remarks((best, dataclasses.replace(other, rms_sigma=2.99)), HELD_OUT)
+    assert (note.leader, note.best, note.by) == (0, 0, DRAW)
+    (note,) = preference.remarks((best, other), HELD_OUT)
+    assert (note.leader, note.best, note.by) == (0, 1, HELD_OUT)
     assert preference.remarks((), "fit") == []
 
 

@@ -11,6 +11,7 @@ from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.inference import priors
 from calibration.inference.foreign import inherited_priors
+from calibration.inference.notes import InheritedPriors
 from mmrjax import params, robots
 from mmrjax.effects import ALL
 
@@ -175,13 +176,11 @@ def read(tmp_path, text):
 def test_friction_left_in_from_another_robot_is_said(tmp_path):
     text = 'configurations = ["rover"]\n[rover]\nlike = "4W2T"\nmass = 3.0\n[motor]\ntorque_constant = 0.012\n'
     motor, rover = inherited_priors(read(tmp_path, text))
-    assert motor == (
-        "motor is not the nominal robot's (torque_constant 0.012 for 0.0259), but its motor.friction_coulomb, "
-        "motor.friction_viscous still are: those priors come from another robot; state yours in the robot's file or "
-        "with --prior"
+    assert motor == InheritedPriors(
+        "motor", (("torque_constant", 0.012, 0.0259),), ("motor.friction_coulomb", "motor.friction_viscous")
     )
-    assert rover.startswith("rover is not the nominal robot's (mass 3 for 11.5), but its rover.track.loss_coulomb")
-    assert "guide" not in rover
+    assert (rover.part, rover.changed) == ("rover", (("mass", 3.0, 11.5),))
+    assert rover.kept[0] == "rover.track.loss_coulomb" and not any("guide" in name for name in rover.kept)
 
 
 def test_friction_that_the_file_or_a_prior_states_is_not_another_robots(tmp_path):
@@ -189,7 +188,7 @@ def test_friction_that_the_file_or_a_prior_states_is_not_another_robots(tmp_path
     assert inherited_priors(read(tmp_path, stated)) == []
     half = "[motor]\nresistance = 1.2\nfriction_coulomb = 1e-3\n"
     (said,) = inherited_priors(read(tmp_path, half))
-    assert "its motor.friction_viscous still is: that prior comes from another robot" in said
+    assert said.kept == ("motor.friction_viscous",)
     assert inherited_priors(read(tmp_path, half), ["motor.friction_viscous"]) == []
 
 
@@ -200,4 +199,4 @@ def test_robots_of_the_paper_and_small_changes_are_their_own(tmp_path):
 
 def test_heavier_robot_on_tracks_is_compared_with_the_tracks_it_is_like(tmp_path):
     (said,) = inherited_priors(read(tmp_path, "[6T2A]\nmass = 30.0\n"))
-    assert said.startswith("6T2A is not the nominal robot's (mass 30 for 13.1)") and "6T2A.track.guide_share" in said
+    assert (said.part, said.changed) == ("6T2A", (("mass", 30.0, 13.1),)) and "6T2A.track.guide_share" in said.kept

@@ -23,6 +23,7 @@ from calibration.sensitivity.analyse import analyse
 from calibration.sensitivity.local import inert, local
 from calibration.sensitivity.methods import correlated, shapley_effects
 from calibration.sensitivity.model import chosen_outputs
+from calibration.sensitivity.notes import Inert
 from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
 from mmrjax import params
@@ -152,7 +153,7 @@ def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlatio
         assert np.all(np.abs(at.value[k] - truth) <= 1.5 * half + 0.01) and half.max() < 0.1
     assert at.value[0, 1] > 0.05 and at.value[0, 2] > 0.01
     assert found.inputs["motor.inductance"].inert and "motor.inductance" not in found.negligible
-    assert [n for n in found.notes if "correlated with: motor.inductance" in n]
+    assert Inert(("motor.inductance",), correlated=True) in found.remarks
     assert correlated(inputs, [3]) == (3,) and correlated(inputs, [2, 3]) == (0, 1, 2, 3)
 
 

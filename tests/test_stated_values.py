@@ -8,7 +8,9 @@ import pytest
 from synthetic import FEW, SETTLED, small, table
 
 from calibration.discovery import discover, findings
+from calibration.discovery.notes import FreedValue
 from calibration.discovery.stated_values import scores, shifts
+from calibration.words import loop as words
 
 NOMINAL = g.CLIMBING["motor.resistance"]
 #: χ² that a shift has to explain to be tried.
@@ -91,7 +93,8 @@ def test_resistance_freed_of_its_prior_is_the_right_one(wrong, truth, looks):
     assert said.rise_chi2 < -NEEDED
     readings = 3 * len(runs)
     assert 2 * shift.fit.cost < readings + 4 * np.sqrt(2 * readings)
-    assert findings.stated_in_words(fitted.space, [shift]) == [f"motor.resistance is {said.value:.3g} ohm"]
+    freed = FreedValue("motor.resistance", said.value, said.unit)
+    assert words.freed_value(freed) == f"motor.resistance is {said.value:.3g} ohm"
 
 
 def test_nothing_is_shifted_where_the_sheet_is_right(looks):
@@ -107,4 +110,6 @@ def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
     assert found.verdict == "class"
     (members,), (stated,) = found.alike.members, found.alike.stated
     assert "series_resistance" in members and [s.name for s in stated] == ["motor.resistance"]
-    assert "or motor.resistance is 1.4" in discover._statement(found)
+    (missing,) = discover.summary(found).missing
+    (value,) = missing.values
+    assert missing.names == members and value.name == "motor.resistance" and f"{value.value:.1f}" == "1.4"

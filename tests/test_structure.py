@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -360,6 +361,48 @@ def _rebound(function: Function) -> set[str]:
     return {name for n in ast.walk(function) if isinstance(n, ast.Global) for name in n.names}
 
 
+#: Rooms that compute, and most words of a string of theirs; what is said in more is said in `calibration/words`.
+COMPUTING = tuple(f"calibration/{room}/" for room in ("inference", "discovery", "sensitivity", "sizing"))
+MOST_WORDS = 5
+
+
+def computing_rooms_say_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
+    """No sentence where things are computed, but docstrings and what an error of input says."""
+    if not path.as_posix().startswith(COMPUTING):
+        return
+    aside = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)} | of_errors(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            aside |= {id(part) for part in node.values}
+            parts = [part.value for part in node.values if isinstance(part, ast.Constant)]
+        else:
+            parts = [node.value] if isinstance(node, ast.Constant) and isinstance(node.value, str) else []
+        if id(node) not in aside and len(re.findall(r"[^\W\d_][^\s]*", " _ ".join(parts))) > MOST_WORDS:
+            yield node.lineno, "says a sentence where things are computed"
+
+
+def of_errors(tree: ast.Module) -> set[int]:
+    """Ids of all that errors are made of: in `raise` and calls of `Bad...`, under names that these take in the same
+    function, and in functions of the module that they call."""
+    found, called = set[int](), set[str]()
+    functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
+    for function in functions:
+        inside = list(ast.walk(function))
+        made = [
+            n
+            for n in inside
+            if isinstance(n, ast.Raise) or (isinstance(n, ast.Call) and ast.unparse(n.func).startswith("Bad"))
+        ]
+        taken = [n for error in made for n in ast.walk(error)]
+        names = {n.id for n in taken if isinstance(n, ast.Name)}
+        for n in inside:
+            if isinstance(n, ast.Assign) and {t.id for t in n.targets if isinstance(t, ast.Name)} & names:
+                taken += ast.walk(n.value)
+        found |= {id(n) for n in taken}
+        called |= {ast.unparse(n.func) for n in taken if isinstance(n, ast.Call)}
+    return found | {id(n) for function in functions if function.name in called for n in ast.walk(function)}
+
+
 RULES: tuple[Rule, ...] = (
     rooms_have_names_of_their_own,
     layers_import_those_before_them,
@@ -372,6 +415,7 @@ RULES: tuple[Rule, ...] = (
     discovery_keeps_its_stages,
     front_door_fits_nothing,
     modules_keep_no_state,
+    computing_rooms_say_nothing,
 )
 
 
@@ -469,6 +513,16 @@ BAD = {
         "mmrjax/bad.py",
         "import contextvars\nCHANNELS = contextvars.ContextVar('channels')",
     ),
+    "says a sentence": ("calibration/inference/bad.py", "def f():\n    return 'one two three four five six'"),
+    "says a sentence 2": ("calibration/sizing/bad.py", "f = lambda x: f'one two {x} three four five six'"),
+    "says a sentence 3": (
+        "calibration/discovery/bad.py",
+        "def f(x):\n    said = 'one two three four five six'\n    if x:\n        raise BadData(x)\n    return said",
+    ),
+    "says a sentence 4": (
+        "calibration/sensitivity/bad.py",
+        "def f(x):\n    return g('one two three four five six')\ndef h(x):\n    raise BadData('no')",
+    ),
     "keeps state in threading.local": ("calibration/bad.py", "import threading\nX = threading.local()"),
 }
 #: What no rule may mind.
@@ -478,6 +532,10 @@ GOOD = {
     "calibration/__init__.py": "",
     "calibration/data/table.py": "'''On 6T2A and 4W2T.'''\ndef f(t):\n    return {'time_s': t['time_s'], 'row': 1}\n",
     "calibration/data/robot_file.py": "from tables import TRACKED\nOLD_NAMES = {'tracked': TRACKED}\n",
+    "calibration/sizing/said.py": "def why(x):\n    return f'{x} is one two three four five six'\ndef f(x, y):\n"
+    "    '''One two three four five six.'''\n    cure = 'one two three four five six' if y else 'seven'\n"
+    "    if x:\n        raise BadData(why(x))\n    return BadConfiguration(f'one two three {x} four five six {cure}')\n",
+    "calibration/words/loop.py": "X = 'one two three four five six seven'\n",
     "calibration/discovery/menu.py": "TURNING, STANDING = ('total_current', 'motor_speed'), ('total_current',)\n",
     "calibration/discovery/search.py": "def f(space: CandidateSpace) -> int: ...\n",
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",

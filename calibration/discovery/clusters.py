@@ -39,10 +39,6 @@ class Cluster:
     of: int
     p: float
 
-    def __str__(self) -> str:
-        where = f"at {self.axis} {self.level}" if self.level else f"at {self.axis} {self.low:.3g} to {self.high:.3g}"
-        return f"{self.inside} of {self.of} rows that lie off stand together {where} (p = {self.p:.1g})"
-
 
 def cluster(
     outliers: np.ndarray,

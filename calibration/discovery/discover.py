@@ -26,6 +26,19 @@ from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import Location, diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.hidden import hidden
+from calibration.discovery.notes import (
+    AssumedNoise,
+    Copies,
+    FreedValue,
+    KeptOut,
+    LostReplicates,
+    Missing,
+    NameSupport,
+    PhasesDiffer,
+    StillLacks,
+    Summary,
+    TooFewReplicates,
+)
 from calibration.discovery.outliers import Screening, ahead, screen, screen_beside
 from calibration.discovery.posterior import of_curve, of_fit
 from calibration.discovery.result import (
@@ -38,17 +51,18 @@ from calibration.discovery.result import (
 from calibration.discovery.score_tests import bootstrap
 from calibration.discovery.search import Search, fewest, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
-from calibration.discovery.standing import NameSupport, standing
+from calibration.discovery.standing import standing
 from calibration.inference import bases as bases_room
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors
-from calibration.inference.bases import Bases, in_words
-from calibration.inference.identifiability import describe_held
+from calibration.inference.bases import Bases
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import common_factors, noise_remarks
+from calibration.inference.notes import FarFromPrior, HeldByPrior, NoiseOff, Note, Notes, Step
 from calibration.inference.residual_clusters import residual_clusters
+from calibration.words.notes import in_words
 from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
@@ -61,6 +75,8 @@ SCREENINGS = 4
 EITHER_WAY = 0.05
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
+#: Is told what the loop does next.
+Tell = Callable[[Note | str], None]
 
 
 def discover(
@@ -98,26 +114,25 @@ def discover(
         forbidden=forbidden,
     )  # fmt: skip
     distinct, known = ready.runs, ready.noise
-    for sentence in ready.foreign:
-        progress(sentence)
+    tell = in_words(progress)
+    for note in ready.foreign:
+        tell(note)
     space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
     with ahead(space, functools.partial(bases_at, distinct), ready.settings):
-        traced, notes = ready.trace(progress=progress), ready.notes
+        traced, notes = ready.trace(progress=tell), ready.notes
     silent = [c.name for c, source in zip(known.channels, known.source, strict=True) if source == "assumed"]
     sizes = observers.kind(distinct).sizes(distinct)
     sds = {f: noise_room.assumed(distinct, sizes, noise, f) for f in FACTORS if silent}
     # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
     with concurrent.futures.ThreadPoolExecutor(len(FACTORS)) as others:
         if silent:
-            progress(f"the verdict with {' and '.join(f'{f:g}' for f in FACTORS)} times the assumed noise, beside:")
+            tell(Step("factors", (tuple(f"{f:g}" for f in FACTORS),)))
         verdicts = {f: others.submit(ready.trace, sd) for f, sd in sds.items()}
-        found = assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, progress)
+        found = assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell)
         sensitivity = [in_short(f, verdict.result()) for f, verdict in verdicts.items()]
     if silent:
-        usual = noise_room.default(known.channels)
-        said = f"no sd is stated for {', '.join(silent)}: {usual} is assumed; state yours with --noise"
-        notes = (*notes, said)
-    return dataclasses.replace(found, notes=(*notes, *found.notes), sensitivity=tuple(sensitivity))
+        notes = (*notes, AssumedNoise(tuple(silent), noise_room.default(known.channels)))
+    return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,10 +153,10 @@ class LoopInput:
     stated: dict[str, tuple[float, float]]
     settings: Settings
     library: Library
-    notes: tuple[str, ...]
-    foreign: tuple[str, ...]
+    notes: Notes
+    foreign: Notes
 
-    def trace(self, noise: Noise | None = None, progress: Callable[[str], None] = lambda text: None) -> LoopStages:
+    def trace(self, noise: Noise | None = None, progress: Tell = lambda note: None) -> LoopStages:
         """The stages up to a verdict, with this noise or another."""
         sds = self.noise if noise is None else noise
         return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress)
@@ -173,7 +188,7 @@ def prepared(
             "needed"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
-    said = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
+    said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
     library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
     return LoopInput(
@@ -189,12 +204,13 @@ def discover_at(
     stated: Mapping[str, tuple[float, float]] | None = None,
     library: Library = effects.BY_NAME,
     numbers: np.ndarray | None = None,
-    progress: Callable[[str], None] = lambda text: None,
+    progress: Tell = lambda note: None,
 ) -> DiscoveryResult:
     """One pass of the loop over a table whose noise is known; the arguments as of `discover`.
 
     Args:
         numbers: of the rows, as messages call them; None counts from 1.
+        progress: is given notes, not sentences.
     """
     traced = trace(runs, robot, noise, settings, stated, library, progress)
     return assemble_result(traced, runs, numbers, settings, library, progress)
@@ -211,7 +227,7 @@ class Sds:
 
     noise: Noise
     factors: dict[str, float] = dataclasses.field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[NoiseOff, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,7 +312,7 @@ def trace(
     settings: Settings,
     stated: Mapping[str, tuple[float, float]] | None = None,
     library: Library = effects.BY_NAME,
-    progress: Callable[[str], None] = lambda text: None,
+    progress: Tell = lambda note: None,
 ) -> LoopStages:
     """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`.
 
@@ -306,7 +322,7 @@ def trace(
 
     def look(noise: Noise) -> Screening:
         space = pose(runs, robot, noise.sd, settings, stated, library)
-        progress("fitting the base model")
+        progress(Step("base"))
         at = functools.partial(bases_at, runs)
         return screen(fit_base(space, settings, runs.source), at, runs, settings)
 
@@ -315,17 +331,17 @@ def trace(
     factors = {} if screened.cluster is not None else common_factors(residuals)
     sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
     if factors:
-        progress("the sds are not as stated: the same with those that the residuals show")
+        progress(Step("sds"))
         sds = dataclasses.replace(sds, noise=noise.scaled(factors))
         screened = look(sds.noise)
 
     for _ in range(SCREENINGS):
         base, space, bases = screened.base.candidate, screened.base.space, screened.bases
-        progress(f"bootstrap of {settings.replicates} tables: what would a complete model leave?")
+        progress(Step("bootstrap", (settings.replicates,)))
         left = diagnosis_of_base(screened, settings)
         if not left.test.rejected and screened.cluster is None:
             return LoopStages("none", screened, left, sds)
-        progress("something is missing: fitting every effect that could explain it")
+        progress(Step("effects"))
         searched = search(space, base, left, bases, settings, progress)
         best, after = searched.best, searched.diagnosis
         if after is None or not after.test.rejected_with_margin:
@@ -333,7 +349,7 @@ def trace(
         more = screen_beside(screened, after.scores, lambda base: bases_at(runs, base), runs, settings)
         if more is None:
             break
-        progress("rows stand alone beside what was found: the same without them")
+        progress(Step("alone"))
         screened = more
 
     stood = standing(space, base, searched, left, bases, settings)
@@ -348,11 +364,11 @@ def trace(
         where = locate(left, bases, space.included)
         return LoopStages("unnamed", screened, left, sds, searched, where=where, standing=stood)
 
-    progress(f"what else explains as much as {' and '.join(best.effects)}?")
+    progress(Step("alike", (best.effects,)))
     alike = classes(space, base, best, searched.ladder, left, settings)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
-        progress("which of those predicts best what a fit has not seen?")
+        progress(Step("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
     verdict = "named" if alike.single else "class"
@@ -445,7 +461,7 @@ def diagnosis_of_base(screened: Screening, settings: Settings) -> Diagnosis:
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
-def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
+def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
     """The runs without exact copies of one another, their row numbers, and what to say of that."""
     columns = [runs[c] for c in observers.kind(runs).identity(runs)]
     seen: set[tuple[str, ...]] = set()
@@ -457,39 +473,49 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[str]]:
         seen.add(row)
     if not copies:
         return runs, np.arange(1, len(runs) + 1), []
-    rows = ", ".join(str(k + 1) for k in copies)
-    said = f"rows {rows} are exact copies of earlier ones and count once"
-    if len(copies) == 1:
-        said = f"row {rows} is an exact copy of an earlier one and counts once"
-    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [said]
+    return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Copies(tuple(k + 1 for k in copies))]
 
 
 def in_short(factor: float, traced: LoopStages) -> Sensitivity:
     """What the loop says with another noise."""
-    said = _statement(traced)
     adequate = not traced.ends.test.rejected_with_margin
-    return Sensitivity(factor, traced.verdict, said, traced.members, adequate)
+    return Sensitivity(factor, traced.verdict, summary(traced), traced.members, adequate)
 
 
-def _statement(traced: LoopStages) -> str:
-    space, alike, p = traced.screened.base.space, traced.alike, traced.left.test.p_value
-    if alike is None:
-        said = findings.statement(traced.verdict, p, traced.where)
-        if traced.verdict == "unnamed" and traced.searched is not None and traced.searched.best is not None:
-            nearest = " and ".join(traced.searched.best.effects)
-            said = f"{said} Nearest comes {nearest}: {traced.standing.reason if traced.standing else ''}."
-    else:
-        stated = [findings.stated_in_words(space, shifts) for shifts in alike.stated]
-        said = findings.statement(traced.verdict, p, traced.where, alike.members, stated, alike.families)
+def summary(traced: LoopStages) -> Summary:
+    """The verdict of these stages, with what else its statement says."""
+    space, alike = traced.screened.base.space, traced.alike
+    best = None if traced.searched is None else traced.searched.best
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
-    if aside > MANY * (aside + counting):
-        share = 100 * aside / (aside + counting)
-        said = f"{aside} of {aside + counting} rows ({share:.0f} %) lie off alone and are set aside. {said}"
-    if traced.sds.factors and traced.verdict == "none":
-        said = f"{said} But {'; '.join(traced.sds.remarks)}"
-    if traced.screened.cluster is not None:
-        said = f"{said} {str(traced.screened.cluster).capitalize()}: that is a finding, and none is set aside."
-    return said
+    many = aside > MANY * (aside + counting)
+    return Summary(
+        traced.verdict,
+        traced.left.test.p_value,
+        traced.where,
+        missing=() if alike is None else missing(space, alike),
+        nearest=best.effects if traced.verdict == "unnamed" and best is not None else (),
+        support=traced.standing,
+        aside=aside if many else 0,
+        of=aside + counting,
+        noise=traced.sds.remarks if traced.sds.factors and traced.verdict == "none" else (),
+        cluster=traced.screened.cluster,
+    )
+
+
+def missing(space: CandidateSpace, alike: Classes) -> tuple[Missing, ...]:
+    """Each effect found, with what it cannot be told from."""
+    c, p = space.coordinates.base, space.free
+    return tuple(
+        Missing(
+            names,
+            tuple(
+                FreedValue(s.name, float(c.value(jnp.asarray(s.fit.z[:p]))[s.index]), c.units[s.index])
+                for s in shifts
+            ),
+            families,
+        )
+        for names, shifts, families in zip(alike.members, alike.stated, alike.families, strict=True)
+    )
 
 
 # --- the result -----------------------------------------------------------------------------------------
@@ -501,14 +527,14 @@ def assemble_result(
     numbers: np.ndarray | None,
     settings: Settings,
     library: Library,
-    progress: Callable[[str], None],
+    progress: Tell,
 ) -> DiscoveryResult:
     """The result of a verdict, with what only now is worth its time: errors held out, and the next experiment."""
     screened, left, where, noise = traced.screened, traced.left, traced.where, traced.sds.noise
     space, base, best, ends = screened.base.space, screened.base.candidate, traced.best, traced.ends
     curve = None
     if traced.verdict == "unnamed" and where is not None:
-        progress("the shape of what is missing")
+        progress(Step("shape"))
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
@@ -526,13 +552,13 @@ def assemble_result(
     elif best is not base:
         after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
 
-    progress("errors on data held out")
+    progress(Step("errors"))
     seen = findings.readings(runs, noise.sd, before, after)
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     compared = traced.held_out
     if traced.alike is not None and not compared and not observe.long:
         compared = preference.compared(space, runs, best, traced.alike)
-    progress("the next experiment")
+    progress(Step("next"))
     ladder = traced.searched.ladder if traced.searched is not None else ()
     near, too_large = findings.alternatives(
         space, best, cost, traced.alike.ladder if traced.alike is not None else ladder, settings
@@ -554,7 +580,7 @@ def assemble_result(
     unnamed = None if curve is None or where is None else findings.unnamed(curve, where, p, rows)
     result = DiscoveryResult(
         verdict=traced.verdict,
-        statement=_statement(traced),
+        summary=summary(traced),
         robot=robot,
         converged=converged,
         posterior=posterior,
@@ -573,7 +599,7 @@ def assemble_result(
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
-        standing="" if traced.standing is None else traced.standing.reason,
+        support=traced.standing,
         cluster=screened.cluster,
         residual_clusters=residual_clusters(_residuals(space, runs, ends.linear, seen.after, z), settings.seed),
         before=findings.evidence(left.test, adequate=not left.test.rejected),
@@ -597,7 +623,7 @@ def assemble_result(
     )
     # What happens for a while is not everywhere alike.
     of_noise = traced.sds.remarks if traced.sds.factors or not traced.events else ()
-    return dataclasses.replace(result, notes=(*of_noise, *remarks(result)))
+    return dataclasses.replace(result, remarks=(*of_noise, *remarks(result)))
 
 
 def residuals_of(screened: Screening, runs: Runs) -> Residuals:
@@ -651,33 +677,25 @@ def _noise(runs: Runs, noise: Noise, kind: type[observers.Observer]) -> dict[str
     }
 
 
-def remarks(found: DiscoveryResult) -> tuple[str, ...]:
-    """What a careful engineer would say of this result, one sentence each."""
-    said = []
-    for rows, why in (
-        (found.unusable, "cannot be simulated: the fitted model slides or fails there"),
-        (found.outliers, "stand alone: outliers, which no effect explains"),
-    ):
+def remarks(found: DiscoveryResult) -> Notes:
+    """What a careful engineer would say of this result."""
+    said: list[Note] = []
+    for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
-            said.append(f"rows {', '.join(map(str, rows))} {why}; they are kept out")
-    for name, p in found.base_shift.items():
-        if abs(p.shift_after) > 3:
-            said.append(f"{name} lies {abs(p.shift_after):.1f} prior sds from its prior: it stands in for something")
-    said += describe_held(found.held_by_prior)
-    said += [c.statement for c in found.residual_clusters]
+            said.append(KeptOut(rows, why))
+    shifts = {name: abs(p.shift_after) for name, p in found.base_shift.items()}
+    said += [FarFromPrior(name, x, "loop") for name, x in shifts.items() if x > 3]
+    said += [HeldByPrior(found.held_by_prior)] * bool(found.held_by_prior)
+    said += found.residual_clusters
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
-        said.append(
-            f"the wave stands at another angle in each run (it explains {wave.score_free_in_each_run:.0f} σ² free in "
-            f"each, {wave.score:.0f} with one phase): robot.toml holds the mean; start runs from a mark"
-        )
+        said.append(PhasesDiffer(wave.score_free_in_each_run, wave.score))
     if found.remains is not None:
-        place, over = in_words(found.remains.place), found.remains.variable.replace("_", " ")
-        said.append(f"what was found does not explain everything: the {place} still lacks something over {over}")
+        said.append(StillLacks(found.remains.place, found.remains.variable))
     said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:
-        said.append(f"only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are theirs")
+        said.append(LostReplicates(settled, asked))
     if 1 / (1 + settled) > min(found.settings.shares.values()):
-        said.append(f"{settled} bootstrap tables are too few for every kind of evidence to count; use 500 or more")
+        said.append(TooFewReplicates(settled))
     return tuple(said)

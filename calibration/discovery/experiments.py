@@ -27,6 +27,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Location
+from calibration.discovery.notes import CarryOut, Instruction, MoreRuns, NothingPossible, NothingTells, TooWeak
 from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
@@ -34,7 +35,6 @@ from calibration.inference.normal_equations import cholesky, forward
 from calibration.inference.optimizers import informing
 from calibration.inference.problem import Problem
 from mmrjax import channels
-from mmrjax.channels import RPM
 from mmrjax.compiling import compiled
 
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
@@ -117,7 +117,7 @@ class Proposal:
 
     Attributes:
         experiments: names of what to carry out; `NONE` alone where the menu holds nothing.
-        description: what to do and what to read.
+        instruction: what to do and what to read.
         separates: alternatives that it tells from the best fit.
         expected_sigma: the smallest separation of a pair that it is worth doing for; 0 for none.
         settles: whether it tells every two alternatives apart, at `Settings.apart`.
@@ -125,7 +125,7 @@ class Proposal:
     """
 
     experiments: tuple[str, ...]
-    description: str
+    instruction: Instruction
     separates: tuple[str, ...]
     expected_sigma: float
     settles: bool
@@ -274,7 +274,7 @@ def choose(seen: PredictedReadings) -> Proposal:
     """The experiment of the menu that tells most apart, with the best one beside it where that adds enough."""
     table = ranked(seen)
     if not table:
-        return Proposal((NONE,), "Every experiment of the menu is forbidden or beyond reach", (), 0.0, False, ())
+        return Proposal((NONE,), NothingPossible(), (), 0.0, False, ())
     plan = table[0]
     (first,) = plan.experiments
     both = (_ranked(seen, first, e.name) for e in seen.experiments if e.name != first)
@@ -282,12 +282,11 @@ def choose(seen: PredictedReadings) -> Proposal:
     if more.told and (not plan.told or _use(more)[1] > _use(plan)[1] + seen.settings.gain):
         plan = more
     if not plan.told:
-        text = f"No experiment of the menu tells {' and '.join(seen.names)} apart by {seen.settings.worth:g} sigma"
-        return Proposal((NONE,), text, (), 0.0, False, table)
-    said = {e.name: e.description for e in seen.experiments}
-    text = ". And: ".join(said[name] for name in plan.experiments)
+        return Proposal((NONE,), NothingTells(seen.names, seen.settings.worth), (), 0.0, False, table)
+    named = {e.name: e for e in seen.experiments}
+    what = CarryOut(tuple(named[name] for name in plan.experiments))
     return Proposal(
-        plan.experiments, text, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
+        plan.experiments, what, plan.separates, min(plan.told), plan.smallest >= seen.settings.apart, table
     )
 
 
@@ -295,90 +294,14 @@ def choose(seen: PredictedReadings) -> Proposal:
 SERIES, REPEATS = 15, 3
 
 
-def _steps(variable: str, within: Reach) -> str | None:
-    """How the variable of a curve is covered more densely, within reach of the table; None for a wave."""
+def more_runs(place: str, variable: str, within: Reach) -> MoreRuns:
+    """How the variable of a curve is covered more densely, within reach of the table."""
     volts = within.voltages
     low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
     slope = max(u.steepest for u in within.used)
     payload = max(u.payloads[-1] for u in within.used)
     step, angle, mass = (menu.round_significant(x / (SERIES - 1), 1) for x in (high - low, slope, payload))
-    load = [f"a payload up to {payload:g} kg"] * (payload > 0) + [f"a slope up to {slope:g} deg"] * (slope > 0)
-    loaded = " and ".join(load) or "a brake or a drawbar pull"
-    if variable in bases.ORDERS:
-        return None
-    happens = bases.window(variable)
-    if happens is not None and happens.axis == "order":
-        return (
-            f"Make runs {happens.low:.0f} to {happens.high:.0f} again, and as many before and after them, in another "
-            "order: what comes back with them hangs on their conditions, what does not happened then"
-        )
-    if happens is not None and happens.axis != "time":
-        return f"Make the runs at {happens.words} again, on another day, and as many a little below and above that"
-    if happens is not None:
-        return (
-            f"Make two of the runs again, sampled as finely as the instruments allow from {happens.low:.3g} to "
-            f"{happens.high:.3g} s, one of them with all that is switched in that time left as it is"
-        )
-    own = _of_rig(variable, within, slope, payload)
-    if own is not None:
-        return own
-    return {
-        "voltage": f"Repeat at one slope and payload with the supply voltage from {low:g} to {high:g} V in steps of "
-        f"{step:g} V",
-        "current": f"Repeat at {high:g} V with {loaded}, raised in small steps, so that the current rises evenly "
-        f"from no load to its largest, some {within.current * within.motors:.2g} A",
-        "speed_motor": f"Repeat on the level, unladen, with the supply voltage in steps of {step:g} V from crawl to "
-        f"{high:g} V",
-        "slope": f"Repeat at one voltage and payload with the slope from 0 to {slope:g} deg in steps of {angle:g} "
-        "deg, and downhill",
-        "payload": f"Repeat at one voltage and slope with the payload from 0 to {payload:g} kg in steps of {mass:g} "
-        "kg",
-        "speed": "Repeat on the level, unladen, with the travelling speed in even steps from crawl to its largest, "
-        f"some {within.speed:.2g} m/s at {high:g} V",
-        "time": f"Record one condition from a cold start for ten minutes, at {low:g} V rather than more, and again "
-        f"at once while everything is warm; watch the winding's temperature ({within.hot:g} °C is allowed)",
-        "order": "Repeat the table in another order, rows that were first last, and one condition again after every "
-        "fifth run",
-    }.get(variable, f"Repeat with {variable.replace('_', ' ')} in even small steps from its least to its largest")
-
-
-def _of_rig(variable: str, within: Reach, slope: float, payload: float) -> str | None:
-    """`_steps` where the motors' speed is imposed, or the load is a shaft; None where they say nothing else."""
-    level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
-    if within.imposed == "motor_speed":
-        fastest = max(within.speeds, default=within.motor_speed) / RPM
-        turning = f"with the motor speed in {SERIES} even steps up to {fastest:.0f} rpm"
-        words = {
-            "speed_motor": f"{level} {turning}",
-            "speed": f"{level} {turning}, and so the travelling speed",
-            "slope": f"Repeat at one motor speed and payload with the slope from 0 to {slope:g} deg, and downhill",
-            "payload": f"Repeat at one motor speed and slope with the payload from 0 to {payload:g} kg",
-            "time": "Record one motor speed from a cold start for ten minutes, and again at once while all is warm",
-        }
-        if not within.has_ground:
-            words["current"] = f"{level} at one motor speed with a brake that is raised in {SERIES} even steps"
-        return words.get(variable)
-    if within.has_ground:
-        return None
-    high = within.voltages[-1]
-    return {
-        "voltage": f"Repeat with the supply voltage in {SERIES} even steps up to {high:g} V",
-        "speed_motor": f"Repeat with the supply voltage in {SERIES} even steps from crawl to {high:g} V",
-        "speed": f"Repeat with the supply voltage in {SERIES} even steps from crawl to {high:g} V",
-        "current": f"Repeat at {high:g} V with a brake that is raised in {SERIES} even steps",
-    }.get(variable)
-
-
-def _steady_speeds(variable: str, within: Reach) -> str:
-    """How a wave is followed from speed to speed."""
-    volts = within.voltages
-    low, high = (volts[0], volts[-1]) if volts[-1] > volts[0] else (menu.round_significant(0.5 * volts[0]), volts[0])
-    three = [f"{menu.round_significant(v):g}" for v in (low, 0.5 * (low + high), high)]
-    return (
-        f"Mark the driving shaft, start every run from the mark, and record steady travel at {', '.join(three[:2])} "
-        f"and {three[2]} V with at least 20 samples a wave: what keeps its {variable} at every speed turns with that "
-        "part"
-    )
+    return MoreRuns(place, variable, SERIES, low, high, volts[-1], slope, payload, (step, angle, mass), within)
 
 
 def denser(space: CandidateSpace, where: Location, settings: Settings) -> Proposal:
@@ -387,18 +310,15 @@ def denser(space: CandidateSpace, where: Location, settings: Settings) -> Propos
     Its expected separation from nothing is that of the table [σ], whose curve explains so much a run, over the
     runs of the series.
     """
-    place, variable = bases.in_words(where.place), where.variable
-    runs, within = space.bare.observe.runs_counting(space.included), reach_of(space)
+    variable, within = where.variable, reach_of(space)
+    runs = space.bare.observe.runs_counting(space.included)
     sigma = float(np.sqrt(max(where.strongest, 0.0) * SERIES * REPEATS / max(runs, 1)))
-    finer = _steps(variable, within)
-    how = _steady_speeds(variable, within) if finer is None else finer
-    text = f"{how}; read every channel. What the {place} lacks then shows its shape"
-    name = f"finer steps in {variable}" if finer is not None else f"steady speeds for {variable}"
-    name = name if bases.window(variable) is None else "the same runs again"
     if sigma < settings.worth:
-        text = f"A series in {variable} would show what is missing by {sigma:.1f} sigma"
-        return Proposal((NONE,), text, (), 0.0, False, ())
-    return Proposal((name,), text, (f"curve of the {place} over {variable}",), sigma, False, ())
+        return Proposal((NONE,), TooWeak(variable, sigma), (), 0.0, False, ())
+    name = f"steady speeds for {variable}" if variable in bases.ORDERS else f"finer steps in {variable}"
+    name = name if bases.window(variable) is None else "the same runs again"
+    curve = f"curve of the {bases.in_words(where.place)} over {variable}"
+    return Proposal((name,), more_runs(where.place, variable, within), (curve,), sigma, False, ())
 
 
 def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:

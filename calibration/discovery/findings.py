@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import math
 from collections.abc import Sequence
 
 import jax
@@ -19,10 +18,10 @@ from calibration.discovery.classes import Classes
 from calibration.discovery.discrepancy import Discrepancy, Location
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import Hidden
+from calibration.discovery.notes import RuledOut
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
-    DiscoveryResult,
     EffectScore,
     Errors,
     Estimate,
@@ -214,21 +213,21 @@ def hidden_effects(space: CandidateSpace, found: Sequence[Hidden]) -> tuple[Hidd
 
 
 def _alternative(space: CandidateSpace, c: Candidate, rise: float, settings: Settings) -> Alternative:
-    sds, sizes, why = {}, {}, []
+    sds, sizes, why = {}, {}, list[RuledOut]()
     for slot, (name, amplitude, size) in enumerate(zip(c.active, c.amplitude, c.size, strict=True)):
         if not name:
             continue
         sds[name], sizes[name] = float(amplitude), float(size)
         sd = settings.width * float(c.sd[space.free + slot])
         if space.library[name].dissipative and amplitude <= 0:
-            why.append(f"{name} would put power in")
+            why.append(RuledOut(name, "power"))
         elif size >= 1:
-            rests = " and ".join(space.library[name].rests_on) or amplitude_of(space.library[name]).spec.meaning
-            why.append(f"{name} at {size:.2g} times its largest plausible size; check {rests}")
+            check = space.library[name].rests_on or (amplitude_of(space.library[name]).spec.meaning,)
+            why.append(RuledOut(name, "size", float(size), tuple(check)))
         elif not c.plausible and size * (1 + sd / max(abs(float(amplitude)), 1e-12)) >= 1:
-            why.append(f"{name} is within an sd of the largest plausible size")
+            why.append(RuledOut(name, "edge"))
     amplitudes = {name: a * size_of(space.library[name]) for name, a in sds.items()}
-    return Alternative(amplitudes, sds, sizes, float(rise), "; ".join(why))
+    return Alternative(amplitudes, sds, sizes, float(rise), tuple(why))
 
 
 def proposed_robot(space: CandidateSpace, best: Candidate) -> Robot:
@@ -247,7 +246,7 @@ def next_experiment(proposal: Proposal | None) -> NextExperiment | None:
         for r in proposal.table
     )
     return NextExperiment(
-        proposal.name, proposal.experiments, proposal.description, proposal.separates, proposal.expected_sigma,
+        proposal.name, proposal.experiments, proposal.instruction, proposal.separates, proposal.expected_sigma,
         proposal.settles, menu,
     )  # fmt: skip
 
@@ -378,131 +377,3 @@ def errors(
         rms = float(np.sqrt(np.mean(there**2))) if there.size else float("nan")
         answer[name] = {**summary(percent[:, k]), "rms_sigma": rms}
     return answer
-
-
-# --- words ----------------------------------------------------------------------------------------------
-
-
-def statement(
-    verdict: str,
-    p: float,
-    where: Location | None,
-    classes: Sequence[Sequence[str]] = (),
-    stated: Sequence[Sequence[str]] = (),
-    families: Sequence[Sequence[str]] = (),
-) -> str:
-    """The verdict in one sentence.
-
-    Args:
-        where: something is missing, or remains.
-        classes: names of each effect found; stated: values that may be wrong instead, in words; families: of each.
-    """
-    if verdict == "none":
-        return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
-    if verdict == "unnamed" and where is not None:
-        others = [bases_room.in_words(p).removeprefix("balance ") for p in where.alike if p != where.place]
-        also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
-        what = f": {where.family}" if where.variable in bases_room.VARIABLES else ""
-        place = bases_room.in_words(where.place)
-        well = [shown_over(v).removeprefix("best shown ") for v in where.variables_alike]
-        over = shown_over(where.variable) + (f" (as well {', '.join(well)})" if well else "")
-        return (
-            f"Something is missing in the {place}{also}, {over}{what}; no effect of the library explains it "
-            f"(family-wise p {describe_p_value(p)})."
-        )
-    names = []
-    for k, words in enumerate(classes):
-        values = list(stated[k]) if k < len(stated) else []
-        said = words[0]
-        if len(words) + len(values) > 1:
-            family = f"{families[k][0]}, " if k < len(families) and len(families[k]) == 1 else ""
-            listed = ", ".join(words) if len(words) == 1 else f"one of {', '.join(words)}"
-            said = f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
-        names.append(said)
-    left = "" if where is None else f" Something remains in the {bases_room.in_words(where.place)}."
-    return f"Missing: {'; '.join(names)} (family-wise p {describe_p_value(p)}).{left}"
-
-
-def describe_ruled_out(found: DiscoveryResult) -> str:
-    """What would explain the data as well as what is proposed, or better, but for its size; empty for nothing.
-
-    Beside names it is said of what would explain more than they do alone.
-    """
-    candidates = found.implausible
-    if found.verdict != "unnamed":
-        candidates = tuple(a for a in candidates if a.rise_chi2 < -found.settings.same)
-    if not candidates:
-        return ""
-    first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
-    what = "the curve" if found.verdict == "unnamed" else "what is proposed"
-    more = first.rise_chi2 < -found.settings.same
-    gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
-    are = "are" if len(first.effects) > 1 else "is"
-    return (
-        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
-    )
-
-
-def describe_hidden(found: DiscoveryResult) -> str:
-    """Which effects what was found could hide, and what would show them, in a sentence; empty for none."""
-    if not found.hidden:
-        return ""
-    each = [
-        f"{h.name} up to {h.amplitude:.2g} {h.unit}".strip()
-        + (f" ({h.experiment} would show it)" if h.experiment else "")
-        for h in found.hidden
-    ]
-    return f"Could be hidden behind what was found: {', '.join(each)}."
-
-
-def describe_standing(found: DiscoveryResult) -> str:
-    """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
-    if not found.standing:
-        return ""
-    if found.verdict == "unnamed":
-        return f"Why no name: {found.standing}."
-    return f"The names keep their significance {found.standing}."
-
-
-def stated_value_said(name: str, s: StatedValue) -> str:
-    """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
-    return f"{name} is {s.value:.3g} {s.unit}".strip() + f" (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
-
-
-def alike_said(e: FoundEffect) -> str:
-    """What these data cannot tell from an effect: other effects, and stated values that may be wrong instead."""
-    others = ", ".join(
-        name + (f" (at {m.size:.2g} times its largest plausible size)" if m.size >= 1 else "")
-        for name, m in list(e.members.items())[1:]
-    )
-    values = " or ".join(stated_value_said(name, s) for name, s in e.stated.items())
-    return ", or ".join(words for words in (others, values) if words)
-
-
-def stated_in_words(space: CandidateSpace, shifts: Sequence[Shift]) -> list[str]:
-    """`motor.resistance is 1.94 ohm`, for each."""
-    c, p = space.coordinates.base, space.free
-    return [
-        f"{s.name} is {float(c.value(jnp.asarray(s.fit.z[:p]))[s.index]):.3g} {c.units[s.index]}".strip()
-        for s in shifts
-    ]
-
-
-def shown_over(variable: str) -> str:
-    """Where a discrepancy shows, in words."""
-    happens = bases_room.window(variable)
-    if happens is None:
-        return f"best shown over {variable.replace('_', ' ')}" if variable != "order" else "drifting from run to run"
-    if happens.axis == "time":
-        return f"from {happens.low:.3g} to {happens.high:.3g} s after the start of the runs"
-    if happens.axis == "order":
-        return f"in runs {happens.low:.0f} to {happens.high:.0f}"
-    return f"in the runs at {happens.words}"
-
-
-def describe_p_value(p: float) -> str:
-    """A p-value in words; a small one, of which the bootstrap knows little, as a bound rounded up."""
-    if p > 0.01:
-        return f"= {p:.2g}"
-    step = 10.0 ** math.floor(math.log10(p))
-    return f"≤ {math.ceil(p / step - 1e-9) * step:.1g}"

@@ -121,7 +121,7 @@ class Proposal:
     """A formula for a discrepancy, by sparse regression over a dictionary of dimensionless monomials.
 
     Attributes:
-        formula: e.g. `ΔU = 0.42 V (I/2 A)^2 (U/24 V)`; mark: that it is a proposal.
+        formula: e.g. `ΔU = 0.42 V (I/2 A)^2 (U/24 V)`, "" where no term shows; mark: that it is a proposal.
         terms: its monomials; coefficients, sds: of each [unit of the balance].
         variables: signals that it depends on, without repeats.
         explained: fall of χ² at the base fit.
@@ -179,7 +179,7 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
         second = [int(j) for j in np.argsort(-two[k])[:SECONDS] if j != k and two[k, j] > one[k]]
         ranked += [((k, j), 2 * cost - two[k, j]) for j in second]
     if not ranked:
-        return Proposal("none: no term shows in these data", (), (), (), (), 0.0, 0.0, len(terms))
+        return Proposal("", (), (), (), (), 0.0, 0.0, len(terms))
     located = {SAME_AS.get(curve.variable, curve.variable)}
     foreign = [len({v for k in chosen for v in terms[k].variables} - located) for chosen, _ in ranked]
     dear = [bic + FOREIGN * n for (_, bic), n in zip(ranked, foreign, strict=True)]
@@ -239,7 +239,7 @@ def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoot
         if a[0, 0] > 0 and 2 * cost - b[0] ** 2 / a[0, 0] < best[0]:
             best = 2 * cost - b[0] ** 2 / a[0, 0], (tau, b[0] / a[0, 0], a[0, 0] ** -0.5)
     if not best[1]:
-        return Proposal("none: no term shows in these data", (), (), (), (), 0.0, 0.0, len(constants))
+        return Proposal("", (), (), (), (), 0.0, 0.0, len(constants))
     tau, value, sd = best[1]
     formula = f"{SYMBOL[balance]} = {value:.2g} {PLACES[balance][0]} exp(-{symbol} / {tau:.2g}{unit})"
     gain = float(curve.freedom * cost - curve.explained - best[0])

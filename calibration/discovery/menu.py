@@ -14,9 +14,10 @@ from jaxtyping import Array
 
 from calibration.data.errors import BadConfiguration, choices
 from calibration.discovery import setups
+from calibration.discovery.notes import Heat, Overspeed, Overvoltage, Watch
 from calibration.discovery.reach import SLOPE, Reach, Used
 from calibration.discovery.setups import Setup
-from mmrjax import balances, channels
+from mmrjax import balances
 from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
 from mmrjax.robot import Robot
@@ -44,7 +45,6 @@ class Act:
 
     Attributes:
         name: of it; kinds: of `KINDS`.
-        description: for an engineer, what to do and what to read.
         reading: of a robot and of what is set [SI], shape (readings,).
         at: what is set, one tuple a reading [SI]; of `weigh`, the configuration's index and the payload.
         sd: of a single reading [SI]; repeats: readings that are averaged.
@@ -52,7 +52,6 @@ class Act:
 
     name: str
     kinds: tuple[str, ...]
-    description: str
     reading: Callable[[Robot, Array], Array]
     at: tuple[tuple[float, ...], ...]
     sd: float
@@ -65,7 +64,7 @@ class Run:
 
     Attributes:
         name: of them; kinds: of `KINDS`, and the configuration where there is one.
-        doing: for an engineer, what to do; where and at what voltages follows from the conditions.
+        doing: a row of `words.experiments.DOING`; where: the configuration's name, "" for none; motors: of the robot.
         setup: how the robot is set up.
         voltage [V], slope [deg], payload [kg]: conditions of each run, shape (runs,).
         channels: names of what is read.
@@ -93,46 +92,17 @@ class Run:
     beyond: float = math.inf
     steepest: bool = False
     repeats: int = 3
-    watch: str = ""
+    watch: tuple[Watch, ...] = ()
     imposed: str = "voltage"
+    where: str = ""
+    motors: int = 1
 
     def read(self, shown: tuple[str, ...]) -> tuple[int, ...]:
         """Positions of the channels that are read, among all that are shown."""
         return tuple(shown.index(c) for c in self.channels)
 
-    @property
-    def description(self) -> str:
-        """For an engineer: what to do, what to read, and what to watch."""
-        level = self.imposed != "voltage" and not any(self.slope)
-        where = "" if self.setup in setups.WEIGHTLESS or level else f" {_slopes(self.slope)}"
-        read = _both([channels.of(c).label for c in self.channels])
-        turning = [round_significant(v / RPM) for v in self.voltage]
-        at = _amounts(self.voltage, "V") if self.imposed == "voltage" else _amounts(turning, "rpm of the motor")
-        text = f"{self.doing}{where} at {at}; read {read}"
-        return f"{text}. Watch {self.watch}" if self.watch else text
-
 
 Experiment = Act | Run
-
-
-def _both(words: Sequence[str]) -> str:
-    """«a, b and c»."""
-    *others, last = words
-    return f"{', '.join(others)} and {last}" if others else last
-
-
-def _amounts(values: Sequence[float], unit: str) -> str:
-    """«15 and 33 V», each once, in order."""
-    return f"{_both([f'{v:g}' for v in sorted(set(values), key=abs)])} {unit}"
-
-
-def _slopes(slopes: Sequence[float]) -> str:
-    """«on the level and up 10 and 20 deg»."""
-    words = ["on the level"] if any(s == 0 for s in slopes) else []
-    for word, sign in (("up", 1), ("down", -1)):
-        some = [abs(s) for s in slopes if s * sign > 0]
-        words += [f"{word} {_amounts(some, 'deg')}"] if some else []
-    return _both(words)
 
 
 def round_significant(value: float, digits: int = 2) -> float:
@@ -182,39 +152,20 @@ def _timed(robot: Robot, at: Array) -> Array:
 
 def acts(reach: Reach) -> tuple[Act, ...]:
     """The calibration acts, the least effort first; none of an instrument that the table's bench lacks."""
-    several = len(reach.used) > 1
-    each = ("in both configurations, " if len(reach.used) == 2 else "in each configuration, ") if several else ""
     payload = round_significant(max(u.payloads[-1] for u in reach.used))
     loads = (0.0, payload) if payload > 0 else (0.0,)
-    laden = f"unladen and with the payload of {payload:g} kg, " if payload > 0 else "unladen, "
     total = reach.current * reach.motors
     amperes = round_significant(0.15 * total, 1), round_significant(0.75 * total, 1)
     turning = round_significant(0.25 * reach.motor_speed), round_significant(0.65 * reach.motor_speed)
     paces = round_significant(0.35 * reach.speed), round_significant(0.8 * reach.speed)
-    weighing = Act(
-        "weigh", ("weigh",),
-        f"Weigh the robot {each}{laden}on scales that are good to 20 g; read the total mass, and take the stated one "
-        "from it",
-        _weighed, tuple((float(u.index), m) for u in reach.used for m in loads), 0.02, repeats=1,
-    )  # fmt: skip
+    at = tuple((float(u.index), m) for u in reach.used for m in loads)
+    weighing = Act("weigh", ("weigh",), _weighed, at, 0.02, repeats=1)
     ammeter = [
-        Act("zero current", ("zero current",), "Switch the motors off; read the ammeter", _shunted, ((0.0,),), 0.02),
-        Act(
-            "shunt", ("shunt",),
-            f"Put a precision shunt and a load in the place of the robot, set {_amounts(amperes, 'A')} by the shunt; "
-            "read the ammeter", _shunted, _each(amperes), 0.02,
-        ),
-    ]  # fmt: skip
-    strobe = Act(
-        "strobe", ("strobe",),
-        f"Set the motor to {_amounts(turning, 'rad/s')} by a stroboscope; read the tachometer",
-        _strobed, _each(turning), 5 * RPM,
-    )  # fmt: skip
-    timing = Act(
-        "timing", ("timing",),
-        f"Time the robot by light gates over a distance measured with a tape, at {_amounts(paces, 'm/s')}; read the "
-        "speed that the bench shows", _timed, _each(paces), 3e-3,
-    )  # fmt: skip
+        Act("zero current", ("zero current",), _shunted, ((0.0,),), 0.02),
+        Act("shunt", ("shunt",), _shunted, _each(amperes), 0.02),
+    ]
+    strobe = Act("strobe", ("strobe",), _strobed, _each(turning), 5 * RPM)
+    timing = Act("timing", ("timing",), _timed, _each(paces), 3e-3)
     found = [weighing] * reach.has_ground
     found += ammeter * ("total_current" in reach.measured)
     found += [strobe] * ("motor_speed" in reach.measured)
@@ -252,11 +203,10 @@ def _runs(
     each = list(itertools.product(dict.fromkeys(slopes), dict.fromkeys(voltages)))
     slope, voltage = (tuple(x) for x in zip(*each, strict=True))
     of = (at.configuration,) if at is not None else ()
-    named, text = ", ".join((name, *of)), ": ".join((*of, doing)) if of else doing
     return Run(
-        named, (*(kinds or (name,)), *of), text, setup, voltage, slope, (payload,) * len(each),
+        ", ".join((name, *of)), (*(kinds or (name,)), *of), doing, setup, voltage, slope, (payload,) * len(each),
         tuple(c for c in (read or reach.measured) if c in reach.measured), 0 if at is None else at.index, sides,
-        brake, math.inf if at is None else at.steepest, steepest,
+        brake, math.inf if at is None else at.steepest, steepest, where=", ".join(of), motors=reach.motors,
     )  # fmt: skip
 
 
@@ -283,13 +233,12 @@ def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
     air, payload = spaced_settings(0.2 * reach.geared, reach.geared, 5), round_significant(used.payload)
     runs = functools.partial(_runs, reach, at=used)
     found = [
-        runs("reverse", "travel backwards", setups.reversed_, voltages=ends, slopes=(0.0, -some)),
-        runs("downhill", "turn the slope about by the same inclinometer and travel forwards", voltages=ends,
-             slopes=(-inclines[0], -some)),
-        runs("lifted", "put it on stands, the movers in the air, and run", setups.lifted, voltages=air, read=TURNING),
-        runs("one motor", f"put it on stands, {_others(reach)}, and run", setups.lifted,
-             kinds=("one motor", "lifted"), voltages=air, sides=1, read=TURNING),
-        runs(f"payload {payload:g} kg", f"travel with {payload:g} kg", kinds=("payload",), voltages=ends,
+        runs("reverse", "backwards", setups.reversed_, voltages=ends, slopes=(0.0, -some)),
+        runs("downhill", "about", voltages=ends, slopes=(-inclines[0], -some)),
+        runs("lifted", "lifted", setups.lifted, voltages=air, read=TURNING),
+        runs("one motor", "one lifted", setups.lifted, kinds=("one motor", "lifted"), voltages=air, sides=1,
+             read=TURNING),
+        runs(f"payload {payload:g} kg", "laden", kinds=("payload",), voltages=ends,
              slopes=(0.0, some, most), payload=payload),
         runs("other voltages", "travel", voltages=other_voltages(reach, volts), slopes=(0.0, more)),
         runs("steepest slope", "travel", voltages=three, steepest=True,
@@ -302,10 +251,6 @@ def _travels(reach: Reach, used: Used) -> tuple[Run, ...]:
     return tuple(r for r in found if not lacks.get(r.kinds[0], False))
 
 
-def _others(reach: Reach) -> str:
-    return "the other motor disconnected" if reach.motors == 2 else "all motors but one disconnected"
-
-
 def _alone(reach: Reach) -> tuple[Run, ...]:
     """Runs of the motors without the robot."""
     volts = spaced_settings(0.2 * reach.alone, reach.alone, 5)
@@ -313,18 +258,13 @@ def _alone(reach: Reach) -> tuple[Run, ...]:
         0.5 * reach.current * reach.resistance, min(reach.current * reach.resistance, reach.voltage), 2
     )
     brake = round_significant(0.6 * reach.torque_constant * reach.current, 1)
-    shafts = {1: "the motor's shaft", 2: "both motor shafts"}.get(reach.motors, f"all {reach.motors} motor shafts")
-    gears = "gearbox" if reach.motors == 1 else "gearboxes"
     found = [
-        _runs(reach, "bare motor", f"Uncouple the {gears} and run the motors alone", setups.bare, voltages=volts,
-              read=TURNING),
-        _runs(reach, "stall", f"Hold {shafts} in a vice and switch on for a moment,", setups.blocked,
-              voltages=stalling, read=STANDING),
-        _runs(reach, "stall, one motor", f"Hold one motor's shaft in a vice, {_others(reach)}, and switch on for a "
-              "moment,", setups.blocked, kinds=("stall", "one motor"), voltages=stalling, read=STANDING, sides=1),
-        _runs(reach, "braked motor", f"Uncouple the {gears} and put a brake of {1e3 * brake:g} mN·m on each motor "
-              "shaft, and run", setups.braked, voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3),
-              read=TURNING, brake=brake),
+        _runs(reach, "bare motor", "alone", setups.bare, voltages=volts, read=TURNING),
+        _runs(reach, "stall", "held", setups.blocked, voltages=stalling, read=STANDING),
+        _runs(reach, "stall, one motor", "one held", setups.blocked, kinds=("stall", "one motor"), voltages=stalling,
+              read=STANDING, sides=1),
+        _runs(reach, "braked motor", "braked", setups.braked,
+              voltages=spaced_settings(0.4 * reach.alone, reach.alone, 3), read=TURNING, brake=brake),
     ]  # fmt: skip
     return tuple(r for r in found if reach.motors > 1 or r.sides is None)
 
@@ -360,7 +300,7 @@ def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
         _runs(reach, "other speeds" if speeds else "other voltages", "run", kinds=("other voltages",), at=used,
               voltages=others),
         *([] if both else [
-            _runs(reach, "reverse", "run the other way round", at=used,
+            _runs(reach, "reverse", "other way", at=used,
                   voltages=[-x if levels[-1] > 0 else x for x in (sizes[0], sizes[-1])])
         ]),
     ]  # fmt: skip
@@ -409,27 +349,18 @@ def carried_out(run: Run, kept: np.ndarray, temperature: np.ndarray, speed: np.n
     voltage, slope, payload = (
         tuple(v for v, k in zip(x, kept, strict=True) if k) for x in (run.voltage, run.slope, run.payload)
     )
-    warnings = []
+    watch: list[Watch] = []
     hottest, fastest, highest = float(temperature[kept].max()), float(np.abs(speed[kept]).max()), max(voltage)
-    would = f"would reach {hottest:.0f} °C" if np.isfinite(hottest) else "would burn: no temperature settles"
-    allowed = f" ({reach.hot:.0f} °C is allowed)" if reach.hot < UNLIMITED else ""
-    heats = f"a winding left on {would}{allowed}"
+    allowed = reach.hot if reach.hot < UNLIMITED else None
     if run.setup is setups.blocked:
-        current = highest / reach.resistance
-        warnings.append(
-            f"current × time: {current:.2g} A in a motor that does not turn, and so is not cooled; {heats}, "
-            "so switch off within seconds and let it cool between readings"
-        )
+        watch.append(Heat("held", hottest, allowed, highest / reach.resistance))
     elif run.setup is setups.braked:
-        warnings.append(f"the brake and the winding's temperature: {heats}; seconds are enough for a reading")
+        watch.append(Heat("braked", hottest, allowed))
     elif hottest > reach.hot - WARM:
-        warnings.append(f"the winding's temperature: {heats}; keep the runs short")
+        watch.append(Heat("run", hottest, allowed))
     limit = reach.limit_alone if run.setup in (setups.bare, setups.braked) else reach.limit_geared
     if run.setup in (setups.bare, setups.lifted) and fastest > FAST * limit:
-        warnings.append(
-            f"the motor speed: about {fastest / RPM:.0f} rpm without load at {highest:g} V, and no more than "
-            f"{limit / RPM:.0f} rpm; raise the voltage slowly"
-        )
+        watch.append(Overspeed(fastest, limit, highest))
     if run.imposed == "voltage" and highest > reach.voltages[-1]:
-        warnings.append(f"the supply: {highest:g} V is more than the table's {reach.voltages[-1]:g} V")
-    return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, watch="; ".join(warnings))
+        watch.append(Overvoltage(highest, reach.voltages[-1]))
+    return dataclasses.replace(run, voltage=voltage, slope=slope, payload=payload, watch=tuple(watch))

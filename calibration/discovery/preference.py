@@ -12,13 +12,13 @@ from calibration.discovery import experiments
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate, fit_candidates, start
 from calibration.discovery.classes import Classes, families
+from calibration.discovery.notes import DRAW, Led
 from calibration.discovery.result import Errors, HeldOutAlternative, Worse
 from calibration.discovery.search import Search, diagnose
 from calibration.discovery.settings import HELD_OUT, Settings
 from calibration.inference import blocks as blocks_room
 from calibration.inference.bases import Bases
 from calibration.inference.held_out import held_out
-from mmrjax import channels
 
 #: Share of itself by which held-out errors have to differ to be told apart; less is not seen in two digits.
 TOLD = 0.01
@@ -45,33 +45,6 @@ def worse(
             if new > (1 + TOLD) * old:
                 found.append(Worse(kind, channel, int(e["rows"]), old, new))
     return tuple(found)
-
-
-def describe_worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]]) -> str:
-    """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
-
-    Args:
-        held_out: kind of block → errors before and after, each over the rows that it predicts.
-    """
-    parts = []
-    for kind, (before, after) in held_out.items():
-        mine = [w for w in found if w.kind == kind]
-        changes = [f"{channels.of(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
-        predicted = {n: (int(before[n]["rows"]), int(after[n]["rows"])) for n in after}
-        if any(w.rows < max(predicted[w.channel]) for w in mine):
-            changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
-        lost = max(was - now for was, now in predicted.values())
-        if lost > 0:
-            changes.append(f"{lost} row{'s' * (lost > 1)} fewer predicted")
-        if changes:
-            parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
-    return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
-
-
-def _change(before: float, after: float) -> str:
-    """Two numbers with as many digits as tell them apart."""
-    texts = [(f"{before:.{k}f}", f"{after:.{k}f}") for k in range(1, 6)]
-    return " → ".join(next((pair for pair in texts if pair[0] != pair[1]), texts[-1]))
 
 
 # --- among alternatives ---------------------------------------------------------------------------------
@@ -184,26 +157,24 @@ def _led(space: CandidateSpace, best: Candidate, leader: Candidate, alike: Class
     )
 
 
-def remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[str]:
+def remarks(table: Sequence[HeldOutAlternative], prefer: str) -> list[Led]:
     """By what the leader was chosen among the alternatives, and whether the other way would have chosen another."""
     if not table:
         return []
     shared = set.intersection(*(set(a.effects) for a in table))
-    names = [" and ".join(n for n in a.effects if n not in shared) for a in table]
     leader = next(k for k, a in enumerate(table) if a.leads)
-    closest = min(range(len(table)), key=lambda k: table[k].rise_chi2)
     wins = _order(table)[0]
-    each = ", ".join(f"{n} {a.rms_sigma:.2f} σ" for n, a in zip(names, table, strict=True))
     alike = any(_draw(table[k], table[0]) for k in _able(table)[1:])
-    by = "errors held out" if prefer == HELD_OUT else "the fit to all rows"
-    if prefer == HELD_OUT and leader == wins == 0 and alike:
-        by = f"the fit to all rows, as errors held out are within {TOLD:.0%}"
-    said = f"{names[leader]} comes first in its class by {by}; errors held out: {each}"
-    if prefer == HELD_OUT and leader != closest:
-        said += f"; by the fit to all rows {names[closest]} would, by Δχ² {table[leader].rise_chi2:.1f}"
-    if leader != wins:
-        why = (
-            "is not as adequate" if prefer == HELD_OUT else f"would come first by --prefer {HELD_OUT}, where adequate"
+    return [
+        Led(
+            tuple(" and ".join(n for n in a.effects if n not in shared) for a in table),
+            tuple(a.rms_sigma for a in table),
+            leader,
+            closest=min(range(len(table)), key=lambda k: table[k].rise_chi2),
+            best=wins,
+            by=DRAW if prefer == HELD_OUT and leader == wins == 0 and alike else prefer,
+            prefer=prefer,
+            told=TOLD,
+            rise_chi2=table[leader].rise_chi2,
         )
-        said += f"; {names[wins]} {why}"
-    return [said]
+    ]

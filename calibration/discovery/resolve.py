@@ -14,11 +14,14 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calibration.data.errors import BadConfiguration
+from calibration.discovery.notes import Asked
 from calibration.discovery.result import PLAUSIBLE, DiscoveryResult, Estimate, Resolved
 from calibration.inference import noise as noise_room
 from calibration.inference import observers
 from calibration.inference.calibrate import calibrate
+from calibration.inference.notes import Step
 from calibration.inference.result import CalibrationResult
+from calibration.words.notes import in_words
 from mmrjax import channels
 from mmrjax.effects import UNNAMED
 from mmrjax.robot import Robot
@@ -32,21 +35,20 @@ FRICTION = ("ground.friction.static", "ground.friction.dynamic", "ground.frictio
 POPULATION, GENERATIONS = 128, 20
 
 
-def asked(found: DiscoveryResult) -> str:
-    """What of a verdict the running gear could leave, in words; "" for nothing."""
+def asked(found: DiscoveryResult) -> Asked | None:
+    """What of a verdict the running gear could leave; None for nothing."""
     places = [w for w in (found.unnamed, found.remains) if w is not None]
     for place in places:
         for balance in (place.balance, *place.balances_alike):
             if balance in BALANCES:
-                return f"what is missing in the balance {balance} over {place.variable.replace('_', ' ')}"
+                return Asked("missing", balance, place.variable)
     named = [e.name for e in found.effects if e.balance in BALANCES]
     if named:
-        return f"{', '.join(named)}, found by the lumped model"
+        return Asked("found", effects=tuple(named))
     weighed = [a for a in found.alternatives if any(found_in(name, found) for name in a.effects)]
     if weighed:
-        names = [n for n in weighed[0].effects if found_in(n, found)]
-        return f"{', '.join(names)}, which explains the readings nearly as well"
-    return ""
+        return Asked("near", effects=tuple(n for n in weighed[0].effects if found_in(n, found)))
+    return None
 
 
 def found_in(name: str, found: DiscoveryResult) -> bool:
@@ -81,7 +83,7 @@ def resolve(
     reason, robot = asked(found), found.robot
     tracked = [name for name, chassis in robot.configurations.items() if float(chassis.on_tracks) > 0.5]
     rows = found.runs.where(found.included & np.isin(found.runs["configuration"], tracked))
-    if not reason or not len(rows):
+    if reason is None or not len(rows):
         return None
     present = {str(c) for c in rows["configuration"]}
     lumped = {f.name for f in found.effects if f.balance in BALANCES} | set(UNNAMED)
@@ -100,9 +102,9 @@ def resolve(
             seed=seed, profiles=False, blocks=False, tell=tell,
         )  # fmt: skip
 
-    tell("resolved: friction through the track model, its running gear as stated")
+    in_words(tell)(Step("gear stated"))
     stated = fit(friction)
-    tell("resolved: the running gear free")
+    in_words(tell)(Step("gear free"))
     free = fit((*friction, *gear), members)
     fall = 2 * (stated.objective - free.objective)
     return Resolved(
@@ -122,7 +124,7 @@ def resolve(
             for c in found.channels
         },
         slip_rms=(_slip_rms(stated, robot), _slip_rms(free, robot)),
-        notes=tuple(free.notes),
+        remarks=free.remarks,
     )
 
 

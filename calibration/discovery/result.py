@@ -14,10 +14,14 @@ from calibration.data.posterior import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOut, Summary
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
-from calibration.inference.identifiability import describe_held
+from calibration.inference.notes import HeldByPrior, Notes
 from calibration.inference.residual_clusters import ResidualCluster
+from calibration.words import experiments
+from calibration.words import loop as words
+from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
@@ -96,12 +100,23 @@ class FoundEffect:
 class Formula:
     """A formula proposed for a curve; see `formula.Proposal`."""
 
-    formula: str
+    expression: str
     mark: str
     coefficients: tuple[float, ...]
     sds: tuple[float, ...]
     bic_gain_over_curve: float
     tried: int
+
+    @property
+    def formula(self) -> str:
+        """Its expression, or that there is none."""
+        return self.expression or words.NO_FORMULA
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {
+            n: getattr(self, n) for n in ("formula", "mark", "coefficients", "sds", "bic_gain_over_curve", "tried")
+        }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,14 +192,23 @@ class Alternative:
     Attributes:
         effects: amplitudes; prior_sds: the same in prior sds; sizes: over the largest plausible ones.
         rise_chi2: over the proposed fit [σ²], negative where they explain more.
-        why: why they are not proposed, in words.
+        reasons: why they are not plausible.
     """
 
     effects: dict[str, float]
     prior_sds: dict[str, float]
     sizes: dict[str, float]
     rise_chi2: float
-    why: str
+    reasons: tuple[RuledOut, ...] = ()
+
+    @property
+    def why(self) -> str:
+        """Why they are not plausible, in words."""
+        return words.why_ruled_out(self.reasons)
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {name: getattr(self, name) for name in ("effects", "prior_sds", "sizes", "rise_chi2", "why")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -253,11 +277,21 @@ class NextExperiment:
 
     name: str
     experiments: tuple[str, ...]
-    description: str
+    instruction: Instruction
     separates: tuple[str, ...]
     expected_sigma: float
     settles: bool
     menu: tuple[RankedExperiment, ...]
+
+    @property
+    def description(self) -> str:
+        """What to do and what to read."""
+        return experiments.instruction(self.instruction)
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        kept = ("name", "experiments", "description", "separates", "expected_sigma", "settles")
+        return {**{n: getattr(self, n) for n in kept}, "menu": [dataclasses.asdict(e) for e in self.menu]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,10 +367,10 @@ class Resolved:
         chi2: of the readings with the gear as stated and with the best one [σ²]; readings: that count.
         rms_percent: by channel, with the gear as stated and with the best one [%].
         slip_rms: the same of the slip [percentage points].
-        notes: of the search.
+        remarks: of the search.
     """
 
-    asked: str
+    asked: Asked
     rows: int
     robot: Robot
     constants: dict[str, Estimate]
@@ -349,7 +383,7 @@ class Resolved:
     readings: int
     rms_percent: dict[str, tuple[float, float]]
     slip_rms: tuple[float, float]
-    notes: tuple[str, ...]
+    remarks: Notes
 
     @property
     def known_from_rows(self) -> tuple[str, ...]:
@@ -364,30 +398,17 @@ class Resolved:
     @property
     def statement(self) -> str:
         """In a sentence or two."""
-        before, after = self.slip_rms
-        gear = ", ".join(
-            f"{name.removeprefix('running_gear.')} {e.value:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
-            for name, e in self.constants.items() if name.startswith("running_gear.")
-        )  # fmt: skip
-        on = "" if self.settled else "; the search had not settled, go on with --members and more --generations"
-        slip = f"slip of the {self.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
-        if not self.explains:
-            why = f"; {', '.join(self.outside)} outside" if self.outside else ""
-            return (
-                f"The track model was asked about {self.asked}: no running gear within its priors was found to leave "
-                f"it ({slip}, χ² falls by {self.fall:.0f}, p = {self.p:.2g}{why}){on}"
-            )
-        held = len(self.constants) - len(self.known_from_rows)
-        known = f"held by their priors: {held} of {len(self.constants)} constants"
-        return (
-            f"The track model was asked about {self.asked}: a running gear within its priors leaves it ({slip}, χ² "
-            f"falls by {self.fall:.0f}, p = {self.p:.2g}): {gear}; {known}{on}"
-        )
+        return words.resolved(self)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Of the search, in sentences."""
+        return sentences(self.remarks)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json."""
         return {
-            "asked": self.asked,
+            "asked": words.asked(self.asked),
             "statement": self.statement,
             "explains": self.explains,
             "rows": self.rows,
@@ -410,7 +431,7 @@ class DiscoveryResult:
     """All that the loop found.
 
     Attributes:
-        verdict: `none`, `named`, `class` or `unnamed`; statement: in one sentence.
+        verdict: `none`, `named`, `class` or `unnamed`; summary: with all that its statement says.
         robot: the proposed one; converged: whether its fit is an optimum; posterior: of all that was fitted.
         runs: the table; numbers: of its rows, as messages call them.
         included: whether a row counts; outliers, unusable: numbers of rows set aside.
@@ -420,7 +441,7 @@ class DiscoveryResult:
             only runs both ways can.
         alternatives, implausible: candidates nearly as good; such that would be but for their size or sign.
         hidden: effects that what was found could hide, the largest first.
-        standing: why names do not stand, or beside what they do; "" where there is nothing to say.
+        support: why names do not stand, or beside what they do; None where none was looked at.
         cluster: what rows that lie off have in common, so that they were not set aside; None for nothing.
         residual_clusters: columns without a role by which what the proposed robot leaves clusters.
         before, after: evidence in what base and proposed robot leave.
@@ -437,13 +458,13 @@ class DiscoveryResult:
         percent_of: what errors in percent are of.
         noise: channel → source and median sd [%].
         settings: the statistical constants; replicates: of the bootstrap, that settled.
-        notes: sentences worth saying.
+        remarks: what is worth saying.
         sensitivity: what is said with other assumed noise.
         resolved: what the track model says of what remains; None where it was not asked, or has no say.
     """
 
     verdict: str
-    statement: str
+    summary: Summary
     robot: Robot
     converged: bool
     posterior: Posterior
@@ -462,7 +483,7 @@ class DiscoveryResult:
     alternatives: tuple[Alternative, ...]
     implausible: tuple[Alternative, ...]
     hidden: tuple[HiddenEffect, ...]
-    standing: str
+    support: NameSupport | None
     cluster: Cluster | None
     residual_clusters: tuple[ResidualCluster, ...]
     before: Evidence
@@ -483,9 +504,24 @@ class DiscoveryResult:
     noise: dict[str, dict[str, Any]]
     settings: Settings
     replicates: int
-    notes: tuple[str, ...] = ()
+    remarks: Notes = ()
     sensitivity: tuple[Sensitivity, ...] = ()
     resolved: Resolved | None = None
+
+    @property
+    def statement(self) -> str:
+        """The verdict in one sentence."""
+        return words.statement(self.summary)
+
+    @property
+    def standing(self) -> str:
+        """Why names do not stand, or beside what they do, in words; "" where there is nothing to say."""
+        return words.reason(self.support)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences worth saying."""
+        return sentences(self.remarks)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -518,14 +554,14 @@ class DiscoveryResult:
             "rows_outliers": list(self.outliers),
             "effects": [_effect(e) for e in self.effects]
             + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
-            "next_experiment": None if proposal is None else dataclasses.asdict(proposal),
+            "next_experiment": None if proposal is None else proposal.to_json(),
             "remains": None if self.remains is None else dataclasses.asdict(self.remains),
             "cannot_see": list(self.cannot_see),
             "needs_series": list(self.needs_histories),
             "needs_reverse": list(self.needs_reverse),
             **self.detail.to_json(),
-            "alternatives": [dataclasses.asdict(a) for a in self.alternatives],
-            "implausible": [dataclasses.asdict(a) for a in self.implausible],
+            "alternatives": [a.to_json() for a in self.alternatives],
+            "implausible": [a.to_json() for a in self.implausible],
             "hidden": [dataclasses.asdict(h) for h in self.hidden],
             "standing": self.standing,
             "cluster": None if self.cluster is None else dataclasses.asdict(self.cluster),
@@ -553,7 +589,7 @@ class DiscoveryResult:
             },
             "settings": dataclasses.asdict(self.settings),
             "noise": self.noise,
-            "noise_sensitivity": [dataclasses.asdict(s) for s in self.sensitivity],
+            "noise_sensitivity": [s.to_json() for s in self.sensitivity],
             "notes": list(self.notes),
             "resolved": None if self.resolved is None else self.resolved.to_json(),
         }
@@ -576,10 +612,10 @@ class DiscoveryResult:
                 name = f"residual_{when}_{channel.name}_sigma"
                 table[name] = (simulated[:, k] - seen.measured[:, k]) / seen.sd[:, k]
         table |= self.detail.columns()
-        words = np.full(len(self.runs), "used", dtype="<U8")
-        words[np.isin(self.numbers, self.outliers)] = "outlier"
-        words[np.isin(self.numbers, self.unusable)] = "unusable"
-        table["use"] = words
+        use = np.full(len(self.runs), "used", dtype="<U8")
+        use[np.isin(self.numbers, self.outliers)] = "outlier"
+        use[np.isin(self.numbers, self.unusable)] = "unusable"
+        table["use"] = use
         return table
 
     def save(self, folder: Path | str, robot_name: str = "") -> None:
@@ -589,9 +625,8 @@ class DiscoveryResult:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
         write_table(folder / "rows.csv", self.rows_table())
-        start = f" from {robot_name}" if robot_name else ""
-        note = f"found by the loop{start} with {self.runs.source}: {self.statement}"
-        note = "\n".join([note, *describe_held(self.held_by_prior)])
+        held = [sentence(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
+        note = "\n".join([words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         posterior.write(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:
@@ -604,9 +639,18 @@ class Sensitivity:
 
     factor: float
     verdict: str
-    statement: str
+    summary: Summary
     classes: tuple[tuple[str, ...], ...]
     adequate_after: bool
+
+    @property
+    def statement(self) -> str:
+        """The verdict in one sentence."""
+        return words.statement(self.summary)
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
 
 
 def _effect(e: FoundEffect) -> dict[str, Any]:
@@ -646,7 +690,7 @@ def _unnamed(d: UnnamedDiscrepancy) -> dict[str, Any]:
         "effect": d.effect,
         "score_free_in_each_run": d.score_free_in_each_run,
         "curve": curve,
-        "proposal": dataclasses.asdict(d.proposal),
+        "proposal": d.proposal.to_json(),
     }
 
 

@@ -15,6 +15,7 @@ from calibration.discovery.candidates import Candidate, filled, fit_beside, fit_
 from calibration.discovery.score_tests import ScoreTable, Statistics, diagnosed
 from calibration.discovery.settings import Settings
 from calibration.inference.bases import Bases
+from calibration.inference.notes import Step
 
 #: Pairs of instances that are looked through for pairs of effects.
 PAIRS = 4000
@@ -50,7 +51,7 @@ def search(
     left: Diagnosis,
     bases: Bases,
     settings: Settings,
-    progress: Callable[[str], None],
+    progress: Callable[[Step], None],
 ) -> Search:
     """Effects that explain what the base leaves, as few as leave nothing that is beyond doubt.
 
@@ -67,7 +68,7 @@ def search(
         diagnosis = diagnose(space, best, bases, left.test.null, settings)
         if not diagnosis.test.rejected_with_margin or len(best.effects) == _most(space, settings):
             break
-        progress(f"{' and '.join(best.effects)} leaves something: fitting further effects beside it")
+        progress(Step("more effects", (best.effects,)))
         more = _extend(space, best, diagnosis.scores, base, left.scores, settings)
         best = _accepted(_best(more), ladder, settings)
         ladder += more

@@ -8,7 +8,6 @@ is not adequate each has to keep its significance with the best curves beside it
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
+from calibration.discovery.notes import CurveOver, NameSupport
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns, beside_columns, family_columns
 from calibration.discovery.search import Search
@@ -46,18 +46,6 @@ def equation(place: str) -> str:
     return EQUATION.get(place, place)
 
 
-@dataclasses.dataclass(frozen=True)
-class NameSupport:
-    """Whether the names of a candidate stand.
-
-    Attributes:
-        stands: whether they do; reason: in a sentence, why not, or what was put beside them.
-    """
-
-    stands: bool
-    reason: str = ""
-
-
 def standing(
     space: CandidateSpace, base: Candidate, searched: Search, left: Diagnosis, bases: Bases, settings: Settings
 ) -> NameSupport:
@@ -68,10 +56,10 @@ def standing(
     """
     best, after = searched.best, searched.diagnosis
     if best is None or after is None:
-        return NameSupport(False, "no effect of the library that explains it is of a plausible size")
+        return NameSupport(False, "implausible")
     other = _ruled_out(space, base, best, searched.ladder, settings)
     if other is not None:
-        return NameSupport(False, f"{' and '.join(other.effects)} would explain more, but not at a plausible size")
+        return NameSupport(False, "larger", other.effects)
     if after.test.rejected_with_margin:
         return _beside_curves(space, base, best, left, after, bases, settings)
     return _against_curves(space, base, best, left.linear, bases, settings)
@@ -118,17 +106,19 @@ def _against_curves(
     tried = _curves(space, linear, bases, crowded)
     if not tried:
         return NameSupport(True)
-    curve, word = max(tried)
+    curve, over = max(tried)
     # Curves are linear at the base: names are weighed by the better of their fit and what they explain there too.
     fall = max(2 * (base.cost - best.cost), _linearly(space, best, linear, settings))
     names = fall - cost_of_names(space, best, settings)
     if curve - 2 * math.log(len(tried)) > names + settings.preferred:
-        return NameSupport(False, f"one smooth {word} is the better explanation than {' and '.join(best.effects)}")
+        return NameSupport(False, "better curve", best.effects, (over,))
     return NameSupport(True)
 
 
-def _curves(space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]) -> list[tuple[float, str]]:
-    """(evidence, words) of every smooth curve: of one variable in any place, of two in the crowded ones."""
+def _curves(
+    space: CandidateSpace, linear: Linearization, bases: Bases, crowded: set[str]
+) -> list[tuple[float, CurveOver]]:
+    """Evidence of every smooth curve: of one variable in any place, of two in the crowded ones."""
     included, offered = space.included, dict.fromkeys(bases_room.names(bases))
     known = [
         v for v in bases_room.VARIABLES if any(v == over for _, over in offered) and _varies(linear, v, included)
@@ -137,18 +127,17 @@ def _curves(space: CandidateSpace, linear: Linearization, bases: Bases, crowded:
     for place, variable in offered:
         if variable in known:
             found = smooth(linear, place, variable, included)
-            tried.append((found.evidence, f"curve in the {_over(place, variable)}"))
+            tried.append((found.evidence, CurveOver(place, (variable,))))
     project = Projection(linear)
     for place in sorted(crowded):
         for pair in itertools.combinations([v for v in VARIABLES if v in known], 2):
             over = surface(linear, place, pair, included, project)
-            tried.append((over.evidence, f"surface in the {_over(place, *pair)}"))
+            tried.append((over.evidence, CurveOver(place, pair)))
     return tried
 
 
-def _over(place: str, *variables: str) -> str:
-    """`balance slip over speed motor and slope`."""
-    return f"{bases_room.in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
+def _over(place: str, variable: str) -> CurveOver:
+    return CurveOver(place, (variable,))
 
 
 def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
@@ -190,27 +179,27 @@ def _beside_curves(
     for k in _strongest(left, names):
         found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
         if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
-            return NameSupport(False, f"one smooth curve in the {_over(*names[k])} leaves nothing")
+            return NameSupport(False, "curve alone", curves=(_over(*names[k]),))
     own = {equation(space.library[e].channel or space.library[e].balance) for e in best.effects}
     chosen, test = _curves_beside(after.linear, after, bases, own, CURVES, settings)
     if test.rejected_with_margin:
         chosen, test = _curves_beside(after.linear, after, bases, set(), CURVES, settings)
     if test.rejected_with_margin:
-        return NameSupport(False, f"the fit with {' and '.join(best.effects)} is not adequate")
+        return NameSupport(False, "not adequate", best.effects)
     columns = np.concatenate([family_columns(after.linear, bases, k) for k in chosen], 1)
     significance = _significance(space, best, after.linear, columns)
     needed = after.test.threshold("single")
     lost = [e for e, t in zip(best.effects, significance, strict=True) if abs(t) < needed]
-    words = ", ".join(_over(*names[k]) for k in chosen)
+    curves = tuple(_over(*names[k]) for k in chosen)
     if lost:
-        return NameSupport(False, f"beside smooth curves ({words}) {' and '.join(lost)} would explain nothing")
+        return NameSupport(False, "lost", tuple(lost), curves)
     where = locate(left, bases, space.included)
     if equation(where.place) in own & {equation(names[k][0]) for k in chosen}:
         # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
         if not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
-            return NameSupport(False, f"one smooth curve in the {_over(where.place, where.variable)} leaves nothing")
-    return NameSupport(True, f"beside smooth curves ({words})")
+            return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
+    return NameSupport(True, "beside", curves=curves)
 
 
 def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:

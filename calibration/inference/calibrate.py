@@ -29,13 +29,15 @@ from calibration.inference import optimizers as fit
 from calibration.inference.multistart import Found
 from calibration.inference.noise import Noise
 from calibration.inference.noise_factor import noise_remarks
+from calibration.inference.notes import Elsewhere, Fact, Note, OfRows, PriorOfProduct, Step
 from calibration.inference.population import GENERATIONS, LEAST
 from calibration.inference.posterior import of_coordinates
 from calibration.inference.preparation import Prepared, prepare
 from calibration.inference.problem import Problem
-from calibration.inference.remarks import remarks
+from calibration.inference.remarks import numbers, remarks
 from calibration.inference.residual_clusters import residual_clusters
 from calibration.inference.result import CalibrationResult
+from calibration.words.notes import in_words
 from mmrjax import fidelities
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
@@ -44,8 +46,6 @@ from mmrjax.signals import FLAGS, STATUSES
 POPULATION = 256
 #: Parameters that the resolved running gear gives another meaning: beginnings after their configuration.
 FRICTION = "ground.friction."
-#: Source of the prior of a guide friction whose share is a result of the model.
-_OF_PRODUCT = "its product with the share of the guides, as in the other fidelities"
 
 
 def calibrate(
@@ -103,6 +103,7 @@ def calibrate(
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
 
+    told = in_words(tell)
     former: list[str] = []
 
     def chosen(prepared: Prepared) -> tuple[str, ...]:
@@ -122,15 +123,17 @@ def calibrate(
 
     ready = prepare(runs, robot, noise, stated, assume=False, choose=chosen)
     robot, known, stated, names = ready.robot, ready.noise, ready.stated, ready.names
-    for sentence in (*ready.former, *ready.foreign):
-        tell(sentence)
+    for note in (*ready.former, *ready.foreign):
+        told(note)
     base = robot
     of_product: dict[str, tuple[float, float]] = {}
     if priors.GUIDE_SHARE in facts.computes:
         present = {robot.configurations.names[k] for k in runs.configurations(robot)}
         base, of_product = _guided(robot, present, names, stated)
     coordinates = priors.coordinates(base, names, {**of_product, **stated})
-    notes = [*ready.foreign, *ready.checked, *ready.weighed, *_of_product(of_product), *ready.begins]
+    notes: list[Note | str] = [*ready.foreign, *ready.checked, *ready.weighed]
+    notes += [PriorOfProduct(name, mean, sd, priors.GUIDED) for name, (mean, sd) in of_product.items()]
+    notes += ready.begins
     posed = observers.pose(runs, base, coordinates, known.sd, model)
 
     if population is None:
@@ -144,7 +147,7 @@ def calibrate(
     if 0 < population < LEAST:
         raise BadConfiguration(f"--population: got {population}; expected 0 or at least {LEAST} members")
     evolved = _Evolved(population, generations or GENERATIONS, members)
-    found, beside = _searched(runs, base, posed, known, starts, evolved, seed, tell)
+    found, beside = _searched(runs, base, posed, known, starts, evolved, seed, told)
     posed, z = found.problem, np.asarray(found.best.z)
     fitted = posed.robot(jnp.asarray(z))
     after, before = fit.observation(posed, jnp.asarray(z)), fit.read(posed, posed.base)
@@ -155,24 +158,22 @@ def calibrate(
 
     if posed.observe.long:
         doing = ["the linear analysis", *["profiles"] * profiles, *["blocks held out"] * bool(kinds)]
-        tell(f"optimum found; now {', '.join(doing)}")
+        told(Step("optimum", (", ".join(doing),)))
     notes += posed.observe.cautions(fitted)
     searched = found.searched
     about = identifiability.analyse(posed, jnp.asarray(z), slope=None if searched is None else searched.slope)
-    notes += searched.statements() if searched is not None else []
+    notes += searched.remarks() if searched is not None else []
     seen_over = scans.profiles(posed, z)
     about = scans.with_scanned_sds(about, seen_over)
-    notes += scans.statements(posed, seen_over)
+    notes += scans.remarks(posed, seen_over)
     elsewhere = scans.apart(seen_over, found.starts.z, found.starts.converged)
     if elsewhere:
-        over = ", ".join(posed.coordinates.names[k] for k in seen_over)
-        notes.append(f"{elsewhere} of {len(found.starts.cost)} searches converged at other values of {over}")
+        over = tuple(posed.coordinates.names[k] for k in seen_over)
+        notes.append(Elsewhere(elsewhere, len(found.starts.cost), over))
     if not np.isfinite(about.covariance).all():
-        notes.append("the posterior has no finite covariance: values stand, intervals do not")
-    jumps = np.flatnonzero(np.asarray(after.flags) >> FLAGS.index("jumps") & 1)
-    if len(jumps):
-        rows = ", ".join(str(k + 1) for k in jumps)
-        notes.append(f"rows {rows}: the calibrated robot's running gear jumps; it leaves the ground at times")
+        notes.append(Fact("no covariance"))
+    if jumps := numbers(np.asarray(after.flags) >> FLAGS.index("jumps") & 1):
+        notes.append(OfRows(jumps, "jumps"))
     profile = identifiability.profile(posed, jnp.asarray(z), float(found.best.cost), about) if profiles else None
     masks = {kind: holdout.blocks(runs, kind) for kind in kinds}
     held = holdout.held_out(posed, np.asarray(z), masks)
@@ -184,7 +185,7 @@ def calibrate(
     left = lack_of_fit.Residuals(observe, runs, seen, whitened, there, about.jacobian, z)
     if not known.estimated.any():
         notes += noise_remarks(left)
-    sources = {name: _OF_PRODUCT for name in of_product} | {name: "stated" for name in stated}
+    sources = {name: "product" for name in of_product} | {name: "stated" for name in stated}
     result = CalibrationResult(
         robot=fitted,
         source=runs.source,
@@ -213,9 +214,9 @@ def calibrate(
         residual_clusters=residual_clusters(left, seed),
         identifiability=about,
         posterior=of_coordinates(posed.coordinates, z, about.covariance),
-        notes=(*notes, *checks.unmeasured(names, about.sensitivity).values()),
+        remarks=(*notes, *checks.unmeasured(names, about.sensitivity)),
     )
-    return dataclasses.replace(result, notes=(*result.notes, *remarks(result)))
+    return dataclasses.replace(result, remarks=(*result.remarks, *remarks(result)))
 
 
 def _guided(
@@ -231,14 +232,6 @@ def _guided(
     return robot, {name: prior for name, prior in known.items() if name in names and name not in stated}
 
 
-def _of_product(known: Mapping[str, tuple[float, float]]) -> list[str]:
-    return [
-        f"{name}: its prior, {mean:.3g} ± {sd:.2g}, is that of its product with the share of the guides in the other "
-        f"fidelities; the track model puts {priors.GUIDED:.0%} of the weight on them"
-        for name, (mean, sd) in known.items()
-    ]
-
-
 def _searched(
     runs: Runs,
     base: Robot,
@@ -247,7 +240,7 @@ def _searched(
     starts: int,
     evolved: _Evolved,
     seed: int,
-    tell: Callable[[str], None],
+    tell: Callable[[Step], None],
 ) -> tuple[Found, np.ndarray | None]:
     """The searches of a problem, and where they began at the optimum of `steady`, that optimum."""
     rng, size = np.random.default_rng(seed), len(posed.coordinates)
@@ -256,7 +249,7 @@ def _searched(
         return multistart.search(posed, known, points), None
     if not posed.observe.eased:
         return multistart.search_one_by_one(posed, known, points, multistart.first_shares(known), tell), None
-    tell("the same with steady first, to begin from its optimum")
+    tell(Step("steady"))
     draws = rng.standard_normal((fidelities.facts("steady").effort.starts, size))
     draws[0] = 0.0
     easy = multistart.search(observers.pose(runs, base, posed.coordinates, known.sd), known, draws)
@@ -280,7 +273,7 @@ def _searched(
             f"so: {said or 'none'}); begin from another robot, or free less"
         )
     posed, shares = multistart.reestimate_noise_at(posed, known, everyone, at)
-    tell("population done; now derivatives against differences at the best")
+    tell(Step("derivatives"))
     about = identifiability.analyse(posed, jnp.asarray(everyone.z[at]))
     off = population.apart(posed, members, everyone.z[at], about.jacobian, about.sd)
     names = tuple(n for n, apart in zip(posed.coordinates.names, off, strict=True) if apart)

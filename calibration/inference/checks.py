@@ -13,34 +13,13 @@ from calibration.data.runs import Runs
 from calibration.inference import observers
 from calibration.inference.conduct import conduct
 from calibration.inference.noise import Noise
+from calibration.inference.notes import Constant, Note, Unmeasured
 from calibration.inference.ranges import check_ranges
 from mmrjax.robot import Robot
 from mmrjax.signals import SLIDES, STATUSES
 
-#: What would measure a parameter that the data do not, by the start or end of its name.
-WOULD_MEASURE = {
-    "battery.": "runs on the on-board battery (Source Mode 1)",
-    "motor.inductance": "a time history of the start-up current, with samples every tenth of a millisecond",
-    "motor.inertia": "a time history of the start",
-    ".inertia": "a time history of the start",
-    "motor.resistance_thermal": "long runs at high current with the effect winding_heating present",
-    "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating present",
-    ".friction.dynamic": "a history in which the movers spin faster than V_d (a start on a slippery slope)",
-    ".friction.speed_dynamic": "a history in which the movers spin faster than V_s (a start on a slippery slope)",
-    ".guide_share": "the fidelities steady and drive (the track model puts it out; free guide_friction there)",
-    ".mass": "a scale, or runs whose table does not state total_mass_kg",
-}
 
-
-def would_measure(name: str) -> str:
-    """What would measure a parameter that nothing in the data does."""
-    for key, what in WOULD_MEASURE.items():
-        if name.startswith(key) or name.endswith(key):
-            return what
-    return "runs under conditions in which it acts"
-
-
-def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[str]:
+def check(runs: Runs, robot: Robot, names: Sequence[str], noise: Noise) -> list[Note | str]:
     """Refuse data that cannot be fitted; return what should be said of data that can.
 
     Raises:
@@ -100,28 +79,22 @@ def _stuck(runs: Runs) -> None:
             )
 
 
-def _constant_conditions(runs: Runs) -> list[str]:
+def _constant_conditions(runs: Runs) -> list[Constant]:
     imposed = runs.layout.imposed_column
-    losses = "rolling resistance, guide friction" if runs.layout.complete else "rolling resistance"
-    says = {
-        "slope_deg": f"{losses} and Coulomb losses act alike without slopes",
-        imposed: "losses that grow with speed and those that do not act alike at one "
-        + ("voltage" if imposed == SUPPLY else "speed"),
+    alike = {
+        "slope_deg": "guides" if runs.layout.complete else "slope",
+        imposed: "voltage" if imposed == SUPPLY else "speed",
     }
     return [
-        f"{column} is {number(runs[column][0])} in every row: {why}, and only their priors tell them apart"
-        for column, why in says.items()
+        Constant(column, runs[column][0], losses)
+        for column, losses in alike.items()
         if column in runs.axes and np.ptp(runs[column]) == 0 and (column != SUPPLY or np.ptp(applied(runs)) == 0)
     ]
 
 
-def unmeasured(names: Sequence[str], sensitivity: np.ndarray) -> dict[str, str]:
-    """Name → sentence, for each free parameter that moves no reading."""
-    return {
-        name: f"{name}: nothing in these data measures it; its value is its prior's. {would_measure(name)} would"
-        for name, s in zip(names, sensitivity, strict=True)
-        if s < 1e-6
-    }
+def unmeasured(names: Sequence[str], sensitivity: np.ndarray) -> list[Unmeasured]:
+    """Free parameters that move no reading."""
+    return [Unmeasured(name) for name, s in zip(names, sensitivity, strict=True) if s < 1e-6]
 
 
 def infeasible(

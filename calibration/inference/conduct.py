@@ -8,6 +8,7 @@ from calibration.data.courses import names as runs_of
 from calibration.data.courses import varies
 from calibration.data.runs import Runs
 from calibration.inference import observers
+from calibration.inference.notes import EndsEarly, Fact, NeverGrips, Note
 from calibration.inference.operating import operating_readings
 from calibration.inference.ranges import UNDER_WAY
 from mmrjax import channels
@@ -18,7 +19,7 @@ from mmrjax.robot import Robot
 SLOW, SLIDING = 0.7, 0.7
 
 
-def conduct(runs: Runs, robot: Robot) -> list[str]:
+def conduct(runs: Runs, robot: Robot) -> list[Note]:
     """Say which runs end before they are under way, and which never grip."""
     runs = runs.of(robot)
     kind = observers.kind(runs)
@@ -41,28 +42,18 @@ def conduct(runs: Runs, robot: Robot) -> list[str]:
     early = (lasts < UNDER_WAY) & (slow | ~known)
     slides = (lasts >= UNDER_WAY) & known & np.isfinite(movers) & (movers > 0) & (speed < SLIDING * movers)
     slides &= ~np.isin(names, runs_of(runs)[varies(runs)])  # what is shown of those is a part of them
-    said = []
+    said: list[Note] = []
     if early.any():
-        at = (
-            f", at {np.nanmedian(speed[slow & early] / steady[slow & early]):.0%} of the speed of steady travel"
-            if (slow & early).any()
-            else ""
-        )
-        said.append(
-            f"{_runs(names, early)} after {lasts[early].max():.2g} s at the latest{at}: before the robot is under "
-            "way, so what resists its travel is known by its priors; record until the speed is steady"
-        )
+        seen = slow & early
+        share = float(np.nanmedian(speed[seen] / steady[seen])) if seen.any() else float("nan")
+        said.append(EndsEarly(_names(names, early), float(lasts[early].max()), share))
     if slides.any():
         share = max(float(np.median(speed[slides] / movers[slides])), 0.0)
-        said.append(
-            f"{_runs(names, slides, 'never grips', 'never grip')}: in the end the robot travels at {share:.0%} of "
-            "the speed of its movers, so what the ground holds before it slides is not measured there"
-        )
+        said.append(NeverGrips(_names(names, slides), share))
     if slides.any() and (slides | early).all():
-        said.append("no run grips: static friction, and slip below it, are known by their priors alone")
+        said.append(Fact("no grip"))
     return said
 
 
-def _runs(names: np.ndarray, which: np.ndarray, one: str = "ends", several: str = "end") -> str:
-    found = [str(n) for n in names[which]]
-    return f"run {found[0]} {one}" if len(found) == 1 else f"runs {', '.join(found)} {several}"
+def _names(names: np.ndarray, which: np.ndarray) -> tuple[str, ...]:
+    return tuple(str(n) for n in names[which])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from calibration.data.errors import number
+from calibration.inference.notes import InheritedPriors
 from calibration.inference.priors import FRICTION, GUIDE_FRICTION, GUIDE_SHARE, known
 from mmrjax import robots
 from mmrjax.robot import Robot
@@ -19,8 +19,8 @@ CHASSIS, GUIDES = (("mass", "radius"), FRICTION), (GUIDE_SHARE, GUIDE_FRICTION)
 DIFFERS = 0.2
 
 
-def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[str]:
-    """A sentence for each part that is not the nominal robot's while friction of it still is.
+def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[InheritedPriors]:
+    """Each part that is not the nominal robot's while friction of it still is.
 
     None of a rig that starts from nothing.
 
@@ -34,30 +34,20 @@ def inherited_priors(robot: Robot, stated: Collection[str] = ()) -> list[str]:
     mine, nominal = ({name: float(p.value) for name, p in known(r).items()} for r in (robot, robots.nominal()))
     pairs = [(part, part, *DRIVE[part]) for part in DRIVE]
     pairs += [(c, other, *CHASSIS) for c in robot.configurations for other in robots.nominal().configurations]
-    found: dict[str, tuple[int, str]] = {}
+    found: dict[str, InheritedPriors] = {}
     for part, other, sheet, friction in pairs:
         on_tracks = part in robot.configurations and float(robot.configurations[part].on_tracks) > 0.5
         guides = GUIDES if on_tracks else ()
-        kept = [
+        kept = tuple(
             f"{part}.{name}"
             for name in (*friction, *guides)
             if mine[f"{part}.{name}"] == nominal[f"{other}.{name}"] != 0 and f"{part}.{name}" not in stated
-        ]
-        changed = [
-            f"{name} {number(mine[f'{part}.{name}'])} for {number(nominal[f'{other}.{name}'])}"
+        )
+        changed = tuple(
+            (name, mine[f"{part}.{name}"], nominal[f"{other}.{name}"])
             for name in sheet
             if abs(mine[f"{part}.{name}"] / nominal[f"{other}.{name}"] - 1) > DIFFERS
-        ]
-        if not kept:
-            continue
-        sentence = ""
-        if changed:
-            one = len(kept) == 1
-            sentence = (
-                f"{part} is not the nominal robot's ({', '.join(changed)}), but its {', '.join(kept)} still "
-                f"{'is' if one else 'are'}: {'that prior comes' if one else 'those priors come'} from another robot; "
-                "state yours in the robot's file or with --prior"
-            )
-        if len(kept) > found.get(part, (0, ""))[0]:
-            found[part] = len(kept), sentence
-    return [sentence for _, sentence in found.values() if sentence]
+        )
+        if len(kept) > len(found[part].kept if part in found else ()):
+            found[part] = InheritedPriors(part, changed, kept)
+    return [note for note in found.values() if note.changed]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -32,13 +31,6 @@ def held_by_prior(sd: np.ndarray) -> np.ndarray:
         sd: posterior, of coordinates whose prior sd is 1 (of a log-normal prior: of the logarithm), any shape.
     """
     return ~(np.asarray(sd) <= HELD)
-
-
-def describe_held(names: Iterable[str]) -> list[str]:
-    """Which parameters are held by their priors, in a sentence; none for none."""
-    names = list(names)
-    whose = "its prior" if len(names) == 1 else "their priors"
-    return [f"held by {whose} (posterior sd above {HELD:g} of the prior's): {', '.join(names)}"] if names else []
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,9 @@ from scipy.special import chdtrc, fdtrc, ndtr
 
 from calibration.data.courses import courses
 from calibration.data.runs import DUTY, Runs
+from calibration.inference.notes import Shown
 from calibration.inference.observers import Observer
+from calibration.words import fits
 
 #: Family-wise error of «not adequate».
 LEVEL = 0.05
@@ -38,7 +40,7 @@ class Adequacy:
         adequate: None where it cannot be tested.
         chi2: misfit of the readings [σ²]; degrees_of_freedom: that the fit leaves them.
         p_value: family-wise, of all tests made; None where none could be.
-        shown_by: the most telling test, in words.
+        shown_by: the most telling test.
         noise_known: whether χ² was among the tests.
     """
 
@@ -46,35 +48,17 @@ class Adequacy:
     chi2: float
     degrees_of_freedom: float
     p_value: float | None
-    shown_by: str
+    shown_by: Shown
     noise_known: bool
 
     @property
     def statement(self) -> str:
         """In one sentence; opens a calibration's output."""
-        chi2 = f"χ² {self.chi2:.4g} on {self.degrees_of_freedom:.4g} degrees of freedom"
-        if self.adequate is None or self.p_value is None:
-            return (
-                "Adequacy cannot be tested: the noise was estimated from the misfit, and "
-                f"{self.degrees_of_freedom:.4g} degrees of freedom cannot show structure; state it with --noise"
-            )
-        p = f"p = {self.p_value:.2g}" if self.p_value > 1e-6 else "p < 1e-6"
-        if not self.adequate:
-            why = f"{chi2}, {p}" if self.noise_known else f"{p}, the noise estimated from them"
-            return (
-                f"Not adequate: {self.shown_by} ({why}), so something is missing and the parameters may stand "
-                "in for it; mmrjax loop finds what"
-            )
-        if self.noise_known:
-            return f"Adequate: the residuals are what the stated noise leaves ({chi2}, {p})"
-        return (
-            f"Adequate as far as can be tested: the residuals show no structure ({p}); the noise was estimated from "
-            "them, so χ² tests nothing"
-        )
+        return fits.adequacy(self)
 
     def to_json(self) -> dict[str, object]:
         """As in `adequate` of result.json."""
-        return {**dataclasses.asdict(self), "statement": self.statement}
+        return {**dataclasses.asdict(self), "shown_by": fits.shown_by(self.shown_by), "statement": self.statement}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,22 +115,22 @@ def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
     found = structure(fit, known=known)
     if known and freedom > 0:
-        found.append((float(chdtrc(freedom, chi2)), "the residuals exceed the stated noise"))
+        found.append((float(chdtrc(freedom, chi2)), Shown(what="stated")))
     if not found:
-        return Adequacy(None, chi2, freedom, None, "", known)
-    p, words = min(found)
+        return Adequacy(None, chi2, freedom, None, Shown(), known)
+    p, shown = min(found)
     p = min(1.0, p * len(found))
-    return Adequacy(p > LEVEL, chi2, freedom, p, words, known)
+    return Adequacy(p > LEVEL, chi2, freedom, p, shown, known)
 
 
-def structure(fit: Residuals, *, known: bool) -> list[tuple[float, str]]:
+def structure(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:
     """Tests of structure, each p-value with what it shows: curves over the conditions, memory, replicates."""
-    families = {words: _p_value(fit, columns, known) for words, columns in _families(fit).items()}
-    tested = [(p, words) for words, p in families.items() if p is not None]
+    families = {shown: _p_value(fit, columns, known) for shown, columns in _families(fit).items()}
+    tested = [(p, shown) for shown, p in families.items() if p is not None]
     found = []
     if tested:
-        p, words = min(tested)
-        found.append((min(1.0, p * len(tested)), words))
+        p, shown = min(tested)
+        found.append((min(1.0, p * len(tested)), shown))
     return [*found, *(made for made in (_memory(fit), _replicates(fit)) if made is not None)]
 
 
@@ -169,8 +153,8 @@ def _p_value(fit: Residuals, columns: np.ndarray, known: bool) -> float | None:
     return float(fdtrc(terms, freedom - terms, explained / terms / rest))
 
 
-def _families(fit: Residuals) -> dict[str, np.ndarray]:
-    """Columns over the readings by what they mean: for each channel, curves over each variable, by configuration."""
+def _families(fit: Residuals) -> dict[Shown, np.ndarray]:
+    """Columns over the readings by what they show: for each channel, curves over each variable, by configuration."""
     observe, runs, simulated, there = fit.observe, fit.runs, fit.simulated, fit.there
     variables = {c: (runs[c], TERMS) for c in (*runs.axes, *DUTY) if runs.has(c)}
     if observe.axis:
@@ -194,11 +178,11 @@ def _families(fit: Residuals) -> dict[str, np.ndarray]:
             own = [curve * ((which == c) & rows)[:, None] for c in np.unique(which)]
             columns = np.zeros((*there.shape, sum(o.shape[1] for o in own)))
             columns[:, k] = np.concatenate(own, 1)
-            families[f"the residuals of {channel.label} follow {name}"] = columns.reshape(there.size, -1)
+            families[Shown(channel.name, "follow", name)] = columns.reshape(there.size, -1)
     return families
 
 
-def _memory(fit: Residuals) -> tuple[float, str] | None:
+def _memory(fit: Residuals) -> tuple[float, Shown] | None:
     """Whether residuals of a run resemble those of the sample before, where rows of a run follow one another."""
     observe, runs, residual, there = fit.observe, fit.runs, fit.whitened, fit.there
     if not observe.axis:
@@ -213,14 +197,14 @@ def _memory(fit: Residuals) -> tuple[float, str] | None:
         power = float(np.sum(e[ok] ** 2))
         if both.sum() >= 20 and power > 0:
             r = float(np.sum(e[1:][both] * e[:-1][both])) / power
-            found.append((float(ndtr(-r * np.sqrt(both.sum()))), f"the residuals of {channel.label} remember"))
+            found.append((float(ndtr(-r * np.sqrt(both.sum()))), Shown(channel.name, "remember")))
     if not found:
         return None
-    p, words = min(found)
-    return min(1.0, p * len(found)), f"{words} the sample before"
+    p, shown = min(found)
+    return min(1.0, p * len(found)), shown
 
 
-def _replicates(fit: Residuals) -> tuple[float, str] | None:
+def _replicates(fit: Residuals) -> tuple[float, Shown] | None:
     """Whether the residuals exceed the scatter of rows under the same conditions."""
     observe, runs, residual, there = fit.observe, fit.runs, fit.whitened, fit.there
     freedom, chi2 = float(fit.freedom.sum()), float(fit.chi2.sum())
@@ -238,4 +222,4 @@ def _replicates(fit: Residuals) -> tuple[float, str] | None:
     if own < REPLICATES or freedom - own < 1 or pure <= 0:
         return None
     quotient = max(chi2 - pure, 0.0) / (freedom - own) / (pure / own)
-    return float(fdtrc(freedom - own, own, quotient)), "the residuals exceed the scatter of repeated runs"
+    return float(fdtrc(freedom - own, own, quotient)), Shown(what="repeats")

@@ -15,8 +15,10 @@ from calibration.inference import identifiability, scans
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.noise import Noise
+from calibration.inference.notes import Agreement, Step
 from calibration.inference.population import Population, Searched, most_probable
 from calibration.inference.problem import Data, Observation, Problem
+from calibration.words import fits
 from mmrjax.robot import Robot
 
 #: Costs closer than this to the best [½σ²] are the same optimum.
@@ -54,21 +56,16 @@ class Starts:
         """How many converged searches ended at the best optimum."""
         return int(np.sum(self.converged & self._at_best))
 
+    @property
+    def agreement(self) -> Agreement:
+        """Whether the starts agree."""
+        other = self.converged & ~self._at_best
+        more = float(self.cost[other].min() - self.cost.min()) if other.any() else 0.0
+        return Agreement(len(self.cost), self.agree, int(other.sum()), more, int(np.sum(~self.converged)))
+
     def statement(self) -> str:
         """Whether the starts agree, as a sentence."""
-        n = len(self.cost)
-        if n == 1:
-            return "one search" if self.converged[0] else "one search, which did not converge"
-        if self.agree == n:
-            return f"all {n} starts end at the same optimum"
-        other = self.converged & ~self._at_best
-        parts = [f"{self.agree} of {n} starts end at the best optimum"]
-        if other.any():
-            best = self.cost[other].min()
-            parts.append(f"{other.sum()} at others (the next costs {best - self.cost.min():.3g} more)")
-        if not self.converged.all():
-            parts.append(f"{np.sum(~self.converged)} did not converge")
-        return ", ".join(parts)
+        return fits.agreement(self.agreement)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,23 +112,25 @@ def search(posed: Problem, noise: Noise, points: np.ndarray) -> Found:
 
 
 def search_one_by_one(
-    posed: Problem, noise: Noise, points: np.ndarray, shares: np.ndarray, tell: Callable[[str], None]
+    posed: Problem, noise: Noise, points: np.ndarray, shares: np.ndarray, tell: Callable[[Step], None]
 ) -> Found:
     """As `search`, one search at a time: the noise settles on the first point's optimum, then the others start once
     each. One that ends lower takes its place, and the noise settles again.
 
     Args:
         posed: with the noise to begin from; shares: of the reading, that it has.
-        tell: is given a sentence after every step.
+        tell: is given what was done after every step.
     """
     begun = time.perf_counter()
 
-    def clock() -> str:
-        return f"{(time.perf_counter() - begun) / 60:.1f} min"
+    def minutes() -> float:
+        return (time.perf_counter() - begun) / 60
 
     def step(posed: Problem, points: np.ndarray, data: Data) -> tuple[fit.Optimum, np.ndarray, np.ndarray]:
         def one(z: np.ndarray) -> tuple[fit.Optimum, Observation, Observation]:
-            return fit.search_long(posed, jnp.asarray(z), data, tell=lambda said: tell(f"  {said}, {clock()}"))
+            return fit.search_long(
+                posed, jnp.asarray(z), data, tell=lambda *done: tell(Step("search", (*done, minutes())))
+            )
 
         found, start, end = one(points[0])
         found, end = scans.searched_on(posed, (found, end), data, lambda z: one(z)[::2], tell)
@@ -144,7 +143,7 @@ def search_one_by_one(
         for round_ in range(1, ROUNDS + 1):
             posed, found, feasible = _tighten(posed, z[None], step)
             z = np.asarray(found.z[0])
-            tell(f"round {round_}: objective {found.cost[0]:.4f} after {found.steps[0]} steps, {clock()}")
+            tell(Step("round", (round_, found.cost[0], found.steps[0], minutes())))
             new = _settling(posed, noise, z, shares)
             if new is None:
                 break
@@ -155,7 +154,7 @@ def search_one_by_one(
             end, status, _ = step(posed, point[None], posed.data)
             ends.append(end)
             feasibles.append(~np.any(unreachable(posed, status), axis=1))
-            tell(f"start {k} of {len(points)}: objective {end.cost[0]:.4f} after {end.steps[0]} steps, {clock()}")
+            tell(Step("start", (k, len(points), end.cost[0], end.steps[0], minutes())))
         found = jax.tree.map(lambda *x: jnp.concatenate(x), *ends)
         k = int(np.nanargmin(found.cost))
         if not found.cost[k] < found.cost[0] - AGREE * (1 + found.cost[0]):
@@ -188,7 +187,7 @@ def nearby(easy: Problem, z: np.ndarray, rng: np.random.Generator, count: int) -
 
 
 def at_best(
-    posed: Problem, noise: Noise, shares: np.ndarray, searched: Searched, tell: Callable[[str], None]
+    posed: Problem, noise: Noise, shares: np.ndarray, searched: Searched, tell: Callable[[Step], None]
 ) -> Found:
     """What a population found, its best member searched on by gradients where those are to be trusted."""
     z = searched.found.z[searched.at]

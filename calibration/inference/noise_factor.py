@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import chdtr, chdtrc
 
 from calibration.inference.lack_of_fit import LEVEL, Residuals, structure
-from mmrjax import channels
+from calibration.inference.notes import NoiseOff
 
 #: Factor on the sds from which it is said, either way; probability under right sds below which it is.
 OFF, IMPROBABLE = 1.25, 0.001
@@ -57,15 +57,9 @@ def _everywhere(fit: Residuals, factors: dict[str, float]) -> bool:
     return len(factors) == count > 1 and max(factors.values()) < ALIKE**2 * min(factors.values())
 
 
-def noise_remarks(fit: Residuals, word: str = "stated") -> list[str]:
-    """What to say of sds that are off by a factor; `word` says where they come from."""
+def noise_remarks(fit: Residuals, source: str = "stated") -> list[NoiseOff]:
+    """Sds that are off by a factor; `source` says where they come from."""
     factors = noise_factors(fit)
     if _everywhere(fit, factors):
-        typical = float(np.exp(np.mean(np.log(list(factors.values())))))
-        where = "in every channel and everywhere alike"
-        return [f"residuals are {typical:.2g} times the {word} sds {where}: are the sds right?"]
-    each = [(channels.of(name).label, factor) for name, factor in factors.items()]
-    return [
-        f"residuals of {label} are {factor:.2g} times the {word} sds, everywhere alike: are these sds right?"
-        for label, factor in each
-    ]
+        return [NoiseOff("", float(np.exp(np.mean(np.log(list(factors.values()))))), source)]
+    return [NoiseOff(name, factor, source) for name, factor in factors.items()]

@@ -473,7 +473,11 @@ def _stepped(at: Progress, found: tuple[Array, Array, Any], held_from: int, held
 
 
 def search_long(
-    problem: Problem, start: Z, data: Data, max_steps: int = 100, tell: Callable[[str], None] = lambda _: None
+    problem: Problem,
+    start: Z,
+    data: Data,
+    max_steps: int = 100,
+    tell: Callable[[int, float], None] = lambda steps, cost: None,
 ) -> tuple[Optimum, Observation, Observation]:
     """`levenberg_marquardt` with the steps taken from outside, so that a rollout is compiled once in all.
 
@@ -500,7 +504,7 @@ def search_long(
             best, last = _optimum(jacobian, r, search.y, data, pin, jnp.asarray(steps)), seen
             done |= bool(best.decrement < 0.1 * (DECREMENT + DECREMENT_SHARE * best.cost))
         assert best is not None  # the first step only evaluates the start, and accepts it
-        tell(f"step {steps}: objective {float(best.cost):.4f}")
+        tell(steps, float(best.cost))
         if done:
             break
     assert best is not None and first is not None and last is not None

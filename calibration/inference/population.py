@@ -26,8 +26,19 @@ from jaxtyping import Array, Bool, Float, Int
 from calibration.data.errors import BadConfiguration
 from calibration.inference import noise as noise_room
 from calibration.inference.noise import Noise
+from calibration.inference.notes import (
+    Edge,
+    EndedAtEdge,
+    Generations,
+    LostRows,
+    MembersJump,
+    Note,
+    ReadFromMembers,
+    Step,
+)
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import MISSING, Observation, Problem
+from calibration.words import fits
 from mmrjax.compiling import compiled
 from mmrjax.signals import FLAGS, STATUSES
 
@@ -43,11 +54,8 @@ LOST = 1e3
 MEMBERS_EACH = 3
 #: Distance from the middle of a prior beyond which a search is at its edge [prior sd].
 EDGE = 2.5
-#: How a member loses a row, in words.
-LOST_AS = {
-    "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
-    "stalled": "stall",
-}  # fmt: skip
+#: Statuses with which a member loses a row.
+LOST_AS = ("slides", "tips", "failed", "stalled")
 #: Step of the differences by which derivatives are checked [posterior sd], and how far the two may be apart.
 STEP, APART = 0.2, 0.25
 
@@ -244,7 +252,7 @@ def evolve(
     seed: int,
     generations: int = GENERATIONS,
     beside: np.ndarray | None = None,
-    tell: Callable[[str], None] = lambda sentence: None,
+    tell: Callable[[Step], None] = lambda step: None,
 ) -> Population:
     """Search by generations.
 
@@ -253,7 +261,7 @@ def evolve(
         centre, covariance: of the first generation, in coordinates z.
         size: members of a generation; seed: of the draws.
         beside: points that are run with the first generation.
-        tell: is given a sentence after every batch.
+        tell: is given what was done after every batch.
     """
     from cmaes import CMA
 
@@ -267,7 +275,7 @@ def evolve(
 
         def advance(done: int) -> None:
             minutes = (time.perf_counter() - begun) / 60
-            tell(f"generation {number}: {done} of {len(asked)} members, {minutes:.1f} min")  # noqa: B023
+            tell(Step("members", (number, done, len(asked), minutes)))  # noqa: B023
 
         now = members.run(asked, advance)
         z = asked if seen is None else np.concatenate([z, asked])
@@ -277,7 +285,7 @@ def evolve(
         search.tell([(d, float(c)) for d, c in zip(drawn, np.where(np.isfinite(own), own, MISSING**2), strict=True)])
         failed = int(np.sum(members.lost(now).any(-1)))
         told.append(Generation(len(asked), failed, float(cost.min()), float(np.median(own))))
-        tell(f"generation {number}: lowest objective {cost.min():.4g}, median {np.median(own):.4g}, {failed} failed")
+        tell(Step("generation", (number, cost.min(), np.median(own), failed)))
         found = Population(z, *seen, cost, tuple(told))
         if found.settled:
             break
@@ -328,16 +336,16 @@ def apart(
     return ~np.isfinite(off) | ((off > APART * size) & (off > 1.0))
 
 
-def edges(coordinates: Coordinates, z: np.ndarray) -> dict[str, str]:
+def edges(coordinates: Coordinates, z: np.ndarray) -> dict[str, Edge]:
     """Parameters at the edge of what is allowed or was expected of them, with where: at a bound, or further than
     `EDGE` from the middle of the prior, by name."""
     bound = coordinates.beyond(z)
     found = {}
     for name, shift, side in zip(coordinates.names, z, bound, strict=True):
         if side:
-            found[name] = f"at its {'lower' if side < 0 else 'upper'} bound"
+            found[name] = Edge("lower" if side < 0 else "upper", float(shift))
         elif abs(shift) > EDGE:
-            found[name] = f"{abs(shift):.1f} prior sd {'below' if shift < 0 else 'above'} the middle of its prior"
+            found[name] = Edge("", float(shift))
     return found
 
 
@@ -358,7 +366,7 @@ class Searched:
     apart: tuple[str, ...]
     slope: np.ndarray | None
     left: float
-    edge: dict[str, str] = dataclasses.field(default_factory=dict)
+    edge: dict[str, Edge] = dataclasses.field(default_factory=dict)
 
     def outcomes(self) -> dict[str, int]:
         """Members with a row that ended so, by the word of the status or flag; none that no member has."""
@@ -378,38 +386,20 @@ class Searched:
             "settled": self.found.settled,
             "generations": [dataclasses.asdict(g) for g in self.found.generations],
             "outcomes": self.outcomes(),
-            "at_edge": self.edge,
+            "at_edge": {name: fits.edge(at) for name, at in self.edge.items()},
             "derivatives_apart": list(self.apart),
             "regression_rms_sd": self.left if np.isfinite(self.left) else None,
         }
 
-    def statements(self) -> list[str]:
-        """What to know of it, a sentence each."""
-        said = [
-            f"{len(self.found.z)} members in {len(self.found.generations)} generations; "
-            + ("the last gained nothing that counts" if self.found.settled else "the last still gained: go on with "
-               "more --generations")
-        ]  # fmt: skip
+    def remarks(self) -> list[Note]:
+        """What to know of it."""
+        said: list[Note] = [Generations(len(self.found.z), len(self.found.generations), self.found.settled)]
         ended = self.outcomes()
-        failed = [f"{ended[word]} {words}" for word, words in LOST_AS.items() if word in ended]
-        if failed:
-            said.append(
-                f"of the members, in some row: {', '.join(failed)}; a row that is lost costs a member its rank"
-            )
+        lost = {status: ended[status] for status in LOST_AS if status in ended}
+        said += [LostRows(lost)] * bool(lost)
         if "jumps" in ended:
             rows = np.flatnonzero(self._jumps(self.found.flags[self.at]))
-            best = f"the best in rows {', '.join(str(k + 1) for k in rows)}" if len(rows) else "the best in none"
-            said.append(
-                f"{ended['jumps']} of the members jump in some row: their running gear drops between guides and "
-                f"pulleys and throws them off the ground at times; {best}"
-            )
-        if self.edge:
-            named = ", ".join(f"{name} {where}" for name, where in self.edge.items())
-            said.append(f"the search ended at the edge of what was allowed: its best member has {named}")
-        if self.apart:
-            said.append(
-                f"derivatives of the run by {', '.join(self.apart)} are not those of its differences (contacts open "
-                "and close): what the rows determine is read from a regression over the members near the best, which "
-                f"leaves {self.left:.2g} sd rms"
-            )
+            said.append(MembersJump(ended["jumps"], tuple(int(k) + 1 for k in rows)))
+        said += [EndedAtEdge(self.edge)] * bool(self.edge)
+        said += [ReadFromMembers(self.apart, self.left)] * bool(self.apart)
         return said

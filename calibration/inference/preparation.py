@@ -16,6 +16,7 @@ from calibration.inference import checks, observers
 from calibration.inference import noise as noise_room
 from calibration.inference.foreign import inherited_priors
 from calibration.inference.noise import Noise
+from calibration.inference.notes import Notes
 from calibration.inference.observers import Observer
 from mmrjax.robot import Robot
 
@@ -38,11 +39,11 @@ class Prepared:
     noise: Noise
     stated: dict[str, tuple[float, float]]
     names: tuple[str, ...]
-    former: tuple[str, ...]
-    foreign: tuple[str, ...]
-    checked: tuple[str, ...]
-    begins: tuple[str, ...]
-    weighed: tuple[str, ...]
+    former: Notes
+    foreign: Notes
+    checked: Notes
+    begins: Notes
+    weighed: Notes
 
 
 def prepare(

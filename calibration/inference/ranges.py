@@ -10,7 +10,9 @@ import numpy as np
 from calibration.data.errors import BadData, number
 from calibration.data.runs import Runs
 from calibration.inference import observers
+from calibration.inference.notes import Note, OffBy, SlopesIn
 from calibration.inference.operating import operating_readings
+from calibration.words import tables
 from mmrjax import channels, params
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
@@ -32,7 +34,7 @@ SLOPES = {"radians": 180 / math.pi, "percent": math.degrees(0.01)}
 FOLLOWS = 0.9
 
 
-def check_ranges(runs: Runs, robot: Robot) -> list[str]:
+def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     """Refuse readings that no robot like this one shows under these conditions; return what should be said of others.
 
     Each channel's readings are compared with steady travel of the robot as its file states it, and with a tenth and
@@ -58,7 +60,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
     if not np.isfinite(possible).any():
         return []
     factors = {c: _factor(measured[:, k], possible[:, :, k]) for k, c in enumerate(robot.channels)}
-    said = []
+    said: list[Note] = []
     for k, (channel, factor) in enumerate(factors.items()):
         off = max(factor, 1 / factor)
         if off <= SAID or (not robot.rig.inherits and channel.name in OF_TORQUE):
@@ -67,10 +69,17 @@ def check_ranges(runs: Runs, robot: Robot) -> list[str]:
         if not units and (kind.axis or _slips(robot, channel, factor)):  # what slides has speeds of its own
             continue
         typical = _factor(measured[:, k], possible[1:2, :, k])
-        sentence = _sentence(channel, typical if units else factor, units, _others(channel, factors), runs)
+        found = OffBy(
+            channel.column,
+            channel.unit,
+            typical if units else factor,
+            tuple(units),
+            tuple(_others(channel, factors)),
+            runs.layout.imposed_column,
+        )
         if off > REFUSED:
-            raise BadData(f"{runs.source}, {sentence}")
-        said.append(sentence)
+            raise BadData(f"{runs.source}, {tables.off_by(found)}")
+        said.append(found)
     return [*said, *_slopes(runs, measured, possible[1], robot)]
 
 
@@ -147,17 +156,6 @@ def _check_gear(runs: Runs, measured: np.ndarray, robot: Robot) -> None:
         )
 
 
-def _sentence(channel: Channel, factor: float, units: list[str], others: list[str], runs: Runs) -> str:
-    off, size = (factor, "large") if factor > 1 else (1 / factor, "small")
-    what = f"{channel.column}: readings are about {number(float(f'{off:.2g}'))} times too {size} for this robot"
-    alike = (
-        f"; {' and '.join(others)} alike: check {runs.layout.imposed_column} and the robot's file" if others else ""
-    )
-    if units:
-        return f"{what}; are they in {' or '.join(units)}? expected {channel.unit}{alike}"
-    return f"{what}{alike}" if others else f"{what}; check the unit, {channel.unit}, and the robot's file"
-
-
 def _check_masses(runs: Runs, robot: Robot) -> None:
     """Refuse total masses that are no mass of this robot."""
     if not runs.has("total_mass_kg"):
@@ -173,7 +171,7 @@ def _check_masses(runs: Runs, robot: Robot) -> None:
         )
 
 
-def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[str]:
+def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot) -> Iterator[SlopesIn]:
     """Say so where the current rises with the slope as if that were in another unit.
 
     Within runs that differ in their slope alone the current is about linear in it; the coefficient of what is
@@ -197,7 +195,4 @@ def _slopes(runs: Runs, measured: np.ndarray, possible: np.ndarray, robot: Robot
     rise = float(x @ y / max(float(x @ x), 1e-300))
     for unit, size in SLOPES.items():
         if follows > FOLLOWS and abs(math.log(max(rise, 1e-9) / size)) < math.log(1.25):
-            yield (
-                f"slope_deg: the current rises {rise:.2g} times as fast with the slope as this robot's; are the "
-                f"slopes in {unit}? expected degrees"
-            )
+            yield SlopesIn(unit, rise)

@@ -22,7 +22,8 @@ from scipy.special import fdtrc
 
 from calibration.data.runs import CONDITIONS, WHEN, Runs
 from calibration.inference.lack_of_fit import CLEAR, Residuals
-from mmrjax import channels
+from calibration.inference.notes import Note
+from calibration.words import fits
 
 #: Family-wise error of reporting a cluster where there is none.
 LEVEL = 0.005
@@ -40,8 +41,6 @@ OWN = 0.3
 _TIMES = re.compile(r"(^|_)(time|date|datetime|timestamp|stamp|epoch|clock)(_|$)", re.IGNORECASE)
 #: Share of the differences between levels from which a coarser column is said to make most of them [-].
 MOSTLY = 0.5
-#: Levels that a sentence lists.
-_LISTED = 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +64,7 @@ class LevelMean:
 
 
 @dataclasses.dataclass(frozen=True)
-class ResidualCluster:
+class ResidualCluster(Note):
     """Residuals of a channel that go with a column without a role.
 
     Attributes:
@@ -99,28 +98,7 @@ class ResidualCluster:
     @property
     def statement(self) -> str:
         """In a sentence."""
-        label = channels.of(self.channel).label
-        what = f"residuals of {label}"
-        within = f" within {self.within}" if self.within else ""
-        signs = ", with opposite signs in the two directions of travel" if self.reversing else ""
-        p = f"p = {self.p:.1g}"
-        role = "a column without a role" + (f" (as well by {', '.join(self.alike)})" if self.alike else "")
-        if self.correlation is not None:
-            return (
-                f"{what} go with {self.column}{within}{signs} (rank correlation {self.correlation:+.2f}; {p}), "
-                f"{role}: find what differs with it"
-            )
-        if self.coarser:
-            shares = ", ".join(f"{name} alone {share:.0%} of it" for name, share in self.coarser)
-            role += f" ({shares})"
-        ordered = sorted(self.levels, key=lambda m: -abs(m.mean))[:_LISTED]
-        kept = [m for m in self.levels if m in ordered]
-        each = ", ".join(f"{m.name}: {m.mean:+.2g} {self.unit}" for m in kept)
-        more = ", ..." if len(kept) < len(self.levels) else ""
-        return (
-            f"{what} cluster by {self.column}{within}{signs} (simulated less measured at levels {each}{more}; {p}), "
-            f"{role}: give each level its own configuration, or find what differs"
-        )
+        return fits.residual_cluster(self)
 
     def to_json(self) -> dict[str, object]:
         """As in `residual_clusters` of result.json."""

@@ -11,11 +11,14 @@ import numpy as np
 
 from calibration.data import posterior, writing
 from calibration.data.posterior import Posterior
-from calibration.inference.identifiability import Identifiability, describe_held
+from calibration.inference.identifiability import Identifiability
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.multistart import Starts
+from calibration.inference.notes import HeldByPrior, Notes
 from calibration.inference.population import Searched
 from calibration.inference.residual_clusters import ResidualCluster
+from calibration.words import fits as words
+from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 from mmrjax.signals import STATUSES
@@ -33,13 +36,17 @@ class Prior:
     Attributes:
         family: `normal` or `log-normal`.
         median: [SI]; interval: that holds 95 % [SI].
-        source: where it comes from.
+        source: where it comes from, of a field in words; else a row of `words.fits.PRIORS`, or `stated`.
     """
 
     family: str
     median: float
     interval: Interval
     source: str
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {**dataclasses.asdict(self), "source": words.PRIORS.get(self.source, self.source)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +120,7 @@ class Estimate:
             "interval_open": self.interval_open,
             "unit": self.unit,
             "meaning": self.meaning,
-            "prior": dataclasses.asdict(self.prior),
+            "prior": self.prior.to_json(),
             "shift_in_prior_sd": self.shift,
             "variance_ratio": self.variance_ratio,
             "held_by_prior": self.held_by_prior,
@@ -262,7 +269,7 @@ class CalibrationResult:
         chi_square: of the readings that are there; adequacy: whether they are what noise leaves.
         residual_clusters: columns without a role by which residuals cluster.
         identifiability: the linear analysis; posterior: of the free parameters.
-        notes: sentences worth reading before it is used.
+        remarks: what is worth reading before it is used.
     """
 
     robot: Robot
@@ -292,11 +299,16 @@ class CalibrationResult:
     residual_clusters: tuple[ResidualCluster, ...]
     identifiability: Identifiability
     posterior: Posterior
-    notes: tuple[str, ...]
+    remarks: Notes
 
     def __len__(self) -> int:
         """Rows of the table."""
         return len(self.status)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences worth saying."""
+        return sentences(self.remarks)
 
     @property
     def profiled(self) -> bool:
@@ -395,8 +407,8 @@ class CalibrationResult:
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        note = f"calibrated from {robot_name} with {self.source}; the free parameters: {', '.join(self.parameters)}"
-        note = "\n".join([note, *describe_held(self.held_by_prior)])
+        held = [sentence(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
+        note = "\n".join([words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
         writing.write_json(folder / "result.json", self.to_json())
         writing.write_table(folder / "rows.csv", self.rows())

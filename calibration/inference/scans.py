@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from calibration.inference.identifiability import Z95, Identifiability
+from calibration.inference.notes import InPieces, Step
 from calibration.inference.optimizers import Optimum, evaluated
 from calibration.inference.priors import known
 from calibration.inference.problem import Data, Observation, Problem
@@ -133,7 +134,7 @@ Found = tuple[Optimum, Observation]
 
 
 def searched_on(
-    problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[str], None]
+    problem: Problem, found: Found, data: Data, search: Callable[[np.ndarray], Found], tell: Callable[[Step], None]
 ) -> Found:
     """Where a search ends that looks over what is scanned from where it ended, and begins again in a lower basin.
 
@@ -163,7 +164,7 @@ def searched_on(
             break
         found = lower
         over = " or ".join(problem.coordinates.names[k] for k in every)
-        tell(f"a lower basin of {over}: objective {float(found[0].cost):.4f}")
+        tell(Step("basin", (over, float(found[0].cost))))
     else:
         return dataclasses.replace(found[0], converged=jnp.asarray(False)), found[1]
     # At a kink there is a slope on either side: that nothing near is lower is what makes it an optimum.
@@ -202,13 +203,6 @@ def apart(scans: dict[int, Scan], z: np.ndarray | None, converged: np.ndarray) -
     return int(np.sum(np.any(outside, 0) & converged)) if outside else 0
 
 
-def statements(problem: Problem, scans: dict[int, Scan]) -> list[str]:
-    """What to say of parameters whose 95 % region is in pieces."""
-    said = []
-    for k, seen in scans.items():
-        if (parts := seen.parts()) > 1:
-            said.append(
-                f"{problem.coordinates.names[k]}: the values within its 95 % interval are in {parts} pieces, with "
-                "worse ones between them; samples closer together would tell them apart"
-            )
-    return said
+def remarks(problem: Problem, scans: dict[int, Scan]) -> list[InPieces]:
+    """Parameters whose 95 % region is in pieces."""
+    return [InPieces(problem.coordinates.names[k], parts) for k, seen in scans.items() if (parts := seen.parts()) > 1]

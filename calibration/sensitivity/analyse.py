@@ -10,6 +10,7 @@ import numpy as np
 
 from calibration.data.errors import BadConfiguration
 from calibration.inference.identifiability import Z95
+from calibration.inference.notes import Note, Step
 from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.local import Local, directions, inert, local
 from calibration.sensitivity.methods import (
@@ -22,6 +23,7 @@ from calibration.sensitivity.methods import (
 )
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.next_runs import Candidates, next_runs
+from calibration.sensitivity.notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
 from calibration.sensitivity.result import METHODS, Input, OutputStudy, SensitivityResult
 from calibration.sensitivity.study import Study
 from mmrjax import fidelities
@@ -69,7 +71,7 @@ def analyse(
     evaluations = usual if evaluations is None else evaluations
     if evaluations < LEAST:
         raise BadConfiguration(f"--evaluations: got {evaluations}; expected {LEAST} or more")
-    study.tell("derivatives at every operating point")
+    study.tell(Step("points"))
     found = local(study)
     if not any(np.isfinite(x).any() for x in found.value.values()):
         raise BadConfiguration(_none_converges(study, found.statuses))
@@ -82,7 +84,7 @@ def analyse(
     comparison: dict[str, dict[str, Any]] = {}
     if method == "derivative":
         spent = study.evaluations, study.seconds, dict(study.sampled)
-        study.tell("Sobol indices of the same points, to compare the bounds with")
+        study.tell(Step("sobol"))
         comparison = _compared(study, parts, sobol_indices(study, ~idle, evaluations, seed, second=False))
         study.evaluations, study.seconds, study.sampled = spent
     outputs = {o.name: _study_of(o, study, found, parts.get(o.name)) for o in model.outputs}
@@ -103,14 +105,14 @@ def analyse(
         evaluations=study.evaluations,
         seconds=round(study.seconds, 3),
         comparison=comparison,
-        notes=_notes(study, method, outputs, idle),
+        remarks=_remarks(study, method, outputs, idle),
     )
 
 
 def _by_method(study: Study, method: str, moving: np.ndarray, evaluations: int, seed: int) -> dict[str, Part]:
     if method == "local":
         return {}
-    study.tell(f"{METHODS[method]}, over {len(study.points)} operating points")
+    study.tell(Sampling(method, len(study.points)))
     if method == "sobol":
         return sobol_indices(study, moving, evaluations, seed)
     if method == "morris":
@@ -217,37 +219,23 @@ def _none_converges(study: Study, statuses: dict[str, dict[str, int]]) -> str:
     )
 
 
-def _notes(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray) -> tuple[str, ...]:
-    said = []
+def _remarks(study: Study, method: str, outputs: dict[str, OutputStudy], idle: np.ndarray) -> tuple[Note, ...]:
+    said: list[Note] = []
     alike: dict[tuple[bytes, bytes], list[OutputStudy]] = {}
     for o in outputs.values():
         alike.setdefault((o.studied.tobytes(), o.lost.tobytes()), []).append(o)
     for group in alike.values():
-        o, names = group[0], ", ".join(x.row.label for x in group)
+        o, names = group[0], tuple(x.row.label for x in group)
         if not o.studied.all():
-            out = int((~o.studied).sum())
-            who = "the robot does" if method == "local" else "too many robots of the sample do"
-            said.append(
-                f"{out} of {len(o.studied)} operating points are left out, since {who} not travel there ({names})"
-            )
+            said.append(PointsLeftOut(int((~o.studied).sum()), len(o.studied), method != "local", names))
         some = o.studied & (o.lost >= 1e-3)
         if some.any():
-            said.append(
-                f"at {int(some.sum())} operating points up to {100 * o.lost[some].max():.1f} % of the sample is left "
-                f"out, since the robot does not travel there: the indices are of robots that do ({names})"
-            )
+            said.append(SampleLeftOut(int(some.sum()), float(o.lost[some].max()), names))
     drawn = correlated(study.inputs, np.flatnonzero(~idle)) if method == "shapley" else ()
-    unsampled = [n for k, n in enumerate(study.inputs.names) if idle[k] and k not in drawn]
-    followed = [n for k, n in enumerate(study.inputs.names) if idle[k] and k in drawn]
-    if unsampled:
-        names = ", ".join(unsampled)
-        said.append(f"not sampled, since every derivative by them is exactly zero where one was taken: {names}")
-    if followed:
-        said.append(
-            "every derivative by them is exactly zero where one was taken, so that what effect they have is that of "
-            f"inputs they are correlated with: {', '.join(followed)}"
-        )
+    for followed in (False, True):
+        names = tuple(n for k, n in enumerate(study.inputs.names) if idle[k] and (k in drawn) == followed)
+        if names:
+            said.append(Inert(names, followed))
     if study.inputs.parameters.tied:
-        followers = ", ".join(f for f, _, _ in study.inputs.parameters.tied)
-        said.append(f"kept at their ratio to another input, and part of what it does: {followers}")
+        said.append(Tied(tuple(f for f, _, _ in study.inputs.parameters.tied)))
     return tuple(said)

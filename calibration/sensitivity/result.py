@@ -9,18 +9,15 @@ import numpy as np
 from scipy import stats
 
 from calibration.data.runs import Runs
+from calibration.inference.notes import Note
 from calibration.sensitivity.model import OutputRow
 from calibration.sensitivity.replicates import LEVEL, REPLICATES, Estimate
+from calibration.words import sensitivity as words
+from calibration.words.notes import sentences
 
 SCHEMA = "mmrjax.sensitivity/1"
-#: Methods, and what each says of an input in one line.
-METHODS = {
-    "local": "exact derivatives at the robot's own values",
-    "sobol": "shares of the variance, alone and with others",
-    "morris": "screening by elementary effects",
-    "derivative": "bounds of those shares from exact gradients",
-    "shapley": "shares of the variance of correlated inputs",
-}
+#: Methods.
+METHODS = ("local", "sobol", "morris", "derivative", "shapley")
 #: Share of an output's variance below which an input does not matter, whatever the output and the point [-].
 NEGLIGIBLE = 0.01
 
@@ -212,7 +209,7 @@ class SensitivityResult:
         next_runs: None where there is no candidate that converges.
         evaluations: of the model, in all; seconds: that these took, with what was compiled for them.
         comparison: of bounds with sampled indices, by output; empty for other methods.
-        notes: sentences worth reading.
+        remarks: what is worth reading.
     """
 
     method: str
@@ -228,7 +225,7 @@ class SensitivityResult:
     evaluations: int
     seconds: float
     comparison: dict[str, dict[str, Any]]
-    notes: tuple[str, ...]
+    remarks: tuple[Note, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -259,24 +256,24 @@ class SensitivityResult:
         """Whether every output has a number at every point."""
         return all(o.studied.all() for o in self.outputs.values())
 
-    def statement(self) -> str:
-        """What decides these outputs, in one sentence."""
-        leaders: dict[str, list[str]] = {}
+    def leaders(self) -> dict[str, list[tuple[str, float]]]:
+        """Input → label and share [-] of each output that it decides more than any other does."""
+        found: dict[str, list[tuple[str, float]]] = {}
         for study in self.outputs.values():
             share = study.overall_share
-            if not share.max(initial=0.0) > 0:
-                continue
-            k = int(np.argmax(share))
-            leaders.setdefault(self.names[k], []).append(f"{study.row.label} ({100 * share[k]:.0f} %)")
-        if not leaders:
-            return "None of these inputs changes any of these outputs."
-        ordered = sorted(leaders.items(), key=lambda item: -len(item[1]))
-        said = "; ".join(f"{name} matters most for {', '.join(what)}" for name, what in ordered)
-        idle = len(self.negligible)
-        return (
-            f"{said[0].upper() if said[0].islower() and '.' not in said.split(' ')[0] else said[0]}{said[1:]}; "
-            + (f"{idle} of {len(self.inputs)} inputs do not matter." if idle else "every input matters somewhere.")
-        )
+            if share.max(initial=0.0) > 0:
+                k = int(np.argmax(share))
+                found.setdefault(self.names[k], []).append((study.row.label, float(share[k])))
+        return found
+
+    def statement(self) -> str:
+        """What decides these outputs, in one sentence."""
+        return words.statement(self)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences worth reading."""
+        return sentences(self.remarks)
 
     def to_json(self) -> dict[str, Any]:
         """As in result.json, docs/schemas/sensitivity.schema.json."""

@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.inference.notes import Step
 from calibration.sensitivity.inputs import Inputs
 from calibration.sensitivity.model import Answer, Model, OutputRow, counted
 from calibration.sensitivity.result import Points
+from calibration.words.notes import in_words
 from mmrjax import fidelities
 from mmrjax.channels import RPM
 from mmrjax.conditions import Conditions
@@ -48,7 +50,7 @@ class Study:
         tell: Tell = lambda text: None,
     ) -> None:
         supply = Supply() if supply is None else supply
-        self.robot, self.inputs, self.points, self.tell = robot, inputs, points, tell
+        self.robot, self.inputs, self.points, self.tell = robot, inputs, points, in_words(tell)
         options = fidelities.facts(model).resolved() if options is None else options
         self.model = Model(robot, inputs.columns, model, options, outputs)
         names = robot.configurations.names
@@ -103,7 +105,7 @@ class Study:
             if time.perf_counter() - self.told > SILENCE:
                 self.told = time.perf_counter()
                 rate = self.evaluations / max(self.seconds, 1e-9)
-                self.tell(f"{self.evaluations:,} model evaluations so far, {rate:,.0f} a second")
+                self.tell(Step("evaluations", (self.evaluations, rate)))
             yield k, answer.values
 
     def _count(self, answer: Answer, rows: int, began: float) -> None:

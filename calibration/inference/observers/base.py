@@ -17,6 +17,7 @@ from calibration.inference.details import Detail
 from calibration.inference.errors import OF_READING, OF_SIZE, percent_error
 from calibration.inference.linearization import Linearization, ScoredEffect
 from calibration.inference.noise import Noise
+from calibration.inference.notes import Note
 from calibration.inference.optimizers import Numbers, Optimum
 from calibration.inference.problem import Data, Observation, Problem
 from mmrjax.conditions import Conditions
@@ -96,7 +97,7 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def check(cls, runs: Runs, noise: Noise) -> list[str]:
+    def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
         """Refuse runs that contradict themselves; return what should be said of them.
 
         Raises:
@@ -105,7 +106,7 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
         """Refuse runs whose beginning the model cannot follow; return what should be said of their length.
 
         Raises:

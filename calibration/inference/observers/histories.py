@@ -29,6 +29,7 @@ from calibration.inference.details import Memory, Strongest, TimeSide, TimeStati
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.normal_equations import backward, cholesky, forward
+from calibration.inference.notes import CoarseSteps, ManyChanges, Note, StopsOnSlope
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Numbers, Optimum, linearised, linearised_signed, searches_long
@@ -191,7 +192,7 @@ class Histories(Observer):
         return np.broadcast_to(np.sqrt(power), measured.shape)
 
     @classmethod
-    def check(cls, runs: Runs, noise: Noise) -> list[str]:
+    def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
         names = _names(runs)
         for name in np.unique(names):
             mine = names == name
@@ -215,7 +216,7 @@ class Histories(Observer):
         return with_begins(robot, runs, noise)
 
     @classmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
         """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
         names, measured = _names(runs), runs.measured()
         # Current rises within a millisecond; what moves does not.
@@ -246,20 +247,14 @@ class Histories(Observer):
                         "starts from rest when the supply is switched on, at 0 s. Settled travel is one row a run, "
                         'without time_s; a rig\'s file may say start = "measured" or "free"'
                     )
-        said = []
+        said: list[Note | str] = []
         step = runs["time_s"].max() / STEPS
         if step > 2 * LONGEST:
-            said.append(
-                f"runs of {runs['time_s'].max():.0f} s are followed in steps of {1e3 * step:.0f} ms: waves of a "
-                "shaft faster than some ten steps are not resolved; cut the runs to look for them"
-            )
+            said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         each = [np.flatnonzero(names == name) for name in np.unique(names)]
         changes = max(len(c) for c in _changes(runs, each)) + 1
         if growth(float(runs["time_s"].max()), changes) > 10 * GROWTH:
-            said.append(
-                f"a run's supply changes {changes - 1} times: inrushes after a change are followed in fewer steps "
-                "than that of a start; cut the runs where the current of an inrush matters"
-            )
+            said.append(ManyChanges(changes - 1))
         return said
 
     @classmethod
@@ -758,16 +753,12 @@ def _check_signs(runs: Runs) -> None:
                     )
 
 
-def _stops(runs: Runs) -> list[str]:
-    """Say what a run is followed by where its motors are not driven on a slope."""
+def _stops(runs: Runs) -> list[Note | str]:
+    """What a run is followed by where its motors are not driven on a slope."""
     still = (applied(runs) == 0) & (runs["slope_deg"] != 0)
     if not still.any():
         return []
-    stopped = ", ".join(dict.fromkeys(str(n) or "(no run_id)" for n in _names(runs)[still]))
-    return [
-        f"run {stopped}: the motors are not driven on a slope; histories have smooth friction at rest, and a robot "
-        "that should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer than that"
-    ]
+    return [StopsOnSlope(tuple(dict.fromkeys(str(n) or "(no run_id)" for n in _names(runs)[still])))]
 
 
 def _knots(rows: np.ndarray, most: int) -> np.ndarray:

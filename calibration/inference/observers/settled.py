@@ -20,6 +20,7 @@ from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
 from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
+from calibration.inference.notes import Note
 from calibration.inference.observers.base import Observer, SearchPolicy
 from calibration.inference.optimizers import Member, Numbers, Optimum, searches_refilled
 from calibration.inference.problem import Data, Observation, Problem
@@ -98,7 +99,7 @@ class SettledRuns(Observer):
         return np.maximum(measured, 0.01 * np.max(np.nan_to_num(measured), 0))
 
     @classmethod
-    def check(cls, runs: Runs, noise: Noise) -> list[str]:
+    def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
         columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
         measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
         for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
@@ -121,7 +122,7 @@ class SettledRuns(Observer):
         return []
 
     @classmethod
-    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[str]:
+    def check_start(cls, runs: Runs, noise: Noise, robot: Robot) -> list[Note | str]:
         for channel in (c for c in runs.channels if not c.settled and runs.has(c.column)):
             raise BadData(f"{runs.source}, {channel.column}: settled runs have none; remove the column")
         return []

@@ -1,0 +1,285 @@
+"""What the loop has to say, as data: verdict, reasons, remarks. `calibration/words` makes English of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, NamedTuple
+
+from calibration.inference.notes import NoiseOff, Note
+
+if TYPE_CHECKING:
+    from calibration.discovery.clusters import Cluster
+    from calibration.discovery.discrepancy import Location
+    from calibration.discovery.menu import Experiment
+    from calibration.discovery.reach import Reach
+
+# --- the verdict ----------------------------------------------------------------------------------------
+
+
+class CurveOver(NamedTuple):
+    """A smooth curve of one variable, or a surface of two, in a place of the model: a balance or a channel."""
+
+    place: str
+    variables: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class NameSupport:
+    """Whether the names of a candidate stand.
+
+    Attributes:
+        stands: whether they do.
+        why: a row of `words.loop.REASONS`: why not, or `beside` what; "" where there is nothing to say.
+        effects: that this is said of; curves: that were put beside, or do as well.
+    """
+
+    stands: bool
+    why: str = ""
+    effects: tuple[str, ...] = ()
+    curves: tuple[CurveOver, ...] = ()
+
+
+class FreedValue(NamedTuple):
+    """A base parameter at the value that explains as much as an effect, in `unit`."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Missing:
+    """An effect that was found: names that these data cannot tell apart, stated values that may be wrong instead, and
+    the families of the names."""
+
+    names: tuple[str, ...]
+    values: tuple[FreedValue, ...]
+    families: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """A verdict with all that its statement says.
+
+    Attributes:
+        verdict: `none`, `named`, `class` or `unnamed`; p: family-wise.
+        where: something is missing, or remains.
+        missing: the effects found.
+        nearest: effects that come nearest where none may be named; support: whether names stand.
+        aside, of: rows that lie off alone where these are many, of how many; 0 else.
+        noise: sds that are off, where that is all; cluster: what rows that lie off have in common.
+    """
+
+    verdict: str
+    p: float
+    where: Location | None
+    missing: tuple[Missing, ...] = ()
+    nearest: tuple[str, ...] = ()
+    support: NameSupport | None = None
+    aside: int = 0
+    of: int = 0
+    noise: tuple[NoiseOff, ...] = ()
+    cluster: Cluster | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class RuledOut:
+    """Why an effect is not plausible.
+
+    Attributes:
+        name: its; why: its sign puts `power` in, its `size`, or an sd would take it to the `edge`.
+        size: over the largest plausible one; check: what that rests on.
+    """
+
+    name: str
+    why: str
+    size: float = 0.0
+    check: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """What the track model is asked about: something `missing` in a balance over a variable, effects that are `found`
+    there, or such as explain the readings nearly as well (`near`)."""
+
+    why: str
+    balance: str = ""
+    variable: str = ""
+    effects: tuple[str, ...] = ()
+
+
+#: Where data held out decide nothing between alternatives.
+DRAW = "draw"
+
+
+# --- remarks --------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class AssumedNoise(Note):
+    """Channels whose sds nobody states, and what is usual, as an option states it."""
+
+    channels: tuple[str, ...]
+    usual: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Copies(Note):
+    """Numbers of rows that copy earlier ones."""
+
+    rows: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class KeptOut(Note):
+    """Numbers of rows that do not count: `unusable` ones, or `outliers`."""
+
+    rows: tuple[int, ...]
+    why: str
+
+
+@dataclasses.dataclass(frozen=True)
+class PhasesDiffer(Note):
+    """A wave with another phase in each run: what it explains with a phase of its own in each, and with one [σ²]."""
+
+    free: float
+    held: float
+
+
+@dataclasses.dataclass(frozen=True)
+class StillLacks(Note):
+    """A place that lacks something over a variable, beside what was found."""
+
+    place: str
+    variable: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Led(Note):
+    """By what the leader of a class was chosen.
+
+    Attributes:
+        names, rms_sigma: of the alternatives, and their errors held out [σ].
+        leader: which one leads; closest: to all rows; best: on data held out, where it is adequate.
+        by: `settings.PREFERENCES`, or `DRAW`; prefer: what was asked for.
+        told: share of itself by which an error has to differ to be told apart [-].
+        rise_chi2: of the leader above the closest [σ²].
+    """
+
+    names: tuple[str, ...]
+    rms_sigma: tuple[float, ...]
+    leader: int
+    closest: int
+    best: int
+    by: str
+    prefer: str
+    told: float
+    rise_chi2: float
+
+
+@dataclasses.dataclass(frozen=True)
+class LostReplicates(Note):
+    """Bootstrap tables that could be fitted again, of those that were asked for."""
+
+    settled: int
+    asked: int
+
+
+@dataclasses.dataclass(frozen=True)
+class TooFewReplicates(Note):
+    """Bootstrap tables that do not do for every kind of evidence."""
+
+    settled: int
+
+
+# --- what to do next ------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Heat:
+    """A winding that gets hot.
+
+    Attributes:
+        how: where it does: in a motor that is `held` or `braked`, or in a `run`.
+        temperature: after long running, infinite where none settles; allowed: None where nobody has stated it [°C].
+        current: of a motor that is held [A], else 0.
+    """
+
+    how: str
+    temperature: float
+    allowed: float | None
+    current: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Overspeed:
+    """Motors without load that turn about as fast as they may: speed and its limit [rad/s], at a voltage [V]."""
+
+    speed: float
+    limit: float
+    voltage: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Overvoltage:
+    """A supply beyond what the table used [V]."""
+
+    voltage: float
+    used: float
+
+
+Watch = Heat | Overspeed | Overvoltage
+
+
+@dataclasses.dataclass(frozen=True)
+class NothingPossible:
+    """Every experiment of the menu is forbidden or beyond reach."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NothingTells:
+    """No experiment of the menu tells alternatives apart by so much [σ]."""
+
+    names: tuple[str, ...]
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CarryOut:
+    """Experiments of the menu, all of them."""
+
+    experiments: tuple[Experiment, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class MoreRuns:
+    """More runs along the variable of a discrepancy in a place.
+
+    Attributes:
+        runs: of the series.
+        low, high: voltages that it goes between, top: the highest that the table used [V].
+        slope [deg], payload [kg]: up to which it may go; steps: of voltage, slope and payload.
+        within: reach of the table.
+    """
+
+    place: str
+    variable: str
+    runs: int
+    low: float
+    high: float
+    top: float
+    slope: float
+    payload: float
+    steps: tuple[float, float, float]
+    within: Reach
+
+
+@dataclasses.dataclass(frozen=True)
+class TooWeak:
+    """A series in a variable that would show what is missing by too little [σ]."""
+
+    variable: str
+    sigma: float
+
+
+Instruction = NothingPossible | NothingTells | CarryOut | MoreRuns | TooWeak

@@ -1,0 +1,344 @@
+"""What a table or a fit has to say, as data: which name, which test, which numbers. `calibration/words` says it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+
+class Note:
+    """Something worth saying; `words.notes.sentence` makes English of it, where it has no sentence of its own."""
+
+    @property
+    def statement(self) -> str:
+        """In one sentence."""
+        raise NotImplementedError
+
+
+#: Notes as results hold them: sentences of the room of data are words already.
+Notes = tuple[Note | str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Step(Note):
+    """What a long computation does next.
+
+    Attributes:
+        name: a row of `words.steps.STEPS`; about: what fills its sentence, in order.
+    """
+
+    name: str
+    about: tuple[object, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldByPrior(Note):
+    """Parameters that are held by their priors."""
+
+    names: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class FarFromPrior(Note):
+    """A parameter far from its prior.
+
+    Attributes:
+        name: its; sds: how far [prior sds].
+        of: what that is told of: `loop`, `calibration`, or the `edge` of a search by population.
+    """
+
+    name: str
+    sds: float
+    of: str
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseOff(Note):
+    """Residuals without structure that are not of the size of the sds.
+
+    Attributes:
+        channel: whose, "" for all alike; factor: of the residuals over the sds; source: where these come from.
+    """
+
+    channel: str
+    factor: float
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Fact(Note):
+    """What is so of a table or a fit, without a name or a number: a row of `words.fits.FACTS`."""
+
+    what: str
+
+
+# --- of a table -----------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Unmeasured(Note):
+    """A free parameter that moves no reading."""
+
+    name: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Constant(Note):
+    """A condition that does not vary.
+
+    Attributes:
+        column: its; value: in every row, in the column's unit.
+        alike: losses that then act alike: along `slope`, of `guides` too, or at one `voltage` or `speed`.
+    """
+
+    column: str
+    value: float
+    alike: str
+
+
+@dataclasses.dataclass(frozen=True)
+class EndsEarly(Note):
+    """Histories that end before the robot is under way: the longest [s], and their speed over that of steady travel
+    [-], NaN where it is not known."""
+
+    runs: tuple[str, ...]
+    lasts: float
+    share: float
+
+
+@dataclasses.dataclass(frozen=True)
+class NeverGrips(Note):
+    """Histories in which the movers slide to the end: the robot's speed over theirs [-]."""
+
+    runs: tuple[str, ...]
+    share: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CoarseSteps(Note):
+    """Histories so long [s] that their steps [s] do not resolve waves of a shaft."""
+
+    lasts: float
+    step: float
+
+
+@dataclasses.dataclass(frozen=True)
+class ManyChanges(Note):
+    """Changes of a run's supply that are too many for the steps of each."""
+
+    changes: int
+
+
+@dataclasses.dataclass(frozen=True)
+class StopsOnSlope(Note):
+    """Histories whose motors are not driven on a slope."""
+
+    runs: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class InheritedPriors(Note):
+    """A part that is not the nominal robot's while friction of it is.
+
+    Attributes:
+        part: its name; changed: what of it differs, here and on the nominal robot; kept: names of what does not.
+    """
+
+    part: str
+    changed: tuple[tuple[str, float, float], ...]
+    kept: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class OffBy(Note):
+    """Readings that no robot like this one shows.
+
+    Attributes:
+        column, unit: of the channel; factor: by which they are too large, or below 1 too small.
+        units: in which they would be possible; others: columns that are off by as much.
+        imposed: column of what is imposed on the motors.
+    """
+
+    column: str
+    unit: str
+    factor: float
+    units: tuple[str, ...]
+    others: tuple[str, ...]
+    imposed: str
+
+
+@dataclasses.dataclass(frozen=True)
+class SlopesIn(Note):
+    """Slopes in another unit: the current rises so many times as fast with them as it should."""
+
+    unit: str
+    rise: float
+
+
+# --- of a fit -------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class EstimatedNoise(Note):
+    """Channels whose noise was estimated, with the sd [%]."""
+
+    percent: tuple[tuple[str, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class BesideSteady(Note):
+    """Parameters within their intervals of the optimum with `steady`, of how many; the furthest and how far [sd]."""
+
+    inside: int
+    of: int
+    furthest: str
+    sds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class OfRows(Note):
+    """Numbers of rows of which something is so: they are `limited` by adhesion, all but a share of it [-], the
+    running gear `jumps`, or a status."""
+
+    rows: tuple[int, ...]
+    what: str
+    share: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class AtBound(Note):
+    """A parameter at its `lower` or `upper` bound."""
+
+    name: str
+    side: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ProductAlone(Note):
+    """A guide's share that acts by its product with its friction alone, which is `free` or held."""
+
+    friction: str
+    share: str
+    free: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class PriorOfProduct(Note):
+    """A guide friction whose prior is that of its product with the guides' share, which the model puts at `share`."""
+
+    name: str
+    mean: float
+    sd: float
+    share: float
+
+
+@dataclasses.dataclass(frozen=True)
+class NoPrediction(Note):
+    """Rows without a prediction where blocks of a kind are held out, of how many."""
+
+    kind: str
+    rows: int
+    of: int
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockNotConverged(Note):
+    """A kind of block without which a search did not converge."""
+
+    kind: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Agreement(Note):
+    """How searches from many starts ended: `agree` of them at the best optimum, `elsewhere` at others, the next of
+    which costs `more` [½σ²], the rest without converging."""
+
+    starts: int
+    agree: int
+    elsewhere: int
+    more: float
+    open: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Elsewhere(Note):
+    """Searches that converged at other values of parameters, of how many."""
+
+    searches: int
+    of: int
+    names: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class InPieces(Note):
+    """A parameter whose 95 % interval is in pieces."""
+
+    name: str
+    pieces: int
+
+
+# --- of a search by population --------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Generations(Note):
+    """Members and generations of a search, and whether the last gained nothing that counts."""
+
+    members: int
+    generations: int
+    settled: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class LostRows(Note):
+    """Members with a row that is lost, by status."""
+
+    members: dict[str, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class MembersJump(Note):
+    """Members whose running gear jumps in some row, and in which rows the best's does."""
+
+    members: int
+    best: tuple[int, ...]
+
+
+class Edge(NamedTuple):
+    """Where a parameter is at the edge of what was allowed: at its `lower` or `upper` bound, else so far from the
+    middle of its prior [prior sd]."""
+
+    bound: str
+    sds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class EndedAtEdge(Note):
+    """Parameters at the edge of what was allowed, by name."""
+
+    edge: dict[str, Edge]
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadFromMembers(Note):
+    """Parameters by which the derivatives of a run are not to be trusted, and what the regression over the members
+    leaves [sd rms]."""
+
+    names: tuple[str, ...]
+    left: float
+
+
+# --- whether a fit is adequate --------------------------------------------------------------------------
+
+
+class Shown(NamedTuple):
+    """What a test of adequacy shows, in the order in which equals are named.
+
+    Attributes:
+        channel: whose residuals, "" for all; what: they exceed the scatter of `repeats` or the `stated` noise, or
+            `follow` a variable, or `remember` the sample before; variable: its column or name.
+    """
+
+    channel: str = ""
+    what: str = ""
+    variable: str = ""

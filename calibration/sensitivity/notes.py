@@ -1,0 +1,50 @@
+"""What a study has to say, as data. `calibration/words` makes English of it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from calibration.inference.notes import Note
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampling(Note):
+    """A method that goes over so many operating points now."""
+
+    method: str
+    points: int
+
+
+@dataclasses.dataclass(frozen=True)
+class PointsLeftOut(Note):
+    """Operating points of outputs that are left out, of how many: the robot does not travel there, or too many of the
+    sample do not."""
+
+    points: int
+    of: int
+    sampled: bool
+    outputs: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class SampleLeftOut(Note):
+    """Operating points of outputs at which up to a share of the sample does not travel, and is left out."""
+
+    points: int
+    share: float
+    outputs: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Inert(Note):
+    """Inputs by which every derivative is zero: they are not sampled, or they are `correlated` with others."""
+
+    inputs: tuple[str, ...]
+    correlated: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Tied(Note):
+    """Inputs that are kept at their ratio to another one."""
+
+    inputs: tuple[str, ...]

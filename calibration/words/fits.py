@@ -1,0 +1,300 @@
+"""What is said of a fit, of the loop as of a calibration."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from calibration.inference import blocks
+from calibration.inference.identifiability import HELD
+from calibration.inference.notes import (
+    Agreement,
+    AtBound,
+    BesideSteady,
+    BlockNotConverged,
+    Edge,
+    Elsewhere,
+    EndedAtEdge,
+    EstimatedNoise,
+    Fact,
+    FarFromPrior,
+    Generations,
+    HeldByPrior,
+    InPieces,
+    LostRows,
+    MembersJump,
+    NoiseOff,
+    NoPrediction,
+    OfRows,
+    PriorOfProduct,
+    ProductAlone,
+    ReadFromMembers,
+    Shown,
+)
+from mmrjax import channels
+
+if TYPE_CHECKING:
+    from calibration.inference.lack_of_fit import Adequacy
+    from calibration.inference.residual_clusters import ResidualCluster
+    from calibration.inference.result import CalibrationResult
+
+
+def held_by_prior(note: HeldByPrior) -> str:
+    """Which parameters are held by their priors."""
+    whose = "its prior" if len(note.names) == 1 else "their priors"
+    return f"held by {whose} (posterior sd above {HELD:g} of the prior's): {', '.join(note.names)}"
+
+
+#: What a parameter far from its prior means, by what it is told of.
+FAR = {
+    "loop": "{} lies {:.1f} prior sds from its prior: it stands in for something",
+    "calibration": "{} lies {:.1f} prior sds from its prior: the prior or the model is wrong",
+    "edge": "{}: its posterior mean lies {:.1f} prior sds from its prior, at the edge of where the search looked: "
+    "widen the prior and search again, or doubt the model",
+}
+#: Facts without a name or a number.
+FACTS = {
+    "not converged": "the search did not converge; values and intervals are not to be trusted",
+    "not profiled": "no profiles were made: the intervals are linear, and too symmetric where the model is curved",
+    "no covariance": "the posterior has no finite covariance: values stand, intervals do not",
+    "no grip": "no run grips: static friction, and slip below it, are known by their priors alone",
+}
+#: Where a prior comes from that is neither a field's nor stated.
+PRIORS = {"product": "its product with the share of the guides, as in the other fidelities"}
+#: How a member of a population loses a row.
+LOST_AS = {
+    "slides": "slide", "tips": "turn over", "failed": "leave the ground for good or cannot be computed",
+    "stalled": "stall",
+}  # fmt: skip
+
+
+def fact(note: Fact) -> str:
+    """What is so."""
+    return FACTS[note.what]
+
+
+def far_from_prior(note: FarFromPrior) -> str:
+    """A parameter far from its prior, and what that means."""
+    return FAR[note.of].format(note.name, note.sds)
+
+
+def noise_off(note: NoiseOff) -> str:
+    """By what sds are off."""
+    if not note.channel:
+        return (
+            f"residuals are {note.factor:.2g} times the {note.source} sds in every channel and everywhere alike: are "
+            "the sds right?"
+        )
+    return (
+        f"residuals of {channels.of(note.channel).label} are {note.factor:.2g} times the {note.source} sds, "
+        "everywhere alike: are these sds right?"
+    )
+
+
+def estimated_noise(note: EstimatedNoise) -> str:
+    """Channels whose noise was estimated."""
+    each = ", ".join(f"{channel.replace('_', ' ')} {percent:.1f} %" for channel, percent in note.percent)
+    return (
+        f"no noise was stated for {each}: estimated from the misfit, so it holds model error too and cannot test "
+        "whether the model is adequate"
+    )
+
+
+def beside_steady(note: BesideSteady) -> str:
+    """How far parameters are from the optimum with `steady`."""
+    return (
+        f"{note.inside} of {note.of} parameters lie within their 95 % intervals of the same problem's optimum with "
+        f"steady; furthest apart is {note.furthest}, {note.sds:.2f} sd"
+    )
+
+
+def of_rows(note: OfRows) -> str:
+    """Of which rows something is so."""
+    rows = f"rows {', '.join(map(str, note.rows))}"
+    if note.what == "limited":
+        return (
+            f"{rows} use all the adhesion but the margin of {note.share:.0%}: the limit holds their static friction "
+            "from below, and the slip that they show is not all explained"
+        )
+    if note.what == "jumps":
+        return f"{rows}: the calibrated robot's running gear jumps; it leaves the ground at times"
+    return f"{rows}: {note.what} with the calibrated robot"
+
+
+def at_bound(note: AtBound) -> str:
+    """A parameter at its bound."""
+    return f"{note.name} is at its {note.side} bound"
+
+
+def product_alone(note: ProductAlone) -> str:
+    """A product of which one factor or both are free."""
+    if note.free:
+        return f"only the product {note.friction} x {note.share} acts; the priors alone divide it"
+    return f"{note.share} is found with {note.friction} held: only their product acts"
+
+
+def prior_of_product(note: PriorOfProduct) -> str:
+    """A guide friction whose prior is that of a product."""
+    return (
+        f"{note.name}: its prior, {note.mean:.3g} ± {note.sd:.2g}, is that of its product with the share of the "
+        f"guides in the other fidelities; the track model puts {note.share:.0%} of the weight on them"
+    )
+
+
+def no_prediction(note: NoPrediction) -> str:
+    """Rows that a fit without their block does not predict."""
+    return (
+        f"held out by {blocks.in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because the "
+        "robot fitted without them slides there; the errors leave them out"
+    )
+
+
+def block_not_converged(note: BlockNotConverged) -> str:
+    """A search without a block that did not converge."""
+    return f"a search without a block of {note.kind} did not converge"
+
+
+def agreement(note: Agreement) -> str:
+    """Whether searches from many starts agree."""
+    if note.starts == 1:
+        return "one search, which did not converge" if note.open else "one search"
+    if note.agree == note.starts:
+        return f"all {note.starts} starts end at the same optimum"
+    parts = [f"{note.agree} of {note.starts} starts end at the best optimum"]
+    if note.elsewhere:
+        parts.append(f"{note.elsewhere} at others (the next costs {note.more:.3g} more)")
+    if note.open:
+        parts.append(f"{note.open} did not converge")
+    return ", ".join(parts)
+
+
+def elsewhere(note: Elsewhere) -> str:
+    """Searches that converged elsewhere."""
+    return f"{note.searches} of {note.of} searches converged at other values of {', '.join(note.names)}"
+
+
+def in_pieces(note: InPieces) -> str:
+    """An interval in pieces."""
+    return (
+        f"{note.name}: the values within its 95 % interval are in {note.pieces} pieces, with worse ones between "
+        "them; samples closer together would tell them apart"
+    )
+
+
+def header(found: CalibrationResult, robot_name: str) -> str:
+    """What heads the calibrated robot's file."""
+    return f"calibrated from {robot_name} with {found.source}; the free parameters: {', '.join(found.parameters)}"
+
+
+# --- a search by population -----------------------------------------------------------------------------
+
+
+def generations(note: Generations) -> str:
+    """How far a search went."""
+    end = "the last gained nothing that counts"
+    if not note.settled:
+        end = "the last still gained: go on with more --generations"
+    return f"{note.members} members in {note.generations} generations; {end}"
+
+
+def lost_rows(note: LostRows) -> str:
+    """Members with a row that is lost."""
+    lost = ", ".join(f"{note.members[status]} {how}" for status, how in LOST_AS.items() if status in note.members)
+    return f"of the members, in some row: {lost}; a row that is lost costs a member its rank"
+
+
+def members_jump(note: MembersJump) -> str:
+    """Members whose running gear jumps."""
+    best = f"the best in rows {', '.join(map(str, note.best))}" if note.best else "the best in none"
+    return (
+        f"{note.members} of the members jump in some row: their running gear drops between guides and pulleys and "
+        f"throws them off the ground at times; {best}"
+    )
+
+
+def edge(at: Edge) -> str:
+    """Where a parameter is at the edge of what was allowed."""
+    if at.bound:
+        return f"at its {at.bound} bound"
+    return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} the middle of its prior"
+
+
+def ended_at_edge(note: EndedAtEdge) -> str:
+    """A search that ended at the edge of what was allowed."""
+    named = ", ".join(f"{name} {edge(at)}" for name, at in note.edge.items())
+    return f"the search ended at the edge of what was allowed: its best member has {named}"
+
+
+def read_from_members(note: ReadFromMembers) -> str:
+    """What the rows determine where derivatives are not to be trusted."""
+    return (
+        f"derivatives of the run by {', '.join(note.names)} are not those of its differences (contacts open and "
+        "close): what the rows determine is read from a regression over the members near the best, which leaves "
+        f"{note.left:.2g} sd rms"
+    )
+
+
+# --- what residuals show --------------------------------------------------------------------------------
+
+
+def shown_by(test: Shown) -> str:
+    """What the most telling test shows."""
+    of = f"the residuals of {channels.of(test.channel).label}" if test.channel else ""
+    return {
+        "": "",
+        "stated": "the residuals exceed the stated noise",
+        "repeats": "the residuals exceed the scatter of repeated runs",
+        "follow": f"{of} follow {test.variable}",
+        "remember": f"{of} remember the sample before",
+    }[test.what]
+
+
+def adequacy(found: Adequacy) -> str:
+    """Whether a fit is adequate; opens a calibration's output."""
+    chi2 = f"χ² {found.chi2:.4g} on {found.degrees_of_freedom:.4g} degrees of freedom"
+    if found.adequate is None or found.p_value is None:
+        return (
+            "Adequacy cannot be tested: the noise was estimated from the misfit, and "
+            f"{found.degrees_of_freedom:.4g} degrees of freedom cannot show structure; state it with --noise"
+        )
+    p = f"p = {found.p_value:.2g}" if found.p_value > 1e-6 else "p < 1e-6"
+    if not found.adequate:
+        why = f"{chi2}, {p}" if found.noise_known else f"{p}, the noise estimated from them"
+        return (
+            f"Not adequate: {shown_by(found.shown_by)} ({why}), so something is missing and the parameters may stand "
+            "in for it; mmrjax loop finds what"
+        )
+    if found.noise_known:
+        return f"Adequate: the residuals are what the stated noise leaves ({chi2}, {p})"
+    return (
+        f"Adequate as far as can be tested: the residuals show no structure ({p}); the noise was estimated from "
+        "them, so χ² tests nothing"
+    )
+
+
+#: Levels of a cluster that are listed, the farthest from nothing.
+LISTED = 6
+
+
+def residual_cluster(c: ResidualCluster) -> str:
+    """Residuals that go with a column without a role."""
+    what = f"residuals of {channels.of(c.channel).label}"
+    within = f" within {c.within}" if c.within else ""
+    signs = ", with opposite signs in the two directions of travel" if c.reversing else ""
+    p = f"p = {c.p:.1g}"
+    role = "a column without a role" + (f" (as well by {', '.join(c.alike)})" if c.alike else "")
+    if c.correlation is not None:
+        return (
+            f"{what} go with {c.column}{within}{signs} (rank correlation {c.correlation:+.2f}; {p}), {role}: find "
+            "what differs with it"
+        )
+    if c.coarser:
+        shares = ", ".join(f"{name} alone {share:.0%} of it" for name, share in c.coarser)
+        role += f" ({shares})"
+    ordered = sorted(c.levels, key=lambda m: -abs(m.mean))[:LISTED]
+    kept = [m for m in c.levels if m in ordered]
+    each = ", ".join(f"{m.name}: {m.mean:+.2g} {c.unit}" for m in kept)
+    more = ", ..." if len(kept) < len(c.levels) else ""
+    return (
+        f"{what} cluster by {c.column}{within}{signs} (simulated less measured at levels {each}{more}; {p}), {role}: "
+        "give each level its own configuration, or find what differs"
+    )

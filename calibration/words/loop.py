@@ -1,0 +1,368 @@
+"""What is said of the loop: its verdict, whether names stand, what is ruled out, hidden or worse, its remarks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from calibration.discovery.notes import (
+    DRAW,
+    Asked,
+    AssumedNoise,
+    Copies,
+    CurveOver,
+    FreedValue,
+    KeptOut,
+    Led,
+    LostReplicates,
+    NameSupport,
+    PhasesDiffer,
+    RuledOut,
+    StillLacks,
+    Summary,
+    TooFewReplicates,
+)
+from calibration.discovery.settings import FIT, HELD_OUT
+from calibration.inference import bases
+from calibration.inference import blocks as blocks_room
+from calibration.words import fits
+from mmrjax import channels
+
+if TYPE_CHECKING:
+    from calibration.discovery.clusters import Cluster
+    from calibration.discovery.discrepancy import Location
+    from calibration.discovery.result import (
+        DiscoveryResult,
+        Errors,
+        FoundEffect,
+        Resolved,
+        StatedValue,
+        Worse,
+    )
+
+# --- the verdict ----------------------------------------------------------------------------------------
+
+
+def statement(said: Summary) -> str:
+    """A verdict in a sentence or a few."""
+    text = _verdict(said)
+    if said.aside:
+        share = 100 * said.aside / said.of
+        text = f"{said.aside} of {said.of} rows ({share:.0f} %) lie off alone and are set aside. {text}"
+    if said.noise:
+        text = f"{text} But {'; '.join(map(fits.noise_off, said.noise))}"
+    if said.cluster is not None:
+        text = f"{text} {cluster(said.cluster).capitalize()}: that is a finding, and none is set aside."
+    return text
+
+
+def _verdict(said: Summary) -> str:
+    where, p = said.where, said.p
+    if said.verdict == "none":
+        return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
+    if said.verdict == "unnamed" and where is not None:
+        text = _without_name(where, p)
+        if said.nearest:
+            text += f" Nearest comes {' and '.join(said.nearest)}: {reason(said.support)}."
+        return text
+    names = []
+    for one in said.missing:
+        text = one.names[0]
+        if len(one.names) + len(one.values) > 1:
+            family = f"{one.families[0]}, " if len(one.families) == 1 else ""
+            listed = ", ".join(one.names) if len(one.names) == 1 else f"one of {', '.join(one.names)}"
+            values = [freed_value(v) for v in one.values]
+            text = f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
+        names.append(text)
+    left = "" if where is None else f" Something remains in the {bases.in_words(where.place)}."
+    return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{left}"
+
+
+def _without_name(where: Location, p: float) -> str:
+    others = [bases.in_words(p).removeprefix("balance ") for p in where.alike if p != where.place]
+    also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
+    what = f": {where.family}" if where.variable in bases.VARIABLES else ""
+    well = [shown_over(v).removeprefix("best shown ") for v in where.variables_alike]
+    over = shown_over(where.variable) + (f" (as well {', '.join(well)})" if well else "")
+    return (
+        f"Something is missing in the {bases.in_words(where.place)}{also}, {over}{what}; no effect of the library "
+        f"explains it (family-wise p {p_value(p)})."
+    )
+
+
+def shown_over(variable: str) -> str:
+    """Where a discrepancy shows."""
+    happens = bases.window(variable)
+    if happens is None:
+        return f"best shown over {variable.replace('_', ' ')}" if variable != "order" else "drifting from run to run"
+    if happens.axis == "time":
+        return f"from {happens.low:.3g} to {happens.high:.3g} s after the start of the runs"
+    if happens.axis == "order":
+        return f"in runs {happens.low:.0f} to {happens.high:.0f}"
+    return f"in the runs at {happens.words}"
+
+
+def freed_value(v: FreedValue) -> str:
+    """`motor.resistance is 1.94 ohm`."""
+    return f"{v.name} is {v.value:.3g} {v.unit}".strip()
+
+
+def p_value(p: float) -> str:
+    """A p-value; a small one, of which the bootstrap knows little, as a bound rounded up."""
+    if p > 0.01:
+        return f"= {p:.2g}"
+    step = 10.0 ** math.floor(math.log10(p))
+    return f"≤ {math.ceil(p / step - 1e-9) * step:.1g}"
+
+
+def cluster(c: Cluster) -> str:
+    """What rows that lie off have in common."""
+    where = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
+    return f"{c.inside} of {c.of} rows that lie off stand together {where} (p = {c.p:.1g})"
+
+
+def header(found: DiscoveryResult, robot_name: str) -> str:
+    """What heads the proposed robot's file."""
+    start = f" from {robot_name}" if robot_name else ""
+    return f"found by the loop{start} with {found.runs.source}: {found.statement}"
+
+
+#: In the place of a formula.
+NO_FORMULA = "none: no term shows in these data"
+
+# --- whether names stand --------------------------------------------------------------------------------
+
+#: Why names do not stand, or beside what they do.
+REASONS = {
+    "": "",
+    "implausible": "no effect of the library that explains it is of a plausible size",
+    "larger": "{effects} would explain more, but not at a plausible size",
+    "better curve": "one smooth {curves} is the better explanation than {effects}",
+    "curve alone": "one smooth {curves} leaves nothing",
+    "not adequate": "the fit with {effects} is not adequate",
+    "lost": "beside smooth curves ({over}) {effects} would explain nothing",
+    "beside": "beside smooth curves ({over})",
+}
+
+
+def reason(support: NameSupport | None) -> str:
+    """Why names do not stand, or beside what they do; empty where there is nothing to say."""
+    if support is None:
+        return ""
+    return REASONS[support.why].format(
+        effects=" and ".join(support.effects),
+        curves=" and ".join(map(_curve, support.curves)),
+        over=", ".join(_over(c.place, *c.variables) for c in support.curves),
+    )
+
+
+def _curve(c: CurveOver) -> str:
+    return f"{'curve' if len(c.variables) == 1 else 'surface'} in the {_over(c.place, *c.variables)}"
+
+
+def _over(place: str, *variables: str) -> str:
+    """`balance slip over speed motor and slope`."""
+    return f"{bases.in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
+
+
+def standing(found: DiscoveryResult) -> str:
+    """Why names do not stand, or beside what they do, in a sentence; empty where there is nothing to say."""
+    if not found.standing:
+        return ""
+    if found.verdict == "unnamed":
+        return f"Why no name: {found.standing}."
+    return f"The names keep their significance {found.standing}."
+
+
+#: Why an effect is not plausible.
+RULED_OUT = {
+    "power": "{0.name} would put power in",
+    "size": "{0.name} at {0.size:.2g} times its largest plausible size; check {check}",
+    "edge": "{0.name} is within an sd of the largest plausible size",
+}
+
+
+def why_ruled_out(reasons: Sequence[RuledOut]) -> str:
+    """Why effects are not plausible, each."""
+    return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
+
+
+def ruled_out(found: DiscoveryResult) -> str:
+    """What would explain the data as well as what is proposed, or better, but for its size; empty for nothing.
+
+    Beside names it is said of what would explain more than they do alone.
+    """
+    candidates = found.implausible
+    if found.verdict != "unnamed":
+        candidates = tuple(a for a in candidates if a.rise_chi2 < -found.settings.same)
+    if not candidates:
+        return ""
+    first = min(candidates, key=lambda a: (len(a.effects), a.rise_chi2))
+    what = "the curve" if found.verdict == "unnamed" else "what is proposed"
+    more = first.rise_chi2 < -found.settings.same
+    gain = f"{-first.rise_chi2:.0f} σ² more than {what}" if more else f"as much as {what}"
+    are = "are" if len(first.effects) > 1 else "is"
+    return (
+        f"{' and '.join(first.effects)} would explain {gain}, but {are} ruled out by size or sign alone: {first.why}."
+    )
+
+
+# --- beside names ---------------------------------------------------------------------------------------
+
+
+def hidden(found: DiscoveryResult) -> str:
+    """Which effects what was found could hide, and what would show them, in a sentence; empty for none."""
+    if not found.hidden:
+        return ""
+    each = [
+        f"{h.name} up to {h.amplitude:.2g} {h.unit}".strip()
+        + (f" ({h.experiment} would show it)" if h.experiment else "")
+        for h in found.hidden
+    ]
+    return f"Could be hidden behind what was found: {', '.join(each)}."
+
+
+def stated_value(name: str, s: StatedValue) -> str:
+    """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
+    return f"{freed_value(FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+
+
+def alike(e: FoundEffect) -> str:
+    """What these data cannot tell from an effect: other effects, and stated values that may be wrong instead."""
+    others = ", ".join(
+        name + (f" (at {m.size:.2g} times its largest plausible size)" if m.size >= 1 else "")
+        for name, m in list(e.members.items())[1:]
+    )
+    values = " or ".join(stated_value(name, s) for name, s in e.stated.items())
+    return ", or ".join(words for words in (others, values) if words)
+
+
+def worse(found: Sequence[Worse], held_out: Mapping[str, tuple[Errors, Errors]]) -> str:
+    """Which errors rise, and where fewer rows are predicted, in a sentence; empty where none does.
+
+    Args:
+        held_out: kind of block → errors before and after, each over the rows that it predicts.
+    """
+    parts = []
+    for kind, (before, after) in held_out.items():
+        mine = [w for w in found if w.kind == kind]
+        changes = [f"{channels.of(w.channel).label} {_change(w.before, w.after)} %" for w in mine]
+        predicted = {n: (int(before[n]["rows"]), int(after[n]["rows"])) for n in after}
+        if any(w.rows < max(predicted[w.channel]) for w in mine):
+            changes[-1] += f" (of the {min(w.rows for w in mine)} rows that both predict)"
+        lost = max(was - now for was, now in predicted.values())
+        if lost > 0:
+            changes.append(f"{lost} row{'s' * (lost > 1)} fewer predicted")
+        if changes:
+            parts.append(f"by {blocks_room.in_words(kind)} {', '.join(changes)}")
+    return f"Held out, what was found predicts worse: {'; '.join(parts)}." if parts else ""
+
+
+def _change(before: float, after: float) -> str:
+    """Two numbers with as many digits as tell them apart."""
+    texts = [(f"{before:.{k}f}", f"{after:.{k}f}") for k in range(1, 6)]
+    return " → ".join(next((pair for pair in texts if pair[0] != pair[1]), texts[-1]))
+
+
+# --- the track model ------------------------------------------------------------------------------------
+
+
+def asked(about: Asked) -> str:
+    """What the track model was asked about."""
+    return {
+        "missing": f"what is missing in the balance {about.balance} over {about.variable.replace('_', ' ')}",
+        "found": f"{', '.join(about.effects)}, found by the lumped model",
+        "near": f"{', '.join(about.effects)}, which explains the readings nearly as well",
+    }[about.why]
+
+
+def resolved(found: Resolved) -> str:
+    """What the track model says, in a sentence or two."""
+    before, after = found.slip_rms
+    gear = ", ".join(
+        f"{name.removeprefix('running_gear.')} {e.value:.3g} ± {e.sd:.2g} {e.unit}".rstrip(" -")
+        for name, e in found.constants.items() if name.startswith("running_gear.")
+    )  # fmt: skip
+    on = "" if found.settled else "; the search had not settled, go on with --members and more --generations"
+    slip = f"slip of the {found.rows} rows on tracks {before:.2g} → {after:.2g} points rms"
+    if not found.explains:
+        why = f"; {', '.join(found.outside)} outside" if found.outside else ""
+        return (
+            f"The track model was asked about {asked(found.asked)}: no running gear within its priors was found to "
+            f"leave it ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
+        )
+    held = len(found.constants) - len(found.known_from_rows)
+    known = f"held by their priors: {held} of {len(found.constants)} constants"
+    return (
+        f"The track model was asked about {asked(found.asked)}: a running gear within its priors leaves it ({slip}, "
+        f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {known}{on}"
+    )
+
+
+# --- remarks --------------------------------------------------------------------------------------------
+
+
+def assumed_noise(note: AssumedNoise) -> str:
+    """Channels whose sds nobody states."""
+    return f"no sd is stated for {', '.join(note.channels)}: {note.usual} is assumed; state yours with --noise"
+
+
+def copies(note: Copies) -> str:
+    """Rows that copy earlier ones."""
+    rows = ", ".join(map(str, note.rows))
+    if len(note.rows) == 1:
+        return f"row {rows} is an exact copy of an earlier one and counts once"
+    return f"rows {rows} are exact copies of earlier ones and count once"
+
+
+def kept_out(note: KeptOut) -> str:
+    """Rows that do not count."""
+    why = {
+        "unusable": "cannot be simulated: the fitted model slides or fails there",
+        "outliers": "stand alone: outliers, which no effect explains",
+    }
+    return f"rows {', '.join(map(str, note.rows))} {why[note.why]}; they are kept out"
+
+
+def phases_differ(note: PhasesDiffer) -> str:
+    """A wave with another phase in each run."""
+    return (
+        f"the wave stands at another angle in each run (it explains {note.free:.0f} σ² free in each, {note.held:.0f} "
+        "with one phase): robot.toml holds the mean; start runs from a mark"
+    )
+
+
+def still_lacks(note: StillLacks) -> str:
+    """What the effects found leave."""
+    place, over = bases.in_words(note.place), note.variable.replace("_", " ")
+    return f"what was found does not explain everything: the {place} still lacks something over {over}"
+
+
+def led(note: Led) -> str:
+    """By what the leader of a class was chosen, and whether the other way would have chosen another."""
+    names, leader = note.names, note.leader
+    by = {
+        HELD_OUT: "errors held out",
+        FIT: "the fit to all rows",
+        DRAW: f"the fit to all rows, as errors held out are within {note.told:.0%}",
+    }
+    each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, note.rms_sigma, strict=True))
+    said = f"{names[leader]} comes first in its class by {by[note.by]}; errors held out: {each}"
+    if note.prefer == HELD_OUT and leader != note.closest:
+        said += f"; by the fit to all rows {names[note.closest]} would, by Δχ² {note.rise_chi2:.1f}"
+    if leader != note.best:
+        asked = note.prefer == HELD_OUT
+        why = "is not as adequate" if asked else f"would come first by --prefer {HELD_OUT}, where adequate"
+        said += f"; {names[note.best]} {why}"
+    return said
+
+
+def lost_replicates(note: LostReplicates) -> str:
+    """Bootstrap tables that could not be fitted again."""
+    return f"only {note.settled} of {note.asked} bootstrap tables could be fitted again; the thresholds are theirs"
+
+
+def too_few_replicates(note: TooFewReplicates) -> str:
+    """Bootstrap tables that are too few."""
+    return f"{note.settled} bootstrap tables are too few for every kind of evidence to count; use 500 or more"

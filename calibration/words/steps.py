@@ -1,0 +1,43 @@
+"""What a long computation does next, in words: a row each."""
+
+from __future__ import annotations
+
+from calibration.inference.notes import Step
+
+STEPS = {
+    # the loop
+    "base": "fitting the base model",
+    "sds": "the sds are not as stated: the same with those that the residuals show",
+    "bootstrap": "bootstrap of {} tables: what would a complete model leave?",
+    "effects": "something is missing: fitting every effect that could explain it",
+    "more effects": "{} leaves something: fitting further effects beside it",
+    "alone": "rows stand alone beside what was found: the same without them",
+    "alike": "what else explains as much as {}?",
+    "held out": "which of those predicts best what a fit has not seen?",
+    "factors": "the verdict with {} times the assumed noise, beside:",
+    "shape": "the shape of what is missing",
+    "errors": "errors on data held out",
+    "next": "the next experiment",
+    "gear stated": "resolved: friction through the track model, its running gear as stated",
+    "gear free": "resolved: the running gear free",
+    # a sensitivity study
+    "points": "derivatives at every operating point",
+    "sobol": "Sobol indices of the same points, to compare the bounds with",
+    "evaluations": "{:,} model evaluations so far, {:,.0f} a second",
+    # a calibration
+    "optimum": "optimum found; now {}",
+    "steady": "the same with steady first, to begin from its optimum",
+    "derivatives": "population done; now derivatives against differences at the best",
+    "search": "  step {}: objective {:.4f}, {:.1f} min",
+    "round": "round {}: objective {:.4f} after {} steps, {:.1f} min",
+    "start": "start {} of {}: objective {:.4f} after {} steps, {:.1f} min",
+    "basin": "a lower basin of {}: objective {:.4f}",
+    "members": "generation {}: {} of {} members, {:.1f} min",
+    "generation": "generation {}: lowest objective {:.4g}, median {:.4g}, {} failed",
+}
+
+
+def step(now: Step) -> str:
+    """A step in a sentence."""
+    about = (" and ".join(x) if isinstance(x, tuple) else x for x in now.about)
+    return STEPS[now.name].format(*about)

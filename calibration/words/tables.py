@@ -1,0 +1,136 @@
+"""What is said of a table, before anything is fitted to it."""
+
+from __future__ import annotations
+
+import math
+
+from calibration.data.errors import number
+from calibration.inference.notes import (
+    CoarseSteps,
+    Constant,
+    EndsEarly,
+    InheritedPriors,
+    ManyChanges,
+    NeverGrips,
+    OffBy,
+    SlopesIn,
+    StopsOnSlope,
+    Unmeasured,
+)
+
+#: What would measure a parameter that the data do not, by the start or end of its name.
+WOULD_MEASURE = {
+    "battery.": "runs on the on-board battery (Source Mode 1)",
+    "motor.inductance": "a time history of the start-up current, with samples every tenth of a millisecond",
+    "motor.inertia": "a time history of the start",
+    ".inertia": "a time history of the start",
+    "motor.resistance_thermal": "long runs at high current with the effect winding_heating present",
+    "motor.temperature_ambient": "runs at several room temperatures with the effect winding_heating present",
+    ".friction.dynamic": "a history in which the movers spin faster than V_d (a start on a slippery slope)",
+    ".friction.speed_dynamic": "a history in which the movers spin faster than V_s (a start on a slippery slope)",
+    ".guide_share": "the fidelities steady and drive (the track model puts it out; free guide_friction there)",
+    ".mass": "a scale, or runs whose table does not state total_mass_kg",
+}
+#: Losses that act alike where a condition does not vary.
+ALIKE = {
+    "guides": "rolling resistance, guide friction and Coulomb losses act alike without slopes",
+    "slope": "rolling resistance and Coulomb losses act alike without slopes",
+    "voltage": "losses that grow with speed and those that do not act alike at one voltage",
+    "speed": "losses that grow with speed and those that do not act alike at one speed",
+}
+
+
+def would_measure(name: str) -> str:
+    """What would measure a parameter that nothing in the data does."""
+    for key, what in WOULD_MEASURE.items():
+        if name.startswith(key) or name.endswith(key):
+            return what
+    return "runs under conditions in which it acts"
+
+
+def unmeasured(note: Unmeasured) -> str:
+    """A free parameter that moves no reading."""
+    return (
+        f"{note.name}: nothing in these data measures it; its value is its prior's. {would_measure(note.name)} would"
+    )
+
+
+def constant(note: Constant) -> str:
+    """A condition that does not vary."""
+    here = f"{note.column} is {number(note.value)} in every row"
+    return f"{here}: {ALIKE[note.alike]}, and only their priors tell them apart"
+
+
+def ends_early(note: EndsEarly) -> str:
+    """Histories that end before the robot is under way."""
+    at = "" if math.isnan(note.share) else f", at {note.share:.0%} of the speed of steady travel"
+    return (
+        f"{_runs(note.runs, 'ends', 'end')} after {note.lasts:.2g} s at the latest{at}: before the robot is under "
+        "way, so what resists its travel is known by its priors; record until the speed is steady"
+    )
+
+
+def never_grips(note: NeverGrips) -> str:
+    """Histories in which the movers slide to the end."""
+    return (
+        f"{_runs(note.runs, 'never grips', 'never grip')}: in the end the robot travels at {note.share:.0%} of the "
+        "speed of its movers, so what the ground holds before it slides is not measured there"
+    )
+
+
+def _runs(names: tuple[str, ...], one: str, several: str) -> str:
+    return f"run {names[0]} {one}" if len(names) == 1 else f"runs {', '.join(names)} {several}"
+
+
+def coarse_steps(note: CoarseSteps) -> str:
+    """Steps that do not resolve waves."""
+    return (
+        f"runs of {note.lasts:.0f} s are followed in steps of {1e3 * note.step:.0f} ms: waves of a shaft faster than "
+        "some ten steps are not resolved; cut the runs to look for them"
+    )
+
+
+def many_changes(note: ManyChanges) -> str:
+    """Changes of a supply that are too many for the steps of each."""
+    return (
+        f"a run's supply changes {note.changes} times: inrushes after a change are followed in fewer steps than that "
+        "of a start; cut the runs where the current of an inrush matters"
+    )
+
+
+def stops_on_slope(note: StopsOnSlope) -> str:
+    """What a run is followed by where its motors are not driven on a slope."""
+    return (
+        f"run {', '.join(note.runs)}: the motors are not driven on a slope; histories have smooth friction at rest, "
+        "and a robot that should stand there creeps by some mm/s. Leave rows at rest out where their readings are "
+        "finer than that"
+    )
+
+
+def inherited_priors(note: InheritedPriors) -> str:
+    """A part that is not the nominal robot's while friction of it is."""
+    changed = ", ".join(f"{name} {number(mine)} for {number(nominal)}" for name, mine, nominal in note.changed)
+    one = len(note.kept) == 1
+    return (
+        f"{note.part} is not the nominal robot's ({changed}), but its {', '.join(note.kept)} still "
+        f"{'is' if one else 'are'}: {'that prior comes' if one else 'those priors come'} from another robot; state "
+        "yours in the robot's file or with --prior"
+    )
+
+
+def off_by(note: OffBy) -> str:
+    """Readings that no robot like this one shows."""
+    off, size = (note.factor, "large") if note.factor > 1 else (1 / note.factor, "small")
+    what = f"{note.column}: readings are about {number(float(f'{off:.2g}'))} times too {size} for this robot"
+    alike = f"; {' and '.join(note.others)} alike: check {note.imposed} and the robot's file" if note.others else ""
+    if note.units:
+        return f"{what}; are they in {' or '.join(note.units)}? expected {note.unit}{alike}"
+    return f"{what}{alike}" if note.others else f"{what}; check the unit, {note.unit}, and the robot's file"
+
+
+def slopes_in(note: SlopesIn) -> str:
+    """Slopes in another unit."""
+    return (
+        f"slope_deg: the current rises {note.rise:.2g} times as fast with the slope as this robot's; are the slopes "
+        f"in {note.unit}? expected degrees"
+    )

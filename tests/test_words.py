@@ -1,0 +1,517 @@
+"""What is said of data, in words: one sentence for each kind of note, and no kind without one."""
+
+import ast
+import dataclasses
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calibration.discovery import notes as of_loop
+from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, RuledOut, Summary
+from calibration.discovery.result import Formula, Worse
+from calibration.inference import notes as of_fit
+from calibration.inference.lack_of_fit import Adequacy
+from calibration.inference.notes import Note, Shown, Step
+from calibration.inference.residual_clusters import LevelMean, ResidualCluster
+from calibration.sensitivity import notes as of_study
+from calibration.words import fits, loop, steps, tables
+from calibration.words.notes import SAID, in_words, sentence
+
+ROOT = Path(__file__).resolve().parents[1]
+#: Notes, and what is said of them.
+SAMPLES = [
+    (of_fit.HeldByPrior(("a",)), "held by its prior (posterior sd above 0.9 of the prior's): a"),
+    (of_fit.HeldByPrior(("a", "b")), "held by their priors (posterior sd above 0.9 of the prior's): a, b"),
+    (of_fit.FarFromPrior("m", 3.2, "loop"), "m lies 3.2 prior sds from its prior: it stands in for something"),
+    (
+        of_fit.FarFromPrior("m", 3.2, "calibration"),
+        "m lies 3.2 prior sds from its prior: the prior or the model is wrong",
+    ),
+    (
+        of_fit.FarFromPrior("m", 2.7, "edge"),
+        "m: its posterior mean lies 2.7 prior sds from its prior, at the edge of where the search looked: widen the "
+        "prior and search again, or doubt the model",
+    ),
+    (
+        of_fit.NoiseOff("", 10.04, "stated"),
+        "residuals are 10 times the stated sds in every channel and everywhere alike: are the sds right?",
+    ),
+    (
+        of_fit.NoiseOff("speed", 3.0, "assumed"),
+        "residuals of speed are 3 times the assumed sds, everywhere alike: are these sds right?",
+    ),
+    (of_fit.Fact("no grip"), "no run grips: static friction, and slip below it, are known by their priors alone"),
+    (
+        of_fit.Unmeasured("6T2A.mass"),
+        "6T2A.mass: nothing in these data measures it; its value is its prior's. a scale, or runs whose table does not "
+        "state total_mass_kg would",
+    ),
+    (
+        of_fit.Constant("slope_deg", 5.0, "guides"),
+        "slope_deg is 5 in every row: rolling resistance, guide friction and Coulomb losses act alike without slopes, "
+        "and only their priors tell them apart",
+    ),
+    (
+        of_fit.Constant("motor_speed_rpm", 900.0, "speed"),
+        "motor_speed_rpm is 900 in every row: losses that grow with speed and those that do not act alike at one speed, "
+        "and only their priors tell them apart",
+    ),
+    (
+        of_fit.EndsEarly(("a", "b"), 0.01, 0.4),
+        "runs a, b end after 0.01 s at the latest, at 40% of the speed of steady travel: before the robot is under way, "
+        "so what resists its travel is known by its priors; record until the speed is steady",
+    ),
+    (
+        of_fit.EndsEarly(("a",), 0.01, float("nan")),
+        "run a ends after 0.01 s at the latest: before the robot is under way, so what resists its travel is known by "
+        "its priors; record until the speed is steady",
+    ),
+    (
+        of_fit.NeverGrips(("a",), 0.31),
+        "run a never grips: in the end the robot travels at 31% of the speed of its movers, so what the ground holds "
+        "before it slides is not measured there",
+    ),
+    (
+        of_fit.CoarseSteps(90.0, 0.03),
+        "runs of 90 s are followed in steps of 30 ms: waves of a shaft faster than some ten steps are not resolved; cut "
+        "the runs to look for them",
+    ),
+    (
+        of_fit.ManyChanges(40),
+        "a run's supply changes 40 times: inrushes after a change are followed in fewer steps than that of a start; cut "
+        "the runs where the current of an inrush matters",
+    ),
+    (
+        of_fit.StopsOnSlope(("a", "b")),
+        "run a, b: the motors are not driven on a slope; histories have smooth friction at rest, and a robot that "
+        "should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer than that",
+    ),
+    (
+        of_fit.InheritedPriors("motor", (("torque_constant", 0.012, 0.0259),), ("motor.a", "motor.b")),
+        "motor is not the nominal robot's (torque_constant 0.012 for 0.0259), but its motor.a, motor.b still are: those "
+        "priors come from another robot; state yours in the robot's file or with --prior",
+    ),
+    (
+        of_fit.InheritedPriors("motor", (("torque_constant", 0.012, 0.0259),), ("motor.a",)),
+        "motor is not the nominal robot's (torque_constant 0.012 for 0.0259), but its motor.a still is: that prior "
+        "comes from another robot; state yours in the robot's file or with --prior",
+    ),
+    (
+        of_fit.OffBy("speed_mm_s", "mm/s", 1 / 3, (), (), "supply_voltage_V"),
+        "speed_mm_s: readings are about 3 times too small for this robot; check the unit, mm/s, and the robot's file",
+    ),
+    (
+        of_fit.OffBy("speed_mm_s", "mm/s", 1000.0, ("um/s", "nm/s"), ("motor_speed_rpm",), "supply_voltage_V"),
+        "speed_mm_s: readings are about 1000 times too large for this robot; are they in um/s or nm/s? expected mm/s; "
+        "motor_speed_rpm alike: check supply_voltage_V and the robot's file",
+    ),
+    (
+        of_fit.SlopesIn("radians", 57.3),
+        "slope_deg: the current rises 57 times as fast with the slope as this robot's; are the slopes in radians? "
+        "expected degrees",
+    ),
+    (
+        of_fit.EstimatedNoise((("motor_speed", 1.23), ("speed", 4.0))),
+        "no noise was stated for motor speed 1.2 %, speed 4.0 %: estimated from the misfit, so it holds model error too "
+        "and cannot test whether the model is adequate",
+    ),
+    (
+        of_fit.BesideSteady(2, 3, "a", 2.345),
+        "2 of 3 parameters lie within their 95 % intervals of the same problem's optimum with steady; furthest apart is "
+        "a, 2.35 sd",
+    ),
+    (
+        of_fit.OfRows((1, 2), "limited", 0.01),
+        "rows 1, 2 use all the adhesion but the margin of 1%: the limit holds their static friction from below, and the "
+        "slip that they show is not all explained",
+    ),
+    (
+        of_fit.OfRows((3,), "jumps"),
+        "rows 3: the calibrated robot's running gear jumps; it leaves the ground at times",
+    ),
+    (of_fit.OfRows((3,), "slides"), "rows 3: slides with the calibrated robot"),
+    (of_fit.AtBound("a", "upper"), "a is at its upper bound"),
+    (of_fit.ProductAlone("f", "s", True), "only the product f x s acts; the priors alone divide it"),
+    (of_fit.ProductAlone("f", "s", False), "s is found with f held: only their product acts"),
+    (
+        of_fit.PriorOfProduct("f", 0.06, 0.02, 0.98),
+        "f: its prior, 0.06 ± 0.02, is that of its product with the share of the guides in the other fidelities; the "
+        "track model puts 98% of the weight on them",
+    ),
+    (
+        of_fit.NoPrediction("voltage_configuration", 2, 20),
+        "held out by voltage and configuration: 2 of 20 rows have no prediction, because the robot fitted without them "
+        "slides there; the errors leave them out",
+    ),
+    (of_fit.BlockNotConverged("slope"), "a search without a block of slope did not converge"),
+    (of_fit.Agreement(1, 1, 0, 0.0, 0), "one search"),
+    (of_fit.Agreement(1, 0, 0, 0.0, 1), "one search, which did not converge"),
+    (of_fit.Agreement(4, 4, 0, 0.0, 0), "all 4 starts end at the same optimum"),
+    (
+        of_fit.Agreement(4, 1, 2, 3.2, 1),
+        "1 of 4 starts end at the best optimum, 2 at others (the next costs 3.2 more), 1 did not converge",
+    ),
+    (of_fit.Elsewhere(1, 3, ("a", "b")), "1 of 3 searches converged at other values of a, b"),
+    (
+        of_fit.InPieces("rig.delay", 2),
+        "rig.delay: the values within its 95 % interval are in 2 pieces, with worse ones between them; samples closer "
+        "together would tell them apart",
+    ),
+    (of_fit.Generations(96, 8, True), "96 members in 8 generations; the last gained nothing that counts"),
+    (
+        of_fit.Generations(96, 8, False),
+        "96 members in 8 generations; the last still gained: go on with more --generations",
+    ),
+    (
+        of_fit.LostRows({"tips": 3, "slides": 2, "failed": 1}),
+        "of the members, in some row: 2 slide, 3 turn over, 1 leave the ground for good or cannot be computed; a row "
+        "that is lost costs a member its rank",
+    ),
+    (
+        of_fit.MembersJump(2, (2, 5)),
+        "2 of the members jump in some row: their running gear drops between guides and pulleys and throws them off the "
+        "ground at times; the best in rows 2, 5",
+    ),
+    (
+        of_fit.EndedAtEdge({"a": of_fit.Edge("upper", 9.0), "b": of_fit.Edge("", -2.64)}),
+        "the search ended at the edge of what was allowed: its best member has a at its upper bound, b 2.6 prior sd "
+        "below the middle of its prior",
+    ),
+    (
+        of_fit.ReadFromMembers(("a", "b"), 0.4),
+        "derivatives of the run by a, b are not those of its differences (contacts open and close): what the rows "
+        "determine is read from a regression over the members near the best, which leaves 0.4 sd rms",
+    ),
+    (
+        of_loop.AssumedNoise(("speed",), "speed=2%"),
+        "no sd is stated for speed: speed=2% is assumed; state yours with --noise",
+    ),
+    (of_loop.Copies((3,)), "row 3 is an exact copy of an earlier one and counts once"),
+    (of_loop.Copies((3, 4)), "rows 3, 4 are exact copies of earlier ones and count once"),
+    (
+        of_loop.KeptOut((1, 2), "unusable"),
+        "rows 1, 2 cannot be simulated: the fitted model slides or fails there; they are kept out",
+    ),
+    (
+        of_loop.KeptOut((7,), "outliers"),
+        "rows 7 stand alone: outliers, which no effect explains; they are kept out",
+    ),
+    (
+        of_loop.PhasesDiffer(80.4, 12.0),
+        "the wave stands at another angle in each run (it explains 80 σ² free in each, 12 with one phase): robot.toml "
+        "holds the mean; start runs from a mark",
+    ),
+    (
+        of_loop.StillLacks("motor_speed", "speed_motor"),
+        "what was found does not explain everything: the reading of motor speed still lacks something over speed motor",
+    ),
+    (
+        of_loop.Led(("a", "b"), (3.0, 2.0), 0, 0, 1, "fit", "fit", 0.01, 0.0),
+        "a comes first in its class by the fit to all rows; errors held out: a 3.00 σ, b 2.00 σ; b would come first by "
+        "--prefer held-out, where adequate",
+    ),
+    (
+        of_loop.Led(("a", "b"), (3.0, 2.0), 1, 0, 1, "held-out", "held-out", 0.01, 1.4),
+        "b comes first in its class by errors held out; errors held out: a 3.00 σ, b 2.00 σ; by the fit to all rows a "
+        "would, by Δχ² 1.4",
+    ),
+    (
+        of_loop.Led(("a", "b"), (3.0, 2.99), 0, 0, 0, of_loop.DRAW, "held-out", 0.01, 0.0),
+        "a comes first in its class by the fit to all rows, as errors held out are within 1%; errors held out: a 3.00 σ, "
+        "b 2.99 σ",
+    ),
+    (
+        of_loop.Led(("a", "b"), (3.0, 2.0), 0, 0, 1, "held-out", "held-out", 0.01, 0.0),
+        "a comes first in its class by errors held out; errors held out: a 3.00 σ, b 2.00 σ; b is not as adequate",
+    ),
+    (
+        of_loop.LostReplicates(400, 500),
+        "only 400 of 500 bootstrap tables could be fitted again; the thresholds are theirs",
+    ),
+    (
+        of_loop.TooFewReplicates(100),
+        "100 bootstrap tables are too few for every kind of evidence to count; use 500 or more",
+    ),
+    (of_study.Sampling("morris", 8), "screening by elementary effects, over 8 operating points"),
+    (
+        of_study.PointsLeftOut(2, 8, False, ("speed", "current")),
+        "2 of 8 operating points are left out, since the robot does not travel there (speed, current)",
+    ),
+    (
+        of_study.PointsLeftOut(2, 8, True, ("speed",)),
+        "2 of 8 operating points are left out, since too many robots of the sample do not travel there (speed)",
+    ),
+    (
+        of_study.SampleLeftOut(3, 0.0123, ("speed",)),
+        "at 3 operating points up to 1.2 % of the sample is left out, since the robot does not travel there: the "
+        "indices are of robots that do (speed)",
+    ),
+    (
+        of_study.Inert(("a", "b"), False),
+        "not sampled, since every derivative by them is exactly zero where one was taken: a, b",
+    ),
+    (
+        of_study.Inert(("a",), True),
+        "every derivative by them is exactly zero where one was taken, so that what effect they have is that of inputs "
+        "they are correlated with: a",
+    ),
+    (of_study.Tied(("a", "b")), "kept at their ratio to another input, and part of what it does: a, b"),
+    (Step("evaluations", (12345, 1234.6)), "12,345 model evaluations so far, 1,235 a second"),
+    (Step("alike", (("a", "b"),)), "what else explains as much as a and b?"),
+    (Step("round", (2, 3.25, 7, 1.26)), "round 2: objective 3.2500 after 7 steps, 1.3 min"),
+]
+
+
+@pytest.mark.parametrize(("note", "said"), SAMPLES, ids=lambda x: type(x).__name__ if isinstance(x, Note) else "")
+def test_a_note_is_said(note, said):
+    assert sentence(note) == said
+    told = []
+    in_words(told.append)(note)
+    assert told == [said]
+
+
+def kinds():
+    """Every kind of note that the rooms have."""
+    return {
+        kind
+        for room in (of_fit, of_loop, of_study)
+        for kind in vars(room).values()
+        if isinstance(kind, type) and issubclass(kind, Note) and kind is not Note
+    }
+
+
+def test_every_kind_of_note_has_a_sentence_and_a_sample():
+    assert kinds() == set(SAID) == {type(note) for note, _ in SAMPLES}
+    assert all(dataclasses.is_dataclass(kind) for kind in kinds())
+
+
+def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
+    assert sentence("as it is") == "as it is"
+    with pytest.raises(NotImplementedError):
+        sentence(Note())
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows"),
+    [("Step", steps.STEPS), ("Fact", fits.FACTS), ("NameSupport", loop.REASONS), ("RuledOut", loop.RULED_OUT)],
+)
+def test_names_of_rows_are_those_of_the_code(kind, rows):
+    """A name without a row would fail only where it is said, and a row without a name is never said."""
+    used = set()
+    for room in ("inference", "discovery", "sensitivity"):
+        for file in (ROOT / "calibration" / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == kind and node.args:
+                    at = 0 if kind in ("Step", "Fact") else 1
+                    used |= {node.args[at].value} if len(node.args) > at else {""}
+    assert used | ({""} & set(rows)) == set(rows)
+
+
+# --- verdicts -------------------------------------------------------------------------------------------
+
+OVER = CurveOver("slip", ("slope",))
+
+
+@pytest.mark.parametrize(
+    ("support", "said"),
+    [
+        (None, ""),
+        (NameSupport(True), ""),
+        (NameSupport(False, "implausible"), "no effect of the library that explains it is of a plausible size"),
+        (NameSupport(False, "larger", ("a", "b")), "a and b would explain more, but not at a plausible size"),
+        (
+            NameSupport(False, "better curve", ("a",), (CurveOver("speed", ("speed_motor", "slope")),)),
+            "one smooth surface in the reading of speed over speed motor and slope is the better explanation than a",
+        ),
+        (
+            NameSupport(False, "curve alone", curves=(OVER,)),
+            "one smooth curve in the balance slip over slope leaves nothing",
+        ),
+        (NameSupport(False, "not adequate", ("a", "b")), "the fit with a and b is not adequate"),
+        (
+            NameSupport(False, "lost", ("a",), (OVER, OVER)),
+            "beside smooth curves (balance slip over slope, balance slip over slope) a would explain nothing",
+        ),
+        (NameSupport(True, "beside", curves=(OVER,)), "beside smooth curves (balance slip over slope)"),
+    ],
+)
+def test_why_names_stand_or_not(support, said):
+    assert loop.reason(support) == said
+
+
+def test_verdict_of_a_complete_model():
+    off = of_fit.NoiseOff("", 2.0, "stated")
+    said = "Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = 0.4)."
+    assert loop.statement(Summary("none", 0.4, None)) == said
+    assert loop.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {sentence(off)}"
+    aside = loop.statement(Summary("none", 0.4, None, aside=10, of=100))
+    assert aside == f"10 of 100 rows (10 %) lie off alone and are set aside. {said}"
+
+
+def test_verdict_lists_what_cannot_be_told_apart():
+    value = FreedValue("motor.resistance", 1.9377, "ohm")
+    one = Missing(("a",), (value,), ("losses",))
+    two = Missing(("b", "c"), (), ("leads", "supply"))
+    assert loop.statement(Summary("class", 0.0004, None, (one, two))) == (
+        "Missing: losses, a, or motor.resistance is 1.94 ohm (these data cannot tell which); one of b, c (these data "
+        "cannot tell which) (family-wise p ≤ 0.0004)."
+    )
+    assert loop.statement(Summary("named", 0.002, None, (Missing(("a",), (), ("x",)),))) == (
+        "Missing: a (family-wise p ≤ 0.002)."
+    )
+
+
+def test_a_formula_without_terms_says_so():
+    assert Formula("", "mark", (), (), 0.0, 9).formula == "none: no term shows in these data"
+    assert Formula("ΔU = 1 V", "mark", (1.0,), (0.1,), 3.0, 9).to_json()["formula"] == "ΔU = 1 V"
+
+
+def test_why_an_effect_is_ruled_out():
+    reasons = (RuledOut("a", "power"), RuledOut("b", "size", 2.94, ("x", "y")), RuledOut("c", "edge"))
+    assert loop.why_ruled_out(reasons) == (
+        "a would put power in; b at 2.9 times its largest plausible size; check x and y; c is within an sd of the "
+        "largest plausible size"
+    )
+
+
+def test_names_say_what_would_explain_more_than_they():
+    def of(verdict, *ruled_out):
+        return SimpleNamespace(verdict=verdict, implausible=ruled_out, settings=SimpleNamespace(same=6.0))
+
+    def candidate(rise, *names):
+        return SimpleNamespace(effects=dict.fromkeys(names, 1.0), rise_chi2=rise, why="too large")
+
+    near, better = candidate(-2.0, "a"), candidate(-30.4, "b", "c")
+    assert loop.ruled_out(of("named", near)) == "" == loop.ruled_out(of("unnamed"))
+    assert loop.ruled_out(of("class", near, better)) == (
+        "b and c would explain 30 σ² more than what is proposed, but are ruled out by size or sign alone: too large."
+    )
+    assert loop.ruled_out(of("unnamed", better, near)).startswith("a would explain as much as the curve, but is")
+
+
+def errors(rows, rms):
+    return {"motor_speed": {"rows": rows, "rms_percent": rms}}
+
+
+@pytest.mark.parametrize(
+    ("found", "before", "after", "said"),
+    [
+        ((4.3, 4.72), errors(10, 4.3), errors(10, 4.72), "motor speed 4.3 → 4.7 %"),
+        ((0.141, 0.149), errors(10, 0.141), errors(10, 0.149), "motor speed 0.14 → 0.15 %"),
+        ((4.0, 5.0), errors(8, 4.0), errors(10, 12.0), "motor speed 4.0 → 5.0 % (of the 8 rows that both predict)"),
+        (None, errors(10, 4.0), errors(8, 3.0), "2 rows fewer predicted"),
+        (None, errors(10, 4.0), errors(9, 3.0), "1 row fewer predicted"),
+        (None, errors(10, 4.0), errors(10, 3.0), ""),
+    ],
+)
+def test_what_is_predicted_worse_is_said_with_its_rows(found, before, after, said):
+    worse = () if found is None else (Worse("voltage", "motor_speed", before["motor_speed"]["rows"], *found),)
+    whole = f"Held out, what was found predicts worse: by voltage {said}."
+    assert loop.worse(worse, {"voltage": (before, after)}) == (whole if said else "")
+
+
+@pytest.mark.parametrize(
+    ("about", "said"),
+    [
+        (("missing", "slip", "speed_motor"), "what is missing in the balance slip over speed motor"),
+        (("found", "", "", ("a", "b")), "a, b, found by the lumped model"),
+        (("near", "", "", ("a",)), "a, which explains the readings nearly as well"),
+    ],
+)
+def test_what_the_track_model_is_asked_about(about, said):
+    assert loop.asked(of_loop.Asked(*about)) == said
+
+
+# --- whether a fit is adequate --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (
+            Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True),
+            "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
+            "something is missing and the parameters may stand in for it; mmrjax loop finds what",
+        ),
+        (
+            Adequacy(False, 60.0, 60.0, 0.0021, Shown("motor_speed", "follow", "slope_deg"), False),
+            "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
+            "so something is missing and the parameters may stand in for it; mmrjax loop finds what",
+        ),
+        (
+            Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),
+            "Adequate: the residuals are what the stated noise leaves (χ² 61 on 60 degrees of freedom, p = 0.4)",
+        ),
+        (
+            Adequacy(True, 50.0, 50.0, 0.4, Shown(), False),
+            "Adequate as far as can be tested: the residuals show no structure (p = 0.4); the noise was estimated from "
+            "them, so χ² tests nothing",
+        ),
+        (
+            Adequacy(None, 5.0, 2.5, None, Shown(), False),
+            "Adequacy cannot be tested: the noise was estimated from the misfit, and 2.5 degrees of freedom cannot show "
+            "structure; state it with --noise",
+        ),
+    ],
+)
+def test_adequacy_is_said(found, said):
+    assert found.statement == said and found.to_json()["statement"] == said
+    assert found.to_json()["shown_by"] == fits.shown_by(found.shown_by)
+
+
+def clustered(levels, **other):
+    """Residuals of speed that go with a column; levels: means by name."""
+    means = tuple(LevelMean(name, "", mean, 9) for name, mean in levels.items())
+    known = dict(
+        column="wheel", channel="speed", unit="mm/s", within="", reversing=False, levels=means, correlation=None, p=2e-7,
+        alike=(), coarser=(), at=np.zeros(0), residual=np.zeros(0),
+    )  # fmt: skip
+    return ResidualCluster(**{**known, **other})
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (
+            clustered({"1": -14.42, "2": 3.6}, alike=("direction_deg",)),
+            "residuals of speed cluster by wheel (simulated less measured at levels 1: -14 mm/s, 2: +3.6 mm/s; p = 2e-07), "
+            "a column without a role (as well by direction_deg): give each level its own configuration, or find what "
+            "differs",
+        ),
+        (
+            clustered({"1": -1.0, "2": 1.0}, reversing=True, within="configuration", coarser=(("axle", 0.91),)),
+            "residuals of speed cluster by wheel within configuration, with opposite signs in the two directions of travel "
+            "(simulated less measured at levels 1: -1 mm/s, 2: +1 mm/s; p = 2e-07), a column without a role (axle alone "
+            "91% of it): give each level its own configuration, or find what differs",
+        ),
+        (
+            clustered({}, correlation=-0.456),
+            "residuals of speed go with wheel (rank correlation -0.46; p = 2e-07), a column without a role: find what "
+            "differs with it",
+        ),
+    ],
+)
+def test_what_residuals_cluster_by_is_said(found, said):
+    assert found.statement == said == sentence(found) == found.to_json()["statement"]
+
+
+def test_six_levels_that_are_furthest_off_are_listed():
+    said = clustered({str(k): k - 5.0 for k in range(1, 10)}).statement
+    assert [int(k) for k in re.findall(r"(\d): [+-]", said)] == [1, 2, 3, 7, 8, 9] and ", ...;" in said
+
+
+def test_tests_that_are_as_improbable_are_named_in_the_order_of_their_words():
+    """Of several that are zero to rounding the first is named: data are compared as their sentences are."""
+    every = [Shown(what="stated"), Shown(what="repeats")]
+    every += [Shown(c, "follow", v) for c in ("total_current", "speed") for v in ("the fitted speed", "slope_deg")]
+    every += [Shown(c, "remember") for c in ("motor_speed", "total_current")]
+    assert sorted(every) == sorted(every, key=fits.shown_by)
+
+
+def test_what_would_measure_is_found_by_either_end_of_a_name():
+    assert tables.would_measure("motor.inductance").startswith("a time history of the start-up current")
+    assert re.search("slippery slope", tables.would_measure("6T2A.ground.friction.dynamic"))
+    assert tables.would_measure("x.y") == "runs under conditions in which it acts"
