@@ -258,7 +258,7 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot 
             for k in range(round(2 / share) - 1):
                 first = low + k * size / 2
                 inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
-                offered.append((axis, x, counts & inside & ~sorted_runs))
+                offered.append((axis, x, counts & inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in axes_of(robot):
             continue
