@@ -232,6 +232,11 @@ SAMPLES = [
         "only 400 of 500 bootstrap tables could be fitted again; the thresholds are theirs",
     ),
     (
+        of_loop.RestsOn("vibration_slip", 10, 10.57, 4.3),
+        "vibration_slip rests on row 10 (10.6 σ with it, 4.3 σ without): make that run again, and runs at conditions on "
+        "either side of it",
+    ),
+    (
         of_loop.Unwritten(True, 0.13, 0.42),
         "the curve predicts runs that it has not seen no better than the refit (+0.13 ± 0.42 nat a reading): robot.toml "
         "is the refit",

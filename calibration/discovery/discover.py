@@ -35,6 +35,7 @@ from calibration.discovery.notes import (
     Missing,
     NameSupport,
     PhasesDiffer,
+    RestsOn,
     StillLacks,
     Summary,
     TooFewReplicates,
@@ -728,6 +729,10 @@ def remarks(found: DiscoveryResult) -> Notes:
         said.append(PhasesDiffer(wave.score_free_in_each_run, wave.score))
     if found.remains is not None:
         said.append(StillLacks(found.remains.place, found.remains.variable))
+    names = [e.name for e in found.effects]
+    for t in () if found.support is None else found.support.tests:
+        if t.rests_on is not None and t.effect in names:
+            said.append(RestsOn(t.effect, t.rests_on, t.root, t.root_without))
     if not found.written and found.gain is not None:
         said.append(Unwritten(found.unnamed is not None, found.gain.mean, found.gain.se))
     said += preference.remarks(found.alternatives_held_out, found.settings.prefer)

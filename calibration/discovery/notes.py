@@ -345,6 +345,16 @@ Instruction = NothingPossible | NothingTells | CarryOut | MoreRuns | TooWeak
 
 
 @dataclasses.dataclass(frozen=True)
+class RestsOn(Note):
+    """An effect that stands by one row alone: the row's number, its root with it and without [σ]."""
+
+    effect: str
+    row: int
+    root: float
+    root_without: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Unwritten(Note):
     """What was found predicts data held out worse than the refit does, or no better, and is not in the robot that is
     written: a `curve`, or effects; by how much, and the standard error [nat a reading]."""

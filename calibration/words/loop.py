@@ -19,6 +19,7 @@ from calibration.discovery.notes import (
     NameSupport,
     NameTest,
     PhasesDiffer,
+    RestsOn,
     RuledOut,
     StillLacks,
     Summary,
@@ -381,6 +382,14 @@ def led(note: Led) -> str:
         why = "is not as adequate" if asked else f"would come first by --prefer {HELD_OUT}, where adequate"
         said += f"; {names[note.best]} {why}"
     return said
+
+
+def rests_on(note: RestsOn) -> str:
+    """An effect that stands by one row alone."""
+    return (
+        f"{note.effect} rests on row {note.row} ({note.root:.1f} σ with it, {note.root_without:.1f} σ without): make that "
+        "run again, and runs at conditions on either side of it"
+    )
 
 
 def unwritten(note: Unwritten) -> str:
