@@ -387,8 +387,8 @@ def led(note: Led) -> str:
 def rests_on(note: RestsOn) -> str:
     """An effect that stands by one row alone."""
     return (
-        f"{note.effect} rests on row {note.row} ({note.root:.1f} σ with it, {note.root_without:.1f} σ without): make that "
-        "run again, and runs at conditions on either side of it"
+        f"{note.effect} rests on row {note.row} ({note.root:.1f} σ with it, {note.root_without:.1f} σ without): make "
+        "that run again, and runs at conditions on either side of it"
     )
 
 
