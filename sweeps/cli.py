@@ -174,13 +174,13 @@ def simulate(
     cells = _cells(configuration, voltage, motor_speed, slope, payload, mass, surface)
     given = cells if runs is None else str(runs)
     if resolved.profile is not None:
-        from sweeps import missions
+        from sweeps.commands import missions
 
         columns = {"voltage": "supply_voltage_V", "slope": "slope_deg", "payload": "payload_kg", "surface": "surface"}
         sources = {option: context.get_parameter_source(option) for option in columns}
         stated = {columns[o]: f"--{o}" for o, s in sources.items() if s is not None and s.name == "COMMANDLINE"}
         return missions.simulate(resolved, given, stated, out, force)
-    from sweeps import simulate as room
+    from sweeps.commands import simulate as room
 
     return room.simulate(resolved, given, out, force)
 
@@ -285,11 +285,11 @@ def sweep(
     wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))
     if zarr or wanted or how != config_campaign.How() or config_campaign.is_campaign(file):
         stored = _prepared(config_campaign.resolve_campaign(file, options), no_cache)
-        from sweeps import campaign
+        from sweeps.commands import campaign
 
         return campaign.store_sweep(stored, where, out, force, how, wanted)
     resolved = _prepared(config.resolve(config.Sweep, file, options), no_cache)
-    from sweeps import sweep as room
+    from sweeps.commands import sweep as room
 
     return room.sweep(resolved, where, out, force)
 
@@ -328,7 +328,7 @@ def compare(
         report=report,
     )
     resolved = _prepared(config.resolve(config.Compare, None, options), no_cache)
-    from sweeps import compare as room
+    from sweeps.commands import compare as room
 
     return room.compare(resolved, data, own_mass, out, force)
 
@@ -353,7 +353,7 @@ def reproduce(
 
     options = _options(model=model, robot=robot, set=set_, effects=effects)
     resolved = _prepared(config.resolve(config.Reproduce, None, options), no_cache)
-    from sweeps import reproduce as room
+    from sweeps.commands import reproduce as room
 
     return room.reproduce(resolved, out, force)
 
@@ -400,7 +400,7 @@ def render(
         discharge_mAh=discharge,
     )
     resolved = _prepared(config.resolve(config.Render, None, options), no_cache)
-    from sweeps import render as room
+    from sweeps.commands import render as room
 
     cells = _cells(configuration, voltage, motor_speed, slope, payload, mass, surface)
     begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
@@ -473,7 +473,7 @@ def calibrate(
         "profiles": profiles, "hold_out": hold_out,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Calibrate, None, options), no_cache)
-    from sweeps import calibrate as room
+    from sweeps.commands import calibrate as room
 
     return room.calibrate(resolved, data, out, force, members)
 
@@ -546,7 +546,7 @@ def loop(
         "generations": generations,
     }  # fmt: skip
     settled = _prepared(config.resolve(config.Loop, None, options), no_cache)
-    from sweeps import loop as room
+    from sweeps.commands import loop as room
 
     return room.loop(settled, data, out, force, members)
 
@@ -649,7 +649,7 @@ def sensitivity(
         "candidates": None if candidates is None else str(candidates), "runs": runs, "noise": noise, "seed": seed,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Sensitivity, None, options), no_cache)
-    from sweeps import sensitivity as room
+    from sweeps.commands import sensitivity as room
 
     return room.sensitivity(resolved, out, force)
 
@@ -702,7 +702,7 @@ def resonance(
         "payloads_kg": config.axis("--payloads", payloads), "slope_deg": slope, "surface": surface,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Resonance, None, options), no_cache)
-    from sweeps import resonance as room
+    from sweeps.commands import resonance as room
 
     return room.resonance(resolved, out, force)
 
@@ -737,7 +737,7 @@ def check(
         "requirements": None if requirements is None else str(requirements), "changes": changes,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Check, None, options), no_cache)
-    from sweeps import check as room
+    from sweeps.commands import check as room
 
     return room.check(resolved, out, force)
 
@@ -781,7 +781,7 @@ def size(
         "seed": seed,
     }  # fmt: skip
     resolved = _prepared(config.resolve(config.Size, None, options), no_cache)
-    from sweeps import size as room
+    from sweeps.commands import size as room
 
     return room.size(resolved, out, force)
 
@@ -803,7 +803,7 @@ def new(
 
     As written it can be read, with numbers of an example. Units are SI but where a comment says another.
     """
-    from sweeps import rig_new
+    from sweeps.commands import rig_new
 
     return rig_new.new(file, kind, force)
 
@@ -825,7 +825,7 @@ def rig_check(
     Exit codes: 0 it can be used; 2 the file cannot; 4 the data cannot.
     """
     _start_jax(no_cache)
-    from sweeps import rig_check as room
+    from sweeps.commands import rig_check as room
 
     return room.check(file, data, tuple(effects or ()), json)
 
@@ -834,7 +834,7 @@ def rig_check(
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""
     _start_jax(no_cache)
-    from sweeps import doctor as room
+    from sweeps.commands import doctor as room
 
     return room.doctor()
 

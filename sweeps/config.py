@@ -150,7 +150,7 @@ class SupplyPart(Part):
 
 
 class GridPart(Part):
-    """The axes of a grid; None leaves them to `sweeps.grid.resolved`: Table 8 for the packaged robot.
+    """The axes of a grid; None leaves them to `sweeps.points.grid.resolved`: Table 8 for the packaged robot.
 
     Attributes:
         configurations: of the robot, by name; None takes all that it has.
@@ -362,7 +362,7 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
         method: `local`, `sobol`, `morris`, `derivative` or `shapley`.
         configurations, voltages_V, motor_speeds_rpm, payloads_kg, slopes_deg, surface: operating points, as of a
             grid; None leaves them to the method: Table 8 where gradients do, its corners and middle where a sample is
-            drawn; of a rig see `sweeps.grid.resolved`.
+            drawn; of a rig see `sweeps.points.grid.resolved`.
         parameters: uncertain, by dotted name, with their priors; empty takes all that have one.
         vary: conditions that are uncertain, `name=low:high`.
         outputs: by name; empty takes the usual ones.

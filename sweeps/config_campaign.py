@@ -26,7 +26,7 @@ EXPORTS = ("csv", "parquet")
 
 
 class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
-    """A sweep of any size over any names, into a Zarr store; `sweeps.axes` reads its tables.
+    """A sweep of any size over any names, into a Zarr store; `sweeps.points.axes` reads its tables.
 
     Attributes:
         conditions: those that do not vary, by name.

@@ -15,9 +15,9 @@ from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH
-from sweeps import imposed
 from sweeps.config import RobotPart
 from sweeps.console import tell
+from sweeps.points import imposed
 
 #: Option that states a condition of one run.
 OPTIONS = {
