@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from mmrjax.signals import FLAGS, STATUSES
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say, tell
-from sweeps.inputs import load_robot, one_run, read_runs
+from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
 from sweeps.pages import words
 from sweeps.points import imposed, run
 from sweeps.results.missions import Missions
@@ -45,14 +45,14 @@ _PRINTED = (
 def simulate(
     config: configuration.Simulate,
     given: str | dict[str, Any],
-    stated: Mapping[str, str],
+    stated: Collection[str],
     out: Path | None,
     force: bool,
 ) -> int:
     """Simulate runs of a file (its name), or one of options (by column), over a profile; returns the exit code.
 
     Args:
-        stated: columns of conditions that options state, with those options.
+        stated: columns of conditions that options state.
 
     Raises:
         BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
@@ -69,7 +69,7 @@ def simulate(
     for column in source.stated:
         if column in stated and not isinstance(given, str):
             raise BadConfiguration(
-                f"{stated[column]}: got it beside {source.source}, which states {column}; expected one of the two"
+                f"{OPTIONS[column]}: got it beside {source.source}, which states {column}; expected one of the two"
             )
     _check_charge(robot, config)
     if isinstance(given, str):
