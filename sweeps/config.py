@@ -334,9 +334,9 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     configuration: str | None = about(None, "One of the robot's", usual="its first")
     voltages_V: Voltages = about(
         tuple(10.0 + k for k in range(31)),
-        "Supply voltages (V), by which the speed is set",
+        "Supply voltages (V), at least 5 of them, by which the speed is set",
         usual="10:40:1, that is 31",
-        minimum=5,
+        minimum=0,
     )
     payloads_kg: Payloads = about(PAYLOADS_KG, "Additional load masses")
     slope_deg: Slope = about(0.0, "Slope, positive uphill")

@@ -15,7 +15,8 @@ from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.pages.page import rms
-from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
 
 
 def calibrate(
@@ -36,17 +37,12 @@ def calibrate(
             profiles=config.profiles, blocks=config.hold_out, tell=tell,
         )  # fmt: skip
         found.save(folder.partial, config.robot)
-        folder.write_text("config.resolved.toml", configuration.as_toml(config))
         print_calibration(found)
-        if config.report:
-            from sweeps.pages import calibration as calibration_page
-
-            calibration_page.write(folder.partial, found, robot_name=config.robot)
-        path = folder.finish({"seed": found.seed, "statuses": found.counts}, runs)
-        say(str(path))
         settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
         reached = words.settled(found.counts) == len(found)
-        return DONE if settled and reached else SOME_NOT_CONVERGED
+        manifest = {"seed": found.seed, "statuses": found.counts}
+        shown = page("calibration", found, robot_name=config.robot)
+        return leave(folder, config, manifest, complete=settled and reached, page=shown, runs=runs)
 
 
 def print_calibration(found: CalibrationResult) -> None:

@@ -14,7 +14,8 @@ from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.results.check import CheckResult, changed, corner, label, limit, reached, wanted
-from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder, open_folder
+from sweeps.skeleton import leave, page
+from sweeps.store import RunFolder, open_folder
 
 #: Changes that the console shows of each missed requirement.
 SHOWN = 3
@@ -30,17 +31,11 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
         found = CheckResult(asked, robot, sheet.check(robot, asked, changes=config.changes))
         _write(folder, config, found)
         print_check(found, changes=config.changes)
-        if config.report:
-            from sweeps.pages import check as check_page
-
-            check_page.write(folder.partial, found, file)
-        path = folder.finish({"seed": None, **sheet.counts(found.outcomes)})
-        say(str(path))
-        return SOME_NOT_CONVERGED if found.missed else DONE
+        manifest = {"seed": None, **sheet.counts(found.outcomes)}
+        return leave(folder, config, manifest, complete=not found.missed, page=page("check", found, file))
 
 
 def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:
-    folder.write_text("config.resolved.toml", configuration.as_toml(config))
     folder.write_text("requirements.toml", found.asked.text)
     robot_file.write(found.robot, folder.partial / "robot.toml", note=f"the robot of this check, from {config.robot}")
     folder.write_table("requirements.csv", table(found))

@@ -22,6 +22,7 @@ from sweeps.console import say
 from sweeps.inputs import beside_robot, load_robot, read_runs
 from sweeps.pages import words
 from sweeps.points import run, uncertainty
+from sweeps.skeleton import page
 from sweeps.store import open_folder
 
 #: Conditions that are printed, and their headings.
@@ -56,15 +57,13 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
             folder.write_table(
                 "comparison.csv", comparison | {f"simulated_{key}": found.columns[key] for key in kept}
             )
-        if config.report:
-            from sweeps.pages import comparison as comparison_page
-
-            comparison_page.write(
-                folder.partial, dataclasses.replace(file, robot=robot), model=config.model, data_name=runs.source,
-                table=comparison, summary=summary, notes=notes,
-            )  # fmt: skip
         further = {"errors": summary, "notes": notes}
-        return run.leave(folder, config, run.SimulationResult("compare", config.model, robot, runs, table, further))
+        result = run.SimulationResult("compare", config.model, robot, runs, table, further)
+        shown = page(
+            "comparison", dataclasses.replace(file, robot=robot), model=config.model, data_name=runs.source,
+            table=comparison, summary=summary, notes=notes,
+        )  # fmt: skip
+        return run.leave(folder, config, result, shown)
 
 
 def compared(

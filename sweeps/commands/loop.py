@@ -20,7 +20,8 @@ from sweeps.console import say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.pages.page import rms
-from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
 
 
 def loop(config: configuration.Loop, source: str, out: Path | None, force: bool, members: Path | None = None) -> int:
@@ -48,18 +49,14 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
                 members=members, seed=config.seed, tell=progress,
             ))  # fmt: skip
         found.save(folder.partial, config.robot)
-        folder.write_text("config.resolved.toml", configuration.as_toml(config))
         print_discovery(found)
         if config.resolve and found.resolved is None:
             say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
         if config.report:
-            from sweeps.pages import loop as loop_page
-
             progress("writing the report")
-            loop_page.write(folder.partial, found, robot_name=config.robot)
-        path = folder.finish({"seed": config.seed, "verdict": found.verdict}, found.runs)
-        say(str(path))
-        return DONE if found.converged and not found.unusable else SOME_NOT_CONVERGED
+        manifest, complete = {"seed": config.seed, "verdict": found.verdict}, found.converged and not found.unusable
+        shown = page("loop", found, robot_name=config.robot)
+        return leave(folder, config, manifest, complete=complete, page=shown, runs=found.runs)
 
 
 def print_discovery(found: DiscoveryResult) -> None:

@@ -29,6 +29,7 @@ from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
 from sweeps.pages import words
 from sweeps.points import imposed, run
 from sweeps.results.missions import Missions
+from sweeps.skeleton import page
 from sweeps.store import open_folder
 
 #: Rows of history.csv: of a run at most, at least, and of all runs together.
@@ -87,12 +88,8 @@ def simulate(
         folder.write_table("segments.csv", capabilities.of(robot, found.segments))
         folder.write_table("history.csv", capabilities.of(robot, found.course))
         print_missions(found, capabilities.idle_columns(robot))
-        if config.report:
-            from sweeps.pages import mission as mission_page
-
-            mission_page.write(folder.partial, file, found)
         result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
-        return run.leave(folder, config, result)
+        return run.leave(folder, config, result, page("mission", file, found))
 
 
 def _check_robot(robot: Robot) -> None:

@@ -9,10 +9,11 @@ from calibration.data import runs as records
 from mmrjax import fidelities
 from mmrjax.tables import CONFIGURATIONS
 from sweeps import config as configuration
-from sweeps.console import say, tell
+from sweeps.console import tell
 from sweeps.inputs import load_robot
 from sweeps.paper import data, report
-from sweeps.store import DONE, open_folder
+from sweeps.skeleton import leave
+from sweeps.store import open_folder
 
 
 def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) -> int:
@@ -29,11 +30,8 @@ def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) ->
         else:
             folder.write_table("rows.csv", data.table(rows))
             result |= {"rows": len(rows.conditions), "errors": data.summary(rows), "adhesion_raised": rows.ratio}
-        folder.write_text("config.resolved.toml", configuration.as_toml(config))
         robot_file.write(
             robot, folder.partial / "robot.toml", note=f"the robot of these figures, from {config.robot}"
         )
         folder.write_json("result.json", result)
-        path = folder.finish({"seed": None}, runs)
-        say(str(path))
-        return DONE
+        return leave(folder, config, {"seed": None}, complete=True, runs=runs)

@@ -38,7 +38,8 @@ from sweeps.inputs import check_configurations, load_robot
 from sweeps.points import imposed, run
 from sweeps.points.grid import grid
 from sweeps.results.resonance import SLOW, ResonanceResult, span
-from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder, open_folder
+from sweeps.skeleton import leave, page
+from sweeps.store import RunFolder, open_folder
 
 CHUNK = 96  # runs in one call
 FEWEST = 5  # voltages over which a peak can be told
@@ -83,13 +84,8 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
         found = _found(config, robot, what, table)
         _write(folder, config, found)
         print_resonance(found)
-        if config.report:
-            from sweeps.pages import resonance as resonance_page
-
-            resonance_page.write(folder.partial, found, file)
-        path = folder.finish({"seed": None, "statuses": found.statuses}, runs)
-        say(str(path))
-        return DONE if found.statuses["converged"] == len(runs) else SOME_NOT_CONVERGED
+        manifest, complete = {"seed": None, "statuses": found.statuses}, found.statuses["converged"] == len(runs)
+        return leave(folder, config, manifest, complete=complete, page=page("resonance", found, file), runs=runs)
 
 
 def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:
@@ -202,7 +198,6 @@ def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceR
         "modes.csv", _rows([{"payload_kg": p, **m._asdict()} for p, of in found.modes.items() for m in of], Mode)
     )
     folder.write_table("peaks.csv", _rows([p._asdict() for p in found.peaks], Peak))
-    folder.write_text("config.resolved.toml", configuration.as_toml(config))
     robot_file.write(found.robot, folder.partial / "robot.toml", note=f"the robot of this map, from {config.robot}")
     folder.write_json("result.json", found.to_json())
 

@@ -35,7 +35,8 @@ from sweeps.points import grid as grid_room
 from sweeps.points import imposed
 from sweeps.points.grid import configurations, grid
 from sweeps.points.run import refuse
-from sweeps.store import DONE, SOME_NOT_CONVERGED, open_folder
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
 
 #: Operating points where a sample is drawn at each: corners and middle of Table 8.
 CORNERS = {
@@ -76,16 +77,11 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
         folder.write_json("result.json", found.to_json())
         for name, table in found.tables().items():
             folder.write_table(name, table)
-        folder.write_text("config.resolved.toml", configuration.as_toml(config))
         robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this study, from {config.robot}")
         print_sensitivity(found)
-        if config.report:
-            from sweeps.pages import sensitivity as sensitivity_page
-
-            sensitivity_page.write(folder.partial, found, file)
-        path = folder.finish({"seed": found.seed, "statuses": found.statuses}, runs)
-        say(str(path))
-        return DONE if found.studied else SOME_NOT_CONVERGED
+        manifest = {"seed": found.seed, "statuses": found.statuses}
+        shown = page("sensitivity", found, file)
+        return leave(folder, config, manifest, complete=bool(found.studied), page=shown, runs=runs)
 
 
 def _ranges(vary: tuple[str, ...]) -> dict[str, tuple[float, float]]:

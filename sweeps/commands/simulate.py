@@ -25,6 +25,7 @@ from sweeps.console import progress, say
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.pages import words
 from sweeps.points import run, uncertainty
+from sweeps.skeleton import page
 from sweeps.store import RunFolder, open_folder
 
 _HISTORIES = 1000  # runs of which histories are kept
@@ -73,19 +74,14 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
             uncertainty.say_lost(found)
         if len(runs) > _SHOWN:
             say(f"... and {len(runs) - _SHOWN} more in runs.csv")
-        if config.report:
-            from sweeps.pages import runs as runs_page
-
-            runs_page.write(
-                folder.partial, file, model=config.model, runs=table,
-                histories=histories,
-            )  # fmt: skip
         further: dict[str, Any] = {"notes": notes}
         if histories is not None and robot.has_ground:
             further["starts"] = starts(robot, histories, runs)
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
-        return run.leave(folder, config, run.SimulationResult("simulate", config.model, robot, runs, table, further))
+        result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
+        shown = page("runs", file, model=config.model, runs=table, histories=histories)
+        return run.leave(folder, config, result, shown)
 
 
 def _simulated(

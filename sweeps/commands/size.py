@@ -17,7 +17,8 @@ from sweeps.console import say
 from sweeps.inputs import load_robot
 from sweeps.results import check as check_result
 from sweeps.results.size import SizeResult, described, missed, objective
-from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder, open_folder
+from sweeps.skeleton import leave, page
+from sweeps.store import RunFolder, open_folder
 
 
 def size(config: configuration.Size, out: Path | None, force: bool) -> int:
@@ -43,18 +44,13 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
         found = SizeResult(asked, robot, sizing, objectives, outcomes)
         _write(folder, config, found)
         print_size(found)
-        if config.report:
-            from sweeps.pages import size as size_page
-
-            size_page.write(folder.partial, found, file)
-        path = folder.finish({"seed": config.seed, "feasible": sizing.best is not None})
-        say(str(path))
-        return DONE if outcomes and all(o.met for o in outcomes) else SOME_NOT_CONVERGED
+        manifest = {"seed": config.seed, "feasible": sizing.best is not None}
+        complete = bool(outcomes) and all(o.met for o in outcomes)
+        return leave(folder, config, manifest, complete=complete, page=page("size", found, file))
 
 
 def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:
     best = found.sizing.best
-    folder.write_text("config.resolved.toml", configuration.as_toml(config))
     folder.write_text("requirements.toml", found.asked.text)
     note = f"the robot that was changed, {config.robot}: no design meets the requirements"
     if best is not None:

@@ -15,6 +15,7 @@ from sweeps.pages import words
 from sweeps.points import run, uncertainty
 from sweeps.points.grid import axes, grid, resolved
 from sweeps.points.zarr_store import STORE
+from sweeps.skeleton import page
 from sweeps.store import open_folder
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
@@ -50,11 +51,8 @@ def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool
             found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
             uncertainty.say_intervals(table, found)
             table |= found.columns
-        if config.report:
-            from sweeps.pages import sweep as sweep_page
-
-            sweep_page.write(folder.partial, file, model=config.model, runs=table)
-        return run.leave(folder, config, run.SimulationResult("sweep", config.model, robot, runs, table))
+        result = run.SimulationResult("sweep", config.model, robot, runs, table)
+        return run.leave(folder, config, result, page("sweep", file, model=config.model, runs=table))
 
 
 def print_counts(table: dict[str, np.ndarray]) -> None:

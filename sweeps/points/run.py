@@ -18,13 +18,13 @@ from mmrjax.fidelities.base import Run
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
-from sweeps import capabilities
+from sweeps import capabilities, skeleton
 from sweeps import config as configuration
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress as bar
-from sweeps.console import say
 from sweeps.pages import words
-from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder
+from sweeps.skeleton import Page
+from sweeps.store import RunFolder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,16 +172,16 @@ def leave(
     folder: RunFolder,
     config: configuration.Simulate | configuration.Sweep | configuration.Compare,
     result: SimulationResult,
+    page: Page,
 ) -> int:
     """Write what every simulating command leaves, and move the folder into place; returns the exit code.
 
     Args:
-        folder: of the command; config: its configuration, with the robot's name.
+        folder: of the command; config: its configuration, with the robot's name; page: its page.
     """
     folder.write_table("runs.csv", capabilities.of(result.robot, result.table))
-    folder.write_text("config.resolved.toml", configuration.as_toml(config))
     robot_file.write(result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
     folder.write_json("result.json", result.to_json())
-    path = folder.finish({"seed": None, "statuses": result.statuses}, result.runs)
-    say(str(path))
-    return DONE if words.settled(result.statuses) == len(result.table["status"]) else SOME_NOT_CONVERGED
+    complete = words.settled(result.statuses) == len(result.table["status"])
+    manifest = {"seed": None, "statuses": result.statuses}
+    return skeleton.leave(folder, config, manifest, complete=complete, page=page, runs=result.runs)
