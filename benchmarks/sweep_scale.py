@@ -57,8 +57,9 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
     import jax
 
     from mmrjax import channels, robots
-    from sweeps import axes, campaign, scale
+    from sweeps.commands import campaign
     from sweeps.config_campaign import Campaign
+    from sweeps.points import axes, scale
 
     chunk = arguments.chunk or scale.default_chunk(arguments.model, jax.default_backend() != "cpu", devices)
     config = Campaign(
@@ -75,7 +76,7 @@ def against_cpu(arguments: argparse.Namespace) -> dict[str, Any]:
     """The first chunk on the default devices and on the processor: largest relative difference of each output."""
     import jax
 
-    from sweeps import scale
+    from sweeps.points import scale
 
     _, job = prepared(arguments, arguments.points, 1)
     count = job.blocks.count(0)
@@ -101,8 +102,9 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
     """One sweep into a store on disk; its times."""
     import jax
 
-    from sweeps import campaign, scale
-    from sweeps.zarr_store import SweepStore
+    from sweeps.commands import campaign
+    from sweeps.points import scale
+    from sweeps.points.zarr_store import SweepStore
 
     devices = jax.local_devices() if devices is None else devices
     config, job = prepared(arguments, points, len(devices))
@@ -192,7 +194,7 @@ def weak(arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 def designs() -> list[dict[str, Any]]:
     """Points a second of each sampled design of four dimensions, out of the middle of 1e9 points."""
-    from sweeps.design import DESIGNS
+    from sweeps.points.design import DESIGNS
 
     rows = []
     for name, design in DESIGNS.items():

@@ -74,8 +74,8 @@ for name, p in found.parameters.items():
     print(f"{name:<40}{p.value:>9.4g}  [{low:.3g}, {high:.3g}]  {p.shift:+.1f} sd{held}")
 
 # %%
-from sweeps import figures_calibration, figures_comparison
-from sweeps.figures_style import style
+from sweeps.pages import calibration_figures, comparison_figures
+from sweeps.pages.figure_style import style
 
 
 def show(draw, *arguments):
@@ -88,7 +88,7 @@ def show(draw, *arguments):
     return Image(data=picture.getvalue())
 
 
-show(figures_calibration.parameters, found)
+show(calibration_figures.parameters, found)
 
 # %% [markdown]
 # ## How sure
@@ -97,7 +97,7 @@ show(figures_calibration.parameters, found)
 # 20 degrees at all; more of it is hardly contradicted.
 
 # %%
-show(figures_calibration.profiles, found)
+show(calibration_figures.profiles, found)
 
 # %% [markdown]
 # ## Errors, and on data not seen
@@ -105,7 +105,7 @@ show(figures_calibration.profiles, found)
 # predict it.
 
 # %%
-show(figures_calibration.before_after, found)
+show(calibration_figures.before_after, found)
 
 # %% [markdown]
 # ## What friction cannot explain
@@ -115,7 +115,7 @@ show(figures_calibration.before_after, found)
 # both voltages. Finding those effects is another tool's work; freeing the electrics here would only hide them.
 
 # %%
-show(figures_comparison.errors_over, found.rows(), found.channels)
+show(comparison_figures.errors_over, found.rows(), found.channels)
 
 # %%
 for note in found.notes:

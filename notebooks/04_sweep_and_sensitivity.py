@@ -95,8 +95,8 @@ for name, output in found.outputs.items():
         print(f"{name:<16}{found.names[k]:<36}{float(total.value):6.3f}  [{total.low:.3f}, {total.high:.3f}]")
 
 # %%
-from sweeps import figures_sensitivity
-from sweeps.figures_style import style
+from sweeps.pages import sensitivity_figures
+from sweeps.pages.figure_style import style
 
 
 def show(draw, *arguments):
@@ -109,7 +109,7 @@ def show(draw, *arguments):
     return Image(data=picture.getvalue())
 
 
-show(figures_sensitivity.indices, found.outputs["total_current"], found)
+show(sensitivity_figures.indices, found.outputs["total_current"], found)
 
 # %% [markdown]
 # ## At the robot's own values
@@ -118,13 +118,13 @@ show(figures_sensitivity.indices, found.outputs["total_current"], found)
 
 # %%
 local = analyse(study, "local")
-show(figures_sensitivity.overview, local)
+show(sensitivity_figures.overview, local)
 
 # %%
 speed = local.outputs["speed"]
 k = local.names.index("motor.torque_constant")
 print(f"1 % more torque constant changes the speed at 15 V by {speed.elasticity[0, k]:+.2f} %")
-show(figures_sensitivity.tornado, speed, local)
+show(sensitivity_figures.tornado, speed, local)
 
 # %%
 assert np.isfinite(current).all() and current[-1, -1] > current[0, 0]

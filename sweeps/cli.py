@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import math
+import functools
+import inspect
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
 from calibration.data.errors import InputError
 from mmrjax import __version__, fidelities
+from sweeps import config, config_campaign
+from sweeps import options as made
 
 INTERRUPTED = 130
 
@@ -25,99 +29,90 @@ app = typer.Typer(
 )  # fmt: skip
 
 
-def _defaults(option: str, shown: float = math.inf) -> str:
-    """Default of a fidelity's option by fidelity, as a help text has it; of `simulate` at most `shown`."""
-    found = {name: o.default for name, facts in fidelities.TABLE.items() for o in facts.options if o.name == option}
-    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in found.items()}
-    texts = [f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else list(capped.values())
-    return f"\\[default: {'; '.join(texts)}]"
-
-
-_Model = Annotated[
-    str | None,
-    typer.Option("--model", help=f"Fidelity: {', '.join(fidelities.NAMES)}.  \\[default: {fidelities.NAMES[0]}]"),
+_Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
+_NoCache = Annotated[
+    bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
 ]
-_Duration = Annotated[
-    float | None, typer.Option("--duration", help=f"Length of a run (s).  {_defaults('duration', shown=5.0)}")
-]
-_Robot = Annotated[
-    str | None, typer.Option("--robot", help="nominal, sm1, sm2, or a robot's TOML file.  \\[default: nominal]")
-]
-_Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="Change a parameter, SI units, repeatable: 6T2A.ground.friction.static=0.6."),
+_Config = Annotated[
+    Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
 ]
 _Effects = Annotated[
     list[str] | None, typer.Option("--effects", help="A Python file with effects of your own, repeatable.")
 ]
-_Configuration = Annotated[
-    str | None,
-    typer.Option(help="One of the robot's, such as 6T2A or 4W2T of the packaged one.  \\[default: its first]"),
-]
-_Voltage = Annotated[
-    float | None,
-    typer.Option(
-        help="Supply voltage (V), negative backward.  \\[default: 33; of a rig its limit; none with --battery]"
-    ),
-]
-_MotorSpeed = Annotated[
-    float | None,
-    typer.Option(help="Motor speed (rpm), negative backward, of a rig on whose motors it is imposed."),
-]
-_MotorSpeeds = Annotated[
-    str | None,
-    typer.Option(
-        help="Motor speeds (rpm) of a rig on whose motors they are imposed.  \\[default: thirds of speed_limit]"
-    ),
-]
-_Slope = Annotated[float | None, typer.Option(help="Slope, positive uphill (deg).  \\[default: 0]")]
-_Payload = Annotated[float | None, typer.Option(help="Additional load mass (kg).  \\[default: 0]")]
-_Mass = Annotated[
-    float | None, typer.Option(help="Total mass (kg).  \\[default: the robot's own mass and the payload]")
-]
-_Surface = Annotated[
-    str | None,
-    typer.Option(
-        help="Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood. Of a rig a label of "
-        "its own.  \\[default: lacquered_wood; of a rig none]"
-    ),
-]
-_Step = Annotated[float | None, typer.Option("--step", help=f"Integration step (s).  {_defaults('step')}")]
-_Out = Annotated[Path | None, typer.Option("--out", help="The run folder.  \\[default: runs/COMMAND-TIME]")]
-_Force = Annotated[bool, typer.Option("--force", help="Replace an existing run folder.")]
-_Report = Annotated[bool | None, typer.Option("--report/--no-report", help="Write report.html.  \\[default: report]")]
-_Battery = Annotated[bool | None, typer.Option("--battery", help="Supply from the on-board battery.")]
-_Discharge = Annotated[
-    float | None, typer.Option("--discharge", help="Charge already taken from the battery (mAh).  \\[default: 0]")
-]
-_Posterior = Annotated[
-    int | None,
-    typer.Option(
-        "--posterior",
-        help="Give results with ± from so many robots drawn from the posterior.nc beside the calibrated --robot.",
-    ),
-]
-_Profile = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        help="A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
-        "supply_voltage_V, slope_deg, payload_kg, surface, current_other_A, or stair, stop_and_go, shuttle, patrol "
-        "(docs/missions.md).",
-    ),
-]
-_NoCache = Annotated[
-    bool, typer.Option("--no-cache", help="Compile anew: neither read nor keep compiled programs (see doctor).")
-]
-_Chunk = Annotated[
-    int | None,
-    typer.Option(
-        "--chunk",
-        help="Runs in one vmapped call.  \\[default: "
-        + ", ".join(f"{name} {facts.chunk}" for name, facts in fidelities.TABLE.items())
-        + "]",
-    ),
-]
+
+
+class Told(NamedTuple):
+    """What a command is told: its configuration, what changes no number beside it, and the file of both, if any."""
+
+    config: Any
+    beside: Any
+    file: Path | None
+
+    @property
+    def where(self) -> str:
+        """Where the configuration stands, for messages."""
+        return "options" if self.file is None else self.file.name
+
+
+def _command(
+    kind: type[config.Part],
+    *,
+    example: str,
+    beside: type[config.Part] | None = None,
+    arguments: tuple[str, ...] = (),
+    resolve: Callable[[Path | None, dict[str, Any]], config.Part] | None = None,
+) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """A command whose options are the fields of a configuration: beside what its function states itself.
+
+    Its function is called with `Told`, once jax is ready, and with its own options and arguments by name.
+
+    Args:
+        kind: of the configuration; beside: of what changes no number, of which a file has `[solver]` alone.
+        arguments: fields that are arguments; a `plan` of the function's own is the file, as --config is.
+        resolve: in place of `config.resolve`.
+    """
+
+    def of(function: Callable[..., int]) -> Callable[..., int]:
+        kinds = (kind,) if beside is None else (kind, beside)
+
+        @functools.wraps(function)
+        def run(**given: Any) -> int:
+            no_cache, file = given.pop("no_cache"), given.pop("config_file")
+            given.pop("help_all", None)
+            plan = given.pop("plan", None)
+            if plan is not None and file is not None:
+                raise InputError(f"--config: got {file} beside {plan}; expected one of them")
+            file = plan if file is None else file
+            stated = made.taken(kind, given)
+            further = None
+            if beside is not None:
+                further = config.resolve_beside(beside, file, made.taken(beside, given))
+            found = config.resolve(kind, file, stated, beside) if resolve is None else resolve(file, stated)
+            return function(Told(_prepared(found, no_cache), further, file), **given)
+
+        own = list(inspect.signature(function, eval_str=True).parameters.values())[1:]
+        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
+        first, last = [p for p in own if p.name not in _LAST], [p for p in own if p.name in _LAST]
+        keyword = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
+        last += [
+            keyword("config_file", annotation=_Config, default=None),
+            keyword("no_cache", annotation=_NoCache, default=False),
+            *made.help_all(kinds),
+        ]
+        fields = [p for k in kinds[::-1] for p in made.parameters(k, arguments)]
+        everything = [*first, *fields, *last]
+        run.__signature__ = inspect.Signature(everything)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in everything}
+        del run.__wrapped__  # whose annotations are not these
+        app.command(epilog=f"Example: {example}")(run)
+        return function
+
+    return of
+
+
+#: Parameters of commands that stand after those of their configurations.
+_LAST = ("out", "force")
 
 
 @app.callback(invoke_without_command=True)
@@ -127,36 +122,19 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
         raise typer.Exit
 
 
-@app.command(
-    epilog="Example: mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
-    "mmrjax simulate --profile patrol --battery --payload 5"
+@_command(
+    config.Simulate,
+    beside=config.OneRun,
+    example="mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
+    "mmrjax simulate --profile patrol --battery --payload 5",
 )
 def simulate(
-    context: typer.Context,
-    configuration: _Configuration = None,
-    voltage: _Voltage = None,
-    motor_speed: _MotorSpeed = None,
-    slope: _Slope = None,
-    payload: _Payload = None,
-    mass: _Mass = None,
-    surface: _Surface = None,
+    told: Told,
     runs: Annotated[
         Path | None, typer.Option(help="CSV of runs to simulate instead; the condition columns are enough.")
     ] = None,
-    profile: _Profile = None,
-    model: _Model = None,
-    duration: _Duration = None,
-    step: _Step = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    battery: _Battery = None,
-    discharge: _Discharge = None,
-    posterior: _Posterior = None,
     out: _Out = None,
     force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
 ) -> int:
     """Simulate one run, or the runs of a CSV file, and write a run folder.
 
@@ -164,64 +142,30 @@ def simulate(
     time; with track, reactions.csv holds every load inside the running gear too. With --profile it follows a mission:
     energy (Wh, Wh/m), distance, peaks, temperatures and charge, of the whole and in segments.csv of each segment.
     """
-    from sweeps import config
-
-    options = _options(
-        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
-        discharge_mAh=discharge, posterior=posterior, report=report, profile=profile,
-    )  # fmt: skip
-    resolved = _prepared(config.resolve(config.Simulate, None, options), no_cache)
-    cells = _cells(configuration, voltage, motor_speed, slope, payload, mass, surface)
+    cells = told.beside.model_dump()
     given = cells if runs is None else str(runs)
-    if resolved.profile is not None:
-        from sweeps import missions
+    if told.config.profile is not None:
+        from sweeps.commands import missions
 
-        columns = {"voltage": "supply_voltage_V", "slope": "slope_deg", "payload": "payload_kg", "surface": "surface"}
-        sources = {option: context.get_parameter_source(option) for option in columns}
-        stated = {columns[o]: f"--{o}" for o, s in sources.items() if s is not None and s.name == "COMMANDLINE"}
-        return missions.simulate(resolved, given, stated, out, force)
-    from sweeps import simulate as room
+        return missions.simulate(told.config, given, {c for c, v in cells.items() if v is not None}, out, force)
+    from sweeps.commands import simulate as room
 
-    return room.simulate(resolved, given, out, force)
+    return room.simulate(told.config, given, out, force)
 
 
-@app.command(
-    epilog="Example: mmrjax sweep --slopes 0:20:0.5 --payloads 0,4,8 --voltages 24 --configurations 6T2A "
-    "--set 6T2A.ground.friction.static=0.6"
+@_command(
+    config.Sweep,
+    beside=config_campaign.SharePart,
+    resolve=config_campaign.resolve_campaign,
+    example="mmrjax sweep --slopes 0:20:0.5 --payloads 0,4,8 --voltages 24 --configurations 6T2A "
+    "--set 6T2A.ground.friction.static=0.6",
 )
 def sweep(
-    file: Annotated[
+    told: Told,
+    plan: Annotated[
         Path | None,
         typer.Argument(metavar="[CONFIG.toml]", help="TOML file with \\[axes] or \\[samples] (docs/sweeps.md)."),
     ] = None,
-    configurations: Annotated[
-        str | None, typer.Option(help="Comma-separated, of the robot's.  \\[default: all that it has]")
-    ] = None,
-    voltages: Annotated[
-        str | None,
-        typer.Option(help="Supply voltages (V), of a rig thirds of its voltage_limit.  \\[default: 15,24,33]"),
-    ] = None,
-    motor_speeds: _MotorSpeeds = None,
-    payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses (kg), of a rig 0.  \\[default: 0,1.5,3,5,6.5,8]")
-    ] = None,
-    slopes: Annotated[
-        str | None, typer.Option(help="Slopes, positive uphill (deg), of a rig 0.  \\[default: 0,5,10,15,20]")
-    ] = None,
-    surface: _Surface = None,
-    config_file: Annotated[
-        Path | None, typer.Option("--config", help="TOML file with the keys of a config.resolved.toml; options win.")
-    ] = None,
-    model: _Model = None,
-    duration: _Duration = None,
-    step: _Step = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    battery: _Battery = None,
-    discharge: _Discharge = None,
-    chunk: _Chunk = None,
-    posterior: _Posterior = None,
     zarr: Annotated[
         bool, typer.Option("--zarr", help="Write a Zarr store, also of a small grid of options.")
     ] = False,
@@ -234,19 +178,11 @@ def sweep(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say points, chunks, bytes and time; write nothing.")
     ] = False,
-    shard: Annotated[
-        str | None, typer.Option(help="Simulate the i-th of n shares, as 3/8: a process of a job array each.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a dask scheduler whose workers simulate, as tcp://host:8786.")
-    ] = None,
     export: Annotated[
         list[str] | None, typer.Option(help="Write the store as csv or parquet too, repeatable.")
     ] = None,
     out: _Out = None,
     force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
 ) -> int:
     """Simulate every combination of a grid in vmapped batches: Table 8 in every configuration by default.
 
@@ -255,111 +191,53 @@ def sweep(
     varies, as a grid or sampled (docs/sweeps.md). An interrupted sweep goes on with the same command and the same
     --out.
     """
-    from sweeps import config, config_campaign
-
-    options = _options(
-        model=model,
-        duration_s=duration,
-        step_s=step,
-        robot=robot,
-        set=set_,
-        effects=effects,
-        battery=battery,
-        discharge_mAh=discharge,
-        chunk=chunk,
-        posterior=posterior,
-        report=report,
-    ) | {
-        "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
-        "voltages_V": config.axis("--voltages", voltages),
-        "motor_speeds_rpm": config.axis("--motor-speeds", motor_speeds),
-        "payloads_kg": config.axis("--payloads", payloads),
-        "slopes_deg": config.axis("--slopes", slopes),
-        "surface": surface,
-    }
-    if file is not None and config_file is not None:
-        raise InputError(f"--config: got {config_file} beside {file}; expected one of them")
-    file = config_file if file is None else file
-    how = config_campaign.how(shard, scheduler, export, dry_run)
-    where = file.name if file is not None else "options"
+    how = config_campaign.how(told.beside.shard, told.beside.scheduler, export, dry_run)
     wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))
-    if zarr or wanted or how != config_campaign.How() or config_campaign.is_campaign(file):
-        stored = _prepared(config_campaign.resolve_campaign(file, options), no_cache)
-        from sweeps import campaign
+    if zarr or wanted or how != config_campaign.How() or not isinstance(told.config, config.Sweep):
+        from sweeps.commands import campaign
 
-        return campaign.store_sweep(stored, where, out, force, how, wanted)
-    resolved = _prepared(config.resolve(config.Sweep, file, options), no_cache)
-    from sweeps import sweep as room
+        return campaign.store_sweep(told.config, told.where, out, force, how, wanted)
+    from sweeps.commands import sweep as room
 
-    return room.sweep(resolved, where, out, force)
+    return room.sweep(told.config, told.where, out, force)
 
 
-@app.command(epilog="Example: mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")
+@_command(config.Compare, example="mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")
 def compare(
+    told: Told,
     data: Annotated[
         str, typer.Argument(help="A CSV of measured runs, or measured, or simulated_by_paper.")
     ] = "measured",
     own_mass: Annotated[
         bool, typer.Option("--own-mass", help="Take the robot's mass and the payload, not the stated total mass.")
     ] = False,
-    model: _Model = None,
-    duration: _Duration = None,
-    step: _Step = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    posterior: _Posterior = None,
     out: _Out = None,
     force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
 ) -> int:
     """Simulate the runs of a table and compare: equation (35) per row and channel, rms, worst, R²."""
-    from sweeps import config
+    from sweeps.commands import compare as room
 
-    options = _options(
-        model=model,
-        duration_s=duration,
-        step_s=step,
-        robot=robot,
-        set=set_,
-        effects=effects,
-        posterior=posterior,
-        report=report,
-    )
-    resolved = _prepared(config.resolve(config.Compare, None, options), no_cache)
-    from sweeps import compare as room
-
-    return room.compare(resolved, data, own_mass, out, force)
+    return room.compare(told.config, data, own_mass, out, force)
 
 
-@app.command(epilog="Example: mmrjax reproduce --robot found/robot.toml --model track")
-def reproduce(
-    model: Annotated[
-        str | None, typer.Option("--model", help="steady, or track for Figs. 23-27 too.  \\[default: steady]")
-    ] = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    out: _Out = None,
-    force: _Force = False,
-    no_cache: _NoCache = False,
-) -> int:
+@_command(config.Reproduce, example="mmrjax reproduce --robot found/robot.toml --model track")
+def reproduce(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Remake the paper's figures and tables with a robot: the bench's rows, Figs. 5a-29, row by row.
 
     With --model track the running gear is resolved: Figs. 23-27, how the weight divides.
     """
-    from sweeps import config
+    from sweeps.commands import reproduce as room
 
-    options = _options(model=model, robot=robot, set=set_, effects=effects)
-    resolved = _prepared(config.resolve(config.Reproduce, None, options), no_cache)
-    from sweeps import reproduce as room
-
-    return room.reproduce(resolved, out, force)
+    return room.reproduce(told.config, out, force)
 
 
-@app.command(epilog="Example: mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20")
+@_command(
+    config.Render,
+    beside=config.OneRun,
+    example="mmrjax render start.mp4 --slope 10 --payload 5 --begin 0 --end 0.2 --slow 20",
+)
 def render(
+    told: Told,
     file: Annotated[Path, typer.Argument(help="What to write: its suffix is .png, .gif or .mp4.")],
     begin: Annotated[
         float | None,
@@ -367,97 +245,29 @@ def render(
     ] = None,
     end: Annotated[float | None, typer.Option(help="Last instant of a film (s).  \\[default: begin + 0.1]")] = None,
     slow: Annotated[float, typer.Option(help="How many times slower than life a film runs.", min=0.01)] = 20.0,
-    configuration: _Configuration = None,
-    voltage: _Voltage = None,
-    motor_speed: _MotorSpeed = None,
-    slope: _Slope = None,
-    payload: _Payload = None,
-    mass: _Mass = None,
-    surface: _Surface = None,
-    duration: _Duration = None,
-    step: _Step = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    battery: _Battery = None,
-    discharge: _Discharge = None,
     force: _Force = False,
-    no_cache: _NoCache = False,
 ) -> int:
     """Draw a run of the track model from standstill: the robot on its slope, its track running, its forces.
 
     Needs no display.
     """
-    from sweeps import config
+    from sweeps.commands import render as room
 
-    options = _options(
-        duration_s=duration,
-        step_s=step,
-        robot=robot,
-        set=set_,
-        effects=effects,
-        battery=battery,
-        discharge_mAh=discharge,
-    )
-    resolved = _prepared(config.resolve(config.Render, None, options), no_cache)
-    from sweeps import render as room
-
-    cells = _cells(configuration, voltage, motor_speed, slope, payload, mass, surface)
     begin = (0.8 if file.suffix == ".png" else 0.0) if begin is None else begin
     end = begin + 0.1 if end is None else end
-    return room.render(resolved, cells, file, begin, end, slow, force)
+    return room.render(told.config, told.beside.model_dump(), file, begin, end, slow, force)
 
 
-@app.command(epilog="Example: mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted")
+@_command(
+    config.Calibrate,
+    beside=config.MembersPart,
+    example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
+)
 def calibrate(
+    told: Told,
     data: Annotated[str, typer.Argument(help="A CSV of measured runs or histories, or measured.")] = "measured",
-    free: Annotated[
-        list[str] | None,
-        typer.Option(help="Parameters to free, comma-separated; default is the default set, motor.* a group."),
-    ] = None,
-    fix: Annotated[list[str] | None, typer.Option(help="Parameters to hold, comma-separated.")] = None,
-    prior: Annotated[
-        list[str] | None,
-        typer.Option(help="A prior in SI units, repeatable: 6T2A.ground.friction.static=0.45±0.05."),
-    ] = None,
-    noise: Annotated[
-        str | None,
-        typer.Option(
-            help="Sd: current=2%,motor_speed=0.5%,speed=1%.  \\[default: the file's columns, else estimated]"
-        ),
-    ] = None,
-    starts: Annotated[
-        int | None, typer.Option(help="Searches.  \\[default: 64; histories 8; rows with drive or track 1]")
-    ] = None,
-    population: Annotated[
-        int | None,
-        typer.Option(
-            help="Members of each generation of a search without gradients, with which one with drive or track "
-            "begins.  \\[default: 256 where the running gear is free, else 0]"
-        ),
-    ] = None,
-    generations: Annotated[int | None, typer.Option(help="Of the population, at most.  \\[default: 30]")] = None,
-    members: Annotated[
-        Path | None,
-        typer.Option(help="File that keeps the population's runs; the same command with it goes on from there."),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the starts.  \\[default: 0]")] = None,
-    profiles: Annotated[
-        bool | None,
-        typer.Option("--profiles/--no-profiles", help="Profile likelihood of each.  \\[default: steady only]"),
-    ] = None,
-    hold_out: Annotated[
-        bool | None,
-        typer.Option("--hold-out/--no-hold-out", help="Fit again without each block.  \\[default: steady only]"),
-    ] = None,
-    model: _Model = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
     out: _Out = None,
     force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
 ) -> int:
     """Find friction coefficients from measured runs, with their uncertainty, by gradients through the model.
 
@@ -465,325 +275,90 @@ def calibrate(
     begins at the optimum of steady; track takes minutes. Intervals are linear then, unless --profiles. With the
     running gear free (--model track --free running_gear.guide_recess,...) a population is searched first.
     """
-    from sweeps import config
+    from sweeps.commands import calibrate as room
 
-    options = _options(model=model, robot=robot, set=set_, effects=effects, report=report) | {
-        "free": config.words(free), "fix": config.words(fix), "prior": tuple(prior) if prior else None,
-        "noise": noise, "starts": starts, "population": population, "generations": generations, "seed": seed,
-        "profiles": profiles, "hold_out": hold_out,
-    }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Calibrate, None, options), no_cache)
-    from sweeps import calibrate as room
-
-    return room.calibrate(resolved, data, out, force, members)
+    return room.calibrate(told.config, data, out, force, told.beside.members)
 
 
-@app.command(epilog="Example: mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml")
+@_command(
+    config.Loop,
+    beside=config.MembersPart,
+    example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
+)
 def loop(
+    told: Told,
     data: Annotated[
         str,
         typer.Argument(help="A CSV of measured runs, or with time_s of histories from rest; or measured."),
     ] = "measured",
-    noise: Annotated[
-        str | None,
-        typer.Option(
-            help="Sd of current, motor_speed, speed in % or A, rpm, mm/s, e.g. current=2%,speed=5mm/s.  \\[default: "
-            "the file's columns; else 2, 0.5, 1 % are assumed, and halved and doubled]"
-        ),
-    ] = None,
-    prior: Annotated[
-        list[str] | None,
-        typer.Option(help="A prior in SI units, repeatable, e.g. motor.resistance=0.9±0.1."),
-    ] = None,
-    prefer: Annotated[
-        str | None,
-        typer.Option(
-            help="By what one of several effects that these data cannot tell apart comes first: fit, or held-out "
-            "(errors of blocks that a fit has not seen).  \\[default: fit]"
-        ),
-    ] = None,
-    replicates: Annotated[int | None, typer.Option(help="Tables of the bootstrap.  \\[default: 500]")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of everything random.  \\[default: 0]")] = None,
-    forbid: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration."
-        ),
-    ] = None,
-    resolve: Annotated[
-        bool,
-        typer.Option(
-            "--resolve",
-            help="Ask the track model whether a running gear within its priors leaves what remains in slip, track or "
-            "ground; tens of minutes on two cores.",
-        ),
-    ] = False,
-    population: Annotated[
-        int | None, typer.Option(help="Members of a generation of --resolve.  \\[default: 128]")
-    ] = None,
-    generations: Annotated[int | None, typer.Option(help="Of --resolve, at most.  \\[default: 20]")] = None,
-    members: Annotated[
-        Path | None, typer.Option(help="File that keeps the runs of --resolve; the same command goes on from there.")
-    ] = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
     out: _Out = None,
     force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
 ) -> int:
     """Find what the model lacks: fit it, trace what is left to an effect, add that, report errors before and after.
 
     Says that nothing is missing where nothing is, and names no effect where none of the library fits. Writes
     result.json, report.html, and robot.toml, which every command takes with --robot.
     """
-    from sweeps import config
+    from sweeps.commands import loop as room
 
-    options = _options(robot=robot, set=set_, effects=effects, report=report) | {
-        "noise": noise, "prior": tuple(prior) if prior else None, "replicates": replicates, "seed": seed,
-        "prefer": prefer, "forbid": config.words(forbid), "resolve": resolve or None, "population": population,
-        "generations": generations,
-    }  # fmt: skip
-    settled = _prepared(config.resolve(config.Loop, None, options), no_cache)
-    from sweeps import loop as room
-
-    return room.loop(settled, data, out, force, members)
+    return room.loop(told.config, data, out, force, told.beside.members)
 
 
-@app.command(epilog="Example: mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000")
-def sensitivity(
-    method: Annotated[
-        str | None,
-        typer.Option(
-            "--method",
-            help="local, sobol, morris, derivative, or shapley (of a posterior).  "
-            "\\[default: sobol; with --posterior shapley]",
-        ),
-    ] = None,
-    parameters: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Uncertain parameters, comma-separated, motor.* a group.  \\[default: all that have a prior]"
-        ),
-    ] = None,
-    vary: Annotated[
-        list[str] | None,
-        typer.Option(help="A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5."),
-    ] = None,
-    outputs: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Outputs, comma-separated: those of a run, steepest_slope, start for the three of a start.  "
-            "\\[default: current, speeds, slip, power, efficiency, steepest slope]"
-        ),
-    ] = None,
-    evaluations: Annotated[
-        int | None,
-        typer.Option(
-            help="Model evaluations, at least, in all.  \\[default: 1000000; shapley 300000; runs over time 100000]"
-        ),
-    ] = None,
-    posterior: Annotated[
-        bool | None,
-        typer.Option("--posterior", help="The inputs are the posterior.nc beside the calibrated --robot."),
-    ] = None,
-    configurations: Annotated[
-        str | None, typer.Option(help="Comma-separated, of the robot's.  \\[default: all that it has]")
-    ] = None,
-    voltages: Annotated[
-        str | None,
-        typer.Option(help="Supply voltages (V).  \\[default: of Table 8; of a rig thirds of its voltage_limit]"),
-    ] = None,
-    motor_speeds: _MotorSpeeds = None,
-    payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses (kg).  \\[default: of Table 8; of a rig 0]")
-    ] = None,
-    slopes: Annotated[
-        str | None, typer.Option(help="Slopes, positive uphill (deg).  \\[default: of Table 8; of a rig 0]")
-    ] = None,
-    surface: _Surface = None,
-    candidates: Annotated[
-        Path | None,
-        typer.Option(
-            help="CSV of runs that could be made next.  \\[default: Table 8; of a rig the operating points]"
-        ),
-    ] = None,
-    runs: Annotated[int | None, typer.Option(help="How many of them to propose.  \\[default: 5]")] = None,
-    noise: Annotated[
-        str | None,
-        typer.Option(help="Sd of their readings: current=2%,motor_speed=0.5%,speed=1%.  \\[default: these]"),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the sample.  \\[default: 0]")] = None,
-    model: _Model = None,
-    duration: _Duration = None,
-    step: _Step = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    battery: _Battery = None,
-    discharge: _Discharge = None,
-    out: _Out = None,
-    force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
-) -> int:
+@_command(
+    config.Sensitivity, example="mmrjax sensitivity --outputs speed,peak_current --slopes 0,5 --evaluations 200000"
+)
+def sensitivity(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Say which parameters matter where, which do not matter at all, and which runs would tell more of them.
 
     Writes result.json, report.html, points.csv and indices.csv. Local derivatives and elasticities at every
     operating point come with every method.
     """
-    from sweeps import config
+    from sweeps.commands import sensitivity as room
 
-    options = _options(
-        model=model, duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, battery=battery,
-        discharge_mAh=discharge, report=report,
-    ) | {
-        "method": method or ("shapley" if posterior else None), "parameters": config.words(parameters),
-        "vary": config.words(vary), "outputs": config.words(outputs), "evaluations": evaluations,
-        "posterior": posterior,
-        "configurations": None if configurations is None else tuple(c.strip() for c in configurations.split(",")),
-        "voltages_V": config.axis("--voltages", voltages), "payloads_kg": config.axis("--payloads", payloads),
-        "slopes_deg": config.axis("--slopes", slopes), "surface": surface,
-        "motor_speeds_rpm": config.axis("--motor-speeds", motor_speeds),
-        "candidates": None if candidates is None else str(candidates), "runs": runs, "noise": noise, "seed": seed,
-    }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Sensitivity, None, options), no_cache)
-    from sweeps import sensitivity as room
-
-    return room.sensitivity(resolved, out, force)
+    return room.sensitivity(told.config, out, force)
 
 
-@app.command(
-    epilog="Example: mmrjax resonance --configuration 6T2A --voltages 10:40:0.5 --payloads 0,4,8 "
-    "--set running_gear.guide_recess=1e-4"
+@_command(
+    config.Resonance,
+    example="mmrjax resonance --configuration 6T2A --voltages 10:40:0.5 --payloads 0,4,8 "
+    "--set running_gear.guide_recess=1e-4",
 )
-def resonance(
-    configuration: _Configuration = None,
-    voltages: Annotated[
-        str | None,
-        typer.Option(
-            help="Supply voltages (V), by which the speed is set; at least 5.  \\[default: 10:40:1, that is 31]"
-        ),
-    ] = None,
-    payloads: Annotated[
-        str | None, typer.Option(help="Additional load masses (kg).  \\[default: 0,1.5,3,5,6.5,8, of Table 8]")
-    ] = None,
-    slope: _Slope = None,
-    surface: _Surface = None,
-    duration: Annotated[
-        float | None,
-        typer.Option(
-            "--duration",
-            help="Length of a run (s), at least 0.5; ripple is read in its second half.  \\[default: 1.5]",
-        ),
-    ] = None,
-    step: _Step = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    out: _Out = None,
-    force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
-) -> int:
+def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Say which speeds to avoid: ripple of reaction, current and speed over speed and payload, by the track model.
 
     A Campbell diagram sets the frequency at which grousers pass, and its harmonics, against bounce and pitch of the
     robot on its contacts. An axis is 0,5,10 or first:last:step. Writes result.json, report.html, points.csv,
     modes.csv and peaks.csv; the points of Table 8 are run too. About a minute on two cores.
     """
-    from sweeps import config
+    from sweeps.commands import resonance as room
 
-    options = _options(
-        duration_s=duration, step_s=step, robot=robot, set=set_, effects=effects, report=report
-    ) | {
-        "configuration": configuration, "voltages_V": config.axis("--voltages", voltages),
-        "payloads_kg": config.axis("--payloads", payloads), "slope_deg": slope, "surface": surface,
-    }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Resonance, None, options), no_cache)
-    from sweeps import resonance as room
-
-    return room.resonance(resolved, out, force)
+    return room.resonance(told.config, out, force)
 
 
-@app.command(epilog="Example: mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40")
-def check(
-    requirements: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[REQUIREMENTS.toml]", help="TOML file (docs/requirements.md).  \\[default: the paper's aims]"
-        ),
-    ] = None,
-    changes: Annotated[
-        bool | None,
-        typer.Option("--changes/--no-changes", help="Look for what would meet what is missed.  \\[default: changes]"),
-    ] = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    out: _Out = None,
-    force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
-) -> int:
+@_command(
+    config.Check,
+    arguments=("requirements",),
+    example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
+)
+def check(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Hold a robot against requirements: pass or fail with margin, each at the worst corner of its envelope.
 
     Of each that is missed it says what change of one parameter would meet it. Exit code 3: one is missed.
     """
-    from sweeps import config
+    from sweeps.commands import check as room
 
-    options = _options(robot=robot, set=set_, effects=effects, report=report) | {
-        "requirements": None if requirements is None else str(requirements), "changes": changes,
-    }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Check, None, options), no_cache)
-    from sweeps import check as room
-
-    return room.check(resolved, out, force)
+    return room.check(told.config, out, force)
 
 
-@app.command(epilog="Example: mmrjax size requirements.toml --pareto mass,energy")
-def size(
-    requirements: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[REQUIREMENTS.toml]", help="TOML file (docs/requirements.md).  \\[default: the paper's aims]"
-        ),
-    ] = None,
-    objective: Annotated[
-        str | None, typer.Option(help="What is made small: mass (kg), energy (Wh/m), cost (EUR).  \\[default: mass]")
-    ] = None,
-    pareto: Annotated[
-        str | None, typer.Option(help="Two objectives, comma-separated, for a front of both instead.")
-    ] = None,
-    motors: Annotated[
-        list[str] | None, typer.Option(help="Motors to choose from, comma-separated.  \\[default: all of the sheets]")
-    ] = None,
-    starts: Annotated[int | None, typer.Option(help="Searches in one batch.  \\[default: 256]")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the starts.  \\[default: 0]")] = None,
-    robot: _Robot = None,
-    set_: _Set = None,
-    effects: _Effects = None,
-    out: _Out = None,
-    force: _Force = False,
-    report: _Report = None,
-    no_cache: _NoCache = False,
-) -> int:
+@_command(config.Size, arguments=("requirements",), example="mmrjax size requirements.toml --pareto mass,energy")
+def size(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Search motor, gearbox, ratio, radius and cells for a robot that meets requirements, with the makers' parts.
 
     Leaves the best as robot.toml, alternatives, what binds each motor. Exit code 3: no design meets all of them.
     """
-    from sweeps import config
+    from sweeps.commands import size as room
 
-    options = _options(robot=robot, set=set_, effects=effects, report=report) | {
-        "requirements": None if requirements is None else str(requirements), "objective": objective,
-        "pareto": config.words([pareto]) if pareto else None, "motors": config.words(motors), "starts": starts,
-        "seed": seed,
-    }  # fmt: skip
-    resolved = _prepared(config.resolve(config.Size, None, options), no_cache)
-    from sweeps import size as room
-
-    return room.size(resolved, out, force)
+    return room.size(told.config, out, force)
 
 
 rig = typer.Typer(
@@ -803,7 +378,7 @@ def new(
 
     As written it can be read, with numbers of an example. Units are SI but where a comment says another.
     """
-    from sweeps import rig_new
+    from sweeps.commands import rig_new
 
     return rig_new.new(file, kind, force)
 
@@ -825,7 +400,7 @@ def rig_check(
     Exit codes: 0 it can be used; 2 the file cannot; 4 the data cannot.
     """
     _start_jax(no_cache)
-    from sweeps import rig_check as room
+    from sweeps.commands import rig_check as room
 
     return room.check(file, data, tuple(effects or ()), json)
 
@@ -834,16 +409,9 @@ def rig_check(
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""
     _start_jax(no_cache)
-    from sweeps import doctor as room
+    from sweeps.commands import doctor as room
 
     return room.doctor()
-
-
-def _options(**given: Any) -> dict[str, Any]:
-    from sweeps import config
-
-    effects = given["effects"]
-    return {**given, "set": config.settings(given["set"]), "effects": tuple(effects) if effects else None}
 
 
 def _prepared(resolved: Any, no_cache: bool = False) -> Any:
@@ -870,17 +438,6 @@ def _start_jax(no_cache: bool) -> None:
     if no_cache:
         jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_enable_x64", True)
-
-
-def _cells(
-    configuration: str | None, voltage: float | None, motor_speed: float | None, slope: float | None,
-    payload: float | None, mass: float | None, surface: str | None,
-) -> dict[str, Any]:  # fmt: skip
-    """One run by the columns of a table of runs; None is left to the robot."""
-    return {
-        "configuration": configuration, "supply_voltage_V": voltage, "motor_speed_rpm": motor_speed,
-        "payload_kg": payload, "slope_deg": slope, "surface": surface, "total_mass_kg": mass,
-    }  # fmt: skip
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -13,7 +14,7 @@ from pydantic_core import PydanticCustomError
 from calibration.data.columns import CONDITIONS
 from calibration.data.errors import BadConfiguration, choices, toml_content, toml_text
 from mmrjax import channels, fidelities
-from mmrjax.tables import BENCH, PAYLOADS_KG, SURFACES
+from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
 
 _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "payload_kg", "slope_deg"))
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
@@ -28,6 +29,19 @@ SHOWN = 5.0
 Seed = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 
+def about(default: Any, description: str, **extra: Any) -> Any:
+    """A field, with all that is said of it: options, their help and the schema are made of it (`sweeps.options`).
+
+    Args:
+        default: where it is not stated; description: what it is, its unit aside, which its name ends with.
+        extra: `usual`, what a default of None comes to, in words; `flag`, its option, where that is not its name;
+            `solver`, how its command solves, which few need: hidden in `--help`, and a key of `[solver]`;
+            `verbatim`, a list each of whose texts may have commas; `metavar` of an argument; `format`, such as path;
+            `minimum`, where the command asks for more than the field.
+    """
+    return Field(default=default, description=description, json_schema_extra=extra or None)
+
+
 class Part(BaseModel):
     """A part of a command's configuration; unknown keys are refused."""
 
@@ -35,23 +49,19 @@ class Part(BaseModel):
 
 
 class RobotPart(Part):
-    """Which robot.
+    """Which robot."""
 
-    Attributes:
-        robot: name of a robot, or path of its TOML file.
-        set: parameters to change, by dotted name, in SI units.
-        effects: Python files with effects of the user's own, see `calibration.data.effect_file`.
-    """
-
-    robot: str = "nominal"
-    set: dict[str, bool | float] = {}
-    effects: tuple[str, ...] = ()
+    robot: str = about("nominal", "nominal, sm1, sm2, or a robot's TOML file")
+    set: dict[str, bool | float] = about(
+        {}, "Change a parameter, SI units, repeatable: 6T2A.ground.friction.static=0.6"
+    )
+    effects: tuple[str, ...] = about((), "A Python file with effects of your own, repeatable", verbatim=True)
 
 
 class ModelPart(Part):
     """Which fidelity, one of `mmrjax.fidelities`."""
 
-    model: str = fidelities.NAMES[0]
+    model: str = about(fidelities.NAMES[0], f"Fidelity: {', '.join(fidelities.NAMES)}")
 
     @field_validator("model")
     @classmethod
@@ -76,15 +86,23 @@ def _most(option: str) -> float:
     return max(o.most for o in _having(option).values())
 
 
+def _usual(option: str, shown: float = math.inf) -> str:
+    """Default of a fidelity's option by fidelity; of `simulate` at most `shown`."""
+    found = {name: o.default for name, o in _having(option).items()}
+    capped = {name: f"{v:g}" + (f", simulate {shown:g}" if v > shown else "") for name, v in found.items()}
+    return "; ".join([f"{name} {text}" for name, text in capped.items()] if len(found) > 1 else capped.values())
+
+
+Duration = Annotated[float, Field(gt=0, le=_most("duration"), allow_inf_nan=False)]
+
+
 class FidelityPart(ModelPart):
-    """Which fidelity simulates, and its options.
+    """Which fidelity simulates, and its options; None takes the fidelity's default."""
 
-    Attributes:
-        duration_s: length of a run [s]; step_s: integration step [s]; None takes the fidelity's default.
-    """
-
-    duration_s: Annotated[float, Field(gt=0, le=_most("duration"), allow_inf_nan=False)] | None = None
-    step_s: Annotated[float, Field(gt=0, le=_most("step"), allow_inf_nan=False)] | None = None
+    duration_s: Duration | None = about(None, "Length of a run", usual=_usual("duration", SHOWN))
+    step_s: Annotated[float, Field(gt=0, le=_most("step"), allow_inf_nan=False)] | None = about(
+        None, "Integration step", usual=_usual("step")
+    )
 
     @model_validator(mode="after")
     def _acts(self) -> Self:
@@ -113,13 +131,13 @@ class FidelityPart(ModelPart):
 
 
 class BatchPart(FidelityPart):
-    """How many runs at once.
+    """How many runs at once; None takes the fidelity's."""
 
-    Attributes:
-        chunk: runs in one vmapped call; None takes the fidelity's.
-    """
-
-    chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = None
+    chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = about(
+        None,
+        "Runs in one vmapped call",
+        usual=", ".join(f"{name} {facts.chunk}" for name, facts in fidelities.TABLE.items()),
+    )
 
     @property
     def runs_at_once(self) -> int:
@@ -128,15 +146,10 @@ class BatchPart(FidelityPart):
 
 
 class SupplyPart(Part):
-    """What feeds the motors.
+    """What feeds the motors."""
 
-    Attributes:
-        battery: run on the on-board battery instead of the external supply.
-        discharge_mAh: charge already taken from the battery.
-    """
-
-    battery: bool = False
-    discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = 0.0
+    battery: bool = about(False, "Supply from the on-board battery")
+    discharge_mAh: Annotated[float, Field(ge=0, le=100_000)] = about(0.0, "Charge already taken from the battery")
 
     @model_validator(mode="after")
     def _feeds(self) -> Self:
@@ -149,66 +162,110 @@ class SupplyPart(Part):
         return self
 
 
-class GridPart(Part):
-    """The axes of a grid; None leaves them to `sweeps.grid.resolved`: Table 8 for the packaged robot.
+Voltages = Annotated[tuple[Voltage, ...], Field(min_length=1)]
+Payloads = Annotated[tuple[Payload, ...], Field(min_length=1)]
+SURFACE = (
+    "Surface of Table 5; scales the adhesion, which a robot states for lacquered_wood. Of a rig a label of its own"
+)
 
-    Attributes:
-        configurations: of the robot, by name; None takes all that it has.
-        voltages_V: of the supply, motor_speeds_rpm: imposed; a robot has one of the two, on the battery none.
-        payloads_kg, slopes_deg, surface: of a vehicle.
+
+def _shown(values: Iterable[float]) -> str:
+    return ",".join(f"{v:g}" for v in values)
+
+
+class OneRun(Part):
+    """The conditions of one run, by the columns of a table of runs; None is left to the robot.
+
+    What it may be is said where the run is made (`inputs.one_run`), as of a row of a table.
     """
 
-    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] | None = None
-    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = None
-    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] | None = None
-    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = None
-    surface: str | None = None
+    configuration: str | None = about(
+        None, "One of the robot's, such as 6T2A or 4W2T of the packaged one", usual="its first"
+    )
+    supply_voltage_V: float | None = about(
+        None,
+        "Supply voltage (V), negative backward",
+        usual="33; of a rig its limit; none with --battery",
+        flag="--voltage",
+    )
+    motor_speed_rpm: float | None = about(
+        None, "Motor speed (rpm), negative backward, of a rig on whose motors it is imposed"
+    )
+    payload_kg: float | None = about(None, "Additional load mass", usual="0")
+    slope_deg: float | None = about(None, "Slope, positive uphill", usual="0")
+    surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    total_mass_kg: float | None = about(
+        None, "Total mass", usual="the robot's own mass and the payload", flag="--mass"
+    )
+
+
+class GridPart(Part):
+    """The axes of a grid; None leaves them to `sweeps.points.grid.resolved`: Table 8 for the packaged robot.
+
+    A robot has voltages or motor speeds, on the battery neither; payloads, slopes and surface are of a vehicle.
+    """
+
+    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = about(
+        None, "Comma-separated, of the robot's", usual="all that it has"
+    )
+    voltages_V: Voltages | None = about(
+        None, "Supply voltages (V), of a rig thirds of its voltage_limit", usual=_shown(VOLTAGES_V)
+    )
+    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = about(
+        None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
+    )
+    payloads_kg: Payloads | None = about(None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG))
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = about(
+        None, "Slopes, positive uphill (deg), of a rig 0", usual=_shown(SLOPES_DEG)
+    )
+    surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
 
 
 class InferencePart(Part):
-    """What is known before the data speak.
+    """What is known before the data speak."""
 
-    Attributes:
-        prior: `name=value±sd` in SI units, in place of the fields' priors.
-        noise: `current=2%,motor_speed=0.5%,speed=1%`; empty takes the file's sd columns, else an assumption or an
-            estimate, which is said.
-        seed: of everything random.
-    """
+    prior: tuple[str, ...] = about(
+        (), "A prior in SI units, repeatable: 6T2A.ground.friction.static=0.45±0.05", verbatim=True
+    )
+    noise: str = about(
+        "",
+        "Sd of current, motor_speed, speed in % or A, rpm, mm/s: current=2%,speed=5mm/s",
+        usual="the file's columns; else calibrate estimates, and loop assumes 2, 0.5, 1 %, halved and doubled",
+    )
+    seed: Seed = about(0, "Of everything random")
 
-    prior: tuple[str, ...] = ()
-    noise: str = ""
-    seed: Seed = 0
+
+class MembersPart(Part):
+    """Where a population keeps its runs, which changes no number."""
+
+    members: Path | None = about(
+        None, "File that keeps the population's runs; the same command with it goes on from there", solver=True
+    )
 
 
 class PosteriorPart(Part):
-    """Whether results come with the uncertainty of a calibrated robot.
+    """Whether results come with the uncertainty of a calibrated robot."""
 
-    Attributes:
-        posterior: robots to draw from the posterior.nc beside the robot's file; None for none.
-    """
-
-    posterior: Annotated[int, Field(ge=10, le=100_000)] | None = None
+    posterior: Annotated[int, Field(ge=10, le=100_000)] | None = about(
+        None, "Give results with ± from so many robots drawn from the posterior.nc beside the calibrated --robot"
+    )
 
 
 class OutputPart(Part):
-    """What is written beside the numbers.
+    """What is written beside the numbers."""
 
-    Attributes:
-        report: whether to write report.html.
-    """
-
-    report: bool = True
+    report: bool = about(True, "Write report.html")
 
 
 class ProfilePart(FidelityPart):
-    """Which mission the runs follow.
+    """Which mission the runs follow."""
 
-    Attributes:
-        profile: name of a packaged profile, or path of a CSV file; None for none.
-    """
-
-    profile: Annotated[str, Field(min_length=1)] | None = None
+    profile: Annotated[str, Field(min_length=1)] | None = about(
+        None,
+        "A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
+        "supply_voltage_V, slope_deg, payload_kg, surface, current_other_A, or stair, stop_and_go, shuttle, patrol "
+        "(docs/missions.md)",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -268,126 +325,164 @@ class Render(RobotPart, FidelityPart, SupplyPart):
 
 
 class Resonance(RobotPart, FidelityPart, OutputPart):
-    """A map of ripple over speed and payload, of the fidelity that resolves the running gear.
-
-    Attributes:
-        configuration: of the robot, by name; None takes its first.
-        voltages_V, payloads_kg: axes of the map; slope_deg, surface: of all of it.
-    """
+    """A map of ripple over speed and payload, of the fidelity that resolves the running gear."""
 
     model: Literal["track"] = "track"
-    configuration: str | None = None
-    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] = tuple(10.0 + k for k in range(31))
-    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] = PAYLOADS_KG
-    slope_deg: Slope = 0.0
-    surface: Literal[tuple(SURFACES)] = BENCH  # type: ignore[valid-type]  # names of a table
+    duration_s: Duration | None = about(
+        None, "Length of a run (s); ripple is read in its second half", usual="1.5", minimum=0.5
+    )
+    configuration: str | None = about(None, "One of the robot's", usual="its first")
+    voltages_V: Voltages = about(
+        tuple(10.0 + k for k in range(31)),
+        "Supply voltages (V), at least 5 of them, by which the speed is set",
+        usual="10:40:1, that is 31",
+        minimum=0,
+    )
+    payloads_kg: Payloads = about(PAYLOADS_KG, "Additional load masses")
+    slope_deg: Slope = about(0.0, "Slope, positive uphill")
+    surface: Literal[tuple(SURFACES)] = about(  # type: ignore[valid-type]  # names of a table
+        BENCH, "Surface of Table 5, which scales the adhesion"
+    )
 
 
 class Reproduce(RobotPart, ModelPart):
     """The paper's figures and tables."""
 
+    model: str = about(fidelities.NAMES[0], "steady, or track for Figs. 23-27 too")
+
 
 class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
-    """A calibration beside its data.
+    """A calibration beside its data; None leaves what has it to the fidelity and the data."""
 
-    Attributes:
-        free, fix: parameters to free (`default` stands for the default set) and to hold, by dotted name.
-        starts: searches; population: members of each generation of a search without gradients
-            before those of a rollout; generations: at most.
-        profiles: whether to profile every parameter.
-        hold_out: whether to fit again without each block. None leaves these three to the fidelity.
-    """
-
-    free: tuple[str, ...] = ()
-    fix: tuple[str, ...] = ()
-    starts: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    population: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
-    generations: Annotated[int, Field(ge=1, le=10_000)] | None = None
-    profiles: bool | None = None
-    hold_out: bool | None = None
+    free: tuple[str, ...] = about(
+        (), "Parameters to free, comma-separated; default is the default set, motor.* a group"
+    )
+    fix: tuple[str, ...] = about((), "Parameters to hold, comma-separated")
+    starts: Annotated[int, Field(ge=1, le=100_000)] | None = about(
+        None, "Searches", usual="64; histories 8; rows with drive or track 1"
+    )
+    population: Annotated[int, Field(ge=0, le=1_000_000)] | None = about(
+        None,
+        "Members of each generation of a search without gradients, with which one with drive or track begins",
+        usual="256 where the running gear is free, else 0",
+        solver=True,
+    )
+    generations: Annotated[int, Field(ge=1, le=10_000)] | None = about(
+        None, "Of the population, at most", usual="30", solver=True
+    )
+    profiles: bool | None = about(None, "Profile likelihood of each", usual="steady only")
+    hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
 
 
 class Loop(RobotPart, InferencePart, OutputPart):
-    """The closed loop beside its data.
+    """The closed loop beside its data."""
 
-    Attributes:
-        replicates: of the bootstrap.
-        prefer: whether the fit to all rows or errors held out choose the leader of a class.
-        forbid: kinds of experiments, and configurations, that are not to be proposed.
-        resolve: whether the track model is asked about what remains; population, generations: of its search.
-    """
-
-    replicates: Annotated[int, Field(ge=250, le=100_000)] = 500
-    prefer: Literal["fit", "held-out"] = "fit"
-    forbid: tuple[str, ...] = ()
-    resolve: bool = False
-    population: Annotated[int, Field(ge=4, le=1_000_000)] | None = None
-    generations: Annotated[int, Field(ge=1, le=10_000)] | None = None
-
-
-class Check(RobotPart, OutputPart):
-    """A robot held against requirements.
-
-    Attributes:
-        requirements: their TOML file, or `paper`: the paper's aims.
-        changes: whether to look for what would meet the missed ones.
-    """
-
-    requirements: str = "paper"
-    changes: bool = True
+    replicates: Annotated[int, Field(ge=250, le=100_000)] = about(500, "Tables of the bootstrap", solver=True)
+    prefer: Literal["fit", "held-out"] = about(
+        "fit",
+        "By what one of several effects that these data cannot tell apart comes first, held-out being errors of "
+        "blocks that a fit has not seen",
+    )
+    forbid: tuple[str, ...] = about(
+        (), "An experiment that cannot be done, repeatable: stall, lifted, 'one motor', or a configuration"
+    )
+    resolve: bool = about(
+        False,
+        "Ask the track model whether a running gear within its priors leaves what remains in slip, track or ground; "
+        "tens of minutes on two cores",
+    )
+    population: Annotated[int, Field(ge=4, le=1_000_000)] | None = about(
+        None, "Members of a generation of --resolve", usual="128", solver=True
+    )
+    generations: Annotated[int, Field(ge=1, le=10_000)] | None = about(
+        None, "Of --resolve, at most", usual="20", solver=True
+    )
 
 
-class Size(RobotPart, OutputPart):
-    """A search for a robot that meets requirements.
+class RequirementsPart(Part):
+    """What a robot is asked to do."""
 
-    Attributes:
-        requirements: their TOML file, or `paper`: the paper's aims.
-        objective: what is made small; pareto: two of them instead, for a front.
-        motors: names of those to choose from; empty: all.
-        starts: searches in one batch; seed: of them.
-    """
+    requirements: str = about(
+        "paper",
+        "TOML file (docs/requirements.md)",
+        usual="the paper's aims",
+        metavar="[REQUIREMENTS.toml]",
+        format="path",
+    )
 
-    requirements: str = "paper"
-    objective: str = "mass"
-    pareto: tuple[str, ...] = ()
-    motors: tuple[str, ...] = ()
-    starts: Annotated[int, Field(ge=1, le=100_000)] = 256
-    seed: Seed = 0
+
+class Check(RequirementsPart, RobotPart, OutputPart):
+    """A robot held against requirements."""
+
+    changes: bool = about(True, "Look for what would meet what is missed")
+
+
+class Size(RequirementsPart, RobotPart, OutputPart):
+    """A search for a robot that meets requirements."""
+
+    objective: str = about("mass", "What is made small: mass (kg), energy (Wh/m), cost (EUR)")
+    pareto: tuple[str, ...] = about((), "Two objectives, comma-separated, for a front of both instead")
+    motors: tuple[str, ...] = about((), "Motors to choose from, comma-separated", usual="all of the sheets")
+    starts: Annotated[int, Field(ge=1, le=100_000)] = about(256, "Searches in one batch")
+    seed: Seed = about(0, "Of the starts")
 
 
 class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
     """A sensitivity study.
 
-    Attributes:
-        method: `local`, `sobol`, `morris`, `derivative` or `shapley`.
-        configurations, voltages_V, motor_speeds_rpm, payloads_kg, slopes_deg, surface: operating points, as of a
-            grid; None leaves them to the method: Table 8 where gradients do, its corners and middle where a sample is
-            drawn; of a rig see `sweeps.grid.resolved`.
-        parameters: uncertain, by dotted name, with their priors; empty takes all that have one.
-        vary: conditions that are uncertain, `name=low:high`.
-        outputs: by name; empty takes the usual ones.
-        evaluations: of the model at least, in all; None takes the default.
-        posterior: whether the inputs are the posterior of a calibrated robot.
-        candidates: CSV of runs that could be made next; empty takes Table 8, of a rig the operating points.
-        runs: how many of them to propose; noise: of their readings, as of `calibrate`.
+    Operating points are those of a grid; None leaves them to the method: Table 8 where gradients do, its corners and
+    middle where a sample is drawn; of a rig see `sweeps.points.grid.resolved`.
     """
 
-    method: str = "sobol"
-    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    voltages_V: Annotated[tuple[Voltage, ...], Field(min_length=1)] | None = None
-    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = None
-    payloads_kg: Annotated[tuple[Payload, ...], Field(min_length=1)] | None = None
-    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = None
-    surface: str | None = None
-    parameters: tuple[str, ...] = ()
-    vary: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
-    evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = None
-    seed: Seed = 0
-    posterior: bool = False
-    candidates: str = ""
-    runs: Annotated[int, Field(ge=1, le=100)] = 5
-    noise: str = ""
+    method: str = about(
+        "sobol",
+        "local, sobol, morris, derivative, or shapley (of a posterior)",
+        usual="sobol; with --posterior shapley",
+    )
+    configurations: Annotated[tuple[str, ...], Field(min_length=1)] | None = about(
+        None, "Comma-separated, of the robot's", usual="all that it has"
+    )
+    voltages_V: Voltages | None = about(
+        None, "Supply voltages", usual="of Table 8; of a rig thirds of its voltage_limit"
+    )
+    motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = about(
+        None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
+    )
+    payloads_kg: Payloads | None = about(None, "Additional load masses", usual="of Table 8; of a rig 0")
+    slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = about(
+        None, "Slopes, positive uphill", usual="of Table 8; of a rig 0"
+    )
+    surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
+    parameters: tuple[str, ...] = about(
+        (), "Uncertain parameters, comma-separated, motor.* a group", usual="all that have a prior"
+    )
+    vary: tuple[str, ...] = about((), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5")
+    outputs: tuple[str, ...] = about(
+        (),
+        "Outputs, comma-separated: those of a run, steepest_slope, start for the three of a start",
+        usual="current, speeds, slip, power, efficiency, steepest slope",
+    )
+    evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = about(
+        None, "Model evaluations, at least, in all", usual="1000000; shapley 300000; runs over time 100000"
+    )
+    seed: Seed = about(0, "Of the sample")
+    posterior: bool = about(False, "The inputs are the posterior.nc beside the calibrated --robot")
+    candidates: str = about(
+        "",
+        "CSV of runs that could be made next",
+        usual="Table 8; of a rig the operating points",
+        format="path",
+    )
+    runs: Annotated[int, Field(ge=1, le=100)] = about(5, "How many of them to propose")
+    noise: str = about("", "Sd of their readings", usual="current=2%,motor_speed=0.5%,speed=1%")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_a_posterior(cls, values: Any) -> Any:
+        """Its inputs depend on one another, which Shapley effects alone are for."""
+        if isinstance(values, dict) and values.get("posterior") and values.get("method") is None:
+            return {**values, "method": "shapley"}
+        return values
 
 
 C = TypeVar("C", bound=Part)
@@ -402,13 +497,52 @@ def read_toml(file: Path) -> dict[str, Any]:
     return toml_content(toml_text(file, file), file)
 
 
-def resolve(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
+def solver_keys(kind: type[Part]) -> list[str]:
+    """The fields of a configuration that say how its command solves, keys of `[solver]` of a file."""
+    extra = {name: f.json_schema_extra for name, f in kind.model_fields.items()}
+    return [name for name, said in extra.items() if isinstance(said, dict) and said.get("solver")]
+
+
+def _keys(kind: type[Part], file: Path, beside: type[Part] | None) -> dict[str, Any]:
+    """The keys of a file for a configuration, those of its table `[solver]` among them."""
+    values = read_toml(file)
+    table = values.pop("solver", {})
+    if not isinstance(table, dict):
+        raise BadConfiguration(f"{file.name}, solver: got {table!r}; expected a table, [solver]")
+    own, others = solver_keys(kind), [] if beside is None else solver_keys(beside)
+    for key in table:
+        if key not in own + others:
+            known = choices(key, own + others) if own + others else "this command has none"
+            raise BadConfiguration(f"{file.name}, solver.{key}: no such key; {known}")
+        if key in values:
+            raise BadConfiguration(f"{file.name}, solver.{key}: the file states {key} too; expected it once")
+    return {**values, **{key: value for key, value in table.items() if key in own}}
+
+
+def resolve_beside(kind: type[C], file: Path | None, options: dict[str, Any]) -> C:
+    """What a command is told beside its configuration, of which a file has the keys of `[solver]` alone.
+
+    Raises:
+        BadConfiguration: as `resolve`.
+    """
+    table = {} if file is None else read_toml(file).get("solver", {})
+    stated = {key: table[key] for key in solver_keys(kind) if key in table}
+    return _checked(kind, file, stated, options)
+
+
+def resolve(kind: type[C], file: Path | None, options: dict[str, Any], beside: type[Part] | None = None) -> C:
     """The configuration of a command: defaults, then the file's keys, then the options given (not None).
+
+    Args:
+        beside: what else the command is told, whose keys the file's table `[solver]` may have too.
 
     Raises:
         BadConfiguration: unreadable file, unknown key, or a value out of range; one sentence.
     """
-    values: dict[str, Any] = {} if file is None else read_toml(file)
+    return _checked(kind, file, {} if file is None else _keys(kind, file, beside), options)
+
+
+def _checked(kind: type[C], file: Path | None, values: dict[str, Any], options: dict[str, Any]) -> C:
     given = {k: v for k, v in options.items() if v is not None}
     if "set" in given:
         stated = values.get("set", {})

@@ -13,7 +13,7 @@ from pydantic import Field
 from calibration.data.errors import BadConfiguration, choices
 from mmrjax.channels import RPM
 from mmrjax.tables import COULOMB_PER_MAH
-from sweeps.config import BatchPart, OutputPart, ProfilePart, RobotPart, Sweep, read_toml, resolve
+from sweeps.config import BatchPart, OutputPart, Part, ProfilePart, RobotPart, Sweep, about, read_toml, resolve
 
 #: Keys that only a sweep into a store has.
 KEYS = ("axes", "samples", "conditions", "outputs", "storage", "compression", "profile")
@@ -26,7 +26,7 @@ EXPORTS = ("csv", "parquet")
 
 
 class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
-    """A sweep of any size over any names, into a Zarr store; `sweeps.axes` reads its tables.
+    """A sweep of any size over any names, into a Zarr store; `sweeps.points.axes` reads its tables.
 
     Attributes:
         conditions: those that do not vary, by name.
@@ -44,6 +44,17 @@ class Campaign(RobotPart, ProfilePart, BatchPart, OutputPart):
     outputs: tuple[str, ...] = ()
     storage: Literal["float64", "float32"] = "float64"
     compression: Literal["none", "zstd"] = "none"
+
+
+class SharePart(Part):
+    """Who simulates a sweep, which changes no number."""
+
+    shard: str | None = about(
+        None, "Simulate the i-th of n shares, as 3/8: a process of a job array each", solver=True
+    )
+    scheduler: str | None = about(
+        None, "Address of a dask scheduler whose workers simulate, as tcp://host:8786", solver=True
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,8 +117,8 @@ def resolve_campaign(file: Path | None, options: dict[str, Any]) -> Campaign | S
                     f"option {name}: acts with a grid of options only; expected it in {file.name}, among its axes or "
                     "conditions"
                 )
-        return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID})
-    return resolve(Sweep, file, options)
+        return resolve(Campaign, file, {k: v for k, v in options.items() if k not in GRID}, SharePart)
+    return resolve(Sweep, file, options, SharePart)
 
 
 def of_grid(grid: Sweep) -> Campaign:

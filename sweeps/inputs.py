@@ -15,15 +15,13 @@ from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
 from mmrjax.robot import Robot
 from mmrjax.tables import BENCH
-from sweeps import imposed
-from sweeps.config import RobotPart
+from sweeps.config import OneRun, RobotPart
 from sweeps.console import tell
+from sweeps.options import flags
+from sweeps.points import imposed
 
 #: Option that states a condition of one run.
-OPTIONS = {
-    "supply_voltage_V": "--voltage", "motor_speed_rpm": "--motor-speed", "payload_kg": "--payload",
-    "slope_deg": "--slope", "total_mass_kg": "--mass", "surface": "--surface",
-}  # fmt: skip
+OPTIONS = flags(OneRun)
 
 
 def load_robot(config: RobotPart) -> RobotFile:

@@ -29,7 +29,7 @@ from calibration.inference.notes import Constant, Unmeasured
 from calibration.inference.observers import SettledRuns
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
-from sweeps import report_calibration
+from sweeps.pages import calibration as calibration_page
 
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = json.loads((ROOT / "docs" / "schemas" / "calibrate.schema.json").read_text(encoding="utf-8"))
@@ -510,9 +510,9 @@ def test_clusters_are_in_the_document_and_on_the_page_of_a_calibration(tmp_path)
     document = json.loads(json.dumps(made.to_json()))
     jsonschema.validate(document, SCHEMA)
     assert document["residual_clusters"][0]["statement"] == found.statement
-    page = report_calibration.write(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
+    page = calibration_page.write(tmp_path / "with", made, robot_name="nominal").read_text("utf-8")
     assert "cluster by idle_wheel" in page and (tmp_path / "with" / "figures" / "clusters.svg").exists()
     bare = dataclasses.replace(plain, residual_clusters=())
-    assert 'id="clusters"' not in report_calibration.write(tmp_path / "bare", bare, robot_name="nominal").read_text(
+    assert 'id="clusters"' not in calibration_page.write(tmp_path / "bare", bare, robot_name="nominal").read_text(
         "utf-8"
     )

@@ -23,7 +23,7 @@ from calibration.inference import estimates, noise, observers
 from calibration.inference.result import CalibrationResult
 from mmrjax import channels, params
 from mmrjax.fidelities.steady import steady_batch
-from sweeps import rig_new
+from sweeps.commands import rig_new
 
 RIG = """base = "none"
 sides = 1

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from calibration.data.errors import BadConfiguration
-from sweeps import cli, config, run
+from sweeps import cli, config
+from sweeps.points import run
 
 MMRJAX = [sys.executable, "-c", "from sweeps.cli import main; main()"]
 HEADER = (

@@ -20,8 +20,8 @@ from calibration.inference.identifiability import HELD, held_by_prior
 from calibration.inference.notes import HeldByPrior
 from calibration.words.notes import sentence
 from mmrjax import robots
-from sweeps import calibrate as command
-from sweeps import report_calibration
+from sweeps.commands import calibrate as command
+from sweeps.pages import calibration as calibration_page
 
 
 def linear(jacobian):
@@ -124,7 +124,7 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
     assert {name for name, line in lines.items() if line.endswith("yes")} == held and set(lines) == set(
         made.parameters
     )
-    page = Tables(report_calibration.write(tmp_path, made, robot_name="nominal").read_text("utf-8"))
+    page = Tables(calibration_page.write(tmp_path, made, robot_name="nominal").read_text("utf-8"))
     head, *rows = page.tables["parametertable"]
     at = head.index("held by its prior")
     assert {row[0] for row in rows if row[at].startswith("yes")} == held
@@ -152,5 +152,9 @@ def test_calibrations_have_what_the_rule_is_for(found):
 def test_no_other_word_is_left_for_it():
     root = Path(__file__).parents[1]
     old = re.compile(r"prior says more than the data of:|prior only|held by the prior\b|data say more; grey")
-    for path in [*root.glob("calibration/**/*.py"), *root.glob("sweeps/**/*.py"), *root.glob("sweeps/templates/*")]:
+    for path in [
+        *root.glob("calibration/**/*.py"),
+        *root.glob("sweeps/**/*.py"),
+        *root.glob("sweeps/pages/templates/*"),
+    ]:
         assert not old.search(path.read_text("utf-8")), path

@@ -26,7 +26,7 @@ from calibration.inference import bases as curves
 from mmrjax import params
 from mmrjax.effects import BY_NAME
 from sweeps import cli
-from sweeps import loop as room
+from sweeps.commands import loop as room
 
 PRIORS = [a for c in ("6T2A", "4W2T") for a in ("--prior", f"{c}.ground.friction.static=0.6±0.09")]
 

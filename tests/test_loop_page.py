@@ -21,8 +21,8 @@ from calibration.discovery.notes import Asked, CurveOver, NameSupport, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.inference.identifiability import HELD
 from calibration.words import loop as words
-from sweeps import loop as room
-from sweeps import report_loop
+from sweeps.commands import loop as room
+from sweeps.pages import loop as loop_page
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "loop.schema.json").read_text("utf-8"))
 
@@ -58,7 +58,7 @@ def shown(tmp_path_factory):
         if name not in known:
             found = MADE[name]()
             folder = tmp_path_factory.mktemp(name)
-            text = report_loop.write(folder, found, robot_name="nominal").read_text("utf-8")
+            text = loop_page.write(folder, found, robot_name="nominal").read_text("utf-8")
             document = finite(found.to_json())
             known[name] = SimpleNamespace(found=found, document=document, text=text, page=Tables(text))
         capsys.readouterr()
@@ -127,7 +127,7 @@ def test_class_with_a_stated_value_is_listed_and_said(shown, capsys, tmp_path):
     (told,) = document["effects"]
     assert told["class"] == ["churning", "motor.resistance"] and told["families"] == ["losses", "leads"]
     assert told["stated_values"]["motor.resistance"]["value"] == 1.411
-    page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
+    page = Tables(loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
     assert "motor.resistance is 1.41 ohm (stated 0.611, +13.1 sds)" in page.tables["effects"][1][-1]
     capsys.readouterr()
     room.print_discovery(found)
@@ -144,7 +144,7 @@ def test_what_is_ruled_out_by_its_size_is_on_the_page(shown, capsys, tmp_path):
     )
     jsonschema.validate(finite(found.to_json()), SCHEMA)
     said = f"winding_heating would explain as much as the curve, but is ruled out by size or sign alone: {why}."
-    text = report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    text = loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
     page = Tables(text)
     assert said in page.text and page.tables["implausible"][1][-1] == why
     assert text.index('id="ruled_out"') < text.index('id="effects"')
@@ -197,7 +197,7 @@ def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_
     assert document["cluster"] == {
         "axis": "time", "low": 0.6, "high": 0.7, "level": "", "inside": 12, "of": 13, "p": 1e-5
     }  # fmt: skip
-    page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
+    page = Tables(loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
     assert words.cluster(cluster) in page.text
     assert "The names keep their significance beside smooth curves (balance slip over slope)." in page.text
 
@@ -210,7 +210,7 @@ def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
     )
     found = dataclasses.replace(found, hidden=two)
     jsonschema.validate(finite(found.to_json()), SCHEMA)
-    page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
+    page = Tables(loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
     assert page.tables["hidden"][1:] == [
         ["brush_drop", "0.21 V", "5.5", "stall (expected 7.2 σ)"], ["load_slip", "0.0001 1/N", "5.1", ""]
     ]  # fmt: skip
@@ -221,7 +221,7 @@ def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):
         in " ".join(capsys.readouterr().out.split())
     )
     found = dataclasses.replace(found, hidden=())
-    assert 'id="hidden"' not in report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    assert 'id="hidden"' not in loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -269,7 +269,7 @@ def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside,
         document["resolved"]["explains"] == (p < 0.01 and not outside)
         and document["resolved"]["slip_rms_points"]["after"] == 0.6
     )
-    page = Tables(report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
+    page = Tables(loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8"))
     assert says in page.text and "slip of the 10 rows on tracks 3.3 → 0.6 points rms" in page.text
     assert page.tables["resolved_constants"][1][0] == "running_gear.guide_recess"
     assert [row[-1] for row in page.tables["resolved_constants"][1:]] == ["no", "yes"]

@@ -23,7 +23,8 @@ import pytest
 from calibration.data import columns
 from mmrjax import channels, derived, missions, outputs, requirements
 from mmrjax.fidelities.resonance import SIGNALS
-from sweeps import capabilities, cli, config, export
+from sweeps import capabilities, cli, config
+from sweeps.points import export
 
 #: Ends of names, and the unit of each.
 UNITS = {

@@ -24,7 +24,7 @@ from calibration.inference.optimizers import read
 from mmrjax import channels, params, robots
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
 from mmrjax.fidelities.steady import steady_batch
-from sweeps import loop as room
+from sweeps.commands import loop as room
 
 #: Mass without payload that the tables here state [kg]; the nominal robot has 13.1 and 11.5 kg.
 MASSES = {"6T2A": 14.2, "4W2T": 13.1}

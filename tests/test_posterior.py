@@ -19,7 +19,8 @@ from calibration.inference.posterior import of_coordinates
 from mmrjax import params
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.variation import Variation
-from sweeps import config, uncertainty
+from sweeps import config
+from sweeps.points import uncertainty
 
 NAMES = ("motor.resistance", "6T2A.track.guide_share", "6T2A.ground.friction.static", "motor.temperature_ambient")
 

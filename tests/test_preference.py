@@ -19,8 +19,8 @@ from calibration.discovery.result import HeldOutAlternative, Worse
 from calibration.discovery.settings import HELD_OUT, settings_for
 from calibration.inference.observers import SettledRuns
 from mmrjax import channels, robots
-from sweeps import loop as room
-from sweeps import report_loop
+from sweeps.commands import loop as room
+from sweeps.pages import loop as loop_page
 
 NAMES = channels.USUAL
 
@@ -171,7 +171,7 @@ def test_page_and_terminal_begin_with_what_gets_worse(traced, tmp_path, capsys):
     assert said in " ".join(printed.split()) and printed.index("Held out, what") < printed.index("effect ")
     assert printed.index("as stated, nothing fitted") < printed.index("before, fitted")
 
-    text = report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    text = loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
     page = Tables(text)
     assert said in page.text
     assert text.index('id="worse"') < text.index('id="effects"') < text.index('id="errors"')
@@ -179,4 +179,4 @@ def test_page_and_terminal_begin_with_what_gets_worse(traced, tmp_path, capsys):
     assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
 
     found = dataclasses.replace(found, held_out_worse=())
-    assert 'id="worse"' not in report_loop.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
+    assert 'id="worse"' not in loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")

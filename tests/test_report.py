@@ -23,16 +23,12 @@ from mmrjax.effects import BY_NAME
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.robots import ROBOTS
 from mmrjax.signals import GRAVITY
-from sweeps import (
-    compare,
-    figures_power,
-    figures_sweep,
-    report_comparison,
-    report_runs,
-    report_sweep,
-    run,
-    words,
-)
+from sweeps.commands import compare
+from sweeps.pages import comparison as comparison_page
+from sweeps.pages import power_figures, sweep_figures, words
+from sweeps.pages import runs as runs_page
+from sweeps.pages import sweep as sweep_page
+from sweeps.points import run
 
 SWEEP_FIGURES = {f"sweep_{name}" for name in channels.USUAL}
 
@@ -55,7 +51,7 @@ def _runs(configuration, voltage, payload, slope):
     return _table(_asked(configuration, voltage, payload, slope))
 
 
-def _write(folder, runs, robot=None, name="nominal", room=report_sweep):
+def _write(folder, runs, robot=None, name="nominal", room=sweep_page):
     robot = ROBOTS["nominal"]() if robot is None else robot
     path = room.write(folder, RobotFile(robot, name), model="steady", runs=runs)
     return path, path.read_text(encoding="utf-8")
@@ -161,7 +157,7 @@ def test_blocks_cover_each_cell_once():
     for joined in (True, False):
         covered = [
             (i + p, j + q)
-            for i, j, wide, tall in figures_sweep._blocks(cells, joined)
+            for i, j, wide, tall in sweep_figures._blocks(cells, joined)
             for p in range(wide)
             for q in range(tall)
         ]
@@ -171,7 +167,7 @@ def test_blocks_cover_each_cell_once():
 def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp_path):
     robot = params.replace(ROBOTS["nominal"](), {"motor.resistance": 0.9})
     robot = dataclasses.replace(robot, effects=(BY_NAME["churning"](amplitude=1e-4),))
-    _, page = _write(tmp_path, _runs("6T2A", 33.0, 0.0, 0.0), robot, "/somewhere/else/mine.toml", report_runs)
+    _, page = _write(tmp_path, _runs("6T2A", 33.0, 0.0, 0.0), robot, "/somewhere/else/mine.toml", runs_page)
     assert "mine.toml" in page and "somewhere" not in page
     changed = {row[0]: row[1:3] for row in Tables(page).tables["changed"][1:]}
     assert changed["motor.resistance"] == ["0.9", "0.611"]
@@ -180,7 +176,7 @@ def test_report_of_a_file_names_it_without_its_folder_and_lists_what_changed(tmp
 
 def test_one_run_is_shown_with_its_readings_limits_and_power(tmp_path):
     runs = _runs("6T2A", 33.0, 0.0, 5.0)
-    _, page = _write(tmp_path, runs, room=report_runs)
+    _, page = _write(tmp_path, runs, room=runs_page)
     assert drawn(page) == {"power"} and outside(tmp_path) == []
     tables = Tables(page).tables
     row = tables["runs"][1]
@@ -193,7 +189,7 @@ def test_one_run_is_shown_with_its_readings_limits_and_power(tmp_path):
 
 
 def test_run_without_numbers_says_why(tmp_path):
-    _, page = _write(tmp_path, _runs("6T2A", 33.0, 0.0, 40.0), room=report_runs)
+    _, page = _write(tmp_path, _runs("6T2A", 33.0, 0.0, 40.0), room=runs_page)
     assert (
         drawn(page) == set() and words.STATUSES["slides"].meaning in page and "No run ends in steady travel" in page
     )
@@ -203,8 +199,8 @@ def test_power_chain_sums_to_what_supply_and_slope_give():
     runs = _runs(("6T2A", "4W2T"), (15.0, 33.0), 8.0, (-20.0, -5.0, 0.0, 10.0))
     keep = runs["status"] == "converged"
     runs = {key: value[keep] for key, value in runs.items()}
-    assert figures_power.drawable(runs).all() and keep.sum() >= 14
-    parts, (supply, slope) = figures_power.split(runs), figures_power.sources(runs)
+    assert power_figures.drawable(runs).all() and keep.sum() >= 14
+    parts, (supply, slope) = power_figures.split(runs), power_figures.sources(runs)
     np.testing.assert_allclose(sum(parts.values()), supply + slope, rtol=1e-9)
     downhill = runs["slope_deg"] < 0
     fall = runs["total_mass_kg"] * GRAVITY * np.sin(np.radians(-runs["slope_deg"])) * runs["speed_mm_s"] / 1e3
@@ -223,7 +219,7 @@ def driven(robot, tmp_path_factory):
     })  # fmt: skip
     table = {**run.conditions(robot, runs), **run.ended(robot, batch)}
     folder = tmp_path_factory.mktemp("driven")
-    report_runs.write(folder, RobotFile(robot, "nominal"), model="drive", runs=table, histories=batch)
+    runs_page.write(folder, RobotFile(robot, "nominal"), model="drive", runs=table, histories=batch)
     return folder, (folder / "report.html").read_text(), batch
 
 
@@ -240,7 +236,7 @@ def test_report_shows_the_runs_own_history_with_its_peak(driven):
 
 
 def test_report_escapes_a_title(tmp_path):
-    path = report_comparison.write(
+    path = comparison_page.write(
         tmp_path,
         RobotFile(ROBOTS["nominal"](), "<b>x.toml"),
         model="steady",
@@ -259,7 +255,7 @@ def _comparison():
 
 def test_comparison_shows_its_summary_and_rows(tmp_path):
     given = _comparison()
-    path = report_comparison.write(
+    path = comparison_page.write(
         tmp_path, RobotFile(ROBOTS["nominal"](), "nominal"), model="steady", data_name="measured", **given
     )
     page = path.read_text()

@@ -8,7 +8,8 @@ import xarray as xr
 from pages import Tables, drawn, outside
 from test_sweep_store import CONFIG
 
-from sweeps import figures_campaign, report_campaign
+from sweeps.pages import campaign as campaign_page
+from sweeps.pages import campaign_figures
 
 REPORTED = CONFIG.replace("report = false\n", "")
 
@@ -57,15 +58,15 @@ def test_page_of_one_axis_has_one_band(page):
 
 
 def test_points_of_the_page_are_drawn_from_all_chunks_where_there_are_many(page, tmp_path, monkeypatch):
-    monkeypatch.setattr(report_campaign, "THINNED", 60)
-    monkeypatch.setattr(report_campaign, "CHUNKS", 6)
+    monkeypatch.setattr(campaign_page, "THINNED", 60)
+    monkeypatch.setattr(campaign_page, "CHUNKS", 6)
     assert "quantiles and figures of 60 points drawn at random" in " ".join(page().text.split())
 
 
 def test_share_is_the_variance_between_levels():
     rng = np.random.default_rng(0)
     x, y = rng.integers(0, 5, 20_000).astype(float), rng.standard_normal(20_000)
-    assert figures_campaign.share(x, x) == pytest.approx(1)
-    assert figures_campaign.share(x, y) < 0.01
-    assert figures_campaign.share(y, y) > 0.98
-    assert figures_campaign.share(x, 3 * x + y * 3 * x.std()) == pytest.approx(0.5, abs=0.02)
+    assert campaign_figures.share(x, x) == pytest.approx(1)
+    assert campaign_figures.share(x, y) < 0.01
+    assert campaign_figures.share(y, y) > 0.98
+    assert campaign_figures.share(x, 3 * x + y * 3 * x.std()) == pytest.approx(0.5, abs=0.02)

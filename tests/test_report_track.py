@@ -13,9 +13,10 @@ from mmrjax import fidelities, params
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.stability import largest_step
 from mmrjax.signals import CONVERGED, FAILED
-from sweeps import figures_gear, report_runs
-from sweeps import run as simulation
+from sweeps.pages import gear_figures
+from sweeps.pages import runs as runs_page
 from sweeps.paper import report, running_gear
+from sweeps.points import run as simulation
 
 FIGURES = {
     "track_fig23_24_from_standstill",
@@ -87,13 +88,13 @@ def test_section_says_why_its_current_is_not_that_of_the_steady_model(robot, wri
 @pytest.fixture(scope="module")
 def gears(robot, written):
     run = written[2]
-    return figures_gear.gears(robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T"))
+    return gear_figures.gears(robot, run, run.result.status, run.steady.guide_share, (0, 1), ("6T2A", "4W2T"))
 
 
 @pytest.mark.slow
 def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(gears, written, period):
     run = written[2]
-    figure, _ = figures_gear.current_ripple(gears)
+    figure, _ = gear_figures.current_ripple(gears)
     time, current = figure.axes[0].lines[0].get_data()
     np.testing.assert_allclose(current, run.signals.total_current[0, -len(current) :])
     spacing = (time[1] - time[0]) / 1e3
@@ -108,7 +109,7 @@ def test_figure_25_draws_the_current_and_it_repeats_with_the_pitch(gears, writte
 
 @pytest.mark.slow
 def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
-    upper, lower = figures_gear.touchdown(gears[0]).axes
+    upper, lower = gear_figures.touchdown(gears[0]).axes
     for axes in (upper, lower):
         marks = sorted(line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == ":")
         assert len(marks) >= 3
@@ -120,7 +121,7 @@ def test_figure_26_marks_a_touchdown_each_pitch(gears, written, period):
 
 @pytest.mark.slow
 def test_figure_27_ripples_on_tracks_and_not_on_wheels(gears):
-    tracked, wheeled = figures_gear.reactions(gears).axes
+    tracked, wheeled = gear_figures.reactions(gears).axes
     swing = [np.ptp(axes.lines[0].get_ydata()) / np.mean(axes.lines[0].get_ydata()) for axes in (tracked, wheeled)]
     assert swing[0] > 0.05 and swing[0] > 100 * swing[1]
     half = 6.0 * 9.80665  # roughly what one side bears [N]
@@ -166,7 +167,7 @@ def test_run_of_the_track_model_shows_its_own_running_gear(robot, tmp_path):
     for name, shown, figures in (("whole", batch, {"history", "power", "ripple", "reactions"}),
                                  ("short", short, {"history", "power"})):  # fmt: skip
         table = {**simulation.conditions(robot, runs), **simulation.ended(robot, batch)}
-        path = report_runs.write(
+        path = runs_page.write(
             tmp_path / name, RobotFile(robot, "nominal"), model="track", runs=table, histories=shown
         )
         assert set(re.findall(r'<figure id="([^"]+)">', path.read_text())) == figures

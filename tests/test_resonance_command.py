@@ -17,9 +17,10 @@ import pytest
 from mmrjax.fidelities.modes import Mode
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import CONVERGED
-from sweeps import cli, config, run
-from sweeps import resonance as room
-from sweeps.figures_resonance import resonance_map
+from sweeps import cli, config
+from sweeps.commands import resonance as room
+from sweeps.pages.resonance_figures import resonance_map
+from sweeps.points import run
 from tests.pages import Tables, drawn, outside
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "resonance.schema.json").read_text("utf-8"))

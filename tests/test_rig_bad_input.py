@@ -7,7 +7,7 @@ from calibration.data import robot_file, stated
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import bases, observers
-from sweeps import rig_check
+from sweeps.commands import rig_check
 
 BRAKE = """
 base = "none"

@@ -16,7 +16,9 @@ from calibration.data.runs import Runs
 from calibration.inference.errors import relative_error, sized_error
 from mmrjax import channels, fidelities, params
 from mmrjax.robots import nominal
-from sweeps import capabilities, imposed, rig_new
+from sweeps import capabilities
+from sweeps.commands import rig_new
+from sweeps.points import imposed
 
 #: Words of the paper's robot, its parts, its tables and its surfaces; none is a rig's.
 FORBIDDEN = (

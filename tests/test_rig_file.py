@@ -19,7 +19,7 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.rig import Instrument
 from mmrjax.signals import GRAVITY
-from sweeps import rig_new
+from sweeps.commands import rig_new
 
 KINDS = tuple(rig_new.KINDS)
 

@@ -24,7 +24,7 @@ from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
 from mmrjax.track import Track
 from sweeps import config as configuration
-from sweeps import run
+from sweeps.points import run
 
 DRIVE = {
     "motor.resistance": 2.0,

@@ -19,7 +19,7 @@ from mmrjax.missions import OUTPUTS
 from mmrjax.profile import profile
 from mmrjax.signals import STATUSES
 from sweeps import cli
-from sweeps.missions import thinned
+from sweeps.commands.missions import thinned
 
 #: Up a slope, to a stop, and back; twice.
 MISSION = """\

@@ -17,7 +17,7 @@ from mmrjax.fidelities.base import History
 from mmrjax.params import replace
 from mmrjax.rig import Rig
 from mmrjax.signals import Signals
-from sweeps import simulate
+from sweeps.commands import simulate
 
 VOLTAGE, V_S = 33.0, 0.02
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "simulate.schema.json").read_text("utf-8"))

@@ -176,7 +176,7 @@ SPELLED = {
     ("calibration/inference/bases.py", "VARIABLES"),
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
-    ("sweeps/figures_loop.py", "VARIABLE_WORDS"),  # words of the same variables
+    ("sweeps/pages/loop_figures.py", "VARIABLE_WORDS"),  # words of the same variables
 }
 
 
@@ -264,15 +264,18 @@ KEPT = {
     ("calibration/discovery/scales.py", "_nominal"): "pure: signals of the nominal robot",
     ("sweeps/cli.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/cli.py", "jax.config"): "a switch of jax, once a process",
-    ("sweeps/cluster.py", "_compiled"): "a worker's compiled job, by its name; computes the same when compiled again",
-    ("sweeps/cluster.py", "_start"): "prepares jax, once a process",
-    ("sweeps/cluster.py", "jax.config"): "a switch of jax, once a process",
+    (
+        "sweeps/points/cluster.py",
+        "_compiled",
+    ): "a worker's compiled job, by its name; computes the same when compiled again",
+    ("sweeps/points/cluster.py", "_start"): "prepares jax, once a process",
+    ("sweeps/points/cluster.py", "jax.config"): "a switch of jax, once a process",
     ("mmrjax/programs.py", "_sources"): "a hash of the files of this program",
     ("mmrjax/programs.py", "_linear_algebra"): "lets jax find LAPACK, once a process",
     ("sweeps/compilation_cache.py", "os.environ"): "set for jax, before it is imported",
     ("sweeps/compilation_cache.py", "jax.config"): "where jax keeps programs",
-    ("sweeps/design.py", "_directions"): "pure, of hashable arguments",
-    ("sweeps/identity.py", "_code"): "hashes of the files of this program",
+    ("sweeps/points/design.py", "_directions"): "pure, of hashable arguments",
+    ("sweeps/points/identity.py", "_code"): "hashes of the files of this program",
 }
 #: Methods that change what they are called on, and decorators that remember what a function returned.
 CHANGES = {
@@ -441,9 +444,12 @@ def test_structure_holds():
 #: What is found → path and source of a module that breaks a rule; several of one rule are told apart by a number.
 BAD = {
     "mmrjax imports calibration": ("mmrjax/bad.py", "from calibration import fit"),
-    "mmrjax imports sweeps.run": ("mmrjax/models/bad.py", "def f():\n    import sweeps.run"),
+    "mmrjax imports sweeps.points.run": ("mmrjax/models/bad.py", "def f():\n    import sweeps.points.run"),
     "calibration imports sweeps": ("calibration/bad.py", "from sweeps import grid"),
-    "mmrjax imports sweeps.grid": ("mmrjax/bad.py", "import importlib\nimportlib.import_module('sweeps.grid')"),
+    "mmrjax imports sweeps.points.grid": (
+        "mmrjax/bad.py",
+        "import importlib\nimportlib.import_module('sweeps.points.grid')",
+    ),
     "sums an effect's term": ("mmrjax/models/bad.py", "def f(e, r, s):\n    return e.term(r, s)"),
     "a room named utils": ("sweeps/utils.py", ""),
     "a room named common": ("mmrjax/common/__init__.py", ""),
@@ -541,11 +547,11 @@ GOOD = {
     "calibration/inference/observers/one.py": "def f(runs, o):\n    return runs.has('time_s') or isinstance(o, Histories)\n",
     "calibration/inference/bases.py": "VARIABLES = {'a': 'speed_mm_s', 'b': 'motor_speed_rpm'}\n",
     "sweeps/__init__.py": "",
-    "sweeps/cluster.py": "_compiled = {}\ndef f(k):\n    _compiled[k] = 1\n",
+    "sweeps/points/cluster.py": "_compiled = {}\ndef f(k):\n    _compiled[k] = 1\n",
     "sweeps/local.py": "import numpy as np\nX = {}\nX[1] = 2\ndef f(X, y):\n    X[1] = y\n    z = np.append(y, 1)\n    z[0] = 1\n",
     "sweeps/options.py": "X = option(help='6T2A or 4W2T')\nfrom calibration.discovery.discover import discover\n",
     "sweeps/paper/rows.py": "X = {'6T2A': ('total_current_A', 'speed_mm_s')}\n",
-    "sweeps/words.py": "X = ['write 6T2A, or else 4W2T']\n",
+    "sweeps/pages/words.py": "X = ['write 6T2A, or else 4W2T']\n",
 }
 
 
@@ -644,7 +650,7 @@ def test_a_campaign_of_its_own_way_is_found():
 def test_one_preparation_serves_all():
     """What fits or foresees calls `prepare`, and no other room does to a table what that does."""
     inner = {"with_inferred_instruments", "with_surface_configurations", "with_initial_states", "check_start"}
-    allowed = {"calibration/inference/preparation.py", "sweeps/compare.py"}  # which fits nothing
+    allowed = {"calibration/inference/preparation.py", "sweeps/commands/compare.py"}  # which fits nothing
     found = {
         path.relative_to(ROOT).as_posix()
         for layer in ("calibration", "sweeps")
@@ -716,7 +722,7 @@ def test_nobody_asks_what_a_load_is():
         if {"Shaft", "Chassis"} & {n.id for n in ast.walk(node.args[1]) if isinstance(n, ast.Name)}
     }
     data = {f"calibration/data/{name}.py" for name in ("configuration_tables", "rig_facts", "robot_file")}
-    assert found == {"mmrjax/balances.py", "sweeps/rig_check.py", *data}
+    assert found == {"mmrjax/balances.py", "sweeps/commands/rig_check.py", *data}
 
 
 def test_toml_is_read_in_one_place():

@@ -19,8 +19,9 @@ from test_sweep_store import CONFIG, arrays
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import robots
-from sweeps import axes, campaign, cluster, identity, scale
+from sweeps.commands import campaign
 from sweeps.config_campaign import Campaign
+from sweeps.points import axes, cluster, identity, scale
 
 pytest.importorskip("distributed")
 

@@ -9,9 +9,9 @@ from scipy import stats
 from calibration.data.errors import BadConfiguration
 from calibration.inference import priors
 from mmrjax import params, robots
-from sweeps import axes, design
 from sweeps.config_campaign import Campaign
-from sweeps.design import Blocks, Design
+from sweeps.points import axes, design
+from sweeps.points.design import Blocks, Design
 
 SCIPY = {
     "uniform": ({"low": 2.0, "high": 6.0}, stats.uniform(2, 4)),

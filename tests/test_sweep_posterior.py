@@ -5,8 +5,8 @@ import pytest
 
 from calibration.data.errors import InputError
 from mmrjax import params, robots
-from sweeps import axes
 from sweeps.config_campaign import Campaign
+from sweeps.points import axes
 
 posteriors = pytest.importorskip("calibration.data.posterior")
 

@@ -22,7 +22,9 @@ from mmrjax import params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
 from mmrjax.signals import STATUSES
-from sweeps import axes, campaign, cli, identity, scale, zarr_store
+from sweeps import cli
+from sweeps.commands import campaign
+from sweeps.points import axes, identity, scale, zarr_store
 
 CONFIG = """report = false
 chunk = 40
@@ -137,11 +139,11 @@ def test_result_counts_statuses_and_states_ranges(whole):
 def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrjax, tmp_path, monkeypatch):
     """Above the limit: no runs.csv, which is said; the same command with --export csv writes it, simulating nothing."""
     grid = ["sweep", "--slopes", "0,5,20", "--voltages", "24", "--payloads", "0,3", "--no-report"]
-    monkeypatch.setattr("sweeps.sweep.TABLE", 12)
+    monkeypatch.setattr("sweeps.commands.sweep.TABLE", 12)
     small, _, _ = mmrjax(*grid, "--out", "small")
     assert small == 3  # some slide
     assert (tmp_path / "small" / "runs.csv").exists() and not (tmp_path / "small" / zarr_store.STORE).exists()
-    monkeypatch.setattr("sweeps.sweep.TABLE", 11)
+    monkeypatch.setattr("sweeps.commands.sweep.TABLE", 11)
     code, out, said = mmrjax(*grid, "--out", "large")
     assert code == small and out.splitlines()[-1] == "large"
     assert "12 points: results.zarr in place of runs.csv, which a sweep of at most 11 has" in said
@@ -161,7 +163,7 @@ def test_large_grid_of_options_leaves_a_store_with_the_numbers_of_the_table(mmrj
 
 
 def test_large_grid_of_a_file_leaves_a_store_too(mmrjax, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweeps.sweep.TABLE", 3)
+    monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
     (tmp_path / "grid.toml").write_text("slopes_deg = [0, 5]\npayloads_kg = [0]\nbattery = true\nreport = false\n")
     code, _, said = mmrjax("sweep", "--config", "grid.toml", "--out", "s")
     assert code == 0 and "4 points: results.zarr" in said and (tmp_path / "s" / zarr_store.STORE).is_dir()
@@ -181,7 +183,7 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
 
 
 def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweeps.sweep.TABLE", 3)
+    monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
     monkeypatch.setattr(campaign, "MARGIN", 10**18)
     code, _, said = mmrjax("sweep", "--slopes", "0,5", "--out", "s")
     assert code == 2 and "--out: the results would take" in said
@@ -702,7 +704,7 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
         "import numpy as np, jax, mmrjax\n"
         "from sweeps import axes, scale\n"
         "from sweeps.config_campaign import Campaign\n"
-        "from sweeps.design import Blocks\n"
+        "from sweeps.points.design import Blocks\n"
         "robot = mmrjax.nominal()\n"
         "plan = axes.plan(Campaign(axes={'voltage': [15, 20, 24, 28, 33]}), robot, 'x')\n"
         "job = scale.Job(robot, 'steady', {}, plan, ('speed',), 'float64', Blocks.of((5,), 5))\n"

@@ -12,8 +12,9 @@ from calibration.data import robot_file, runs
 from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import robots, signals
 from mmrjax.fidelities.drive import drive_batch
-from sweeps import figures_history, report_runs, words
-from sweeps.simulate import PEAK, remarks
+from sweeps.commands.simulate import PEAK, remarks
+from sweeps.pages import history_figures, words
+from sweeps.pages import runs as runs_page
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
 SPEED_REST = 0.1 * SPEED_STATIC
@@ -270,9 +271,9 @@ def test_a_history_has_the_peak_of_the_inrush(climb, mmrjax, tmp_path):
 @pytest.mark.slow
 def test_a_start_is_drawn_of_the_run_that_was_asked_for(climb):
     robot, found = climb
-    heading = report_runs.labels(found.to_dict())
+    heading = runs_page.labels(found.to_dict())
     assert heading == ["6T2A, 33 V, 0 kg, 10°", "6T2A, -33 V, 0 kg, -10°"]
-    up, back = figures_history.starts(robot, found.history, np.asarray(found.status), [0, 0], heading)
+    up, back = history_figures.starts(robot, found.history, np.asarray(found.status), [0, 0], heading)
     for k, start in enumerate((up, back)):
         assert start.ended[0] == pytest.approx(abs(float(found.total_current[k])), rel=1e-6)
         assert start.ended[1] == pytest.approx(1e3 * abs(float(found.speed[k])), rel=1e-6)
@@ -375,7 +376,7 @@ def test_rated_limits_stand_in_the_report():
     robot = robots.nominal()
     found = api.simulate(robot, api.Conditions("6T2A", 33.0, 10.0, 8.0, battery=1.0))
     run = {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
-    shown = {line["words"]: line for line in report_runs.limits(robot, run)}
+    shown = {line["words"]: line for line in runs_page.limits(robot, run)}
     torque = shown["gearbox torque at the driving wheel"]
     wheel = float(found.theoretical_speed) / float(robot.configurations["6T2A"].radius)
     assert torque["limit"] == "6.25 N·m"
@@ -385,7 +386,7 @@ def test_rated_limits_stand_in_the_report():
 
 @pytest.mark.slow
 def test_a_film_begins_at_the_start_and_a_start_that_still_gains_speed_is_done(mmrjax, monkeypatch):
-    from sweeps import render
+    from sweeps.commands import render
 
     drawn = []
     monkeypatch.setattr(render.pictures, "scene", lambda *a: None)

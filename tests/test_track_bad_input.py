@@ -16,8 +16,8 @@ from mmrjax.fidelities.stability import _whole, largest_step
 from mmrjax.fidelities.track import _batch, track_batch
 from mmrjax.signals import CONVERGED, FAILED, FLAGS, TIPS
 from sweeps import config as configuration
-from sweeps import run
-from sweeps.grid import grid
+from sweeps.points import run
+from sweeps.points.grid import grid
 
 TWO = Conditions(
     voltage=jnp.asarray([33.0, 33.0]), payload=jnp.asarray([0.0, 8.0]), configuration=jnp.asarray([0.0, 1.0])

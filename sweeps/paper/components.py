@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmrjax.tables import TRACKED, WHEELED
-from sweeps.figures_style import FAINT, INK, PURPLE, figure, label_end, note
+from sweeps.pages.figure_style import FAINT, INK, PURPLE, figure, label_end, note
+from sweeps.pages.page import words_shown
 from sweeps.paper import data
 from sweeps.paper.look import CONFIGURATION, MODEL
-from sweeps.report import words_shown
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot

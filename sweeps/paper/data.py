@@ -15,8 +15,8 @@ from mmrjax.channels import MM, RPM, Channel
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import History
 from mmrjax.tables import CONFIGURATIONS, SURFACES, TRACKED, adhesion_ratio
-from sweeps import figures_history
-from sweeps.figures_history import Start
+from sweeps.pages import history_figures
+from sweeps.pages.history_figures import Start
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -238,7 +238,7 @@ def starts_of(robot: Robot, history: Any, status: Any) -> list[Start]:
         history: time, signals and reactions (None where contacts are not resolved); status: codes of how runs ended.
     """
     names = kinds(robot)
-    return figures_history.starts(robot, history, status, [robot.configurations.index(c) for c in names], names)
+    return history_figures.starts(robot, history, status, [robot.configurations.index(c) for c in names], names)
 
 
 def current_over_slope(robot: Robot, ratio: dict[str, float], slopes: np.ndarray) -> dict[tuple[str, int], Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mmrjax.tables import TRACKED, WHEELED
-from sweeps.figures_style import BLUE, GREEN, ORANGE, VERMILION
+from sweeps.pages.figure_style import BLUE, GREEN, ORANGE, VERMILION
 
 CONFIGURATION = {TRACKED: BLUE, WHEELED: VERMILION}
 MODEL = {"nominal": BLUE, "sm1": ORANGE, "sm2": GREEN}

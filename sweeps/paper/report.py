@@ -10,9 +10,9 @@ import numpy as np
 from calibration.inference import errors as residual
 from mmrjax.robots import ROBOTS
 from mmrjax.tables import TRACKED
-from sweeps import figures_history, report
+from sweeps.pages import history_figures, page
+from sweeps.pages.page import words_shown
 from sweeps.paper import components, data, runs, tables
-from sweeps.report import words_shown
 
 if TYPE_CHECKING:
     from calibration.data.robot_file import RobotFile
@@ -32,10 +32,10 @@ def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Pat
         configurations.
     """
     nominal = ROBOTS["nominal"]()
-    robot, shown = file.robot, report.named(file)
+    robot, shown = file.robot, page.named(file)
     name = file.name if shown["robot"] == words_shown(file.name) else shown["robot"]
     robots = {name: robot} | {n: make() for n, make in ROBOTS.items() if n != name}
-    album = report.Album(folder)
+    album = page.Album(folder)
     known: dict[str, Any] = {"gear": None, "errors": [], "sliding": [], "measured": 0, "raised": ""}
     rows = {n: r for n, r in ((n, data.rows(member)) for n, member in robots.items()) if r is not None}
     mine = rows.get(name)
@@ -43,7 +43,7 @@ def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Pat
     if mine is not None:
         known |= _against_the_bench(album, robots, rows, name)
     starts = data.starts(robot)
-    album.add("fig23_24_from_standstill", lambda: figures_history.from_standstill(starts, data.FIG_23, data.FIG_24))
+    album.add("fig23_24_from_standstill", lambda: history_figures.from_standstill(starts, data.FIG_23, data.FIG_24))
     if gear:
         from sweeps.paper import running_gear
 
@@ -63,11 +63,11 @@ def write(folder: Path, file: RobotFile, *, model: str, gear: bool) -> tuple[Pat
         "paper_idle_r2": components.PAPER_IDLE_R2,
     }
     title = f"The paper's figures and tables: {shown['robot']}"
-    return report.render(folder, "paper.html.j2", album, title=title, model=model, **shown, **known), mine
+    return page.render(folder, "paper.html.j2", album, title=title, model=model, **shown, **known), mine
 
 
 def _against_the_bench(
-    album: report.Album, robots: dict[str, Robot], rows: dict[str, data.Rows], name: str
+    album: page.Album, robots: dict[str, Robot], rows: dict[str, data.Rows], name: str
 ) -> dict[str, Any]:
     mine, robot = rows[name], robots[name]
     album.add("rows", lambda: runs.row_parity(mine, name))

@@ -10,9 +10,9 @@ import numpy as np
 from mmrjax.fidelities.stability import largest_step
 from mmrjax.fidelities.track import STEP, Trajectory, track_batch
 from mmrjax.tables import TRACKED
-from sweeps import figures_gear, figures_history, words
+from sweeps.pages import gear_figures, history_figures, words
+from sweeps.pages.page import Album
 from sweeps.paper import data
-from sweeps.report import Album
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot
@@ -45,21 +45,21 @@ def draw(album: Album, robot: Robot) -> dict[str, Any]:
     run, names = runs(robot), data.kinds(robot)
     which = [robot.configurations.index(c) for c in names]
     status, share = np.asarray(run.result.status), np.asarray(run.steady.guide_share)
-    gears = figures_gear.gears(robot, run, status, share, which, names)
+    gears = gear_figures.gears(robot, run, status, share, which, names)
     if not all(gear.rolls for gear in gears):
         return {"left_out": ", ".join(f"{g.name}: {words.short(g.status)}" for g in gears)}
     starts = data.starts_of(robot, run, run.result.status)
     album.add(
         "track_fig23_24_from_standstill",
-        lambda: figures_history.from_standstill(starts, data.FIG_23, data.FIG_24),
+        lambda: history_figures.from_standstill(starts, data.FIG_23, data.FIG_24),
     )
-    facts = album.add("track_fig25_ripple", lambda: figures_gear.current_ripple(gears, "Fig. 25: {}"))
-    album.add("track_fig27_reactions", lambda: figures_gear.reactions(gears, "Fig. 27: {}, one side"))
+    facts = album.add("track_fig25_ripple", lambda: gear_figures.current_ripple(gears, "Fig. 25: {}"))
+    album.add("track_fig27_reactions", lambda: gear_figures.reactions(gears, "Fig. 27: {}, one side"))
     known = {"left_out": None, "rows": facts, "currents": None}
     if TRACKED not in names:
         return known
     k = names.index(TRACKED)
-    album.add("track_fig26_touchdown", lambda: figures_gear.touchdown(gears[k], "Fig. 26: grousers land (dotted)"))
+    album.add("track_fig26_touchdown", lambda: gear_figures.touchdown(gears[k], "Fig. 26: grousers land (dotted)"))
     lumped = data.operating_points(robot, data.conditions(robot, np.array([TRACKED]), voltage=33.0))
     track = robot.configurations[TRACKED].track
     return known | {

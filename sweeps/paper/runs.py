@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from calibration.inference import errors as residual
 from mmrjax.tables import TRACKED, WHEELED
-from sweeps import words
-from sweeps.figures_style import (
+from sweeps.pages import words
+from sweeps.pages.figure_style import (
     BLUE,
     GREEN,
     INK,
@@ -23,9 +23,9 @@ from sweeps.figures_style import (
     label_end,
     note,
 )
+from sweeps.pages.page import words_shown
 from sweeps.paper import data
 from sweeps.paper.look import CONFIGURATION, MODEL
-from sweeps.report import words_shown
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot

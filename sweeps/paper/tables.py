@@ -11,8 +11,8 @@ from calibration.data import runs as records
 from calibration.inference import errors as residual
 from mmrjax.channels import MM, RPM
 from mmrjax.tables import CONFIGURATIONS, TRACKED, WHEELED
+from sweeps.pages.page import reading
 from sweeps.paper import data
-from sweeps.report import reading
 
 if TYPE_CHECKING:
     from mmrjax.robot import Robot

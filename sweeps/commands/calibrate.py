@@ -1,0 +1,73 @@
+"""The command `calibrate`: from a table of runs to a run folder with the calibrated robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.table import Table
+
+from calibration.data.columns import Layout
+from calibration.inference import blocks, priors
+from calibration.inference.calibrate import calibrate as run
+from calibration.inference.result import CalibrationResult
+from sweeps import config as configuration
+from sweeps.console import say, tell
+from sweeps.inputs import load_robot, read_runs
+from sweeps.pages import words
+from sweeps.pages.page import rms
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
+
+
+def calibrate(
+    config: configuration.Calibrate, source: str, out: Path | None, force: bool, members: Path | None = None
+) -> int:
+    """Calibrate a robot to a table and leave a run folder; returns the exit code.
+
+    0 done; 3 done, but the search did not converge, or a row or a fit without a block did not.
+    """
+    robot = load_robot(config).robot
+    runs = read_runs(source, robot, measured=True, series=True)
+    stated = priors.parse_priors(config.prior)
+    with open_folder("calibrate", config, robot, out, force, runs) as folder:
+        found = run(
+            runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
+            model=config.model, starts=config.starts, population=config.population,
+            generations=config.generations, members=members, seed=config.seed,
+            profiles=config.profiles, blocks=config.hold_out, tell=tell,
+        )  # fmt: skip
+        found.save(folder.partial, config.robot)
+        print_calibration(found)
+        settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
+        reached = words.settled(found.counts) == len(found)
+        manifest = {"seed": found.seed, "statuses": found.counts}
+        shown = page("calibration", found, robot_name=config.robot)
+        return leave(folder, config, manifest, complete=settled and reached, page=shown, runs=runs)
+
+
+def print_calibration(found: CalibrationResult) -> None:
+    """Whether the fit is adequate; parameters, errors and remarks, for a person."""
+    say(found.adequacy.statement)
+    shown = Table(title=f"{len(found)} rows, {found.model}", title_justify="left", box=None, pad_edge=False)
+    for heading in ("parameter", "value", "95 % interval", "shift [σ]", "held by its prior"):
+        left = heading in ("parameter", "held by its prior")
+        shown.add_column(heading, justify="left" if left else "right", no_wrap=True, overflow="ignore")
+    for name, p in found.parameters.items():
+        low, high = (f"{v:.3g}" for v in p.interval)
+        marks = "> " * p.interval_open[1] + "< " * p.interval_open[0]  # the end lies further out
+        shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", "yes" * p.held_by_prior)
+    say(shown)
+    errors = Table(title=f"rms of simulated - measured [% of {found.percent_of}]", title_justify="left")
+    for heading in ("", "rows", *(c.label for c in found.channels)):
+        errors.add_column(heading, justify="right" if heading else "left")
+    lines = {"before": found.errors_before, "after": found.errors_after}
+    lines |= {f"after, held out by {blocks.in_words(k)}": h.errors for k, h in found.held_out.items()}
+    for which, by in lines.items():
+        cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
+        errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)
+    say(errors)
+    if Layout.of(found.robot).crosses_zero:
+        say(words.describe_rms(rms(found.rows(), found.channels, ("before", "after", "held_out"))))
+    say(found.starts.statement())
+    for note in found.notes:
+        say(f"- {note}")

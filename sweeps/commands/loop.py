@@ -1,0 +1,120 @@
+"""The command `loop`: from a table of runs to what the model lacks, and a robot that has it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+from rich.table import Table
+
+from calibration.data import effect_file
+from calibration.data.columns import Layout
+from calibration.discovery.discover import discover
+from calibration.discovery.resolve import resolve
+from calibration.discovery.result import DiscoveryResult
+from calibration.inference import blocks, priors
+from calibration.words import loop as said_of
+from sweeps import config as configuration
+from sweeps.console import say, tell
+from sweeps.inputs import load_robot, read_runs
+from sweeps.pages import words
+from sweeps.pages.page import rms
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
+
+
+def loop(config: configuration.Loop, source: str, out: Path | None, force: bool, members: Path | None = None) -> int:
+    """Run the closed loop on a table and leave a run folder; returns the exit code.
+
+    0 done; 3 done, but rows could not be simulated, or the fit that is proposed did not converge.
+    """
+    began = time.monotonic()
+    robot = load_robot(config).robot
+    runs = read_runs(source, robot, measured=True, series=True)
+    stated = priors.parse_priors(config.prior)
+
+    def progress(text: str) -> None:
+        tell(f"{time.monotonic() - began:4.0f} s  {text}")
+
+    with open_folder("loop", config, robot, out, force, runs) as folder:
+        found = discover(
+            runs, robot, noise=config.noise or None, stated=stated, library=effect_file.library(config.effects),
+            replicates=config.replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
+            progress=progress,
+        )  # fmt: skip
+        if config.resolve:
+            found = dataclasses.replace(found, resolved=resolve(
+                found, noise=config.noise or None, population=config.population, generations=config.generations,
+                members=members, seed=config.seed, tell=progress,
+            ))  # fmt: skip
+        found.save(folder.partial, config.robot)
+        print_discovery(found)
+        if config.resolve and found.resolved is None:
+            say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
+        if config.report:
+            progress("writing the report")
+        manifest, complete = {"seed": config.seed, "verdict": found.verdict}, found.converged and not found.unusable
+        shown = page("loop", found, robot_name=config.robot)
+        return leave(folder, config, manifest, complete=complete, page=shown, runs=found.runs)
+
+
+def print_discovery(found: DiscoveryResult) -> None:
+    """Verdict, effects, errors and remarks, for a person."""
+    say(f"{found.verdict}: {found.statement}")
+    if not found.robot.has_ground and found.verdict != "none":
+        say("The balance track of a shaft is what its load loses.")
+    for said in (said_of.standing(found), said_of.ruled_out(found)):
+        if said:
+            say(said)
+    rise = said_of.worse(found.held_out_worse, found.errors_held_out)
+    if rise:
+        say(rise)
+    if found.effects:
+        shown = Table(box=None, pad_edge=False)
+        for heading in ("effect", "what is missing", "amplitude", "explains [σ²]", "own p", "indistinguishable from"):
+            number = heading in ("amplitude", "explains [σ²]", "own p")
+            shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
+        for e in found.effects:
+            a = e.parameters["amplitude"]
+            shown.add_row(
+                e.name, ", or ".join(e.families), f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", f"{e.score:.0f}",
+                f"{e.p_value:.2g}", said_of.alike(e) or "-",
+            )  # fmt: skip
+        say(shown)
+        say("explains: rise of χ² without it, all else fitted again; own p: among the strongest of the library")
+    if found.hidden:
+        say(said_of.hidden(found))
+    if found.unnamed is not None:
+        say(f"{found.unnamed.proposal.formula} ({found.unnamed.proposal.mark})")
+    if found.resolved is not None:
+        say(found.resolved.statement)
+        for note in found.resolved.notes:
+            say(f"- track model: {note}")
+    after = found.next_experiment
+    if after is not None:
+        sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""
+        say(f"next: {after.name}: {after.description}{sigma}")
+    errors = Table(title=f"rms error [% of the {found.percent_of}]", title_justify="left")
+    for heading in ("", "rows", *(c.label for c in found.channels)):
+        errors.add_column(heading, justify="right" if heading else "left")
+    whens = (0,) if found.verdict == "none" else (0, 1)
+    when = ("before", "after")
+    lines = {"as stated, nothing fitted": found.errors_as_stated}
+    lines |= {f"{when[k]}, fitted": found.errors[k] for k in whens}
+    for kind, both in found.errors_held_out.items():
+        lines |= {f"{when[k]}, held out by {blocks.in_words(kind)}": both[k] for k in whens}
+    for text, by in lines.items():
+        cells = ("-" if e["rows"] == 0 else f"{e['rms_percent']:.1f}" for e in by.values())
+        errors.add_row(text, f"{max(e['rows'] for e in by.values())}/{len(found.runs)}", *cells)
+    say(errors)
+    if Layout.of(found.robot).crosses_zero:
+        say(
+            words.describe_rms(
+                rms(found.rows_table(), found.channels, ("before", "after", "held_out_before", "held_out_after"))
+            )
+        )
+    for other in found.sensitivity:
+        say(f"with {other.factor:g} times the assumed noise: {other.verdict}: {other.statement}")
+    for note in found.notes:
+        say(f"- {note}")

@@ -1,0 +1,339 @@
+"""The command `simulate` over a profile: every run follows one mission; its numbers, segments, course as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from calibration.data import profiles
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from calibration.data.profiles import ProfileTable
+from mmrjax import balances, channels, ground, missions, outputs
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.mission import Mission
+from mmrjax.fidelities.mission_steps import MARKS
+from mmrjax.missions import JOULE_PER_WH
+from mmrjax.power import COULOMB_PER_MAH
+from mmrjax.robot import Robot
+from mmrjax.signals import FLAGS, STATUSES
+from sweeps import capabilities
+from sweeps import config as configuration
+from sweeps.console import progress, say, tell
+from sweeps.inputs import OPTIONS, load_robot, one_run, read_runs
+from sweeps.pages import words
+from sweeps.points import imposed, run
+from sweeps.results.missions import Missions
+from sweeps.skeleton import page
+from sweeps.store import open_folder
+
+#: Rows of history.csv: of a run at most, at least, and of all runs together.
+MOST_ROWS, LEAST_ROWS, ALL_ROWS = 20_000, 200, 200_000
+_SHOWN = 6  # runs on the console
+_LASTING = MARKS.index("battery_empty")  # events from here on are kept in history.csv: stops and starts are too many
+#: What the console shows of a mission.
+_PRINTED = (
+    "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
+    "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
+)  # fmt: skip
+
+
+def simulate(
+    config: configuration.Simulate,
+    given: str | dict[str, Any],
+    stated: Collection[str],
+    out: Path | None,
+    force: bool,
+) -> int:
+    """Simulate runs of a file (its name), or one of options (by column), over a profile; returns the exit code.
+
+    Args:
+        stated: columns of conditions that options state.
+
+    Raises:
+        BadConfiguration: a condition that both the options and the profile state, a battery that is empty or below
+            its cut-off at the start.
+        BadData: a wrong profile or table of runs.
+    """
+    assert config.profile is not None
+    file = load_robot(config)
+    robot = file.robot
+    _check_robot(robot)
+    source = profiles.read(config.profile)
+    _check_acting(robot, source)
+    source.check_source(config.battery)
+    for column in source.stated:
+        if column in stated and not isinstance(given, str):
+            raise BadConfiguration(
+                f"{OPTIONS[column]}: got it beside {source.source}, which states {column}; expected one of the two"
+            )
+    _check_charge(robot, config)
+    if isinstance(given, str):
+        runs = read_runs(given, robot, measured=False, battery=config.battery)
+    else:
+        runs = one_run(robot, given, config.battery, source.stated)
+    for column in source.stated:
+        if isinstance(given, str) and runs.has(column):
+            tell(f"{runs.source}, {column}: not used, {source.source} states it")
+    if "current_other" in source.values and not config.battery:
+        tell(f"{source.source}, current_other_A: not used, other consumers are on the battery")
+    _check_cutoff(robot, runs, source, config)
+    with open_folder("simulate", config, robot, out, force, runs) as folder:
+        found = simulated(robot, runs, source, config)
+        folder.write_table("segments.csv", capabilities.of(robot, found.segments))
+        folder.write_table("history.csv", capabilities.of(robot, found.course))
+        print_missions(found, capabilities.idle_columns(robot))
+        result = run.SimulationResult("simulate", config.model, robot, runs, found.table, found.to_json())
+        return run.leave(folder, config, result, page("mission", file, found))
+
+
+def _check_robot(robot: Robot) -> None:
+    if robot.rig.imposed == "motor_speed":
+        raise BadConfiguration(
+            "--profile: the motors' speed is imposed on this robot, and a profile drives motors by their voltage; "
+            'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
+        )
+    if robot.loose:
+        raise BadConfiguration(
+            "--profile: a profile does not follow a backlash; set it to 0, or simulate over time with --model drive"
+        )
+    for name, load in robot.configurations.items():
+        if float(load.torque_gravity) > 0:
+            raise BadConfiguration(
+                f"--profile: {name} is an arm on which gravity acts with its angle, which a profile does not follow; "
+                "simulate it over time with --model drive"
+            )
+
+
+def _check_acting(robot: Robot, source: ProfileTable) -> None:
+    """Refuse a profile that states what does not act on the robot's load."""
+    ground = ("slope_deg", "payload_kg", "surface")
+    imposed.check_acting(robot, (f"{source.source}, {column}" for column in ground if column in source.stated))
+    if "speed" in source.modes and not robot.shows_travel:
+        raise BadConfiguration(
+            f"{source.source}, speed_mm_s: the robot's load is a shaft, of which no channel shows a travel; demand "
+            "motor_speed_rpm or duty"
+        )
+
+
+def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
+    capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
+    if config.battery and config.discharge_mAh >= capacity:
+        raise BadConfiguration(
+            f"--discharge: got {config.discharge_mAh:g} mAh; the battery is empty at {capacity:g} mAh, before the "
+            "mission begins"
+        )
+
+
+def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> None:
+    """Refuse missions that begin with cells below their cut-off."""
+    if not config.battery:
+        return
+    conditions = run.commanded(robot, runs, config)
+    cell = missions.begins_below(robot, conditions, source.profile(robot, conditions), source.start)
+    below = np.flatnonzero(np.isfinite(cell))
+    if len(below):
+        raise BadConfiguration(
+            f"--discharge: got {config.discharge_mAh:g} mAh; a cell is then at {cell[below[0]]:.4g} V, below its "
+            f"cut-off of {robot.battery.voltage_cutoff:g} V, before the mission begins"
+        )
+
+
+def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Missions:
+    """Runs over a profile."""
+    conditions = run.commanded(robot, runs, config)
+    profile = source.profile(robot, conditions)
+    names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
+    rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
+    tables: list[dict[str, np.ndarray]] = []
+    segments: list[dict[str, np.ndarray]] = []
+    courses: list[dict[str, np.ndarray]] = []
+    done, whole = 0, True
+    with progress(len(runs), quiet=False) as advance:
+        for found in missions.simulate_in_parts(robot, conditions, profile, source.start):
+            count = len(found.steps)
+            own = slice(done, done + count)
+            at = jax.tree.map(lambda x, own=own: x[own], conditions)
+            numbers = jax.device_get(missions.numbers(robot, at, found))
+            tables.append({**missions.columns(numbers), **outputs.codes(found.result.status, found.result.flags)})
+            segments.append(_segments(robot, at, source, found, names[own]))
+            courses += [_course(robot, at, source, found, k, str(names[done + k]), rows) for k in range(count)]
+            assert found.course is not None  # it was asked for
+            whole &= bool((found.steps - found.rejected <= found.course.time.shape[-1]).all())
+            done += count
+            advance(count)
+    about = _conditions(robot, runs, source, config)
+    return Missions({**about, **_below(tables)}, _below(segments), _below(courses), source, whole)
+
+
+def _below(tables: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Tables of the same columns one below the other."""
+    return {key: np.concatenate([table[key] for table in tables]) for key in tables[0]}
+
+
+def _conditions(
+    robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate
+) -> dict[str, np.ndarray]:
+    """Conditions of the runs, empty where the profile states them or the battery sets them."""
+    nothing = np.full(len(runs), np.nan)
+    unknown = {*source.stated, *(["supply_voltage_V"] if config.battery else [])}
+    unknown |= {"total_mass_kg"} if "payload_kg" in unknown else set()
+    about = {key: nothing if key in unknown else value for key, value in run.conditions(robot, runs).items()}
+    if source.surface is not None:
+        about.pop(profiles.SURFACE, None)
+    return about
+
+
+def _segments(
+    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, names: np.ndarray
+) -> dict[str, np.ndarray]:
+    """A row for each segment of each cycle of each run, up to where the run has ended."""
+    numbers = missions.columns(jax.device_get(missions.totals(found.segments, found.segment_peaks)))
+    (runs, cycles, segments) = found.status.shape
+    time = np.asarray(found.segments.time).reshape(runs, -1)
+    begun = np.cumsum(time, 1) - time
+    count = cycles * segments
+    last = np.stack([np.searchsorted(_segment_of(found, k), np.arange(count), side="right") - 1 for k in range(runs)])
+    whole = np.stack([_segment_of(found, k)[np.maximum(last[k], 0)] == np.arange(count) for k in range(runs)])
+    assert found.course is not None  # it was asked for
+    discharge = np.take_along_axis(np.asarray(found.course.signals.discharge), np.maximum(last, 0), 1)
+    on_battery = np.asarray(conditions.battery)[:, None] > 0.5
+    charge = np.where(on_battery & whole, 1 - discharge / float(robot.battery.capacity), np.nan)
+    of = np.tile(np.arange(segments), cycles)
+    rows = {
+        "run_id": np.repeat(names, count),
+        "cycle": np.tile(np.repeat(np.arange(1, cycles + 1), segments), runs),
+        "segment": np.tile(of + 1, runs),
+        "time_s": begun.ravel(),
+        "mode": np.tile(np.array(source.modes)[of], runs),
+        **{column: np.asarray(numbers[column]).ravel() for column in numbers},
+        "state_of_charge": charge.ravel(),
+        **outputs.codes(found.status.ravel(), found.flags.ravel()),
+    }
+    order = ["run_id", "cycle", "segment", "time_s", "mode", *(c for c in missions.names() if c in rows)]
+    reached = time.ravel() > 0
+    return {column: rows[column][reached] for column in (*order, "status", "flags")}
+
+
+def _segment_of(found: Mission, k: int) -> np.ndarray:
+    """Segment of each kept step of a run; those after the last are of one beyond the end."""
+    assert found.course is not None  # it was asked for
+    of = np.asarray(found.course.segment[k])
+    return np.where(of < 0, np.iinfo(of.dtype).max, of)
+
+
+def thinned(segment: np.ndarray, current: np.ndarray, most: int, marked: np.ndarray | None = None) -> np.ndarray:
+    """Which rows of a course to keep, in order: the peak of current of each segment, marked rows, evenly spread ones.
+
+    Args:
+        segment: of each row, not decreasing; current: of each row; most: rows to keep at most; marked: rows to keep,
+            of many the last ones.
+    """
+    if len(segment) <= most:
+        return np.arange(len(segment))
+    firsts = np.flatnonzero(np.diff(segment, prepend=segment[0] - 1))
+    ends = np.append(firsts[1:], len(segment))
+    peaks = np.array([a + np.argmax(np.abs(current[a:b])) for a, b in zip(firsts, ends, strict=True)])
+    if len(peaks) > most // 2:  # of so many segments the highest
+        peaks = peaks[np.argsort(-np.abs(current[peaks]), kind="stable")[: most // 2]]
+    if marked is not None:
+        peaks = np.union1d(peaks, np.flatnonzero(marked)[-(most // 4) :])
+    spread = np.round(np.linspace(0, len(segment) - 1, most - len(peaks))).astype(int)
+    return np.unique(np.concatenate([peaks, spread]))
+
+
+def _course(
+    robot: Robot, conditions: Conditions, source: ProfileTable, found: Mission, k: int, name: str, most: int
+) -> dict[str, np.ndarray]:
+    """Rows of history.csv of one run."""
+    course = jax.tree.map(lambda x: np.asarray(x[k]), found.course)
+    there = course.segment >= 0
+    signals = course.signals
+    marked = course.event[there] >= _LASTING
+    picked = np.flatnonzero(there)[thinned(course.segment[there], signals.current[there], most, marked)]
+    course = jax.tree.map(lambda x: x[picked], course)
+    signals, reading = course.signals, balances.sensor(robot, course.signals)
+    # What the profile demands acts this much later than its rows say, and all that is written beside it with it.
+    late = float(robot.rig.delay)
+    segment = course.segment % source.segments
+    length = np.asarray(found.segments.time[k]).ravel()
+    elapsed = course.time - (np.cumsum(length) - length)[course.segment]
+    which = int(np.asarray(conditions.configuration)[k])
+    per_speed = float(robot.gearbox.ratio) / float(robot.configurations.members[which].radius)
+    battery = float(np.asarray(conditions.battery)[k]) > 0.5
+    left = 1 - signals.discharge / float(robot.battery.capacity)
+    demanded = source.demanded(segment, elapsed, per_speed)
+    turning = {}
+    if not robot.has_ground:
+        turning = {
+            "motor_speed_rpm": np.asarray(reading["motor_speed"]) / channels.RPM,
+            "demanded_motor_speed_rpm": demanded * per_speed / channels.RPM,
+        }
+    return {
+        "run_id": np.full(len(picked), name),
+        "time_s": course.time + late,
+        **{c.column: np.asarray(reading[c.name]) / c.factor for c in robot.channels},
+        "theoretical_speed_mm_s": signals.speed_theoretical / channels.MM,
+        "slip": np.asarray(ground.slip(signals.speed, signals.speed_theoretical)),
+        "distance_m": course.path,
+        "displacement_m": course.distance,
+        "voltage_V": signals.voltage,
+        "traction_N": float(robot.sides) * signals.traction,
+        "demanded_speed_mm_s": demanded / channels.MM,
+        **turning,
+        "duty": signals.duty,
+        "source_voltage_V": signals.voltage_source,
+        "motor_current_A": np.asarray(reading["motor_current"]),
+        "slope_deg": np.degrees(signals.slope),
+        "winding_temperature_C": np.asarray(reading["winding_temperature"]),
+        "housing_temperature_C": course.temperature_housing,
+        "energy_Wh": course.energy / JOULE_PER_WH,
+        "state_of_charge": left if battery else np.full(len(picked), np.nan),
+        "cycle": course.segment // source.segments + 1,
+        "segment": segment + 1,
+        "event": np.array([*MARKS, ""])[course.event],
+    }
+
+
+def _charge_left(table: dict[str, np.ndarray], status: str) -> str:
+    """At what charge missions were cut off."""
+    left = 100 * table["state_of_charge"][table["status"] == "cut_off"]
+    if status != "cut_off" or not len(left):
+        return ""
+    span = f"{left.min():.1f}" if len(left) == 1 else f"{left.min():.1f} to {left.max():.1f}"
+    return f"; ended with {span} % of the charge left"
+
+
+def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
+    """What missions come to, one a column, without `idle` columns; statuses and flags in words."""
+    about = {output.column: output for output in missions.OUTPUTS}
+    table, source = found.table, found.source
+    count = len(table["status"])
+    cycles = f", {source.cycles} cycles" if source.cycles > 1 else ""
+    say(f"profile {source.source}: {source.duration:g} s{cycles}, {source.segments} segments each")
+    shown = Table(show_header=False)
+    shown.add_row("configuration", *table["configuration"][:_SHOWN])
+    for key in _PRINTED:
+        heading, form = f"{about[key].label} [{about[key].unit}]", f".{about[key].resolution}f"
+        if np.isfinite(table[key]).any() and key not in idle:
+            shown.add_row(heading, *("-" if v != v else format(v, form) for v in table[key][:_SHOWN]))
+    shown.add_row("status", *table["status"][:_SHOWN])
+    say(shown)
+    for status in dict.fromkeys(table["status"]):
+        if status != STATUSES[0]:
+            say(f"{status}: {words.STATUSES[status].why}{_charge_left(table, status)}")
+    for flag in FLAGS:
+        flagged = int(np.sum([flag in str(f).split(";") for f in table["flags"]]))
+        if flagged:
+            said = np.array([flag in str(f).split(";") for f in found.segments["flags"]])
+            where = f"{int(said.sum())} of {len(said)} segments"
+            say(f"{flag}: {words.FLAGS[flag]} ({where if count == 1 else f'{flagged} of {count} runs, {where}'})")
+    if count > _SHOWN:
+        say(f"... and {count - _SHOWN} more in runs.csv")
+    if not found.whole:
+        tell("history.csv ends before the mission does, which has taken more steps than are kept")

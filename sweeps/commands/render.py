@@ -1,0 +1,66 @@
+"""The command `render`: a picture or a film of a run whose running gear is resolved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from calibration.data.errors import BadConfiguration
+from mmrjax import render as pictures
+from mmrjax.fidelities.track import track_batch
+from mmrjax.signals import STATUSES
+from sweeps import capabilities
+from sweeps import config as configuration
+from sweeps.console import progress, say, tell
+from sweeps.inputs import load_robot, one_run
+from sweeps.pages import words
+from sweeps.points import imposed, run
+from sweeps.store import DONE, SOME_NOT_CONVERGED
+
+
+def render(
+    config: configuration.Render, given: dict[str, Any], file: Path, begin: float, end: float | None, slow: float,
+    force: bool,
+) -> int:  # fmt: skip
+    """Draw one run (of options, by column) from standstill, as a picture or a film; returns the exit code.
+
+    0 also where the run has not settled; 3 where it ends otherwise.
+    """
+    options = config.options
+    try:
+        pictures.instants(file, begin, end, slow, options["duration"])
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}") from error
+    if file.exists() and not force:
+        raise BadConfiguration(f"FILE: {file} exists already; choose another name (--force replaces it)")
+    if not file.parent.is_dir():
+        raise BadConfiguration(f"FILE: {file.parent} is no folder; choose another path")
+    robot = load_robot(config).robot
+    imposed.check_on_ground(robot, "render")
+    conditions = run.commanded(robot, one_run(robot, given, config.battery), config)
+    run.refuse(robot, conditions, config)
+    if not robot.rig.inherits and not capabilities.stated(robot, "running_gear."):
+        tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
+    with progress(1, quiet=False) as advance:
+        told = run.shares(advance, 1)
+        trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
+        told(1.0)
+    trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))
+    aside = file.with_name(f".{file.stem}.writing{file.suffix}")
+    try:
+        view = pictures.scene(robot, conditions, trajectory)
+        with progress(1, quiet=False, doing="drawing") as advance:
+            pictures.render(view, aside, begin, end, slow)
+            advance(1)
+        aside.replace(file)
+    except ValueError as error:
+        raise BadConfiguration(f"render: {error}") from error
+    finally:
+        aside.unlink(missing_ok=True)
+    status = STATUSES[int(trajectory.result.status)]
+    say(f"{status}: {words.STATUSES[status].why}")
+    say(str(file))
+    # A start is drawn from its beginning: that it still gains speed at the end of the run is no fault of the picture.
+    return DONE if status in (*words.SETTLED, "not_settled") else SOME_NOT_CONVERGED

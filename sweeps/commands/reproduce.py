@@ -1,0 +1,37 @@
+"""The command `reproduce`: the paper's figures and tables, remade for a robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from mmrjax import fidelities
+from mmrjax.tables import CONFIGURATIONS
+from sweeps import config as configuration
+from sweeps.console import tell
+from sweeps.inputs import load_robot
+from sweeps.paper import data, report
+from sweeps.skeleton import leave
+from sweeps.store import open_folder
+
+
+def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) -> int:
+    """Write the paper's figures and tables for a robot into a run folder; returns the exit code."""
+    file = load_robot(config)
+    robot = file.robot
+    runs = records.read("measured")
+    gear = "track.guide_share" in fidelities.facts(config.model).computes
+    with open_folder("reproduce", config, robot, out, force) as folder:
+        _, rows = report.write(folder.partial, file, model=config.model, gear=gear)
+        result = {"schema": "mmrjax.reproduce/1", "model": config.model, "rows": 0}
+        if rows is None:
+            tell(f"the paper's runs are of {', '.join(CONFIGURATIONS)}; none of them is this robot's")
+        else:
+            folder.write_table("rows.csv", data.table(rows))
+            result |= {"rows": len(rows.conditions), "errors": data.summary(rows), "adhesion_raised": rows.ratio}
+        robot_file.write(
+            robot, folder.partial / "robot.toml", note=f"the robot of these figures, from {config.robot}"
+        )
+        folder.write_json("result.json", result)
+        return leave(folder, config, {"seed": None}, complete=True, runs=runs)

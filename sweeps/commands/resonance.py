@@ -1,0 +1,235 @@
+"""The command `resonance`: ripple over speed and payload, and which speeds to avoid."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from calibration.data import robot_file
+from calibration.data.errors import BadConfiguration
+from calibration.data.runs import Runs
+from mmrjax.channels import MM
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.modes import Mode, modes
+from mmrjax.fidelities.resonance import (
+    PERIODS,
+    SIGNALS,
+    Passing,
+    Peak,
+    confirmed,
+    crossings,
+    passing,
+    peaks,
+    vibrations,
+)
+from mmrjax.fidelities.track import track_batch
+from mmrjax.robot import Robot
+from mmrjax.signals import STATUSES
+from mmrjax.tables import PAYLOADS_KG, VOLTAGES_V
+from sweeps import config as configuration
+from sweeps.config import GridPart
+from sweeps.console import progress, say
+from sweeps.inputs import check_configurations, load_robot
+from sweeps.points import imposed, run
+from sweeps.points.grid import grid
+from sweeps.results.resonance import SLOW, ResonanceResult, span
+from sweeps.skeleton import leave, page
+from sweeps.store import RunFolder, open_folder
+
+CHUNK = 96  # runs in one call
+FEWEST = 5  # voltages over which a peak can be told
+SHORTEST = 0.5  # [s], of a run
+
+
+def resonance(config: configuration.Resonance, out: Path | None, force: bool) -> int:
+    """Map the ripple of a robot and leave a run folder; returns the exit code.
+
+    0 done; 3 done, but some runs did not settle, or slid, tipped or failed.
+    """
+    file = load_robot(config)
+    robot = file.robot
+    imposed.check_on_ground(robot, "resonance")
+    name = config.configuration or robot.configurations.names[0]
+    check_configurations(robot, (name,), "--configuration")
+    config = config.model_copy(
+        update={
+            "configuration": name,
+            "voltages_V": tuple(sorted(set(config.voltages_V))),
+            "payloads_kg": tuple(sorted(set(config.payloads_kg))),
+        }
+    )
+    if config.voltages_V[0] <= 0:
+        raise BadConfiguration(f"--voltages: got {config.voltages_V[0]:g}; expected more than 0 to 100, forward")
+    if len(config.voltages_V) < FEWEST:
+        raise BadConfiguration(
+            f"--voltages: got {len(config.voltages_V)} of them; expected at least {FEWEST}, or no peak over speed "
+            "can be told"
+        )
+    if config.options["duration"] < SHORTEST:
+        raise BadConfiguration(
+            f"--duration: got {config.options['duration']:g} s; expected at least {SHORTEST:g} s, or no grousers pass"
+        )
+    runs, of_table8 = _points(config, robot)
+    conditions = run.commanded(robot, runs, config)
+    run.refuse(robot, conditions, config)
+    with open_folder("resonance", config, robot, out, force, runs) as folder:
+        what = passing(robot, robot.configurations.names.index(name))
+        columns = _rippled(folder, robot, conditions, config, what)
+        table = {**run.conditions(robot, runs), "table8": of_table8, **columns}
+        found = _found(config, robot, what, table)
+        _write(folder, config, found)
+        print_resonance(found)
+        manifest, complete = {"seed": None, "statuses": found.statuses}, found.statuses["converged"] == len(runs)
+        return leave(folder, config, manifest, complete=complete, page=page("resonance", found, file), runs=runs)
+
+
+def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:
+    assert config.configuration is not None
+    return GridPart(
+        configurations=(config.configuration,),
+        voltages_V=voltages,
+        payloads_kg=payloads,
+        slopes_deg=(config.slope_deg,),
+        surface=config.surface,
+    )
+
+
+def _points(config: configuration.Resonance, robot: Robot) -> tuple[Runs, np.ndarray]:
+    """The grid, then those points of Table 8 that it lacks; and which rows are of Table 8."""
+    parts = [
+        grid(_grid(config, v, p), robot)
+        for v, p in ((config.voltages_V, config.payloads_kg), (VOLTAGES_V, PAYLOADS_KG))
+    ]
+    pairs = [list(zip(part["supply_voltage_V"], part["payload_kg"], strict=True)) for part in parts]
+    new = np.array([pair not in set(pairs[0]) for pair in pairs[1]])
+    columns = {key: np.concatenate([parts[0][key], parts[1][key][new]]) for key in parts[0].columns}
+    runs = Runs(source="the grid and Table 8", columns=columns)
+    paper = set(pairs[1])
+    of_table8 = [pair in paper for pair in zip(runs["supply_voltage_V"], runs["payload_kg"], strict=True)]
+    return runs, np.array(of_table8)
+
+
+def _rippled(
+    folder: RunFolder, robot: Robot, conditions: Conditions, config: configuration.Resonance, what: Passing
+) -> dict[str, np.ndarray]:
+    """The columns of ripple, chunk by chunk; chunks that an interrupted run left are not simulated again."""
+    total, parts = conditions.shape[0], []
+    size = min(CHUNK, total)
+    with progress(total, quiet=False) as advance:
+        for first in range(0, total, size):
+            rows = np.minimum(np.arange(first, first + size), total - 1)
+            count, name = min(size, total - first), f"chunk-{first // size:06d}"
+            part = folder.chunk(name)
+            if part is None:
+                told = run.shares(advance, count)
+                chosen = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
+                options = {key: config.options[key] for key in ("duration", "step")}
+                ended = track_batch(robot, chosen, rolling=True, progress=told, **options)
+                part = {key: x[:count] for key, x in _columns(robot, ended, what).items()}
+                folder.keep_chunk(name, part)
+                told(1.0)
+            else:
+                advance(count)
+            parts.append(part)
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def _columns(robot: Robot, ended: Any, what: Passing) -> dict[str, np.ndarray]:
+    """Ripple of a batch of runs, in the units of the table."""
+    found = vibrations(robot, ended, what.pitch)
+    status = np.array(STATUSES)[found.status]
+    slow = ~found.read & np.isin(status, ("converged", "not_settled"))
+    columns = {
+        "status": np.where(slow, SLOW, status),
+        "passing_Hz": found.passing,
+    }
+    for name, signal in SIGNALS.items():
+        columns |= {
+            f"{name}_mean_{signal.unit}": found.mean[name] / signal.factor,
+            f"{name}_ripple_percent": 100 * found.deviation[name],
+            f"{name}_frequency_Hz": found.frequency[name],
+        }
+    return columns
+
+
+def _found(
+    config: configuration.Resonance, robot: Robot, what: Passing, table: dict[str, np.ndarray]
+) -> ResonanceResult:
+    """Natural frequencies at the middle voltage, and peaks and crossings at each payload."""
+    assert config.configuration is not None
+    payloads, middle = config.payloads_kg, config.voltages_V[len(config.voltages_V) // 2]
+    at = _grid(config, (middle,), payloads)
+    linear = modes(robot, run.commanded(robot, grid(at, robot), config))
+    by_payload = dict(zip(payloads, linear, strict=True))
+    tops: list[Peak] = []
+    ends: dict[float, tuple[float, float]] = {}
+    for payload, of in by_payload.items():
+        gridded = (table["payload_kg"] == payload) & np.isin(table["supply_voltage_V"], config.voltages_V)
+        rows = np.flatnonzero(gridded & (table["status"] == "converged"))
+        rows = rows[np.argsort(table["speed_mean_mm_s"][rows])]
+        if not len(rows):
+            continue
+        speed = table["speed_mean_mm_s"][rows] * MM
+        here = [
+            peak
+            for name in SIGNALS
+            for peak in peaks(
+                name, payload, speed, table["passing_Hz"][rows], table[f"{name}_ripple_percent"][rows] / 100,
+                table[f"{name}_frequency_Hz"][rows], of,
+            )
+        ]  # fmt: skip
+        tops += here
+        ends[payload] = float(speed[0]), float(speed[-1])
+    tops = confirmed(tops, by_payload)
+    meets = [c for p, of in ends.items() for c in crossings(by_payload[p], p, what.travel, *of, tops)]
+    return ResonanceResult(
+        config.configuration, config.slope_deg, config.surface, what, robot, table, by_payload, tops, meets
+    )
+
+
+def _write(folder: RunFolder, config: configuration.Resonance, found: ResonanceResult) -> None:
+    folder.write_table("points.csv", found.table)
+    folder.write_table(
+        "modes.csv", _rows([{"payload_kg": p, **m._asdict()} for p, of in found.modes.items() for m in of], Mode)
+    )
+    folder.write_table("peaks.csv", _rows([p._asdict() for p in found.peaks], Peak))
+    robot_file.write(found.robot, folder.partial / "robot.toml", note=f"the robot of this map, from {config.robot}")
+    folder.write_json("result.json", found.to_json())
+
+
+_COLUMNS = {
+    "frequency": "frequency_Hz", "low": "low", "natural": "natural_Hz", "payload": "payload_kg", "speed": "speed_m_s",
+}  # fmt: skip
+
+
+def _rows(rows: Iterable[dict[str, Any]], kind: type) -> dict[str, np.ndarray]:
+    """Rows of a named tuple as columns with units in their names; without rows the columns alone."""
+    rows, unit = list(rows), "Hz" if kind is Mode else "m_s"
+    keys = list(rows[0]) if rows else list(kind.__annotations__)
+    names = _COLUMNS | {"low": f"low_{unit}", "high": f"high_{unit}"}
+    return {names.get(key, key): np.array([row[key] for row in rows]) for key in keys}
+
+
+def print_resonance(found: ResonanceResult) -> None:
+    """Natural frequencies, and which speeds to avoid; for a person."""
+    shown = Table(title="natural frequencies [Hz], mean (range over the belt's position), damping ratio", box=None)
+    shown.title_justify = "left"
+    names = list(dict.fromkeys(m.name for of in found.modes.values() for m in of))
+    shown.add_column("payload [kg]")
+    for name in names:
+        shown.add_column(name)
+    for payload, of in found.modes.items():
+        cells = {m.name: f"{m.frequency:.0f} ({span(m.low, m.high, 1)}), {m.damping:.2f}" for m in of}
+        shown.add_row(f"{payload:g}", *(cells.get(name, "-") for name in names))
+    say(shown)
+    say(found.statement())
+    others = {s: n for s, n in found.statuses.items() if n and s != STATUSES[0]}
+    if others:
+        say("of " + f"{len(found.table['status'])} runs: " + ", ".join(f"{n} {s}" for s, n in others.items()))
+    if SLOW in others:
+        say(f"{SLOW}: fewer than {PERIODS} {found.passing.name} passed in the second half of the run")

@@ -1,0 +1,336 @@
+"""The command `rig check`: what a rig's file says, whether its numbers make sense, what data can tell of it."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from calibration.data import rig_facts
+from calibration.data.columns import SUPPLY, Layout
+from calibration.data.errors import BadConfiguration
+from calibration.data.rig_facts import Fact, Origin
+from calibration.data.rig_file import FREE
+from calibration.data.runs import Runs
+from calibration.data.writing import finite
+from calibration.inference import foresight, identifiability
+from calibration.inference.foresight import Foresight
+from mmrjax import channels
+from mmrjax.robot import Robot
+from mmrjax.shaft import Shaft
+from sweeps.config import RobotPart
+from sweeps.console import say
+from sweeps.inputs import load_robot, read_runs
+from sweeps.pages import words
+
+#: Of the templates: what stands beside a number that is not the user's yet.
+EXAMPLE = "example: yours"
+
+
+@dataclasses.dataclass(frozen=True)
+class RigCheck:
+    """What the command found.
+
+    Attributes:
+        file: that was read; robot: of it; examples: its lines that still hold an example's number.
+        origins: of its numbers; facts: that follow from them.
+        runs: of the table, None without one; shown: its columns by the names of this program; foresight: what it can
+            determine.
+    """
+
+    file: str
+    robot: Robot
+    examples: tuple[int, ...]
+    origins: tuple[Origin, ...]
+    facts: tuple[Fact, ...]
+    runs: Runs | None = None
+    shown: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    foresight: Foresight | None = None
+
+    def understood(self) -> list[str]:
+        """What it is, how it is driven and measured, in sentences."""
+        robot, rig = self.robot, self.robot.rig
+        count = int(robot.sides)
+        motors = "One motor drives" if count == 1 else f"{count} motors alike drive"
+        gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
+        loads = "; ".join(f"{name}: {_load(load)}" for name, load in robot.configurations.items())
+        imposed = "the voltage (times the duty in histories)" if rig.imposed == "voltage" else "the motors' speed"
+        starts = {
+            "rest": "start at rest",
+            "measured": "start as their first samples show",
+            "free": "start as a fit finds",
+        }
+        delay = float(rig.delay)
+        return [
+            f"{motors}, through {gear}, {loads}.",
+            f"Imposed is {imposed}{f', {delay:g} s late' if delay else ''}; histories {starts[rig.start]}.",
+        ]
+
+    def remarks(self) -> list[str]:
+        """What should be looked at, a sentence each."""
+        said = []
+        if self.robot.rig.inherits:
+            said.append(
+                'what the file does not state is its base\'s, a packaged robot (base = "none" starts from nothing)'
+            )
+        if self.examples:
+            lines = ", ".join(map(str, self.examples))
+            said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
+        said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
+        loose = [o.name for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value != 0]
+        if loose and not self.robot.rig.inherits:
+            said.append(f"without ±, so with the program's: {', '.join(loose)}")
+        if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
+            said.append("motor.voltage_limit is not stated: experiments are proposed up to what a table used")
+        return said
+
+    def channels(self) -> list[dict[str, Any]]:
+        """Of each channel: name, the user's column, whether it is signed, its step [unit], source of its sd."""
+        theirs = {mine: column for mine, column, _ in self.robot.rig.columns}
+        shown, found = (self if self.foresight is None else self.foresight).robot.rig, []
+        for k, channel in enumerate(self.robot.channels):
+            instrument = shown.instrument(channel.name)
+            usual = f"{channel.sd_column} of the table, else {100 * channel.sd_share:g} % of the reading"
+            found.append(
+                {
+                    "channel": channel.name,
+                    "column": theirs.get(channel.column, channel.column),
+                    "signed": instrument.signed,
+                    "quantum": None if instrument.quantum is None else instrument.quantum / channel.factor,
+                    "unit": channel.unit,
+                    "sd": usual if self.foresight is None else self.foresight.noise[k],
+                }
+            )
+        return found
+
+    def columns(self) -> list[dict[str, Any]]:
+        """Of each column of the table: what it is used for, its range."""
+        if self.runs is None:
+            return []
+        found = []
+        for name, values in self.runs.columns.items():
+            if name not in self.shown and self._means_nothing(name):
+                continue
+            number = np.issubdtype(values.dtype, np.number)
+            there = values[np.isfinite(values)] if number else values
+            kinds = np.unique(there)
+            found.append(
+                {
+                    "column": name,
+                    "theirs": self.shown.get(name, ""),
+                    "use": _use(name, self.robot) if name in self.shown else "not in the table",
+                    "values": len(kinds),
+                    "least": float(there.min()) if number and len(there) else None,
+                    "greatest": float(there.max()) if number and len(there) else None,
+                    "words": [] if number else kinds.tolist(),
+                }
+            )
+        return found
+
+    def _means_nothing(self, column: str) -> bool:
+        """Whether a column that the table lacks says nothing of this rig: of a ground, or what is not imposed."""
+        idle = Layout.of(self.robot).idle
+        return column in idle or (column == SUPPLY and self.robot.rig.imposed != "voltage")
+
+    def unused(self) -> list[str]:
+        """Of each column that is not used, why."""
+        if self.runs is None:
+            return []
+        every = {c.column: c.name for c in channels.EVERY}
+        said = [
+            f"{name}: not among the rig's channels; add {every[name]} to channels in its file to use it"
+            for name in self.runs.unknown
+            if name in every
+        ]
+        others = [name for name in self.runs.unknown if name not in every]
+        without = (
+            f"{', '.join(others)}: without a role, so residuals are tested for clusters by each; name one under "
+        )
+        without += "[columns] in the rig's file if it has one"
+        return [*said, *([without] if others else [])]
+
+    def statement(self) -> str:
+        """What the table can determine, in a sentence."""
+        if self.foresight is None:
+            return "Without data: give a table to see what it can determine."
+        held = [p.name for p in self.foresight.parameters if p.held]
+        told = [p.name for p in self.foresight.parameters if not p.held]
+        parts = [f"These data determine {', '.join(told)}" if told else "These data determine no parameter"]
+        parts += (
+            [f"{', '.join(held)} would be held by {'its prior' if len(held) == 1 else 'their priors'}"]
+            if held
+            else []
+        )
+        return "; ".join(parts) + "."
+
+    def to_json(self) -> dict[str, Any]:
+        """The whole, for machines."""
+        runs = None
+        if self.runs is not None:
+            assert self.foresight is not None
+            names, counts = np.unique(np.array(self.foresight.status), return_counts=True)
+            runs = {
+                "source": self.runs.source,
+                "rows": len(self.runs),
+                "columns": self.columns(),
+                "unused": self.unused(),
+                "status": {str(n): int(c) for n, c in zip(names, counts, strict=True)},
+                "parameters": [dataclasses.asdict(p) for p in self.foresight.parameters],
+                "alike": [list(pair) for pair in self.foresight.alike],
+            }
+        return {
+            "schema": "mmrjax.rig_check/1",
+            "file": self.file,
+            "understood": self.understood(),
+            "imposed": self.robot.rig.imposed,
+            "start": self.robot.rig.start,
+            "configurations": list(self.robot.configurations),
+            "channels": self.channels(),
+            "numbers": [dataclasses.asdict(o) for o in self.origins],
+            "facts": [dataclasses.asdict(f) for f in self.facts],
+            "remarks": self.remarks(),
+            "data": runs,
+            "statement": self.statement(),
+        }
+
+
+def _load(load: Any) -> str:
+    if not isinstance(load, Shaft):
+        on = "tracks" if float(load.on_tracks) > 0.5 else "wheels"
+        return f"a vehicle of {float(load.mass):g} kg on {on}"
+    words = [f"a shaft of {float(load.inertia):.3g} kg·m²"]
+    words += ["an arm that gravity pulls"] if float(load.torque_gravity) > 0 else []
+    words += ["a constant torque"] if float(load.torque_constant) != 0 else []
+    travel = float(load.radius)
+    words += [f"{2e3 * np.pi * travel:.4g} mm of travel a turn"] if travel != 1.0 else []
+    return ", ".join(words)
+
+
+def _use(column: str, robot: Robot) -> str:
+    for channel in channels.EVERY:
+        if channel.name == robot.rig.imposed and column == channel.column:
+            return "imposed"
+        if channel in robot.channels and column == channel.column:
+            return f"channel {channel.name}"
+        if column == channel.sd_column:
+            return f"sd of {channel.name}"
+    if column == "supply_voltage_V" and robot.rig.imposed == "voltage":
+        return "imposed"
+    return "condition"
+
+
+def check(file: Path, data: str | None, effects: tuple[str, ...], as_json: bool) -> int:
+    """Say what was understood of a rig's file, and what a table can tell of it; returns 0.
+
+    Raises:
+        BadConfiguration: a file that cannot be read, or lacks something, with all that it lacks.
+        BadData: a table that cannot be used with this rig.
+    """
+    if file.is_dir():
+        raise BadConfiguration(f"{file}: is a folder; expected a rig's TOML file")
+    if not file.is_file():
+        raise BadConfiguration(f"{file}: no such file; mmrjax rig new {file} writes one to fill in")
+    found = examined(file, data, effects)
+    if as_json:
+        print(json.dumps(finite(found.to_json()), indent=2, ensure_ascii=False))
+    else:
+        print_check(found)
+    return 0
+
+
+def examined(file: Path, data: str | None, effects: tuple[str, ...] = ()) -> RigCheck:
+    """What there is to say of a rig's file, and of a table beside it."""
+    rig = load_robot(RobotPart(robot=str(file), effects=effects))
+    lines, robot = rig.text.splitlines(), rig.robot
+    examples = tuple(k for k, line in enumerate(lines, 1) if EXAMPLE in line and not line.startswith("#"))
+    found = RigCheck(rig.name, robot, examples, tuple(rig_facts.origins(rig)), tuple(rig_facts.facts(robot)))
+    if data is None:
+        return found
+    runs = read_runs(data, robot, measured=True, series=True)
+    seen = foresight.foresee(runs, robot)
+    return dataclasses.replace(found, runs=runs, shown=_shown(runs, data), foresight=seen)
+
+
+def _shown(runs: Runs, data: str) -> dict[str, str]:
+    """Columns of a table as its file calls them, by the names of this program."""
+    if not Path(data).is_file():
+        return {name: name for name in runs.columns}
+    with Path(data).open(encoding="utf-8-sig", newline="") as stream:
+        header = [cell.strip() for cell in next(csv.reader(stream))]
+    return {m.column: m.shown for m in runs.layout.meanings(runs.source, header) if m is not None}
+
+
+def _table(title: str, *headings: str) -> Table:
+    shown = Table(title=title, box=None, pad_edge=False, title_justify="left")
+    for heading in headings:
+        name, _, right = heading.partition(">")
+        shown.add_column(name, justify="right" if right else "left", overflow="fold")
+    return shown
+
+
+def print_check(found: RigCheck) -> None:
+    """All of it, for a person."""
+    say(f"{found.file}")
+    for sentence in found.understood():
+        say(sentence)
+    shown = _table("\nchannels", "channel", "column", "sign", "step>r", "sd")
+    for c in found.channels():
+        step = FREE if c["quantum"] is None else f"{c['quantum']:.3g} {c['unit']}" if c["quantum"] else ""
+        sign = {None: FREE, True: "signed", False: "magnitude"}[c["signed"]]
+        shown.add_row(c["channel"], c["column"], sign, step, c["sd"])
+    say(shown)
+    shown = _table("\nnumbers", "parameter", "value>r", "±>r", "unit", "from")
+    for o in found.origins:
+        sd = "" if o.sd is None else f"{o.sd:.2g}" if o.sd > 0 else "exact"
+        shown.add_row(o.name, f"{o.value:.5g}", sd, o.unit, o.why)
+    say(shown)
+    shown = _table("\nwhat follows", "", "value>r", "")
+    for fact in found.facts:
+        shown.add_row(fact.what, fact.value, "LOOK" if fact.odd else "ok")
+    say(shown)
+    for sentence in found.remarks():
+        say(f"- {sentence}")
+    if found.runs is not None and found.foresight is not None:
+        _print_data(found, found.runs, found.foresight)
+    say(f"\n{found.statement()}")
+
+
+def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
+    shown = _table(f"\n{runs.source}: {len(runs)} rows", "column", "used as", "values>r", "from>r", "to>r")
+    for c in found.columns():
+        ends = [_words(c["words"]), ""] if c["words"] else [_end(c["least"]), _end(c["greatest"])]
+        name = c["column"] if c["theirs"] in ("", c["column"]) else f"{c['column']}, yours {c['theirs']}"
+        shown.add_row(name, c["use"], str(c["values"]), *ends)
+    say(shown)
+    for sentence in [*found.unused(), *runs.missing()]:
+        say(f"- {sentence}")
+    names, counts = np.unique(np.array(seen.status), return_counts=True)
+    others = [f"{count} rows: {name}" for name, count in zip(names, counts, strict=True) if name not in words.SETTLED]
+    if others:
+        say(
+            f"- with the file's numbers not every row settles ({', '.join(others)}); one that the "
+            "robot does not reach counts for nothing"
+        )
+    title = "\nwhat these data can determine (posterior sd over prior sd, at the numbers of the file)"
+    shown = _table(title, "parameter", "value>r", "prior ±>r", "unit", "posterior/prior>r", "")
+    for p in sorted(seen.parameters, key=lambda p: p.share):
+        said = "held by its prior" if p.held else "determined"
+        shown.add_row(p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", said)
+    say(shown)
+    say(f"held by its prior: above {identifiability.HELD:g}")
+    for one, other, size in seen.alike:
+        say(f"- {one} and {other} act alike in these data (correlation {size:+.2f})")
+
+
+def _words(words: list[str]) -> str:
+    return ", ".join(words) if len(words) < 5 else f"{', '.join(words[:3])}, ..."
+
+
+def _end(value: float | None) -> str:
+    return "" if value is None else f"{value:.5g}"

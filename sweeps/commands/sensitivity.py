@@ -1,0 +1,195 @@
+"""The command `sensitivity`: which parameters matter where, and which runs would tell more of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from calibration.data import robot_file
+from calibration.data.columns import Layout
+from calibration.data.errors import BadConfiguration
+from calibration.data.robot_file import RobotFile
+from calibration.data.runs import Runs
+from calibration.inference import noise
+from calibration.sensitivity import inputs as room
+from calibration.sensitivity.analyse import analyse
+from calibration.sensitivity.inputs import Inputs
+from calibration.sensitivity.model import chosen_outputs
+from calibration.sensitivity.next_runs import Candidates
+from calibration.sensitivity.result import METHODS, NEGLIGIBLE, Points, SensitivityResult
+from calibration.sensitivity.study import Study, Supply
+from calibration.words import sensitivity as words
+from mmrjax.channels import RPM
+from mmrjax.power import COULOMB_PER_MAH
+from mmrjax.robot import Robot
+from mmrjax.tables import PAYLOADS_KG, SLOPES_DEG, VOLTAGES_V
+from sweeps import config as configuration
+from sweeps.config import GridPart
+from sweeps.console import say, tell
+from sweeps.inputs import beside_robot, load_robot, read_runs
+from sweeps.pages.figure_style import short
+from sweeps.points import axes as axes_room
+from sweeps.points import grid as grid_room
+from sweeps.points import imposed
+from sweeps.points.grid import configurations, grid
+from sweeps.points.run import refuse
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
+
+#: Operating points where a sample is drawn at each: corners and middle of Table 8.
+CORNERS = {
+    "voltages_V": (VOLTAGES_V[0], VOLTAGES_V[-1]),
+    "payloads_kg": (PAYLOADS_KG[0], PAYLOADS_KG[-1]),
+    "slopes_deg": SLOPES_DEG[::2],
+}
+WHOLE = {"voltages_V": VOLTAGES_V, "payloads_kg": PAYLOADS_KG, "slopes_deg": SLOPES_DEG}
+#: Condition that may vary → the axis of operating points that it takes the place of.
+AXES = {
+    "voltage": "voltages_V",
+    "motor_speed": "motor_speeds_rpm",
+    "payload": "payloads_kg",
+    "slope_deg": "slopes_deg",
+}
+
+
+def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
+    """Study a robot and leave a run folder; returns the exit code.
+
+    0 done; 3 done, but some operating points have no numbers.
+    """
+    file = load_robot(config)
+    robot = file.robot
+    if config.method not in METHODS:
+        raise BadConfiguration(f"option method: got {config.method!r}; input should be one of {', '.join(METHODS)}")
+    outputs = chosen_outputs(config.outputs, robot)
+    ranges = _ranges(config.vary)
+    runs = _operating_points(config, robot, ranges)
+    inputs = _inputs(config, file, runs, ranges)
+    candidates = _candidates(config, robot, runs)
+    conditions = runs.conditions(robot)
+    refuse(robot, conditions, config)
+    supply = Supply(float(config.battery), config.discharge_mAh * COULOMB_PER_MAH, np.asarray(conditions.adhesion))
+    study = Study(robot, inputs, Points.of(runs), outputs, config.model, config.options, supply, tell)
+    with open_folder("sensitivity", config, robot, out, force, runs) as folder:
+        found = analyse(study, config.method, config.evaluations, config.seed, candidates)
+        folder.write_json("result.json", found.to_json())
+        for name, table in found.tables().items():
+            folder.write_table(name, table)
+        robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this study, from {config.robot}")
+        print_sensitivity(found)
+        manifest = {"seed": found.seed, "statuses": found.statuses}
+        shown = page("sensitivity", found, file)
+        return leave(folder, config, manifest, complete=bool(found.studied), page=shown, runs=runs)
+
+
+def _ranges(vary: tuple[str, ...]) -> dict[str, tuple[float, float]]:
+    """`name=low:high` of every varied condition."""
+    found: dict[str, tuple[float, float]] = {}
+    for text in vary:
+        name, _, ends = text.partition("=")
+        low, _, high = ends.partition(":")
+        if name in found:
+            raise BadConfiguration(f"--vary {name}: given twice; give it once")
+        try:
+            found[name] = float(low), float(high)
+        except ValueError:
+            raise BadConfiguration(
+                f"--vary: got {text}; expected name=low:high with numbers, such as voltage=22:26"
+            ) from None
+    return found
+
+
+def _operating_points(
+    config: configuration.Sensitivity, robot: Robot, ranges: dict[str, tuple[float, float]]
+) -> Runs:
+    """The grid of operating points; an axis that varies has one value, the middle of its range."""
+    layout = Layout.of(robot)
+    table8: dict[str, tuple[float, ...]] = {}
+    if layout.table8:
+        table8 = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE
+    axes = {key: getattr(config, key) or table8.get(key) for key in (*WHOLE, "motor_speeds_rpm")}
+    for name in ranges:
+        imposed.check_acting(robot, [f"--vary {name}"] if name in axes_room.ON_GROUND else [])
+        if name in grid_room.AXIS and name != layout.imposed:
+            raise BadConfiguration(
+                f"--vary {name}: the robot's file imposes the {words_of(layout.imposed)}; vary that"
+            )
+    if config.battery and "voltage" in ranges:
+        raise BadConfiguration("--vary voltage: acts without --battery only, whose voltage is that of its charge")
+    for name, (low, high) in ranges.items():
+        if name in AXES:
+            if getattr(config, AXES[name]) is not None:
+                option = AXES[name].partition("_")[0]
+                raise BadConfiguration(f"--vary {name}: --{option} states it too; give one of them")
+            axes[AXES[name]] = ((low + high) / 2 / (RPM if name == "motor_speed" else 1.0),)
+    try:
+        stated = GridPart(configurations=config.configurations, surface=config.surface, **axes)
+    except ValueError:
+        raise BadConfiguration(f"--vary: got {', '.join(config.vary)}; a range leaves what a run may have") from None
+    notes: list[str] = []
+    stated = grid_room.resolved(stated, robot, config.battery, notes)
+    for note in notes:
+        tell(note)
+    names = configurations(stated, robot)
+    return grid(stated.model_copy(update={"configurations": tuple(dict.fromkeys(names))}), robot, config.battery)
+
+
+def words_of(name: str) -> str:
+    """What is imposed, in words."""
+    return name.replace("_", " ")
+
+
+def _inputs(
+    config: configuration.Sensitivity, file: RobotFile, runs: Runs, ranges: dict[str, tuple[float, float]]
+) -> Inputs:
+    robot, present = file.robot, tuple(dict.fromkeys(map(str, runs["configuration"])))
+    if config.posterior:
+        if config.parameters:
+            raise BadConfiguration("--posterior: says what is uncertain, and so does --parameters; give one of them")
+        return room.of_posterior(robot, beside_robot(file), ranges)
+    names = config.parameters or room.default_names(robot, present, config.battery, config.model)
+    return room.of_priors(robot, names, ranges)
+
+
+def _candidates(config: configuration.Sensitivity, robot: Robot, points: Runs) -> Candidates:
+    """Runs of a table, or of Table 8 in every configuration; of a rig its operating points."""
+    if config.candidates:
+        runs = read_runs(config.candidates, robot, measured=False)
+        source = runs.source
+    elif not Layout.of(robot).table8:
+        runs, source = points, "the operating points"
+    else:
+        runs = grid(GridPart(surface=config.surface), robot)
+        source = "Table 8"
+    usual = noise.default(robot.channels)
+    stated = noise.parse(usual, robot.channels)
+    if config.noise:
+        stated |= noise.parse(config.noise, robot.channels)
+    return Candidates(
+        Points.of(runs), runs.conditions(robot), source, stated, config.noise or usual, runs.deviations(), config.runs
+    )
+
+
+def print_sensitivity(found: SensitivityResult) -> None:
+    """What decides which output, what does not matter, what to measure next; for a person."""
+    say(found.statement())
+    title = f"{words.METHODS[found.method]}, {len(found.points)} operating points"
+    shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for heading in ("", "first", "second", "third"):
+        shown.add_column(heading)
+    for study in found.outputs.values():
+        share = study.overall_share
+        top = [k for k in np.argsort(-share)[:3] if share[k] >= NEGLIGIBLE]
+        shown.add_row(study.row.label, *(f"{short(found.names[k])} {100 * share[k]:.0f} %" for k in top))
+    say(shown)
+    idle = found.negligible
+    if idle:
+        say(f"less than {100 * NEGLIGIBLE:g} % everywhere: {', '.join(idle)}")
+    if found.next_runs is not None:
+        n = found.next_runs
+        labels = "; ".join(n.points.label(k) for k in range(len(n.points)))
+        say(f"next runs, of {n.candidates} ({n.source}), read to {n.noise}: {labels}")
+    for note in found.notes:
+        say(f"- {note}")

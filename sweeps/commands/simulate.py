@@ -1,0 +1,284 @@
+"""The command `simulate`: a few given runs, with their histories where the fidelity has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from mmrjax import channels, fidelities, ground, outputs, stages
+from mmrjax.channels import Channel
+from mmrjax.fidelities.base import History, Run
+from mmrjax.fidelities.result import result
+from mmrjax.robot import Robot
+from mmrjax.signals import BATTERY_EMPTY, STATUSES
+from sweeps import capabilities
+from sweeps import config as configuration
+from sweeps.console import progress, say
+from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
+from sweeps.pages import words
+from sweeps.points import run, uncertainty
+from sweeps.skeleton import page
+from sweeps.store import RunFolder, open_folder
+
+_HISTORIES = 1000  # runs of which histories are kept
+_SHOWN = 6  # runs on the console
+#: Channels that histories of a shaft have in any case.
+OF_SHAFT = ("motor_speed", "output_angle")
+#: The same of a vehicle.
+OF_VEHICLE = ("speed",)
+#: Column of the largest current of all motors together in a run over time (not of the supply, which gives the duty's
+#: share of it).
+PEAK = "peak_current_A"
+#: Column of the time that a run's current may flow before its windings are at their limit.
+PERMISSIBLE = "permissible_time_s"
+
+
+def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
+    """Simulate runs of a file (its name), or one of options (by column); leave a run folder; returns the exit code.
+
+    Raises:
+        BadConfiguration: more runs than histories can be kept of.
+    """
+    file = load_robot(config)
+    robot = file.robot
+    if isinstance(given, str):
+        runs = read_runs(given, robot, measured=False, battery=config.battery)
+    else:
+        runs = one_run(robot, given, config.battery)
+    if fidelities.facts(config.model).histories and len(runs) > _HISTORIES:
+        raise BadConfiguration(
+            f"--runs: got {len(runs)} runs; --model {config.model} keeps at most {_HISTORIES} histories"
+        )
+    drawn = None if config.posterior is None else beside_robot(file)
+    with open_folder("simulate", config, robot, out, force, runs) as folder:
+        table, histories = _simulated(folder, robot, runs, config)
+        table[PERMISSIBLE] = permissible(robot, table)
+        notes = remarks(robot, table)
+        found = None
+        if drawn is not None and config.posterior is not None:
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            table |= found.columns
+        print_runs({key: value[:_SHOWN] for key, value in capabilities.of(robot, table).items()}, robot.channels)
+        for note in notes:
+            say(note)
+        if found is not None:
+            say(f"± one sd over {found.draws} robots drawn from the posterior; 95 % intervals are in runs.csv")
+            uncertainty.say_lost(found)
+        if len(runs) > _SHOWN:
+            say(f"... and {len(runs) - _SHOWN} more in runs.csv")
+        further: dict[str, Any] = {"notes": notes}
+        if histories is not None and robot.has_ground:
+            further["starts"] = starts(robot, histories, runs)
+        if PEAK in table:
+            further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
+        result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
+        shown = page("runs", file, model=config.model, runs=table, histories=histories)
+        return run.leave(folder, config, result, shown)
+
+
+def _simulated(
+    folder: RunFolder, robot: Robot, runs: records.Runs, config: configuration.Simulate
+) -> tuple[dict[str, np.ndarray], Run | None]:
+    """The table of the runs; where the fidelity keeps them over time these are written, and returned too."""
+    fidelity = fidelities.get(config.model)
+    if fidelity.histories is None:
+        return run.evaluate(robot, runs, config, folder), None
+    conditions = run.commanded(robot, runs, config)
+    run.refuse(robot, conditions, config)
+    with progress(len(runs), quiet=not fidelity.facts.slow) as advance:
+        told = run.shares(advance, len(runs))
+        batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
+        told(1.0)
+    assert batch.history is not None  # the fidelity was asked for it
+    folder.write_table("history.csv", capabilities.of(robot, history_table(robot, batch.history, runs)))
+    if batch.history.reactions is not None:
+        folder.write_table("reactions.csv", reactions_table(batch.history, runs))
+    return {**run.conditions(robot, runs), **over_time(robot, batch)}, batch
+
+
+def over_time(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
+    """The columns of how runs that were kept over time ended, with what they came to.
+
+    Of a run whose battery went empty they are those of its last instant before, and `time_end_s` is when: the charge
+    left then over the current that took it.
+    """
+    history, status = batch.history, np.asarray(batch.result.status)
+    assert history is not None  # the fidelity was asked for it
+    columns = run.ended(robot, batch)
+    current, time = np.asarray(history.signals.total_current), np.asarray(history.time)
+    there = np.isfinite(current)
+    last = np.where(there.any(-1), there.shape[-1] - 1 - np.argmax(there[..., ::-1], -1), 0)
+    rows = np.arange(len(last))
+    motors = float(robot.sides) * np.asarray(history.signals.current)
+    columns[PEAK] = np.abs(np.where(there, motors, 0.0)).max(-1)
+    columns["displacement_m"], columns["time_end_s"] = np.array(history.distance)[rows, last], time[rows, last]
+    empty = (status == BATTERY_EMPTY) & ~there[rows, -1]
+    if empty.any():
+        signals = jax.tree.map(lambda x: np.asarray(x)[rows, last], history.signals)
+        at_last = outputs.columns(jax.device_get(result(robot, signals, jnp.asarray(status))), robot.channels)
+        for name, values in at_last.items():
+            columns[name] = np.where(empty & there.any(-1), values, columns[name])
+        after = time[rows, np.minimum(last + 1, there.shape[-1] - 1)] - time[rows, last]
+        draws = np.asarray(robot.battery.current(signals.total_current))
+        left = (float(robot.battery.capacity) - signals.discharge) / np.where(draws > 0, draws, np.nan)
+        left = np.where(empty & there.any(-1), np.clip(np.nan_to_num(left), 0.0, after), 0.0)
+        columns["time_end_s"] = columns["time_end_s"] + left
+        columns["displacement_m"] = np.nan_to_num(columns["displacement_m"] + left * np.nan_to_num(signals.speed))
+    return columns
+
+
+def permissible(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+    """How long the current of each run may flow from ambient temperature [s]; inf for ever, NaN without a current."""
+    current = amperes(robot, table)
+    known = np.isfinite(current)
+    time = jax.vmap(robot.motor.time_permissible)(jnp.asarray(np.where(known, current, 0.0)))
+    return np.where(known, np.asarray(time), np.nan)
+
+
+def amperes(robot: Robot, table: dict[str, np.ndarray]) -> np.ndarray:
+    """Size of the current of one motor [A], NaN where no column tells it."""
+    for column, motors in (("total_current_A", float(robot.sides)), ("motor_current_A", 1.0)):
+        if column in table:
+            return np.asarray(np.abs(np.asarray(table[column])) / motors)
+    return np.full(len(table["status"]), np.nan)
+
+
+def remarks(robot: Robot, table: dict[str, np.ndarray]) -> list[str]:
+    """What the numbers of the runs do not say by themselves, a sentence each, of a few runs at most."""
+    said: list[str] = []
+    several = len(table["status"]) > 1
+    times = table[PERMISSIBLE] if PERMISSIBLE in table else permissible(robot, table)
+    for k, status in enumerate(table["status"]):
+        name = f"run {k + 1}: " if several else ""
+        flags, cell = str(table["flags"][k]).split(";"), float(table["voltage_cell_V"][k])
+        if "overvoltage" in flags:
+            back = -float(robot.battery.current(table["total_current_A"][k]))
+            said.append(
+                f"{name}overvoltage: {back:.2f} A flow into the battery, a cell at {cell:.2f} V, where "
+                f"{robot.battery.voltage_charge:g} V is the highest to charge it with"
+            )
+        if "cut_off" in flags:
+            said.append(
+                f"{name}cut_off: a cell at {cell:.2f} V, below its cut-off voltage of "
+                f"{robot.battery.voltage_cutoff:g} V"
+            )
+        if "winding_hot" in flags:
+            limit, ambient = robot.motor.temperature_limit, float(robot.motor.temperature_ambient)
+            said.append(
+                f"{name}winding_hot: {limit:g} °C are reached after {float(times[k]):.3g} s at this "
+                f"current, from {ambient:g} °C"
+            )
+        if np.isinf(table["winding_settled_C"][k]) and capabilities.thermal(robot):
+            current = float(amperes(robot, table)[k])
+            said.append(
+                f"{name}winding, long running: {words.NONE_SETTLES} at {current:.2f} A a motor, as resistance "
+                "rises faster than its heat leaves; it stays permissible up to "
+                f"{float(robot.motor.current_continuous):.2f} A"
+            )
+        if status == "battery_empty" and "time_end_s" in table:
+            when, far = float(table["time_end_s"][k]), float(table["displacement_m"][k])
+            said.append(
+                f"{name}battery_empty: after {when:.1f} s and {far:.2f} m; the numbers are those just before"
+                if when > 0
+                else f"{name}battery_empty: empty before the start"
+            )
+    return said[:_SHOWN] + ([f"... and {len(said) - _SHOWN} more remarks"] if len(said) > _SHOWN else [])
+
+
+def _names(runs: records.Runs) -> np.ndarray:
+    return runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
+
+
+def history_table(robot: Robot, history: History, runs: records.Runs) -> dict[str, np.ndarray]:
+    """Time histories of a batch as one table, a row a sample; the columns that series are read with."""
+    signals = history.signals
+    of_rig = {*robot.rig.channels, *(OF_VEHICLE if robot.has_ground else OF_SHAFT)}
+    shown = [c for c in channels.EVERY if c.over_time and c.name in of_rig]
+    return {
+        "run_id": np.repeat(_names(runs), history.time.shape[-1]),
+        "time_s": np.ravel(history.time),
+        **{c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown},
+        "theoretical_speed_mm_s": np.ravel(signals.speed_theoretical) / channels.MM,
+        "slip": np.ravel(ground.slip(signals.speed, signals.speed_theoretical)),
+        "displacement_m": np.ravel(history.distance),
+        "voltage_V": np.ravel(signals.voltage),
+        "traction_N": float(robot.sides) * np.ravel(signals.traction),
+    }
+
+
+def starts(robot: Robot, batch: Run, runs: records.Runs) -> list[dict[str, Any]]:
+    """Of each run from standstill its stages, their slip (33) and the acceleration time; no stages where it does not
+    get under way."""
+    assert batch.history is not None  # the fidelity was asked for it
+    found = stages.of_histories(robot, batch.history, runs.configurations(robot))
+    nothing: dict[str, Any] = {"stages": [], "acceleration_time_s": None, "slip_over_acceleration": None}
+    under_way = [STATUSES[int(s)] in words.UNDER_WAY for s in np.asarray(batch.result.status)]
+    return [
+        {"run_id": str(name), **(s.to_json() if s is not None and goes else nothing)}
+        for name, s, goes in zip(_names(runs), found, under_way, strict=True)
+    ]
+
+
+def reactions_table(history: History, runs: records.Runs) -> dict[str, np.ndarray]:
+    """Loads inside one side's running gear over time [N], a row a sample."""
+    loads = history.reactions
+    assert loads is not None  # the fidelity resolves them
+    table = {
+        "run_id": np.repeat(_names(runs), history.time.shape[-1]),
+        "time_s": np.ravel(history.time),
+        "guide_N": np.ravel(loads.guided.sum(-1)),
+        "front_N": np.ravel(loads.support[..., 0]),
+        "rear_N": np.ravel(loads.support[..., 1]),
+        "centrifugal_tension_N": np.ravel(loads.centrifugal),
+    }
+    for name in ("grouser", "tension"):
+        values = getattr(loads, name)
+        table |= {f"{name}_{k + 1:02d}_N": values[..., k].ravel() for k in range(values.shape[-1])}
+    return table
+
+
+def print_runs(table: dict[str, np.ndarray], shown: Sequence[Channel]) -> None:
+    """Operating points, one a column."""
+    rows = {
+        "configuration": ("configuration", ""), "supply_voltage_V": ("supply voltage [V]", "g"),
+        **({} if "supply_voltage_V" in table else {"motor_speed_rpm": ("motor speed [rpm]", ".1f")}),
+        "total_mass_kg": ("total mass [kg]", "g"), "slope_deg": ("slope [deg]", "g"),
+        **{c.column: (f"{c.label} [{c.unit}]", f".{c.resolution}f") for c in shown},
+        PEAK: ("peak current, all motors [A]", ".1f"), "displacement_m": ("displacement [m]", ".2f"),
+        "time_end_s": ("time [s]", ".6g"), "voltage_cell_V": ("voltage of a cell [V]", ".3f"),
+        "slip": ("slip", ".4f"),
+        "power_supply_W": ("power from supply P_e [W]", ".2f"), "power_motor_W": ("at motor shafts N_d [W]", ".2f"),
+        "power_gear_W": ("at gearbox outputs N_r [W]", ".2f"), "power_ground_W": ("to the ground N_t [W]", ".2f"),
+        "winding_settled_C": ("winding, long running [°C]", ".0f"),
+        PERMISSIBLE: ("permissible at this current for [s]", ".3g"), "adhesion_used": ("adhesion used", ".3f"),
+        "status": ("status", ""), "flags": ("limits exceeded", ""),
+    }  # fmt: skip
+    printed = Table(show_header=False)
+    absent = {"supply_voltage_V": "battery"}
+    for key, (heading, form) in rows.items():
+        if key not in table or (key == "voltage_cell_V" and not np.nan_to_num(table[key]).any()):
+            continue
+        cells = [
+            str(v).replace(";", "\n") if not form
+            else absent.get(key, "-") if v != v
+            else (words.FOR_EVER if key == PERMISSIBLE else words.NONE_SETTLES) if np.isinf(v)
+            else format(v, form)
+            for v in table[key]
+        ]  # fmt: skip
+        if form and key + uncertainty.SD in table:
+            digits = int(form.strip(".f"))
+            pairs = zip(table[key], table[key + uncertainty.SD], strict=True)
+            cells = ["-" if v != v else uncertainty.with_sd(v, sd, digits) for v, sd in pairs]
+        printed.add_row(heading, *cells)
+    say(printed)
+    for status in dict.fromkeys(table["status"]):
+        if status != STATUSES[0]:
+            say(f"{status}: {words.STATUSES[status].why}")

@@ -1,0 +1,145 @@
+"""Options of the command line made of the fields of configurations, which state all that is said of them."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sweeps import config
+from sweeps.config import Part
+
+#: Units that names of fields end with.
+UNITS = ("s", "V", "rpm", "kg", "deg", "mAh")
+_TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
+_LISTS = {"number": str, "string": list[str]}  # an axis is one text
+
+
+def facts(kind: type[Part]) -> dict[str, dict[str, Any]]:
+    """What the schema of a configuration says of each field, in the order of its parts, its own first."""
+    schema = kind.model_json_schema()["properties"]
+    own = [name for part in kind.__mro__ if issubclass(part, Part) for name in vars(part).get("__annotations__", {})]
+    found = {}
+    for name in dict.fromkeys(n for n in own if n in schema):
+        stated = schema[name]
+        given: dict[str, Any] = next((a for a in stated.get("anyOf", ()) if a.get("type") != "null"), {})
+        found[name] = {**given, **stated}
+    return found
+
+
+def flag(name: str, fact: Mapping[str, Any]) -> str:
+    """The option of a field: `--discharge` of `discharge_mAh`."""
+    stem, _, unit = name.rpartition("_")
+    return str(fact.get("flag") or "--" + (stem if unit in UNITS else name).replace("_", "-"))
+
+
+def flags(kind: type[Part]) -> dict[str, str]:
+    """The option of each field."""
+    return {name: flag(name, fact) for name, fact in facts(kind).items()}
+
+
+def described(name: str, fact: Mapping[str, Any]) -> str:
+    """Meaning, unit, choices, bounds and default of a field, as a help text has them."""
+    unit = name.rpartition("_")[2]
+    texts = [str(fact.get("description", name)).rstrip(".")]
+    if unit in UNITS and f"({unit})" not in texts[0]:
+        texts[0] += f" ({unit})"
+    if "enum" in fact:
+        texts[0] += f": {', '.join(map(str, fact['enum']))}"
+    texts[0] += "."
+    texts += [f"\\[{text}]" for text in (_bounds(fact), _default(name, fact)) if text]
+    return "  ".join(texts)
+
+
+def _bounds(fact: Mapping[str, Any]) -> str:
+    of = {**fact.get("items", {}), **fact}
+    ends = [f"{of[key]:.10g}" if key in of else "" for key in ("minimum", "maximum")]
+    if all(ends):
+        return " to ".join(ends)
+    words = {"minimum": "at least", "exclusiveMinimum": "above", "maximum": "at most", "exclusiveMaximum": "below"}
+    return ", ".join(f"{word} {of[key]:.10g}" for key, word in words.items() if key in of)
+
+
+def _default(name: str, fact: Mapping[str, Any]) -> str:
+    value = fact.get("usual", fact.get("default"))
+    if isinstance(value, bool):
+        return "default: " + flag(name, fact).removeprefix("--") if value else ""
+    if isinstance(value, list):
+        value = ",".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value)
+    return (
+        "" if value in (None, "", {}) else f"default: {value:g}" if isinstance(value, float) else f"default: {value}"
+    )
+
+
+def parameters(kind: type[Part], arguments: tuple[str, ...] = ()) -> Iterator[inspect.Parameter]:
+    """A parameter of a command's function for each field that can be chosen, None where it is not given.
+
+    Args:
+        arguments: fields that are arguments and not options.
+    """
+    for name, fact in facts(kind).items():
+        if "const" in fact:  # one choice is none
+            continue
+        if name in arguments:
+            told: Any = typer.Argument(metavar=fact["metavar"], help=described(name, fact))
+        else:
+            word = flag(name, fact)
+            pair = fact.get("type") == "boolean" and fact.get("default") is not False
+            names = f"{word}/--no-{word.removeprefix('--')}" if pair else word
+            told = typer.Option(names, help=described(name, fact), hidden=bool(fact.get("solver")))
+        yield inspect.Parameter(
+            name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[_type(fact) | None, told]
+        )
+
+
+def _type(fact: Mapping[str, Any]) -> Any:
+    if fact.get("format") == "path":
+        return Path
+    return _LISTS[fact["items"]["type"]] if fact["type"] == "array" else _TYPES[fact["type"]]
+
+
+def taken(kind: type[Part], values: dict[str, Any]) -> dict[str, Any]:
+    """Takes what was given for the fields of a configuration out of the values of a command, and reads their texts.
+
+    Raises:
+        BadConfiguration: an axis or a change that cannot be read.
+    """
+    return {name: _read(name, fact, values.pop(name, None)) for name, fact in facts(kind).items()}
+
+
+def _read(name: str, fact: Mapping[str, Any], value: Any) -> Any:
+    if value is None:
+        return None
+    if fact["type"] == "object":
+        return config.settings(value)
+    if fact["type"] == "array" and fact["items"]["type"] == "number":
+        return config.axis(flag(name, fact), value)
+    if fact["type"] == "array":
+        return (tuple(value) or None) if fact.get("verbatim") else config.words(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def help_all(kinds: tuple[type[Part], ...]) -> Iterator[inspect.Parameter]:
+    """The option that shows those of solvers too, where a command has any."""
+    hidden = [flag(name, fact) for kind in kinds for name, fact in facts(kind).items() if fact.get("solver")]
+    if hidden:
+        told = typer.Option(
+            "--help-all", is_eager=True, callback=_show_all,
+            help=f"Show this with {', '.join(hidden)} too, which \\[solver] of --config may state.",
+        )  # fmt: skip
+        kind = inspect.Parameter.KEYWORD_ONLY
+        yield inspect.Parameter("help_all", kind, default=False, annotation=Annotated[bool, told])
+
+
+def _show_all(context: typer.Context, wanted: bool) -> None:
+    if wanted:
+        shown = copy.copy(context.command)
+        shown.params = [copy.copy(p) for p in shown.params]
+        for p in shown.params:
+            p.hidden = False  # type: ignore[attr-defined]  # of an option
+        typer.echo(shown.get_help(context))
+        raise typer.Exit

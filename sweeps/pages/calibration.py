@@ -1,0 +1,55 @@
+"""The report of a calibration: one offline page with its parameters, errors and figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calibration.data.columns import Layout
+from calibration.inference.identifiability import HELD
+from calibration.inference.result import CalibrationResult
+from sweeps.pages import calibration_figures, cluster_figures, comparison_figures
+from sweeps.pages.page import Album, columns, conditions, first_rows, render, rms, words_shown
+
+
+def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
+    """Write `report.html` and `figures/` for a calibration.
+
+    Args:
+        folder: an existing run folder.
+        robot_name: name or file of the robot that was calibrated.
+
+    Returns:
+        The path of the page.
+    """
+    table = found.rows()
+    table |= {f"simulated_{c.column}": table[f"after_{c.column}"] for c in found.channels}
+    album = Album(folder)
+    album.add("parameters", lambda: calibration_figures.parameters(found))
+    album.add("before_after", lambda: calibration_figures.before_after(found))
+    if found.axis:
+        album.add("histories", lambda: calibration_figures.histories(table, found.channels))
+    along = {found.axis: "time [s]"} if found.axis else {}
+    sized = Layout.of(found.robot).crosses_zero
+    album.add("parity", lambda: comparison_figures.parity(table, found.channels, band=not sized))
+    album.add("residuals", lambda: comparison_figures.errors_over(table, found.channels, sized, along))
+    if found.residual_clusters:
+        album.add("clusters", lambda: cluster_figures.clusters(found.residual_clusters))
+    if found.profiled:
+        album.add("profiles", lambda: calibration_figures.profiles(found))
+    album.add("correlations", lambda: calibration_figures.correlations(found))
+    return render(
+        folder,
+        "calibration.html.j2",
+        album,
+        of_channels=found.channels,
+        title=f"Calibration of {words_shown(Path(robot_name).name)} to {Path(found.source).name}",
+        document=found.to_json(),
+        rows=first_rows(table),
+        conditions=conditions(table),
+        columns=columns(found.channels),
+        sized=sized,
+        has_ground=found.robot.has_ground,
+        rms=rms(table, found.channels, ("before", "after", "held_out")),
+        held=HELD,
+        shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
+    )

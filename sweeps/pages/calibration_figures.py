@@ -1,0 +1,128 @@
+"""Figures of a calibration: parameters against their priors, profiles, correlations, errors seen and unseen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibration.inference import blocks
+from calibration.inference.identifiability import Z95
+from calibration.inference.result import CalibrationResult
+from mmrjax.channels import Channel
+from sweeps.pages.figure_style import BLUE, FAINT, INK, ORANGE, VERMILION, axis_label, figure, short
+
+#: Runs of which histories are drawn.
+HISTORIES = 6
+
+
+def parameters(found: CalibrationResult) -> Figure:
+    """Where each parameter lies in prior sds, with its 95 % interval, over the prior's own."""
+    fig, grid = figure(1, 1, 1.1 + 0.32 * len(found.parameters))
+    axes = grid[0, 0]
+    axes.axvspan(-Z95, Z95, color="#eeeeee", lw=0, zorder=0)
+    axes.axvline(0, color=FAINT, lw=0.9)
+    for row, p in enumerate(found.parameters.values()):
+        colour = FAINT if p.held_by_prior else BLUE
+        axes.plot(p.interval_shift, [row, row], color=colour, lw=2.4, solid_capstyle="butt")
+        axes.plot(p.shift, row, "o", color=colour, ms=6)
+        words = f"{p.value:.3g} {p.unit}".removesuffix(" -")
+        axes.text(1.01, row, words, transform=axes.get_yaxis_transform(), va="center", fontsize=8.5, color=INK)
+    axes.set_yticks(range(len(found.parameters)), [short(n) for n in found.parameters])
+    axes.set(xlabel="shift from the prior [prior sds]")
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set_title("grey: held by its prior; band: the prior's 95 %")
+    return fig
+
+
+def profiles(found: CalibrationResult) -> Figure:
+    """Profile likelihood of each parameter: rise of the objective over its value, with the 95 % level."""
+    profiled = [(name, p, p.profile) for name, p in found.parameters.items() if p.profile is not None]
+    rows = -(-len(profiled) // 4)
+    fig, grid = figure(rows, 4, 2.1 * rows, sharey=True)
+    for axes in grid.flat[len(profiled) :]:
+        axes.set_visible(False)
+    for axes, (name, p, profile) in zip(grid.flat, profiled, strict=False):
+        near = profile.rise < 12
+        axes.axhline(Z95**2, color=ORANGE, lw=1)
+        axes.axvspan(*p.interval, color="#e3eef7", lw=0, zorder=0)
+        axes.plot(profile.value[near], profile.rise[near], "o-", ms=3, color=BLUE)
+        axes.axvline(p.value, color=INK, lw=0.9)
+        axes.plot(p.prior.median, 0.3, "^", color=VERMILION, ms=6, clip_on=False)
+        axes.set_title(short(name), fontsize=9)
+        axes.set_xlabel(f"[{p.unit}]")
+        axes.set_ylim(0, 10)
+        axes.locator_params(axis="x", nbins=4)
+    for row in grid:
+        row[0].set_ylabel("rise [σ²]")
+    fig.supxlabel("black: the optimum; shaded: its 95 % interval; triangle: the prior's median", fontsize=8.5)
+    return fig
+
+
+def correlations(found: CalibrationResult) -> Figure:
+    """Posterior correlation of every pair of parameters, and the singular values."""
+    names = [short(n) for n in found.identifiability.names]
+    fig, grid = figure(1, 2, 1.6 + 0.36 * len(names), width_ratios=[1.7, 1.0])
+    left, right = grid[0]
+    c = found.identifiability.correlation
+    image = left.imshow(c, cmap=matplotlib.colormaps["RdBu_r"], vmin=-1, vmax=1)
+    left.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=8.5)
+    left.set_yticks(range(len(names)), names, fontsize=8.5)
+    left.grid(visible=False)
+    for i in range(len(names)):
+        for j in range(i):
+            if abs(c[i, j]) > 0.3:
+                left.text(j, i, f"{c[i, j]:.2f}".replace("0.", "."), ha="center", va="center", fontsize=7.5,
+                          color="white" if abs(c[i, j]) > 0.7 else INK)  # fmt: skip
+    fig.colorbar(image, ax=left, shrink=0.8, label="correlation")
+    s = np.maximum(found.identifiability.singular_values, 1e-6)
+    right.semilogy(np.arange(1, len(s) + 1), s, "o-", color=BLUE)
+    right.axhline(1.0, color=ORANGE, lw=1)
+    right.text(len(s), 1.1, "below: the prior says more", fontsize=8.5, ha="right", va="bottom")
+    right.set_xticks(np.arange(1, len(s) + 1, 2))
+    right.set(xlabel="direction", ylabel="singular value (prior sd / data sd)")
+    right.set_title("what the data tell apart")
+    return fig
+
+
+def before_after(found: CalibrationResult) -> Figure:
+    """rms errors by channel: before, fitted, and with each kind of block held out."""
+    lines = {"before": found.errors_before, "fitted": found.errors_after}
+    lines |= {f"held out: {blocks.in_words(kind, ' + ')}": held.errors for kind, held in found.held_out.items()}
+    fig, grid = figure(1, len(found.channels), 1.1 + 0.36 * len(lines), sharey=True)
+    for axes, channel in zip(grid[0], found.channels, strict=True):
+        most = int(np.isfinite(found.readings[channel.name].measured).sum())
+        for row, (words, by) in enumerate(lines.items()):
+            errors = by[channel.name]
+            colour = FAINT if words == "before" else BLUE if words == "fitted" else ORANGE
+            if errors.rows:
+                axes.barh(row, errors.rms_percent, color=colour, height=0.62)
+                missing = "" if errors.rows == most else f" ({errors.rows} of {most} rows)"
+                axes.text(errors.rms_percent, row, f" {errors.rms_percent:.1f}{missing}", va="center", fontsize=8.5)
+            else:
+                axes.text(0, row, " no row reached" if most else " no readings", va="center", fontsize=8.5)
+        axes.set_title(channel.label)
+        axes.set_xlabel("rms error [%]")
+        axes.margins(x=0.55)
+        axes.grid(axis="y", visible=False)
+    grid[0, 0].set_yticks(range(len(lines)), list(lines))
+    grid[0, 0].invert_yaxis()
+    return fig
+
+
+def histories(table: dict[str, np.ndarray], channels: Sequence[Channel]) -> Figure:
+    """Time histories: measured dots and the fitted line, a row of panels for each run (six at most)."""
+    names = list(dict.fromkeys(table["run_id"]))[:HISTORIES] if "run_id" in table else [None]
+    fig, grid = figure(len(names), len(channels), 2.2 * len(names))
+    for row, name in zip(grid, names, strict=True):
+        pick = np.ones(len(table["time_s"]), bool) if name is None else table["run_id"] == name
+        order = np.flatnonzero(pick)[np.argsort(table["time_s"][pick])]
+        for axes, channel in zip(row, channels, strict=True):
+            axes.plot(table["time_s"][order], table[channel.column][order], "o", ms=3, color=INK)
+            axes.plot(table["time_s"][order], table[f"after_{channel.column}"][order], color=BLUE)
+            axes.set(xlabel="time [s]", ylabel=axis_label(channel))
+        row[0].set_title(name or "the run")
+    return fig

@@ -1,0 +1,118 @@
+"""The page of a sweep into a store: how the points ended, what came out, and what it follows."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mmrjax import signals
+from mmrjax.variation import STATUS
+from sweeps.pages import campaign_figures, words
+from sweeps.pages.campaign_figures import Varied
+from sweeps.pages.page import Album, named, render
+from sweeps.points.zarr_store import STORE, Layout
+
+if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
+
+#: Points, and chunks that they come from, that figures and quantiles are made of; outputs that are drawn.
+THINNED, CHUNKS, DRAWN = 200_000, 100, 6
+
+
+def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any]) -> Path:
+    """Write `report.html` and `figures/` for a store whose every chunk is done.
+
+    Args:
+        folder: that holds the store; file: of the robot that was varied.
+        result: `result.json`.
+    """
+    values, found = thinned(folder / STORE, layout)
+    album = Album(folder)
+    known = layout.coordinates
+    settled = np.isin(found[STATUS], signals.DONE)
+    rows = []
+    for variable in layout.variables:
+        if "units" not in variable.attributes:
+            continue
+        name, unit, label = variable.name, variable.attributes["units"], variable.attributes["long_name"]
+        usable = settled & np.isfinite(found[name])
+        numbers = found[name][usable].astype(float)
+        quantiles = np.quantile(numbers, (0.05, 0.5, 0.95)) if len(numbers) else np.full(3, np.nan)
+        extremes = result["outputs"][name]
+        ends = {key: np.nan if extremes[key] is None else extremes[key] for key in ("least", "greatest")}
+        rows.append({"name": name, "label": label, "unit": unit, **ends, "quantiles": quantiles.tolist()})
+        if len(numbers) and len(album.pictures) < DRAWN:
+            varied = {
+                n: Varied(values[usable, k], _label(n, known[n].get("units", "")), layout.labels.get(n, ()))
+                for k, n in enumerate(layout.design.names)
+            }
+            drawing = partial(campaign_figures.spread, numbers, f"{label} [{unit}]", varied)
+            album.add(f"spread_{name}", drawing)
+    total = result["points"]
+    statuses = [
+        {"name": s, "count": n, "percent": 100 * n / total, "meaning": words.meaning(s)}
+        for s, n in result["statuses"].items()
+        if n
+    ]
+    return render(
+        folder,
+        "campaign.html.j2",
+        album,
+        title=f"Sweep of {total:,} points",
+        model=result["model"],
+        total=total,
+        status=statuses,
+        varied=_varied(layout, values),
+        outputs=rows,
+        thinned=len(values),
+        **named(file),
+    )
+
+
+def _label(name: str, unit: str) -> str:
+    return name if unit in ("", "1") else f"{name} [{unit}]"
+
+
+def thinned(store: Path, layout: Layout) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Some of the points, at random and always the same ones.
+
+    Returns:
+        Values of what varies, shape (points, names), and outputs by name.
+    """
+    import zarr
+
+    group: Any = zarr.open_group(store, mode="r")
+    rng, blocks = np.random.default_rng(0), layout.blocks
+    chunks = np.sort(rng.permutation(len(blocks))[:CHUNKS])
+    each = -(-THINNED // len(chunks))
+    values: list[np.ndarray] = []
+    found: dict[str, list[np.ndarray]] = {v.name: [] for v in layout.variables}
+    for chunk in map(int, chunks):
+        box, count = blocks.box(chunk), blocks.count(chunk)
+        rows = np.sort(rng.permutation(count)[:each]) if count > each else np.arange(count)
+        values.append(layout.design.block(box)[rows])
+        for variable in layout.variables:
+            found[variable.name].append(group[variable.name][box].ravel()[rows])
+    return np.concatenate(values), {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def _varied(layout: Layout, values: np.ndarray) -> list[dict[str, Any]]:
+    """What varies, in words, a row a name."""
+    rows = []
+    for k, name in enumerate(layout.design.names):
+        about = layout.coordinates[name]
+        axis, labels = layout.design.axes.get(name), layout.labels.get(name)
+        if axis is None:
+            low, high = values[:, k].min(), values[:, k].max()
+            text = f"{layout.design.shape[-1]:,} samples, {low:.4g} to {high:.4g}"
+        elif labels is not None:
+            text = ", ".join(labels[int(v)] for v in axis)
+        elif len(axis) <= 8:
+            text = ", ".join(f"{v:.4g}" for v in axis)
+        else:
+            text = f"{axis.min():.4g} to {axis.max():.4g}, {len(axis):,} values"
+        rows.append({"name": name, "meaning": about["long_name"], "unit": about.get("units", ""), "values": text})
+    return rows

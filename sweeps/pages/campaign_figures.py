@@ -1,0 +1,101 @@
+"""Figures of a sweep into a store: how an output spreads, and how it follows what varies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+
+from sweeps.pages.figure_style import BLUE, figure, note, short
+
+#: Bins of a histogram, and along a name at most.
+BARS, BINS = 40, 24
+#: Points of a bin below which its median says nothing.
+FEW = 5
+
+
+class Varied(NamedTuple):
+    """Values of a name at the points drawn, its label with the unit, and words of the values where they have some."""
+
+    values: np.ndarray
+    label: str
+    words: tuple[str, ...] = ()
+
+
+def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figure:
+    """Histogram of an output, its median over the two names that it follows most, and over both together.
+
+    Args:
+        output: of the points that settled; label: with its unit.
+        varied: by name, at these points.
+    """
+    names = sorted(varied, key=lambda name: -share(varied[name].values, output))[:2]
+    fig, ((histogram, *others),) = figure(1, 2 + len(names) if len(names) == 2 else 2, 2.9)
+    histogram.hist(output, bins=BARS, color=BLUE)
+    histogram.set(xlabel=label, ylabel="points", title="how often")
+    for axes, name in zip(others, names, strict=False):
+        _band(axes, varied[name].values, output)
+        axes.set(xlabel=varied[name].label, ylabel=label, title=f"over {short(name)}")
+        _ticks(axes.xaxis, varied[name])
+    if len(names) == 2:
+        _map(fig, others[2], varied[names[0]], varied[names[1]], output, label)
+    return fig
+
+
+def bins(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bin of each value, and the bins' middles: its levels where there are few, else equal numbers of points."""
+    levels = np.unique(values)
+    if len(levels) <= BINS:
+        return np.searchsorted(levels, values), levels
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2), (edges[1:] + edges[:-1]) / 2
+
+
+def share(values: np.ndarray, output: np.ndarray) -> float:
+    """Share of an output's variance that lies between the bins of a name: its first-order index, roughly."""
+    which, middles = bins(values)
+    count = np.bincount(which, minlength=len(middles))
+    mean = np.bincount(which, output, minlength=len(middles)) / np.maximum(count, 1)
+    total = float(np.var(output))
+    return float(np.sum(count * (mean - output.mean()) ** 2) / len(output) / total) if total > 0 else 0.0
+
+
+def _band(axes: Axes, values: np.ndarray, output: np.ndarray) -> None:
+    which, middles = bins(values)
+    known = [k for k in range(len(middles)) if np.sum(which == k) >= FEW]
+    quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in known]).reshape(-1, 3)
+    axes.fill_between(middles[known], quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
+    axes.plot(middles[known], quantiles[:, 1], color=BLUE)
+    note(axes, f"{100 * share(values, output):.0f} % of the variance")
+
+
+def _ticks(axis: Axis, varied: Varied) -> None:
+    if varied.words:
+        axis.set_ticks(range(len(varied.words)), labels=list(varied.words))
+
+
+def _map(
+    fig: Figure,
+    axes: Axes,
+    one: Varied,
+    other: Varied,
+    output: np.ndarray,
+    label: str,
+) -> None:
+    (a, across), (b, along) = bins(one.values), bins(other.values)
+    cells = np.full((len(along), len(across)), np.nan)
+    cell = b * len(across) + a
+    order = np.argsort(cell, kind="stable")
+    numbers, first = np.unique(cell[order], return_index=True)
+    for number, values in zip(numbers, np.split(output[order], first[1:]), strict=True):
+        cells.flat[number] = np.median(values)
+    drawn = axes.pcolormesh(across, along, cells, shading="nearest", cmap="viridis", rasterized=True)
+    fig.colorbar(drawn, ax=axes, label=f"median {label}")
+    axes.set(xlabel=one.label, ylabel=other.label, title="over both")
+    _ticks(axes.xaxis, one)
+    _ticks(axes.yaxis, other)
+    axes.grid(False)

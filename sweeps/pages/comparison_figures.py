@@ -1,0 +1,117 @@
+"""Figures of a comparison with measured runs: parity, and errors over each condition."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mmrjax.channels import Channel
+from sweeps.pages.figure_style import axis_label, figure, looks, note
+
+
+def parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band: bool = True) -> Figure:
+    """Simulated over measured, one panel a channel; a reading that is missing is not drawn.
+
+    Args:
+        band: whether ±5 % are shaded.
+    """
+    fig, grid = figure(1, len(channels), 3.6)
+    look = looks(table["configuration"])
+    for axes, channel in zip(grid[0], channels, strict=True):
+        measured, simulated = table[channel.column], table[f"simulated_{channel.column}"]
+        both = np.isfinite(measured) & np.isfinite(simulated)
+        ends = np.concatenate([measured[both], simulated[both]]) if both.any() else np.array([0.0, 1.0])
+        low, high = min(0.0, float(ends.min())), max(0.0, float(ends.max()))
+        span = np.array([low - 0.05 * (high - low) * (low < 0), high + 0.05 * (high - low)])
+        if band:
+            axes.fill_between(span, span * 0.95, span * 1.05, color="#eef3ee", lw=0)
+        axes.plot(span, span, color="#666666", lw=0.9)
+        for kind, (colour, marker) in look.items():
+            pick = both & (table["configuration"] == kind)
+            if pick.any():
+                axes.plot(
+                    measured[pick],
+                    simulated[pick],
+                    marker,
+                    ms=5,
+                    mec="white",
+                    mew=0.5,
+                    color=colour,
+                    label=kind,
+                    rasterized=bool(pick.sum() > 2000),
+                )
+        axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
+        axes.set_xlim(*span)
+        axes.set_ylim(*span)
+        if not both.any():
+            note(axes, "no row has both numbers")
+    if grid[0, 0].get_legend_handles_labels()[0]:
+        grid[0, 0].legend(loc="lower right")
+    if band:
+        note(grid[0, 0], "band: ±5 %")
+    return fig
+
+
+def errors_over(
+    table: dict[str, np.ndarray],
+    channels: Sequence[Channel],
+    in_units: bool = False,
+    beside: Mapping[str, str] | None = None,
+) -> Figure:
+    """Error (35) of each channel over each condition.
+
+    Args:
+        beside: further columns than conditions, with their words, where errors are in units.
+        in_units: errors in the unit of the channel instead, with a band of two sds where they are known; over those
+            conditions that vary.
+    """
+    every = {
+        "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]",
+        "payload_kg": "payload [kg]",
+    }  # fmt: skip
+    conditions = {c: words for c, words in every.items() if c in table and f"simulated_{c}" not in table}
+    if in_units:
+        conditions |= beside or {}
+        varied = {c: words for c, words in conditions.items() if np.unique(table[c]).size > 1}
+        conditions = varied or dict(list(conditions.items())[:1])
+    fig, grid = figure(len(channels), len(conditions), 2.3 * len(channels), sharex="col", sharey="row")
+    look = looks(table["configuration"])
+    for row, channel in zip(grid, channels, strict=True):
+        error = table[f"error_{channel.name}_percent"]
+        half = 5.0
+        if in_units:
+            error = table[f"simulated_{channel.column}"] - table[channel.column]
+            sd = table.get(channel.sd_column, np.array([np.nan]))
+            half = 2 * float(np.median(sd[np.isfinite(sd)])) if np.isfinite(sd).any() else 0.0
+        for axes, (condition, words) in zip(row, conditions.items(), strict=True):
+            axes.axhspan(-half, half, color="#eef3ee", zorder=0)
+            axes.axhline(0, color="#666666", lw=0.9)
+            levels = np.unique(table[condition])
+            shift = 0.012 * max(1e-9, float(np.ptp(levels))) if levels.size > 1 else 0.02
+            sides = np.linspace(-1, 1, len(look)) if len(look) > 1 else (0.0,)
+            for side, (kind, (colour, marker)) in zip(sides, look.items(), strict=True):
+                pick = (table["configuration"] == kind) & np.isfinite(error)
+                if pick.any():
+                    axes.plot(
+                        table[condition][pick] + side * shift,
+                        error[pick],
+                        marker,
+                        ms=5,
+                        mec="white",
+                        mew=0.5,
+                        color=colour,
+                        label=kind,
+                        rasterized=bool(pick.sum() > 2000),
+                    )
+            if row[0] is grid[-1, 0]:
+                axes.set_xlabel(words)
+                if levels.size <= 8:
+                    axes.set_xticks(levels)
+        row[0].set_ylabel(f"{channel.label}\nerror [{channel.unit if in_units else '%'}]")
+    for axes in grid[0]:
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(loc="best")
+            break
+    return fig

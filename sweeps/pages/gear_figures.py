@@ -1,0 +1,184 @@
+"""Figures of the resolved running gear: ripple in steady travel, grousers landing, normal reactions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from mmrjax.fidelities import ripple
+from mmrjax.signals import STATUSES
+from mmrjax.tables import PITCH_GROUSER, PITCH_TOOTH
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, figure, label_end, looks, note
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+TAIL = 0.3  # of a run at its end that is looked at for ripple [s]
+SHOWN = 0.15  # and drawn [s]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gear:
+    """One run of the track model.
+
+    Attributes:
+        name: heading; on_tracks: or on wheels; status; radius: of the pulleys [m].
+        time: [s]; signals, reactions: over it; guide_share: on average at the end [-].
+    """
+
+    name: str
+    on_tracks: bool
+    status: str
+    radius: float
+    time: np.ndarray
+    signals: Any
+    reactions: Any
+    guide_share: float
+
+    def tail(self, seconds: float) -> slice:
+        """The last `seconds` of the record."""
+        return slice(int(np.searchsorted(self.time, self.time[-1] - seconds)), None)
+
+    def settled_since(self, instant: float) -> bool:
+        """Whether from that instant [s] on there is enough of the run to look for ripple."""
+        return bool(instant <= self.time[-1] - TAIL)
+
+    @property
+    def rolls(self) -> bool:
+        """Whether it moved forward on its contacts to the end, so that there is a ripple to show."""
+        return self.status in ("converged", "not_settled", "slides")
+
+    @property
+    def period(self) -> float:
+        """Eq. (34) [s], at the mean speed of the driving pulley; the belt runs on the pulley on wheels too."""
+        speed = float(self.signals.speed_wheel[self.tail(TAIL)].mean())
+        return ripple.period_pitch(PITCH_GROUSER if self.on_tracks else PITCH_TOOTH, speed, self.radius)
+
+
+def gears(
+    robot: Robot,
+    history: Any,
+    status: np.ndarray,
+    guide_share: np.ndarray,
+    which: Sequence[int],
+    names: Sequence[str],
+) -> list[Gear]:
+    """Members of a batch of runs whose running gear is resolved.
+
+    Args:
+        history: time, signals and reactions of the batch; status: codes of how its members ended.
+        guide_share: of each member [-].
+        which: index of each member's configuration in `robot`; names: headings of the members.
+    """
+    import jax
+
+    answer = []
+    for k, name in enumerate(names):
+        on_tracks = float(robot.configurations.members[int(which[k])].on_tracks) > 0.5
+        over_time = (history.time, history.signals, history.reactions)
+        time, signals, reactions = jax.tree.map(lambda x, k=k: np.asarray(x[k]), over_time)
+        ended, share = STATUSES[int(status[k])], float(guide_share[k])
+        answer.append(Gear(name, on_tracks, ended, float(robot.radius_pulley), time, signals, reactions, share))
+    return answer
+
+
+def current_ripple(shown: list[Gear], title: str = "{}") -> tuple[Figure, list[dict[str, Any]]]:
+    """Total current at the end of each run, and what ripples by how much."""
+    fig, grid = figure(1, len(shown), 3.0)
+    look = looks(gear.name for gear in shown)
+    facts = []
+    for axes, gear in zip(grid[0], shown, strict=True):
+        last, tail, expected = gear.tail(SHOWN), gear.tail(TAIL), gear.period
+        time, current = gear.time[last], gear.signals.total_current[last]
+        axes.plot(1e3 * (time - time[0]), current, color=look[gear.name][0])
+        axes.axhline(current.mean(), color=FAINT, lw=0.9)
+        low, high = current.min(), current.max()
+        span = max(high - low, 1e-6)
+        axes.set(ylim=(low - 0.2 * span, high + 0.45 * span), xlabel="time [ms]", ylabel="total current [A]")
+        axes.ticklabel_format(axis="y", useOffset=False)
+        start = 1e3 * (time[int(np.argmax(current[: len(current) // 2]))] - time[0])
+        level = high + 0.12 * span
+        arrow = dict(arrowstyle="<->", color=INK, lw=1.0)
+        axes.annotate("", (start, level), (start + 1e3 * expected, level), arrowprops=arrow)
+        axes.text(start, level + 0.05 * span, f"{1e3 * expected:.1f} ms, eq. (34)", fontsize=8.5, va="bottom")
+        axes.set_title(title.format(gear.name))
+        of = gear.signals
+        drawn, travel, reaction = (
+            ripple.ripple(gear.time[tail], x[tail]) for x in (of.total_current, of.speed, of.normal)
+        )
+        facts.append(
+            {
+                "configuration": gear.name,
+                "pitch": "grousers, S_g = 35 mm" if gear.on_tracks else "teeth, S_t = 5 mm",
+                "period_ms": 1e3 * drawn.period,
+                "equation_ms": 1e3 * expected,
+                "current_percent": 100 * drawn.amplitude,
+                "speed_percent": 100 * travel.amplitude,
+                "reaction_percent": 100 * reaction.amplitude,
+                "guide_percent": 100 * gear.guide_share if gear.on_tracks else None,
+            }
+        )
+    return fig, facts
+
+
+def touchdown(gear: Gear, title: str = "grousers land (dotted)") -> Figure:
+    """Current of a run on tracks over time with touchdowns marked, above the load on each grouser."""
+    fig, grid = figure(2, 1, 5.0, sharex=True)
+    last = gear.tail(SHOWN)
+    time = 1e3 * (gear.time[last] - gear.time[last][0])
+    lands = ripple.touchdowns(time, gear.reactions.grouser[last], gear.reactions.place[last])
+    upper, lower = grid[:, 0]
+    upper.plot(time, gear.signals.total_current[last], color=BLUE)
+    upper.set(ylabel="total current [A]")
+    upper.set_title(title)
+    shades = (BLUE, ORANGE, GREEN)
+    loads = gear.reactions.grouser[last]
+    for j in range(loads.shape[1]):
+        bears = loads[:, j] > 0
+        if bears.any():
+            lower.plot(time, np.where(bears, loads[:, j], np.nan), color=shades[j % 3], lw=1.0)
+    lower.set(xlabel="time [ms]", ylabel="normal reaction of a grouser [N]", ylim=(0, None))
+    for axes in (upper, lower):
+        for instant in lands:
+            axes.axvline(instant, color=INK, lw=0.9, ls=":")
+    return fig
+
+
+def reactions(shown: list[Gear], title: str = "{}, one side") -> Figure:
+    """Normal reactions of one side: of all grousers and the lower guide on tracks, of both wheels on wheels."""
+    fig, grid = figure(1, len(shown), 3.2)
+    look = looks(gear.name for gear in shown)
+    for axes, gear in zip(grid[0], shown, strict=True):
+        last, colour = gear.tail(SHOWN), look[gear.name][0]
+        loads = gear.reactions
+        lines = (
+            {
+                "all grousers": (loads.grouser[last].sum(-1), colour),
+                "lower guide": (loads.guided[last].sum(-1), ORANGE),
+            }
+            if gear.on_tracks
+            else {
+                "both wheels": (loads.support[last].sum(-1), colour),
+                "front wheel": (loads.support[last, 0], BLUE),
+                "rear wheel": (loads.support[last, 1], GREEN),
+            }
+        )
+        time = 1e3 * (gear.time[last] - gear.time[last][0])
+        top = 0.0
+        for words, (values, shade) in lines.items():
+            axes.plot(time, values, color=shade, lw=1.4, alpha=0.9)
+            if not gear.on_tracks:
+                apart = {"front wheel": 7, "rear wheel": -7}.get(words, 0)  # they nearly coincide
+                label_end(axes, time, np.asarray(values), words, shade, offset=(5, apart))
+            top = max(top, float(np.max(values)))
+        axes.set(ylim=(0, 1.25 * top), xlabel="time [ms]", ylabel="normal reaction [N]")
+        axes.set_title(title.format(gear.name))
+        if gear.on_tracks:
+            note(axes, "orange: what the lower guide carries; above it: all grousers")
+        else:
+            axes.set_xlim(0, 1.3e3 * SHOWN)
+    return fig

@@ -1,0 +1,326 @@
+"""Figures of runs from standstill: current and speeds over time, the inrush marked, the stages of a start shaded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mmrjax import channels
+from mmrjax.channels import MM, Channel
+from mmrjax.stages import Stages, ending, numbers, of_histories
+from sweeps.pages import words
+from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, axis_label, figure, looks, note
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+INRUSH = 0.04  # s, shown enlarged
+_STAGES = (("I", "#fdebd0", "starting"), ("II", "#e3eef7", "slipping"), ("III", "#eaf5ea", "uniform"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """A run from standstill, with numbers up to its last finite sample.
+
+    Attributes:
+        name: heading; configuration; status.
+        time: [s]; current: of all motors [A]; speed, theoretical: V and r_k ω_k [mm/s].
+        stages: of the start; current and speeds are drawn, and kept here, times its `sense`. None without numbers.
+    """
+
+    name: str
+    configuration: str
+    status: str
+    time: np.ndarray
+    current: np.ndarray
+    speed: np.ndarray
+    theoretical: np.ndarray
+    stages: Stages | None
+
+    @property
+    def sense(self) -> float:
+        """In which the shafts turn at the end, 1 or -1."""
+        return 1.0 if self.stages is None else self.stages.sense
+
+    @property
+    def starting(self) -> float:
+        """End of stage I [s]."""
+        return 0.0 if self.stages is None else self.stages.starting
+
+    @property
+    def slipping(self) -> float:
+        """End of stage II [s]."""
+        return 0.0 if self.stages is None else self.stages.slipping
+
+    @property
+    def settled(self) -> float:
+        """t' [s]."""
+        return 0.0 if self.stages is None else self.stages.settled
+
+    @property
+    def gets_under_way(self) -> bool:
+        """Whether there are stages to tell apart."""
+        return self.status in words.UNDER_WAY
+
+    @property
+    def peak(self) -> float:
+        """Largest current [A], with the sign that it is drawn with."""
+        return float(self.current[int(np.argmax(np.abs(self.current)))])
+
+    @property
+    def ended(self) -> tuple[float, float]:
+        """Current [A] and speed [mm/s] at the end: the running gear may ripple, so the means over the last 0.15 s."""
+        last = ending(self.time)
+        return float(self.current[last].mean()), float(self.speed[last].mean())
+
+
+def starts(robot: Robot, history: Any, status: np.ndarray, which: Sequence[int], names: Sequence[str]) -> list[Start]:
+    """Members of a batch of runs from standstill, of any fidelity that has histories.
+
+    Args:
+        history: time and signals of the batch; status: codes of how its members ended.
+        which: index of each member's configuration in `robot`; names: headings of the members.
+    """
+    from mmrjax.signals import STATUSES
+
+    answer = []
+    for k, (name, found) in enumerate(zip(names, of_histories(robot, history, which[: len(names)]), strict=True)):
+        current = np.asarray(history.signals.total_current[k])
+        upto = slice(0, numbers(current))
+        speed, theoretical = (
+            np.asarray(x[k])[upto] for x in (history.signals.speed, history.signals.speed_theoretical)
+        )
+        sense = 1.0 if found is None else found.sense
+        kind, ended, scale = robot.configurations.names[int(which[k])], STATUSES[int(status[k])], sense / MM
+        times = np.asarray(history.time[k])[upto]
+        answer.append(
+            Start(name, kind, ended, times, sense * current[upto], scale * speed, scale * theoretical, found)
+        )
+    return answer
+
+
+def from_standstill(shown: list[Start], current_title: str = "total current", speed_title: str = "speeds") -> Figure:
+    """A row for each run: the inrush enlarged, the total current, V and the speed of the shafts, stages shaded.
+
+    Where a run ends backward, backward is drawn positive.
+    """
+    fig, grid = figure(len(shown), 3, 3.1 * len(shown), width_ratios=[0.85, 1.2, 1.35])
+    look = looks(start.configuration for start in shown)
+    for (zoom, current, speed), start in zip(grid, shown, strict=True):
+        zoom.set_title(f"{start.name}\nfirst {1e3 * INRUSH:.0f} ms")
+        backward = ", backward positive" if start.sense < 0 else ""
+        current.set_title(current_title + backward)
+        speed.set_title(speed_title + backward)
+        if not start.time.size:
+            note(zoom, f"no numbers: {words.short(start.status)}", color=VERMILION)
+            continue
+        colour = look[start.configuration][0]
+        _inrush(zoom, start, colour)
+        _current(current, start, colour)
+        _speeds(speed, start, colour)
+    return fig
+
+
+def _inrush(axes: Axes, start: Start, colour: str) -> None:
+    peak = int(np.argmax(start.current))
+    early = start.time <= INRUSH
+    axes.plot(1e3 * start.time[early], start.current[early], color=colour)
+    top = 1.3 * max(float(start.current[early].max()), 1e-3)
+    axes.set(xlim=(0, 1e3 * INRUSH), ylim=(min(0.0, 1.1 * float(start.current[early].min())), top))
+    axes.set(xlabel="time [ms]", ylabel="total current [A]")
+    if early[peak]:
+        place = (1e3 * start.time[peak], start.current[peak])
+        axes.plot(*place, "o", ms=5, color=colour)
+        axes.annotate(
+            f"peak {start.current[peak]:.3g} A\nat {1e3 * start.time[peak]:.1f} ms", place, xytext=(8, -2),
+            textcoords="offset points", fontsize=8.5, va="top",
+        )  # fmt: skip
+    _stages(axes, start, 1e3)
+
+
+def _current(axes: Axes, start: Start, colour: str) -> None:
+    last, peak = float(start.time[-1]), float(start.current.max())
+    run = start.current[start.time > start.starting]
+    run = run[len(run) // 20 :] if len(run) > 20 else start.current
+    top = max(1.75 * float(run.max()), 0.1)
+    cut = peak > top
+    axes.plot(start.time, np.minimum(start.current, 1.2 * top), color=colour)
+    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.current.min())), top if cut else 1.3 * peak))
+    axes.set(xlabel="time [s]", ylabel="total current [A]")
+    _stages(axes, start)
+    if cut:
+        note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
+    during = (start.time > start.starting) & (start.time < start.slipping)
+    if start.slipping - start.starting > 0.15 * last and start.gets_under_way:
+        middle = float(np.median(start.current[during]))
+        at = (start.starting + start.slipping) / 2
+        axes.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
+    crest = start.current[ending(start.time)].max()
+    axes.annotate(
+        f"{start.ended[0]:.2f} A", (0.98 * last, crest), xytext=(0, 5), ha="right", textcoords="offset points"
+    )
+
+
+def _speeds(axes: Axes, start: Start, colour: str) -> None:
+    last, top = float(start.time[-1]), max(float(start.theoretical.max()), 1.0)
+    axes.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
+    axes.plot(start.time, start.speed, color=colour)
+    axes.set(xlim=(0, last), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
+    axes.set_ylabel("speed [mm/s]")
+    _stages(axes, start)
+    axes.text(0.02 * last, 1.02 * top, r"$V_{x\,teor}$ (shafts)", fontsize=8.5, va="bottom")
+    if 0 < start.settled < last and start.gets_under_way:
+        axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
+        text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
+        axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
+    half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
+    axes.annotate(
+        "$V_x$ (robot)", (start.time[half], start.speed[half]), xytext=(6, -12), textcoords="offset points",
+        color=colour, fontsize=8.5,
+    )  # fmt: skip
+    if start.status not in words.SETTLED:
+        note(axes, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
+
+
+def slip_over_start(shown: list[Start]) -> Figure:
+    """A row for each run: V_x and V_x_teor until after the start, and beside them the slip (33), its mean over each
+    stage and over t'. Where a run ends backward, backward is drawn positive."""
+    fig, grid = figure(len(shown), 2, 3.1 * len(shown), width_ratios=[1.2, 1.0])
+    look = looks(start.configuration for start in shown)
+    for (speeds, slip), start in zip(grid, shown, strict=True):
+        speeds.set_title(f"{start.name}\nspeeds, Fig. 24{', backward positive' if start.sense < 0 else ''}")
+        slip.set_title("slip")
+        if start.stages is None:
+            note(speeds, f"no numbers: {words.short(start.status)}", color=VERMILION)
+            continue
+        colour = look[start.configuration][0]
+        last = float(start.time[-1])
+        upto = min(1.6 * max(start.settled, start.slipping, 0.02 * last), last) if start.gets_under_way else last
+        speeds.fill_between(start.time, start.speed, start.theoretical, color=colour, alpha=0.15, lw=0)
+        speeds.plot(start.time, start.theoretical, "--", color=INK, lw=1.4)
+        speeds.plot(start.time, start.speed, color=colour)
+        top = max(float(start.theoretical.max()), 1.0)
+        speeds.set(xlim=(0, upto), ylim=(min(0.0, 1.1 * float(start.speed.min())), 1.38 * top), xlabel="time [s]")
+        speeds.set_ylabel("speed [mm/s]")
+        for words_of, curve, colour_of, place in (
+            (r"2  $V_{x\,teor}$", start.theoretical, INK, (0, 5)), ("1  $V_x$", start.speed, colour, (0, -14)),
+        ):  # fmt: skip
+            at = 0.78 * upto
+            speeds.annotate(
+                words_of, (at, float(np.interp(at, start.time, curve))), xytext=place, textcoords="offset points",
+                color=colour_of, fontsize=9, ha="center",
+            )  # fmt: skip
+        _stages(speeds, start)
+        rolling = np.abs(start.theoretical) > 1e-3 * top
+        share = 100 * (1 - start.speed / np.where(rolling, start.theoretical, np.nan))
+        slip.plot(start.time, share, color=colour)
+        slip.set(xlim=(0, upto), ylim=(min(0.0, *np.clip(share[rolling], -20, 0)) if rolling.any() else 0.0, 125))
+        slip.set(xlabel="time [s]", ylabel="slip s [%]")
+        _stages(slip, start)
+        if start.gets_under_way:
+            _means(speeds, slip, start, upto)
+        if start.status not in words.SETTLED:
+            note(slip, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
+    return fig
+
+
+def _means(speeds: Axes, slip: Axes, start: Start, upto: float) -> None:
+    """Mark t' and draw the mean slip of each stage as a level."""
+    assert start.stages is not None
+    for axes in (speeds, slip):
+        if 0 < start.settled < upto:
+            axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
+    if 0 < start.settled < upto:
+        text = f"t' = {start.settled:.3g} s\ns over t' = {100 * start.stages.over_settling:.1f} %"
+        speeds.annotate(text, (start.settled, 0), xytext=(4, 8), textcoords="offset points", fontsize=8.5)
+    bounds = start.stages.bounds
+    for left, right, mean in zip(bounds[:-1], bounds[1:], start.stages.slip, strict=True):
+        if right <= left or left >= upto or not np.isfinite(mean):
+            continue
+        right = min(right, upto)
+        slip.hlines(100 * mean, left, right, color=INK, lw=1.2, ls="--")
+        if right - left > 0.15 * upto:
+            slip.annotate(
+                f"mean {100 * mean:.1f} %", (right, 100 * mean), xytext=(-3, 4), textcoords="offset points",
+                ha="right", fontsize=8.5,
+            )  # fmt: skip
+
+
+def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
+    """Shade the stages behind a plot over time in units of 1/`scale` s and name them at the top."""
+    if not start.gets_under_way:
+        return
+    bounds = scale * np.array([0.0, start.starting, start.slipping, start.time[-1]])
+    left_edge, right_edge = axes.get_xlim()
+    for (stage, shade, name), left, right in zip(_STAGES, bounds[:-1], bounds[1:], strict=True):
+        right = min(right, right_edge)
+        if right <= left:
+            continue
+        axes.axvspan(left, right, color=shade, zorder=0, lw=0)
+        if (right - left) / (right_edge - left_edge) > 0.15:
+            axes.text(
+                (left + right) / 2, 0.985, f"{stage}\n{name}", transform=axes.get_xaxis_transform(), ha="center",
+                va="top", fontsize=8.5, fontweight="bold", color=INK,
+            )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Course:
+    """A run of a shaft over time, up to its last finite sample.
+
+    Attributes:
+        name: heading; status; time: [s]; readings: of each channel by name, in the unit of its column.
+    """
+
+    name: str
+    status: str
+    time: np.ndarray
+    readings: dict[str, np.ndarray]
+
+    def largest(self, channel: str) -> float:
+        """Reading that is largest in size."""
+        values = self.readings[channel]
+        return float(values[int(np.argmax(np.abs(values)))]) if values.size else np.nan
+
+    def last(self, channel: str) -> float:
+        """Reading at the end."""
+        values = self.readings[channel]
+        return float(values[-1]) if values.size else np.nan
+
+
+def courses(read: Iterable[Channel], history: Any, status: np.ndarray, names: Sequence[str]) -> list[Course]:
+    """Members of a batch of runs as their instruments show them.
+
+    Args:
+        read: channels of the robot; history: of the batch; status: codes of how its members ended.
+        names: headings of the members.
+    """
+    from mmrjax.signals import STATUSES
+
+    answer, shown = [], tuple(c for c in read if c.over_time)
+    for k, name in enumerate(names):
+        readings = {c.name: np.asarray(history.reading[c.name][k]) / c.factor for c in shown}
+        finite = np.flatnonzero(np.isfinite(np.stack(list(readings.values()))).all(0))
+        upto = slice(0, int(finite[-1]) + 1 if finite.size else 0)
+        of = {channel: values[upto] for channel, values in readings.items()}
+        answer.append(Course(name, STATUSES[int(status[k])], np.asarray(history.time[k])[upto], of))
+    return answer
+
+
+def over_time(shown: list[Course]) -> Figure:
+    """A row for each run, a panel for each channel."""
+    read = channels.rows(shown[0].readings)
+    fig, grid = figure(len(shown), len(read), 2.6 * len(shown))
+    for row, course in zip(grid, shown, strict=True):
+        row[0].set_title(course.name)
+        for axes, channel in zip(row, read, strict=True):
+            axes.plot(course.time, course.readings[channel.name], color=BLUE)
+            axes.set(xlabel="time [s]", ylabel=axis_label(channel))
+        if course.status not in words.SETTLED:
+            note(row[0], f"ends: {words.short(course.status)}", color=VERMILION)
+    return fig

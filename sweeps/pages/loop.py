@@ -1,0 +1,96 @@
+"""The report of the loop: verdict, residual before and after, and the next experiment on one page; then the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from calibration.data.columns import Layout
+from calibration.discovery.result import DiscoveryResult
+from calibration.inference.details import Detail, EquationDefects, TimeStatistics
+from calibration.words import loop as words
+from sweeps.pages import cluster_figures, loop_figures
+from sweeps.pages.page import Album, columns, conditions, first_rows, render, rms, words_shown
+
+Section = Callable[[Album, DiscoveryResult], None]
+
+
+def rows_of(found: DiscoveryResult) -> dict[str, np.ndarray]:
+    """Rows of the result as figures and page show them: of a rig each surface is a configuration of its own."""
+    table = found.rows_table()
+    if Layout.of(found.robot).crosses_zero:
+        table["configuration"] = found.runs.configurations_named(found.robot)
+    return table
+
+
+def _run_by_run(album: Album, found: DiscoveryResult) -> None:
+    table = rows_of(found)
+    album.add("before_after", lambda: loop_figures.before_after(table, found.channels, found.verdict))
+    album.add("defects", lambda: loop_figures.defects(table, found.verdict, Layout.of(found.robot).crosses_zero))
+
+
+def _over_time(album: Album, found: DiscoveryResult) -> None:
+    assert isinstance(found.detail, TimeStatistics)
+    detail = found.detail
+    album.add("before_after", lambda: loop_figures.over_time(rows_of(found), found.channels, found.verdict))
+    album.add("series", lambda: loop_figures.time_statistics(detail, found.channels, found.verdict))
+
+
+#: What a page shows of one kind of data, by the type of the result's detail.
+SECTIONS: dict[type[Detail], Section] = {EquationDefects: _run_by_run, TimeStatistics: _over_time}
+
+
+def alike(found: DiscoveryResult) -> list[str]:
+    """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
+    if found.unnamed is not None:
+        return [", ".join(b for b in found.unnamed.balances_alike if b != found.unnamed.balance)]
+    return [words.alike(e) for e in found.effects]
+
+
+def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
+    """Write `report.html` and `figures/` for a pass of the loop.
+
+    Args:
+        folder: an existing run folder.
+        robot_name: name or file of the robot that it began with.
+
+    Returns:
+        The path of the page.
+    """
+    album = Album(Path(folder))
+    table, sized = rows_of(found), Layout.of(found.robot).crosses_zero
+    SECTIONS[type(found.detail)](album, found)
+    if found.residual_clusters:
+        album.add("clusters", lambda: cluster_figures.clusters(found.residual_clusters))
+    album.add("errors", lambda: loop_figures.errors(found))
+    if found.unnamed is not None:
+        curve = found.unnamed
+        album.add("curve", lambda: loop_figures.curve(rows_of(found), curve, float(found.robot.sides)))
+    album.add("ladder", lambda: loop_figures.ladder(found))
+    album.add("null", lambda: loop_figures.null(found.before))
+    album.add("look_alikes", lambda: loop_figures.look_alikes(found))
+    album.add("base_shift", lambda: loop_figures.base_shift(found))
+    return render(
+        Path(folder),
+        "loop.html.j2",
+        album,
+        of_channels=found.channels,
+        title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
+        document=found.to_json(),
+        p=words.p_value(found.before.p_value),
+        cluster="" if found.cluster is None else words.cluster(found.cluster),
+        standing=words.standing(found),
+        ruled_out=words.ruled_out(found),
+        alike=alike(found),
+        worse=words.worse(found.held_out_worse, found.errors_held_out),
+        rows=first_rows(rows_of(found)),
+        conditions=conditions(rows_of(found)),
+        columns=columns(found.channels),
+        sized=sized,
+        has_ground=found.robot.has_ground,
+        closed=loop_figures.closed(table) if sized and isinstance(found.detail, EquationDefects) else [],
+        rms=rms(table, found.channels, ("before", "after", "held_out_before", "held_out_after")),
+        shift=lambda z: "bad" if abs(z) > 3 else "fair" if abs(z) > 2 else "",
+    )

@@ -1,0 +1,344 @@
+"""Figures of the loop: residuals before and after, the score ladder, defects, look-alikes, base parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibration.discovery.result import DiscoveryResult, Evidence, UnnamedDiscrepancy
+from calibration.inference import blocks
+from calibration.inference.bases import in_words
+from calibration.inference.details import TimeStatistics
+from mmrjax.channels import MM, RPM, Channel
+from sweeps.pages.figure_style import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    SKY,
+    colours_of,
+    figure,
+    note,
+    short,
+)
+from sweeps.pages.sweep_figures import UNITS, imposed
+
+#: Effects on the ladder and on the map of look-alikes.
+RUNGS, ALIKE = 20, 14
+DEFECT_WORDS = {
+    "electrical": ("voltage missing", "V", "current_A", "current of all motors [A]"),
+    "track": ("torque missing at the pulley", "N·m", "motor_speed_rpm", "motor speed [rpm]"),
+    "slip": ("speed lost", "mm/s", "slope_deg", "slope [deg]"),
+}
+
+
+#: The same of a rig, whose output need be no pulley.
+RIG_WORDS = {"track": "torque missing at the output"}
+IMPOSED_WORDS = {"supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]"}
+
+
+def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
+    """Residual of every reading in sigmas, before and after; runs grouped by configuration and voltage."""
+    own = imposed(table)
+    beside = [c for c in ("payload_kg", "slope_deg") if c in table]
+    order = np.lexsort((*(table[c] for c in beside), table[own], table["configuration"]))
+    fig, grid = figure(len(channels), 1, 1.8 * len(channels), sharex=True)
+    levels = np.unique(table[own]).size
+    few = levels <= 8 or own == "supply_voltage_V"  # else a group by configuration alone
+    groups = [f"{table['configuration'][k]}" + (f", {table[own][k]:g} {UNITS[own]}" if few else "") for k in order]
+    edges = [i for i in range(1, len(groups)) if groups[i] != groups[i - 1]]
+    x = np.arange(len(order))
+    for axes, channel in zip(grid[:, 0], channels, strict=True):
+        before = table[f"residual_before_{channel.name}_sigma"][order]
+        after = table[f"residual_after_{channel.name}_sigma"][order]
+        axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
+        axes.axhline(0, color=FAINT, lw=0.8)
+        if verdict == "none":
+            axes.plot(x, before, "o", ms=4.5, color=BLUE, label="the fitted model")
+        else:
+            axes.plot(x, before, "o", ms=5.5, mfc="none", color=ORANGE, label="before: the fitted model")
+            axes.plot(x, after, "o", ms=4, color=BLUE, label="after: with what was found")
+        for edge in edges:
+            axes.axvline(edge - 0.5, color="#bbbbbb", lw=0.8, ls=":")
+        axes.set_ylabel(f"{channel.label} [σ]")
+    grid[0, 0].legend(loc="upper left", ncols=2, bbox_to_anchor=(0, 1.28))
+    starts = [0, *edges]
+    grid[-1, 0].set_xticks([(a + b - 1) / 2 for a, b in zip(starts, [*edges, len(order)], strict=True)],
+                           [groups[a] for a in starts])  # fmt: skip
+    grid[-1, 0].grid(axis="x", visible=False)
+    varied = own == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
+    within = (
+        "by slope, then payload"
+        if beside and varied
+        else "by motor speed"
+        if own == "motor_speed_rpm"
+        else "by voltage"
+    )
+    grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
+    return fig
+
+
+#: Runs of histories whose residual is drawn, and samples over which it is averaged.
+RUNS_SHOWN, AVERAGED = 8, 5
+
+
+def _range(x: np.ndarray) -> str:
+    low, high = np.min(x), np.max(x)
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def over_time(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
+    """Residual of every history over time in sigmas, before and after; one column a run, samples as dots and their
+    running mean as a line."""
+    names = list(dict.fromkeys(table.get("run_id", np.zeros(len(table["row"]), str))))[:RUNS_SHOWN]
+    count = len(channels)
+    fig, grid = figure(count, len(names), 1.8 * count, sharex="col", sharey="row")
+    whens = [("before", ORANGE)] if verdict != "none" else []
+    whens += [("after", BLUE)]
+    for column, name in enumerate(names):
+        mine = np.flatnonzero(table["run_id"] == name) if "run_id" in table else np.arange(len(table["row"]))
+        mine = mine[np.argsort(table["time_s"][mine])]
+        for axes, channel in zip(grid[:, column], channels, strict=True):
+            axes.axhspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
+            axes.axhline(0, color=FAINT, lw=0.8)
+            for when, colour in whens:
+                y = table[f"residual_{when}_{channel.name}_sigma"][mine]
+                axes.plot(table["time_s"][mine], y, ".", ms=3, color=colour, alpha=0.35)
+                if len(y) >= AVERAGED:
+                    smooth = np.convolve(y, np.ones(AVERAGED) / AVERAGED, "valid")
+                    edge = AVERAGED // 2
+                    axes.plot(table["time_s"][mine][edge : edge + len(smooth)], smooth, color=colour, lw=1.3)
+            if column == 0:
+                axes.set_ylabel(f"{channel.label} [σ]")
+        first = mine[0]
+        grid[0, column].set_title(
+            f"{name}\n{table['configuration'][first]} {_range(table[imposed(table)][mine])} {UNITS[imposed(table)]}"
+            + (f" {_range(table['slope_deg'][mine])}°" if "slope_deg" in table else ""), fontsize=8,
+        )  # fmt: skip
+        grid[-1, column].set_xlabel("time [s]")
+    words = "blue: the fitted model" if verdict == "none" else "orange: before, blue: after"
+    fig.suptitle(f"{words}; line: mean of {AVERAGED} samples; band: ±2σ of the instruments", fontsize=8.5)
+    return fig
+
+
+def time_statistics(detail: TimeStatistics, channels: Sequence[Channel], verdict: str) -> Figure:
+    """What only histories tell: memory of the residual, waves in shaft angle, drift in time."""
+    sides = [("before", detail.before, ORANGE), ("after", detail.after, BLUE)]
+    sides = sides if verdict != "none" else sides[1:]
+    count = len(channels)
+    fig, grid = figure(1, count + 1, 2.9, width_ratios=[1] * count + [1.5])
+    for axes, channel in zip(grid[0, :count], channels, strict=True):
+        lags = np.arange(1, detail.before.memory.lags + 1)
+        limit = 2 / np.sqrt(detail.samples)
+        axes.axhspan(-limit, limit, color="#eeeeee", lw=0, zorder=0)
+        axes.axhline(0, color=FAINT, lw=0.8)
+        for when, side, colour in sides:
+            axes.plot(lags, side.memory.autocorrelation[channel.name], "o-", ms=3, lw=1, color=colour, label=when)
+        axes.set_title(channel.label)
+        axes.set_xlabel("lag [samples]")
+    grid[0, 0].set_ylabel("autocorrelation of the residual")
+    grid[0, 0].legend(loc="best")
+    axes = grid[0, count]
+    lines = [*(word for word, _ in detail.before.orders), "drift in time"]
+    for k, (_, side, colour) in enumerate(sides):
+        values = [*(o.explained for o in side.orders.values()), side.drift.explained]
+        place = np.arange(len(lines)) + (k - (len(sides) - 1) / 2) * 0.36
+        axes.barh(place, np.sqrt(values), height=0.34, color=colour)
+    axes.set_yticks(range(len(lines)), lines, fontsize=8)
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set_xlabel("would explain [σ]")
+    return fig
+
+
+def ladder(found: DiscoveryResult) -> Figure:
+    """Score of every effect at the base fit, with the threshold that noise alone passes in few tables."""
+    rungs = found.scores[:RUNGS]
+    named = {e.name for e in found.effects}
+    alike = {n for e in found.effects for n in e.members} - named
+    fig, grid = figure(1, 1, 1.1 + 0.24 * len(rungs))
+    axes = grid[0, 0]
+    root = [np.sqrt(r.score) for r in rungs]
+    colours = [BLUE if r.name in named else SKY if r.name in alike else "#c9c9c9" for r in rungs]
+    axes.barh(range(len(rungs)), root, color=colours, height=0.72)
+    level = found.before.kinds["single"].threshold
+    axes.axvline(level, color=ORANGE, lw=1.6)
+    axes.text(level, -0.9, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
+    axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set(xlabel="score: what the effect alone, at a plausible size, would explain beside the base [σ], linearly")
+    axes.set_title("blue: found; light blue: these data cannot tell it from one that was found")
+    return fig
+
+
+#: Kinds of evidence that are drawn, and what their statistics are.
+KINDS = {
+    "single": "strongest effect [σ]",
+    "curve": "strongest curve [normal deviate]",
+    "chi2": "χ² of the residuals",
+}
+
+
+def null(before: Evidence) -> Figure:
+    """The strongest statistics among bootstrap tables in which nothing is missing, and those of the data."""
+    fig, grid = figure(1, len(KINDS), 2.5)
+    for axes, (name, text) in zip(grid[0], KINDS.items(), strict=True):
+        kind = before.kinds[name]
+        axes.hist(kind.null, bins=30, color="#c9c9c9")
+        axes.axvline(kind.threshold, color=ORANGE, lw=1.6)
+        axes.axvline(kind.found, color=BLUE, lw=2)
+        axes.set_xlabel(text)
+        axes.set_yticks([])
+    note(grid[0, 0], "grey: bootstrap\norange: threshold\nblue: these data", x=0.62)
+    return fig
+
+
+def errors(found: DiscoveryResult) -> Figure:
+    """rms error (35) before and after, fitted and held out by every kind of block."""
+    lines = {"fitted": found.errors}
+    lines |= {f"held out by\n{blocks.in_words(k, ', ')}": v for k, v in found.errors_held_out.items()}
+    fig, grid = figure(1, len(found.channels), 2.9, sharey=False)
+    for place, channel in enumerate(found.channels):
+        axes = grid[0, place]
+        for k, (colour, when) in enumerate(((ORANGE, "before"), (BLUE, "after"))):
+            values = [v[k][channel.name]["rms_percent"] for v in lines.values()]
+            axes.barh(np.arange(len(lines)) + 0.4 * k - 0.2, values, height=0.38, color=colour, label=when)
+            for row, v in enumerate(values):
+                axes.text(v, row + 0.4 * k - 0.2, f" {v:.2g}", va="center", fontsize=8, color=INK)
+        axes.set_yticks(range(len(lines)), list(lines) if place == 0 else [""] * len(lines))
+        axes.invert_yaxis()
+        axes.margins(x=0.16)
+        axes.grid(axis="y", visible=False)
+        axes.set_title(channel.label)
+        axes.set_xlabel("rms error [%]")
+    grid[0, -1].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
+    return fig
+
+
+def closed(table: dict[str, np.ndarray]) -> list[str]:
+    """Equations that the readings close: those with a defect somewhere, at least one."""
+    found = [b for b in DEFECT_WORDS if np.nan_to_num(table[f"defect_before_{b}"]).any()]
+    return found or ["track"]
+
+
+def _over(table: dict[str, np.ndarray], column: str, label: str) -> tuple[np.ndarray, str]:
+    """The variable over which a defect is drawn, or what is imposed where a table lacks it or it does not vary."""
+    column = "total_" + column if column == "current_A" else column
+    own = imposed(table)
+    if column not in table or (column not in ("total_current_A", own) and np.unique(table[column]).size == 1):
+        return table[own], IMPOSED_WORDS[own]
+    return table[column], label
+
+
+def defects(table: dict[str, np.ndarray], verdict: str, blank: bool = False) -> Figure:
+    """What each equation lacks, run by run, over the variable that shows it, before and after.
+
+    Args:
+        blank: whether the robot is a rig, of which the equations are drawn that its readings close.
+    """
+    whens = ("before",) if verdict in ("none", "unnamed") else ("before", "after")
+    drawn = {b: DEFECT_WORDS[b] for b in (closed(table) if blank else DEFECT_WORDS)}
+    fig, grid = figure(len(whens), len(drawn), 2.5 * len(whens) + 0.3, sharex="col", sharey="col")
+    for row, when in enumerate(whens):
+        for axes, (balance, (words, unit, column, label)) in zip(grid[row], drawn.items(), strict=True):
+            if blank:
+                x, label = _over(table, column, label)
+                balance_words = RIG_WORDS.get(balance, words)
+            else:
+                x, balance_words = table["total_" + column if column == "current_A" else column], words
+            y = table[f"defect_{when}_{balance}"] * (1e3 if balance == "slip" else 1.0)
+            axes.axhline(0, color=FAINT, lw=0.8)
+            for name, colour in colours_of(table["configuration"]).items():
+                mine = table["configuration"] == name
+                axes.plot(x[mine], y[mine], "o", ms=4.5, color=colour, label=name)
+            axes.set_title(f"{'torque' if blank and balance == 'track' else balance}, {when}")
+            axes.set_ylabel(f"{balance_words} [{unit}]")
+            if row == len(whens) - 1:
+                axes.set_xlabel(label)
+    grid[0, 0].legend(loc="best")
+    return fig
+
+
+def look_alikes(found: DiscoveryResult) -> Figure:
+    """|cos| between what the base leaves of two effects' signatures, for the effects that score highest."""
+    names = [s.name for s in found.scores if s.score > 0][:ALIKE]
+    cosine = found.cosine[: len(names), : len(names)]
+    fig, grid = figure(1, 1, 5.6)
+    axes = grid[0, 0]
+    shown = axes.imshow(cosine, cmap="Blues", vmin=0, vmax=1)
+    for i in range(len(names)):
+        for j in range(len(names)):
+            if i != j and cosine[i, j] > 0.5:
+                axes.text(j, i, f"{cosine[i, j]:.2f}", ha="center", va="center", fontsize=7,
+                          color="white" if cosine[i, j] > 0.7 else INK)  # fmt: skip
+    axes.set_xticks(range(len(names)), names, rotation=60, ha="right")
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(visible=False)
+    fig.colorbar(shown, ax=axes, label="|cos| of the signatures", shrink=0.8)
+    return fig
+
+
+def base_shift(found: DiscoveryResult) -> Figure:
+    """Where each base parameter lies in prior sds, before and after the effects were added."""
+    shift = found.base_shift
+    fig, grid = figure(1, 1, 1.0 + 0.27 * len(shift))
+    axes = grid[0, 0]
+    axes.axvspan(-2, 2, color="#eeeeee", lw=0, zorder=0)
+    axes.axvline(0, color=FAINT, lw=0.9)
+    for row, p in enumerate(shift.values()):
+        axes.plot([p.shift_before, p.shift_after], [row, row], color="#c9c9c9", lw=1.6, zorder=1)
+        axes.plot(p.shift_before, row, "o", ms=6, mfc="white", color=ORANGE)
+        axes.plot(p.shift_after, row, "o", ms=5, color=BLUE)
+    axes.set_yticks(range(len(shift)), [short(n) for n in shift])
+    axes.invert_yaxis()
+    axes.grid(axis="y", visible=False)
+    axes.set(xlabel="shift from the prior [prior sds]")
+    axes.set_title("orange: before, blue: after; a far one stands in for something that is missing")
+    return fig
+
+
+def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy, sides: float = 2.0) -> Figure:
+    """The defect that has no name, run by run over the variable that shows it, with the smooth curve and its band.
+
+    Args:
+        sides: motors that the total current is of.
+    """
+    variable = found.variable if found.window is None else str(found.window["axis"])
+    column, factor, words = VARIABLE_WORDS.get(variable, ("", 1.0, f"phase of the wave, {variable} [rad]"))
+    if variable == "current":
+        one = "motor_current_A" in table and "total_current_A" not in table
+        column, factor = ("motor_current_A", 1.0) if one else (column, 1 / sides)
+    fig, grid = figure(1, 1, 3.4)
+    axes = grid[0, 0]
+    axes.axhline(0, color=FAINT, lw=0.8)
+    if found.defect is not None and found.defect_sd is not None and column in table:
+        there = np.isfinite(found.defect)
+        axes.errorbar(np.asarray(table[column])[there] * factor, found.defect[there], 2 * found.defect_sd[there],
+                      fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip
+    scale = SHOWN.get(variable, 1.0)
+    if found.window is not None:
+        axes.axvspan(float(found.window["low"]), float(found.window["high"]), color="#eeeeee", lw=0, zorder=0)
+    low, high = found.value - 1.96 * found.sd, found.value + 1.96 * found.sd
+    axes.fill_between(found.at * scale, low, high, color="#cfe3f2", lw=0, label="95 %")
+    axes.plot(found.at * scale, found.value, color=GREEN, label="smooth curve")
+    axes.set(xlabel=words, ylabel=f"missing in the {in_words(found.place)} [{found.unit}]")
+    axes.legend(loc="best")
+    return fig
+
+
+#: Column, factor to the figure's unit, and words of the variable of a curve; factor from SI to that unit.
+VARIABLE_WORDS = {
+    "voltage": ("supply_voltage_V", 1.0, "supply voltage [V]"),
+    "current": ("total_current_A", 0.5, "current of one motor [A]"),
+    "speed_motor": ("motor_speed_rpm", 1.0, "motor speed [rpm]"),
+    "slope": ("slope_deg", 1.0, "slope [deg]"),
+    "payload": ("payload_kg", 1.0, "payload [kg]"),
+    "speed": ("speed_mm_s", 1.0, "speed [mm/s]"),
+    "time": ("time_s", 1.0, "time since the start [s]"),
+    "order": ("order", 1.0, "order of the runs"),
+}
+SHOWN = {"speed_motor": 1 / RPM, "slope": 180 / np.pi, "speed": 1 / MM}

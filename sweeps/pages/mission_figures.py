@@ -1,0 +1,187 @@
+"""Figures of missions: speed, slope, current, duty, temperatures and charge over time, and where the energy goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mmrjax.energy import SINKS
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, note
+from sweeps.points.imposed import UNLIMITED
+
+#: Units of a time axis: how long a mission is for it [s], its size [s], its name.
+_TIMES = ((7200.0, 3600.0, "h"), (600.0, 60.0, "min"), (0.0, 1.0, "s"))
+#: Names of where energy goes, as bars have room for, and the colour of each.
+_BARS = {
+    "battery": ("cells of the battery", INK), "other": ("other consumers", FAINT), "driver": ("driver", FAINT),
+    "winding": ("windings, brushes, leads", VERMILION), "motor": ("friction of the motors", ORANGE),
+    "gearbox": ("gearboxes", PURPLE), "track": ("tracks and guides", BLUE),
+    "sliding": ("sliding over the ground", SKY), "rolling": ("rolling resistance", SKY),
+    "lift": ("lift (net of what comes back)", GREEN),
+}  # fmt: skip
+
+
+def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, linear: bool, sides: float) -> Figure:
+    """A run over its profile, a row a subject; beside it its first cycle, where it has several.
+
+    Args:
+        rows: of history.csv, of one run; cycle: end of its first cycle [s], None where it has one only.
+        limit: of the winding's temperature [°C]; linear: whether the profile's values are, between rows.
+        sides: how many motors there are.
+    """
+    spans = [float(rows["time_s"][-1]), *([cycle] if cycle is not None else [])]
+    titles = ["the mission", "its first cycle"]
+    fig, grid = figure(4, len(spans), 9.6, width_ratios=[1.5, 1.0][: len(spans)], sharex="col")
+    for column, (span, title) in enumerate(zip(spans, titles, strict=False)):
+        axes = grid[:, column]
+        _, size, unit = next(t for t in _TIMES if span >= t[0])
+        shown = {key: value[rows["time_s"] <= span] for key, value in rows.items()}
+        time = shown["time_s"] / size
+        first = column == 0
+        axes[0].set_title(f"{title}: speed" + (" and slope" if np.any(rows.get("slope_deg", 0.0)) else ""))
+        _speed(axes[0], time, shown, linear, legend=first)
+        axes[1].set_title("current of all motors, and duty of the driver")
+        _current(axes[1], time, shown, sides, legend=first)
+        unlimited = limit >= UNLIMITED or "housing_temperature_C" not in rows
+        beyond = (
+            "" if unlimited or _near(shown, limit) else f", the winding's limit of {limit:.0f} °C beyond the scale"
+        )
+        axes[2].set_title("temperatures" + (beyond if first else ""))
+        _temperatures(axes[2], time, shown, limit, legend=first)
+        _source(axes[3], time, shown)
+        axes[3].set(xlabel=f"time [{unit}]", xlim=(0, span / size))
+    return fig
+
+
+def _beside(axes: Axes, label: str, colour: str) -> Axes:
+    """Axes with a scale of their own at the right."""
+    other = axes.twinx()
+    other.grid(False)
+    other.spines["right"].set_visible(True)
+    other.tick_params(axis="y", colors=colour)
+    other.set_ylabel(label, color=colour)
+    return other
+
+
+def _legend(axes: Axes, *others: Axes) -> None:
+    handles = [h for a in (axes, *others) for h in a.get_legend_handles_labels()[0]]
+    axes.legend(handles, [str(h.get_label()) for h in handles], loc="upper center", ncols=len(handles), fontsize=8)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.22 * (high - low))  # room for it
+
+
+def _speed(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], linear: bool, legend: bool) -> None:
+    turning = "demanded_motor_speed_rpm" in rows  # a shaft's
+    speed = rows["motor_speed_rpm"] if turning else rows.get("speed_mm_s", rows["theoretical_speed_mm_s"])
+    axes.plot(time, speed, color=BLUE, lw=1.4, label="speed")
+    demanded = rows["demanded_motor_speed_rpm" if turning else "demanded_speed_mm_s"]
+    if np.isfinite(demanded).any():
+        axes.plot(time, demanded, color=INK, lw=0.9, ls=(0, (4, 2)), label="demanded")
+    axes.set_ylabel("motor speed [rpm]" if turning else "speed [mm/s]")
+    if turning or not np.any(rows["slope_deg"]):
+        note(axes, "" if turning else "level ground", x=0.98, y=0.04, va="bottom", ha="right", color=FAINT)
+        if legend:
+            _legend(axes)
+        return
+    slope = _beside(axes, "slope [°]", GREEN)
+    slope.plot(
+        time, rows["slope_deg"], color=GREEN, lw=1.0, label="slope", drawstyle="default" if linear else "steps-post"
+    )
+    most = max(1.0, 1.3 * float(np.max(np.abs(rows["slope_deg"]))))
+    slope.set_ylim(-most, most)
+    if legend:
+        _legend(axes, slope)
+
+
+def _current(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], sides: float, legend: bool) -> None:
+    current = sides * rows["motor_current_A"]
+    axes.plot(time, current, color=VERMILION, lw=1.0, label="current")
+    top = int(np.argmax(np.abs(current)))
+    axes.plot(time[top], current[top], marker="o", ms=4, color=INK, ls="none", label=f"peak {current[top]:.2f} A")
+    axes.set_ylabel("current [A]")
+    duty = _beside(axes, "duty [%]", PURPLE)
+    duty.plot(time, 100 * rows["duty"], color=PURPLE, lw=0.9, alpha=0.8, label="duty")
+    low = -110 if (rows["duty"] < 0).any() else 0
+    duty.set_ylim(low, 110)
+    if legend:
+        _legend(axes, duty)
+
+
+def _near(rows: Mapping[str, np.ndarray], limit: float) -> bool:
+    """Whether the limit is near enough to be drawn; far above it would flatten what is to be seen."""
+    return "housing_temperature_C" in rows and bool(np.max(rows["winding_temperature_C"]) > 0.6 * limit)
+
+
+def _temperatures(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray], limit: float, legend: bool) -> None:
+    if "housing_temperature_C" not in rows:
+        note(axes, "the robot's file does not state how heat leaves the windings (motor.resistance_thermal_...)")
+        axes.set_yticks([])
+        return
+    axes.plot(time, rows["winding_temperature_C"], color=VERMILION, lw=1.4, label="winding")
+    axes.plot(time, rows["housing_temperature_C"], color=ORANGE, lw=1.4, label="housing")
+    top, bottom = float(np.max(rows["winding_temperature_C"])), float(np.min(rows["housing_temperature_C"]))
+    if _near(rows, limit):
+        axes.axhline(limit, color=INK, lw=1.0, ls="--", label=f"limit {limit:.0f} °C")
+        axes.set_ylim(bottom - 2, 1.1 * max(top, limit))
+    else:
+        axes.set_ylim(bottom - 0.5, top + max(1.0, 0.3 * (top - bottom)))
+    axes.set_ylabel("temperature [°C]")
+    if legend:
+        _legend(axes)
+
+
+def _source(axes: Axes, time: np.ndarray, rows: Mapping[str, np.ndarray]) -> None:
+    charge = rows["state_of_charge"]
+    volts = rows["source_voltage_V"]
+    if not np.isfinite(charge).any():
+        axes.set_title("voltage of the supply")
+        axes.plot(time, volts, color=BLUE, lw=1.3)
+        axes.set_ylabel("voltage [V]")
+        return
+    axes.set_title("state of charge, and voltage of the battery")
+    axes.plot(time, 100 * charge, color=GREEN, lw=1.8)
+    axes.set_ylabel("charge [%]", color=GREEN)
+    span = float(charge.max() - charge.min())
+    if span > 0.05:
+        axes.set_ylim(0, 105)
+    beside = _beside(axes, "voltage [V]", BLUE)
+    beside.plot(time, volts, color=BLUE, lw=0.8, alpha=0.8)
+    for k in np.flatnonzero(rows["event"] == "below_cut_off")[-1:]:
+        axes.axvline(time[k], color=VERMILION, lw=1.0, ls="--")
+        note(axes, "cells below their cut-off from the broken line on", x=0.02, y=0.06, va="bottom", color=FAINT)
+
+
+def energy(run: Mapping[str, Any], on_battery: bool) -> Figure:
+    """Where the energy of one run goes, in the order of the chain [Wh], and its share of what was drawn [%].
+
+    Args:
+        run: its row of runs.csv.
+    """
+    drawn = float(run["energy_drawn_Wh"])
+    source = "drawn from the battery's charge" if on_battery else "drawn from the supply"
+    bars: list[tuple[str, float, str]] = [(source, drawn, INK)]
+    for name in SINKS:
+        label, colour = _BARS[name]
+        bars.append((label, float(run[f"energy_to_{name}_Wh"]), colour))
+    bars.append(("left in motion at the end", float(run["energy_stored_Wh"]), FAINT))
+    bars.append(("returned to the source", float(run["energy_returned_Wh"]), GREEN))
+    bars = [bar for bar in bars if abs(bar[1]) > 1e-5 * max(drawn, 1e-12)]
+    fig, grid = figure(1, 1, 0.9 + 0.34 * len(bars))
+    axes = grid[0, 0]
+    place = np.arange(len(bars), dtype=float)
+    widths = np.array([bar[1] for bar in bars])
+    axes.barh(place, widths, height=0.7, color=[bar[2] for bar in bars])
+    for y, (_, width, _) in zip(place, bars, strict=True):
+        share = f" ({100 * width / drawn:.1f} %)" if drawn > 0 else ""
+        axes.text(max(width, 0.0), y, f"  {width:.3g} Wh{share}", va="center", fontsize=8.5)
+    axes.set_yticks(place, [bar[0] for bar in bars], fontsize=9)
+    axes.invert_yaxis()
+    axes.grid(False, axis="y")
+    axes.axvline(0, color="#666666", lw=0.8)
+    low = min(0.0, float(widths.min()))
+    axes.set(xlabel="energy [Wh]", xlim=(1.1 * low, 1.22 * float(widths.max())))
+    return fig

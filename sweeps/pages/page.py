@@ -1,0 +1,208 @@
+"""The page of every report: figures drawn once and inlined, a template, one offline HTML file."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable, Iterable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jinja2
+import numpy as np
+
+from mmrjax import __version__, channels, params
+from mmrjax.channels import Channel
+from sweeps import capabilities
+from sweeps.pages import words
+from sweeps.pages.figure_style import style, svg
+
+if TYPE_CHECKING:
+    from calibration.data.robot_file import RobotFile
+    from mmrjax.robot import Robot
+
+ROWS = 200  # of a table on a page
+_PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
+
+
+class Album:
+    """Draws figures into `folder/figures` and keeps them, encoded, for the page."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder) / "figures"
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.pictures: dict[str, str] = {}
+
+    def add(self, name: str, draw: Callable[[], Any]) -> Any:
+        """Draw one figure; `draw` returns it, alone or followed by numbers, which are returned."""
+        with style():
+            drawn = draw()
+            figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
+            text = svg(figure)
+        (self.folder / f"{name}.svg").write_text(text, encoding="utf-8")
+        self.pictures[name] = "data:image/svg+xml;base64," + base64.b64encode(text.encode()).decode()
+        return numbers[0] if numbers else None
+
+
+def named(file: RobotFile) -> dict[str, Any]:
+    """What a page says of the robot: the `robot`'s name, and the parameters `changed` from the nominal one's.
+
+    Of a rig that starts from nothing its `own`, with where each comes from. A changed packaged robot is said to be
+    one.
+    """
+    from mmrjax.robots import ROBOTS
+
+    robot, name = file.robot, file.name
+    if not robot.rig.inherits:
+        return {"robot": name, "changed": [], "own": capabilities.parameters(file)}
+    if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
+        name = f"{name}, changed"
+    return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]()), "own": []}
+
+
+def words_shown(name: str) -> str:
+    """A robot's name as a page shows it."""
+    return _PAPERS_NAMES.get(name, name)
+
+
+def changed_parameters(robot: Robot, nominal: Robot) -> list[dict[str, str]]:
+    """Every parameter of `robot` that is not the nominal robot's, with both values."""
+    base = {p.name: float(p.value) for p in params.walk(nominal)}
+    answer = []
+    for p in params.walk(robot):
+        value = float(p.value)
+        if p.name not in base or not np.isclose(value, base[p.name], rtol=1e-9, atol=0.0):
+            before = f"{base[p.name]:.6g}" if p.name in base else "not in the paper's model"
+            answer.append(
+                {"name": p.name, "meaning": p.spec.meaning, "unit": p.spec.unit, "value": f"{value:.6g}"}
+                | {"nominal": before}
+            )
+    return answer
+
+
+#: Conditions of a run by their columns: heading, and format of a number.
+CONDITIONS = {
+    "supply_voltage_V": ("U [V]", "{:g}"),
+    "motor_speed_rpm": ("n [rpm]", "{:g}"),
+    "total_mass_kg": ("M [kg]", "{:.1f}"),
+    "payload_kg": ("payload [kg]", "{:g}"),
+    "slope_deg": ("slope [°]", "{:g}"),
+}
+
+
+def conditions(table: dict[str, np.ndarray], *, mass: bool = False) -> dict[str, tuple[str, str]]:
+    """Heading and format of each condition that a table has, by column; readings of channels are none.
+
+    Args:
+        mass: whether the total mass is among them.
+    """
+    readings = {c for c in table if f"simulated_{c}" in table or f"after_{c}" in table}
+    shown = {c: about for c, about in CONDITIONS.items() if c in table and c not in readings}
+    return {c: about for c, about in shown.items() if mass or c != "total_mass_kg"}
+
+
+def label(table: dict[str, np.ndarray], row: int) -> str:
+    """The conditions of a row in words: what is imposed, and on a vehicle payload, slope and a rig's surface."""
+    parts = [str(table["configuration"][row])]
+    if "supply_voltage_V" in table:
+        parts.append(supply(table["supply_voltage_V"][row]))
+    elif "motor_speed_rpm" in table:
+        parts.append(f"{table['motor_speed_rpm'][row]:g} rpm")
+    if "payload_kg" in table:
+        parts += [f"{table['payload_kg'][row]:g} kg", f"{table['slope_deg'][row]:g}°"]
+    return ", ".join(parts)
+
+
+def columns(shown: Iterable[Channel]) -> dict[str, str]:
+    """Column of each channel, as in the tables of runs."""
+    return {c.name: c.column for c in shown}
+
+
+def rms(table: dict[str, np.ndarray], shown: Sequence[Channel], whens: Iterable[str]) -> dict[str, dict[str, float]]:
+    """rms of simulated less measured in each channel's unit, by when (of columns `WHEN_COLUMN`) and channel."""
+    found: dict[str, dict[str, float]] = {}
+    for when in whens:
+        for c in shown:
+            if f"{when}_{c.column}" in table:
+                error = np.square(table[f"{when}_{c.column}"] - table[c.column])
+                there = error[np.isfinite(error)]
+                found.setdefault(when, {})[c.name] = float(np.sqrt(there.mean())) if there.size else math.nan
+    return found
+
+
+def first_rows(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """The rows of a table that a page has room for."""
+    return [{k: v[i] for k, v in table.items()} for i in range(min(len(next(iter(table.values()))), ROWS))]
+
+
+def statuses(table: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Count, share and meaning of each status that a table has, in the order of `words`."""
+    known = [*words.STATUSES, *(set(map(str, table["status"])) - set(words.STATUSES))]
+    total = len(table["status"])
+    return [
+        {"name": s, "count": n, "percent": 100 * n / total, "meaning": words.meaning(s)}
+        for s in known
+        if (n := int((table["status"] == s).sum()))
+    ]
+
+
+def number(value: Any, form: str = "{:.2f}") -> str:
+    """A number as a page prints it; what is not finite is a dash."""
+    if isinstance(value, int | float | np.number):
+        return form.format(float(value)) if math.isfinite(float(value)) else "–"
+    return str(value)
+
+
+def winding(value: Any) -> str:
+    """A winding's temperature after long running [°C] as a page prints it."""
+    return words.NONE_SETTLES if math.isinf(float(value)) else number(value, "{:.0f}")
+
+
+def supply(value: Any) -> str:
+    """A supply voltage [V] as a page prints it; runs on the battery have none."""
+    return "battery" if math.isnan(float(value)) else f"{float(value):g} V"
+
+
+def reading(value: Any, channel: str) -> str:
+    """A reading with the digits that matter beside others of its kind, one less than its resolution."""
+    digits = max(channels.of(channel).resolution - 1, 0)
+    return number(value, f"{{:.{digits}f}}")
+
+
+def error(value: Any, channel: str) -> str:
+    """A difference of readings, with its sign, with a digit more than they."""
+    return number(value, f"{{:+.{channels.of(channel).resolution}f}}")
+
+
+def _grade(value: Any) -> str:
+    """Class of a cell by the size of its error [%]: the paper claims 7 %."""
+    size = abs(float(value))
+    return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
+
+
+def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[Channel] = (), **known: Any) -> Path:
+    """Write `report.html` from a template, the album's pictures and what the template asks for.
+
+    Args:
+        of_channels: that the page is about.
+    """
+    templates = resources.files("sweeps.pages") / "templates"
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda n: (templates / n).read_text("utf-8")),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": number, "reading": reading, "grade": _grade, "error": error, "winding": winding}
+    environment.globals |= {
+        "channels": {c.name: (c.label, c.unit) for c in of_channels},
+        "status_words": {name: status.short for name, status in words.STATUSES.items()},
+        "settled_words": words.SETTLED,
+        "version": __version__,
+    }
+    page = environment.get_template(template).render(pictures=album.pictures, **known)
+    path = Path(folder) / "report.html"
+    path.write_text(page, encoding="utf-8")
+    return path

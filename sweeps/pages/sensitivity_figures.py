@@ -1,0 +1,224 @@
+"""Figures of a sensitivity study: who decides what, tornadoes, heat maps over conditions, convergence, next runs."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from calibration.sensitivity.replicates import Estimate
+from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note, short
+
+#: Inputs that a figure shows at most, and operating points of a tornado.
+SHOWN, TALLEST, PANELS = 8, 10, 4
+_MAP = "Blues"
+
+
+def ranked(share: np.ndarray, most: int = SHOWN) -> np.ndarray:
+    """Indices of the inputs with the largest share, none that is negligible unless all are."""
+    order = np.argsort(-share, kind="stable")
+    kept = [k for k in order[:most] if share[k] >= NEGLIGIBLE]
+    return np.array(kept or order[:1], int)
+
+
+def overview(found: SensitivityResult) -> Figure:
+    """Share of every input in every output, over all operating points together."""
+    shares = np.stack([study.overall_share for study in found.outputs.values()], 1)
+    rows = [k for k in np.argsort(-shares.max(1), kind="stable") if shares[k].max() >= NEGLIGIBLE][:14]
+    rows = rows or [int(np.argmax(shares.max(1)))]
+    fig, axes = figure(1, 1, 0.9 + 0.29 * len(rows))
+    ax: Axes = axes[0, 0]
+    _cells(ax, shares[rows], 12)
+    ax.set_yticks(range(len(rows)), [short(found.names[k]) for k in rows])
+    ax.set_xticks(range(shares.shape[1]), [s.row.label for s in found.outputs.values()], rotation=18, ha="left")
+    ax.xaxis.tick_top()
+    return fig
+
+
+def _cells(ax: Axes, shares: np.ndarray, labelled: int) -> None:
+    """A heat map of shares, each cell with its percent where there are few columns."""
+    ax.grid(False)
+    hidden = np.ma.masked_invalid(np.where(shares < NEGLIGIBLE, 0.0, shares))
+    ax.imshow(np.sqrt(hidden), cmap=_MAP, vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+    ax.set_facecolor("#eeeeee")
+    for side in ("left", "bottom"):
+        ax.spines[side].set_visible(False)
+    ax.tick_params(length=0)
+    if shares.shape[1] <= labelled:
+        for (i, j), x in np.ndenumerate(shares):
+            if np.isfinite(x) and x >= NEGLIGIBLE:
+                ink = "white" if x > 0.36 else INK
+                ax.text(j, i, f"{100 * x:.0f}", ha="center", va="center", fontsize=8.5, color=ink)
+
+
+def panels(study: OutputStudy, found: SensitivityResult) -> list[int]:
+    """Operating points of a tornado: of each configuration the gentlest and the hardest that it runs, or between."""
+    points = found.points
+    kinds = list(dict.fromkeys(map(str, points.configuration)))
+    each = max(PANELS // len(kinds), 1)
+    chosen: list[int] = []
+    for kind in kinds:
+        mine = np.flatnonzero((points.configuration == kind) & np.isfinite(study.value) & study.studied)
+        order = mine[np.lexsort((points.payload[mine], points.slope_deg[mine], points.imposed[1][mine]))]
+        if order.size:
+            chosen += [int(order[k]) for k in np.unique(np.linspace(0, order.size - 1, each).astype(int))]
+    return chosen[:PANELS]
+
+
+def tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
+    """The output with each input alone at the ends of its 95 % interval, at a few operating points."""
+    where = panels(study, found)
+    unit, factor = study.row.unit, study.row.factor
+    swing, value = study.swing[:, where] / factor, study.value[where] / factor
+    reach = np.nanmax(np.abs(swing - value[:, None]), 0, initial=0.0, where=np.isfinite(swing))
+    relative = (reach / np.maximum(reach.max(1, keepdims=True), 1e-300)).sum(0)
+    top = [i for i in np.argsort(-relative, kind="stable")[:TALLEST] if relative[i] > 0.03]
+    fig, axes = figure(1, max(len(where), 1), 0.9 + 0.26 * len(top), sharey=True)
+    for n, ax in enumerate(axes[0]):
+        for place, i in enumerate(top):
+            for end, colour in ((swing[0, n, i], VERMILION), (swing[1, n, i], BLUE)):
+                if np.isfinite(end):
+                    ax.barh(-place, end - value[n], left=value[n], color=colour, height=0.66)
+                else:
+                    ax.text(value[n], -place, " × does not travel", va="center", fontsize=7.5, color=FAINT)
+        ax.axvline(value[n], color=INK, linewidth=0.9)
+        ax.set_title(_split(found.points.label(where[n])), fontsize=8.5)
+        ax.tick_params(axis="x", labelsize=8)
+        ax.locator_params(axis="x", nbins=4)
+        ax.grid(axis="y", visible=False)
+    axes[0, 0].set_yticks([-p for p in range(len(top))], [short(found.names[i]) for i in top], fontsize=8.5)
+    axes[0, 0].set_xlabel(f"{study.row.label}{'' if unit == '-' else f' [{unit}]'}", fontsize=9)
+    return fig
+
+
+def _split(label: str) -> str:
+    first, *rest = label.split(", ")
+    return f"{first}\n{', '.join(rest)}"
+
+
+def indices(study: OutputStudy, found: SensitivityResult) -> Figure:
+    """Indices over all points with their 95 % intervals, and the share of each input at every point."""
+    share = study.overall_share
+    top = ranked(share)
+    fig, axes = figure(1, 2, 1.0 + 0.3 * max(len(top), 3), width_ratios=(1.0, 1.7))
+    left, right = axes[0]
+    _bars(left, study, found, top)
+    _over_points(right, study, found, top)
+    return fig
+
+
+#: Names of indices as legends say them, and their colours.
+_WORDS = {
+    "first": ("alone (first order)", BLUE), "total": ("with others (total)", ORANGE),
+    "lower": ("first order is at least", BLUE), "upper": ("total is at most", ORANGE),
+    "shapley": ("Shapley effect", PURPLE), "mean_absolute_effect": ("μ*, mean size of effects", GREEN),
+}  # fmt: skip
+
+
+def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
+    shown: dict[str, Estimate | None] = {key: e for key, e in study.overall.items() if key in _WORDS}
+    shown = shown or {"": None}
+    height = 0.8 / len(shown)
+    for j, (key, estimate) in enumerate(shown.items()):
+        at = -np.arange(len(top)) + 0.4 - height * (j + 0.5)
+        if estimate is None:
+            ax.barh(at, study.overall_share[top], color=BLUE, height=height, label="share of the linear variance")
+            continue
+        words, colour = _WORDS[key]
+        scale = study.row.factor if key == "mean_absolute_effect" else 1.0
+        value = estimate.value[top] / scale
+        ends = np.stack([estimate.value - estimate.low, estimate.high - estimate.value])[:, top] / scale
+        ax.barh(at, np.maximum(value, 0.0), color=colour, height=0.9 * height, label=words)
+        ax.errorbar(value, at, xerr=np.maximum(ends, 0.0), fmt="none", ecolor=INK, elinewidth=0.9, capsize=1.5)
+    ax.set_yticks(-np.arange(len(top)), [short(found.names[k]) for k in top], fontsize=8.5)
+    ax.set_xlim(left=0)
+    unit = "" if study.row.unit == "-" else f" [{study.row.unit}]"
+    ax.set_xlabel(
+        f"effect over the 95 % range{unit}" if "mean_absolute_effect" in shown else "share of the variance [-]"
+    )
+    ax.grid(axis="y", visible=False)
+    ax.legend(loc="lower right", fontsize=7.5)
+
+
+def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:
+    points = found.points
+    names = np.array(list(map(str, points.configuration)))
+    kinds = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    order = np.lexsort((points.payload, points.imposed[1], points.slope_deg, np.array([kinds[n] for n in names])))
+    _cells(ax, study.share[order][:, top].T, 24)
+    ax.set_yticks([])
+    ticks, labels = [], []
+    word, own, unit = points.imposed
+    along, levels, mark = ("slope", points.slope_deg, "°") if points.has_ground else (f"{word} [{unit}]", own, "")
+    for kind in kinds:
+        mine = np.flatnonzero(names[order] == kind)
+        if mine[0]:
+            ax.axvline(mine[0] - 0.5, color="white", linewidth=4)
+        for level in np.unique(levels[order][mine]):
+            at = mine[levels[order][mine] == level]
+            ticks.append(at.mean())
+            labels.append(f"{level:g}{mark}")
+            if at[0] != mine[0]:
+                ax.axvline(at[0] - 0.5, color="white", linewidth=1.5)
+        ax.text(mine.mean(), -0.62, kind, ha="center", va="bottom", fontsize=9, fontweight="bold")
+    ax.set_xticks(ticks, labels, fontsize=8.5)
+    other = ((word, own, unit), ("payload", points.payload, "kg"))
+    inner = [f"{word} {_range(x)} {unit}" for word, x, unit in other if x is not levels and np.unique(x).size > 1]
+    within = f"; within each {' and '.join(inner)}" if inner else ""
+    ax.set_xlabel(f"{along}{within}; grey: no index there", fontsize=8.5)
+
+
+def _range(values: np.ndarray) -> str:
+    return f"{values.min():g}-{values.max():g}"
+
+
+def convergence(found: SensitivityResult) -> Figure:
+    """The main index of the leading inputs of each output against the model evaluations spent."""
+    shown = [s for s in found.outputs.values() if s.convergence][:6]
+    rows = -(-len(shown) // 3)
+    fig, axes = figure(rows, min(3, len(shown)), 2.1 * rows + 0.4)
+    for ax, study in zip(axes.ravel(), shown, strict=False):
+        counts = np.array([count for count, _ in study.convergence])
+        for k, colour in zip(ranked(study.overall_share, 3), (BLUE, VERMILION, GREEN), strict=False):
+            series = [e[k] for _, e in study.convergence]
+            low, high = np.array([e.low for e in series]), np.array([e.high for e in series])
+            ax.fill_between(counts, low, high, color=colour, alpha=0.18, linewidth=0)
+            ax.plot(
+                counts,
+                [float(e.value) for e in series],
+                "o-",
+                color=colour,
+                markersize=3,
+                label=short(found.names[k]),
+            )
+        ax.set_xscale("log")
+        ax.set_xticks(counts, [f"{count / 1000:.0f}k" for count in counts])
+        ax.minorticks_off()
+        ax.set_ylim(bottom=0)
+        ax.set_title(study.row.label)
+        ax.legend(fontsize=7.5, loc="best")
+    for ax in axes.ravel()[len(shown) :]:
+        ax.set_visible(False)
+    axes[-1, 0].set_xlabel("model evaluations")
+    axes[-1, 0].set_ylabel("total index [-]")
+    return fig
+
+
+def next_runs(runs: NextRuns, found: SensitivityResult) -> Figure:
+    """What is left of each input's sd after each of the proposed runs."""
+    left = runs.sd[-1]
+    moving = [k for k in np.argsort(left, kind="stable") if left[k] < 0.99][:10]
+    fig, axes = figure(1, 1, 0.8 + 0.28 * max(len(moving), 2))
+    ax = axes[0, 0]
+    for place, k in enumerate(moving):
+        ax.barh(-place, 1.0, color="#e9ecef", height=0.66)
+        ax.barh(-place, left[k], color=BLUE, height=0.66)
+        ax.text(left[k] + 0.01, -place, f"{100 * left[k]:.0f} %", va="center", fontsize=8.5)
+    ax.set_yticks([-p for p in range(len(moving))], [short(found.names[k]) for k in moving])
+    ax.set_xlim(0, 1.02)
+    ax.set_xlabel(f"standard deviation after these {len(runs.points)} runs, as a share of that before [-]")
+    ax.grid(axis="y", visible=False)
+    if not moving:
+        note(ax, "these runs tell nothing of these inputs")
+    return fig

@@ -1,0 +1,235 @@
+"""Figures of a sweep: small multiples of a channel over slope and payload, every status visible."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps, colors
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from mmrjax.channels import Channel
+from sweeps.pages import words
+from sweeps.pages.figure_style import FAINT, INK, axis_label, figure, note
+from sweeps.pages.page import reading
+
+_PANELS = 3  # voltages drawn of a configuration
+_CELLS = 12  # along an axis up to which cells are labelled
+
+
+#: Axis of what is imposed: its unit, and words of several.
+UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm"}
+PLURAL = {"supply_voltage_V": "voltages", "motor_speed_rpm": "motor speeds"}
+
+
+def imposed(runs: dict[str, np.ndarray]) -> str:
+    """Column of what is imposed in runs."""
+    return next(column for column in UNITS if column in runs)
+
+
+def on_ground(runs: dict[str, np.ndarray]) -> bool:
+    """Whether runs are of a vehicle, with slope and payload."""
+    return "slope_deg" in runs and "payload_kg" in runs
+
+
+def panels(voltages: np.ndarray, column: str = "supply_voltage_V") -> list[tuple[str, np.ndarray]]:
+    """How a figure splits runs by what is imposed: a title and a mask for each of at most three panels.
+
+    Every voltage up to three; of a grid of more, the least, a middle and the greatest; where nearly every
+    run has a voltage of its own, thirds of the range.
+    """
+    if np.isnan(voltages).all():
+        return [("battery", np.ones(len(voltages), bool))]
+    levels, unit = np.unique(voltages), UNITS[column]
+    if levels.size > _PANELS and 4 * levels.size > voltages.size:
+        bounds = np.linspace(levels[0], levels[-1], _PANELS + 1)
+        third = np.clip(np.searchsorted(bounds, voltages, side="right") - 1, 0, _PANELS - 1)
+        return [(f"{bounds[k]:.3g} to {bounds[k + 1]:.3g} {unit}", third == k) for k in range(_PANELS)]
+    if levels.size > _PANELS:
+        levels = levels[[0, levels.size // 2, -1]]
+    return [(f"{v:.4g} {unit}", voltages == v) for v in levels]
+
+
+def is_map(runs: dict[str, np.ndarray]) -> bool:
+    """Whether the runs have at least two slopes and two payloads, and so fill a map."""
+    return on_ground(runs) and np.unique(runs["slope_deg"]).size > 1 and np.unique(runs["payload_kg"]).size > 1
+
+
+def settled(runs: dict[str, np.ndarray], channel: Channel) -> np.ndarray:
+    """Which runs have a number to draw: `drive` leaves numbers of a moment with other statuses too."""
+    return np.isin(runs["status"], words.SETTLED) & np.isfinite(runs[channel.column])
+
+
+def sweep(runs: dict[str, np.ndarray], channel: Channel) -> Figure:
+    """One channel over slope and payload, a panel for each voltage and configuration.
+
+    With a single slope or payload the panels are lines over the other. A cell that did not settle is hatched
+    and says why. Where several runs share a cell their median is shown.
+    """
+    kinds = list(dict.fromkeys(map(str, runs["configuration"])))
+    volts = panels(runs[imposed(runs)], imposed(runs))
+    if not is_map(runs):
+        return _lines(runs, channel, kinds)
+    there = runs[channel.column][settled(runs, channel)]
+    low, high = (float(there.min()), float(there.max())) if there.size else (0.0, 1.0)
+    norm = colors.Normalize(low, high if high > low else low + 1.0)
+    payloads = np.unique(runs["payload_kg"])
+    tall = min(0.3 * payloads.size, 2.2) + 1.0
+    fig, grid = figure(len(kinds), len(volts), max(2.0, tall) * len(kinds) + 0.5)
+    for row, kind in zip(grid, kinds, strict=True):
+        for axes, (volt, mask) in zip(row, volts, strict=True):
+            _map(axes, runs, np.nonzero((runs["configuration"] == kind) & mask)[0], channel, norm)
+            axes.set_title(f"{kind}, {volt}")
+            axes.set(xlabel="slope [°]", ylabel="payload [kg]")
+    from matplotlib.cm import ScalarMappable
+
+    bar = fig.colorbar(ScalarMappable(norm, "viridis"), ax=grid, shrink=0.8, pad=0.01)
+    bar.set_label(axis_label(channel))
+    return fig
+
+
+def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:
+    axes.grid(False)
+    if not index.size:
+        note(axes, "no runs")
+        return
+    slopes, at_slope = np.unique(runs["slope_deg"][index], return_inverse=True)
+    payloads, at_payload = np.unique(runs["payload_kg"][index], return_inverse=True)
+    if slopes.size * payloads.size > 4 * index.size:  # scattered, no grid
+        _scatter(axes, runs, index, channel, norm)
+        return
+    cells: dict[tuple[int, int], list[int]] = {}
+    for run, i, j in zip(index, at_slope, at_payload, strict=True):
+        cells.setdefault((int(i), int(j)), []).append(int(run))
+    image = np.full((payloads.size, slopes.size), np.nan)
+    missing: dict[tuple[int, int], str] = {}
+    has_number = settled(runs, channel)
+    for (i, j), members in cells.items():
+        values = runs[channel.column][[m for m in members if has_number[m]]]
+        if values.size:
+            image[j, i] = np.median(values)
+        else:
+            missing[i, j] = str(runs["status"][members[0]])
+    axes.imshow(image, origin="lower", aspect="auto", cmap="viridis", norm=norm, interpolation="nearest")
+    labelled = slopes.size <= _CELLS and payloads.size <= _CELLS
+    if labelled:
+        for j, i in zip(*np.nonzero(np.isfinite(image)), strict=True):
+            shade = colormaps["viridis"](norm(image[j, i]))
+            ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
+            axes.text(i, j, reading(image[j, i], channel.name), ha="center", va="center", fontsize=7.5, color=ink)
+    for i, j, wide, tall in _blocks(set(missing), joined=not labelled):
+        axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
+    _say_missing(axes, missing, labelled)
+    _ticks(axes.set_xticks, slopes)
+    _ticks(axes.set_yticks, payloads)
+
+
+def _blocks(cells: set[tuple[int, int]], joined: bool) -> list[tuple[int, int, int, int]]:
+    """Rectangles (i, j, width, height) that cover the cells; joined where they touch, or one a cell."""
+    if not joined:
+        return [(i, j, 1, 1) for i, j in sorted(cells)]
+    blocks = []
+    left = set(cells)
+    while left:
+        i, j = min(left)
+        tall = 1
+        while (i, j + tall) in left:
+            tall += 1
+        wide = 1
+        while all((i + wide, j + k) in left for k in range(tall)):
+            wide += 1
+        left -= {(i + p, j + q) for p in range(wide) for q in range(tall)}
+        blocks.append((i, j, wide, tall))
+    return blocks
+
+
+def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) -> None:
+    box = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
+    if each:
+        for (i, j), status in missing.items():
+            axes.text(i, j, words.short(str(status)), ha="center", va="center", fontsize=6.8, bbox=box)
+        return
+    for status in sorted(set(missing.values())):
+        places = np.array([p for p, s in missing.items() if s == status], float)
+        i, j = places[np.argmin(((places - places.mean(0)) ** 2).sum(1))]
+        edge = axes.get_xlim()[1]
+        side = "right" if i > 0.88 * edge else "left" if i < 0.12 * edge else "center"
+        axes.text(i, j, words.short(str(status)), ha=side, va="center", fontsize=8.5, bbox=box)
+
+
+def _ticks(setter: Any, levels: np.ndarray) -> None:
+    every = 1 if levels.size <= 8 else -(-levels.size // 5)
+    setter(range(0, levels.size, every), [f"{v:.3g}" for v in levels[::every]])
+
+
+def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:
+    values = runs[channel.column][index]
+    there = settled(runs, channel)[index]
+    x, y = runs["slope_deg"][index], runs["payload_kg"][index]
+    axes.scatter(x[there], y[there], c=values[there], cmap="viridis", norm=norm, s=8, rasterized=True)
+    for status in np.unique(runs["status"][index][~there]):
+        pick = ~there & (runs["status"][index] == status)
+        axes.plot(x[pick], y[pick], "x", ms=3, color=FAINT, rasterized=True, label=words.short(str(status)))
+    if not there.all():
+        axes.legend(loc="upper right", fontsize=7.5, frameon=True, markerscale=1.5)
+
+
+def _lines(runs: dict[str, np.ndarray], channel: Channel, kinds: list[str]) -> Figure:
+    column, there = channel.column, settled(runs, channel)
+    over = own = imposed(runs)
+    if on_ground(runs):
+        over = "payload_kg" if np.unique(runs["payload_kg"]).size > 1 else "slope_deg"
+        if np.unique(runs[over]).size == 1 and np.unique(runs[own]).size > 1:
+            over = own
+    label = {
+        "payload_kg": "payload [kg]", "slope_deg": "slope [°]", "supply_voltage_V": "supply voltage [V]",
+        "motor_speed_rpm": "motor speed [rpm]",
+    }[over]  # fmt: skip
+    fig, grid = figure(1, len(kinds), 3.2, sharey=True)
+    for axes, kind in zip(grid[0], kinds, strict=True):
+        mine = runs["configuration"] == kind
+        volts = [("", mine)] if over == own else panels(runs[own], own)
+        for k, (volt, mask) in enumerate(volts):
+            pick = np.nonzero(mine & mask)[0]
+            pick = pick[np.argsort(runs[over][pick], kind="stable")]
+            shade = colormaps["viridis"](0.15 + 0.7 * k / max(1, len(volts) - 1))
+            shown = np.where(there[pick], runs[column][pick], np.nan)
+            axes.plot(
+                runs[over][pick],
+                shown,
+                "o-" if pick.size <= 60 else "-",
+                ms=4,
+                color=shade,
+                label=volt or None,
+            )
+            gone = pick[~np.isfinite(shown)]
+            for status in np.unique(runs["status"][gone]):
+                at = gone[runs["status"][gone] == status]
+                axes.plot(
+                    runs[over][at],
+                    np.full(at.size, 0.03 + 0.05 * k),
+                    "x",
+                    color=shade,
+                    ms=6,
+                    mew=1.6,
+                    transform=axes.get_xaxis_transform(),
+                    clip_on=False,
+                )
+                axes.annotate(
+                    words.short(str(status)),
+                    (runs[over][at[0]], 0.03 + 0.05 * k),
+                    xycoords=axes.get_xaxis_transform(),
+                    xytext=(6, 4),
+                    textcoords="offset points",
+                    fontsize=8,
+                )
+        axes.set(xlabel=label, title=kind)
+        if volts[0][0]:
+            axes.legend()
+    drawn = runs[column][there]
+    low, high = (float(drawn.min()), float(drawn.max())) if drawn.size else (0.0, 1.0)
+    grid[0, 0].set_ylim(min(0.0, 1.1 * low), max(0.0, 1.1 * high) or 1.0)
+    grid[0, 0].set_ylabel(axis_label(channel))
+    return fig

@@ -1,0 +1,360 @@
+"""The design that a configuration states: axes, ranges, distributions and fixed conditions, each checked by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.data.errors import BadConfiguration, choices, stated_number
+from mmrjax import variation
+from mmrjax.channels import RPM
+from mmrjax.rig import IMPOSED
+from mmrjax.robot import Robot
+from mmrjax.tables import SURFACES, adhesion_ratio
+from mmrjax.variation import Axis
+from sweeps import config as configuration
+from sweeps.config_campaign import Campaign
+from sweeps.points import imposed
+from sweeps.points.design import DESIGNS, Design, Joint, Samples, in_blocks
+
+if TYPE_CHECKING:
+    from mmrjax.conditions import Conditions
+
+CONFIGURATION, SURFACE = "configuration", "surface"
+#: Condition that is imposed, by `rig.IMPOSED`; those that act on a vehicle alone.
+AXIS = {name: name for name in IMPOSED}
+ON_GROUND = ("slope_deg", "payload", "total_mass", "adhesion")
+#: Most values of one axis: they are kept in memory, samples are not.
+LONGEST = 10_000_000
+#: Most points: beyond it their numbers leave 64 bits.
+MOST = 2**62
+
+Quantile = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What a sweep simulates.
+
+    Attributes:
+        design: the points; axes: what is known of each name.
+        conditions: those that do not vary, by name, `configuration` as an index.
+        surface: of Table 5, which scales the adhesion by configuration; None where adhesion is stated or varies.
+        data: files that the design came from, beside the configuration.
+    """
+
+    design: Design
+    axes: dict[str, Axis]
+    conditions: dict[str, float]
+    surface: str | None = None
+    data: tuple[str, ...] = ()
+
+    def fixed(self) -> Conditions:
+        """The conditions that do not vary, of shape ()."""
+        from mmrjax.conditions import Conditions
+
+        which = int(self.conditions.get(CONFIGURATION, 0))
+        return Conditions(which, **{k: v for k, v in self.conditions.items() if k != CONFIGURATION})
+
+
+def plan(config: Campaign, robot: Robot, where: str) -> Plan:
+    """The design of a configuration, checked.
+
+    Args:
+        where: its file, for messages.
+
+    Raises:
+        BadConfiguration: an unknown name, an axis without values, a range upside down, a value out of its bounds, a
+            name stated twice, and the like; one sentence.
+    """
+    data: list[str] = []
+    axes = {name: _axis(name, stated, robot, f"{where}, axes.{name}") for name, stated in config.axes.items()}
+    samples = _samples(config.samples, robot, f"{where}, samples", data)
+    if not axes and samples is None:
+        raise BadConfiguration(f"{where}: got neither [axes] nor [samples]; expected at least one name that varies")
+    design = Design(axes, samples)
+    fixed, surface = _fixed(config.conditions, robot, f"{where}, conditions")
+    for k, name in enumerate(design.names):
+        if name in fixed or name in design.names[:k]:
+            raise BadConfiguration(f"{where}, {name}: stated twice; expected it in one of conditions, axes, samples")
+    if fixed.get("battery", 0.0) > 0.5 and "voltage" in {*fixed, *design.names}:
+        raise BadConfiguration(
+            f"{where}, voltage: acts without battery only, whose voltage is that of its charge; remove one of them"
+        )
+    _acting({*fixed, *design.names}, robot, where, surface)
+    own = AXIS[robot.rig.imposed]
+    if not robot.rig.inherits and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
+        level = imposed.default(robot, f"{where}, conditions.{own}")
+        fixed[own] = level if own == "voltage" else level * RPM
+    if surface is not None and "adhesion" in {*fixed, *design.names}:
+        raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
+    if design.points > MOST:
+        raise BadConfiguration(f"{where}: got {design.points:.3g} points; expected at most {MOST:.3g}")
+    known = variation.Variation(robot, design.names).axes
+    return Plan(design, known, fixed, surface, tuple(data))
+
+
+def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
+    """Refuse conditions that do not act on a robot."""
+    idle = ("motor_speed", "motor_acceleration") if robot.rig.imposed == "voltage" else ("voltage", "duty", "open")
+    for name in sorted(names & set(idle)):
+        raise BadConfiguration(
+            f"{where}, {name}: the robot's file imposes the {robot.rig.imposed.replace('_', ' ')}; vary "
+            f"{AXIS[robot.rig.imposed]} instead"
+        )
+    ground = {*names, *([SURFACE] if surface is not None else [])} & {*ON_GROUND, SURFACE}
+    imposed.check_acting(robot, (f"{where}, {name}" for name in sorted(ground)))
+    if surface is not None and not robot.rig.scales_adhesion:
+        raise BadConfiguration(
+            f"{where}, conditions.surface: got {surface}; a rig's surfaces are configurations of its own "
+            f"({', '.join(robot.configurations)}); vary or state configuration"
+        )
+
+
+def adhesions(robot: Robot, surface: str) -> tuple[float, ...]:
+    """Adhesion of each of the robot's configurations on a surface, as a ratio to the bench's."""
+    return tuple(adhesion_ratio(surface, float(c.on_tracks) > 0.5) for c in robot.configurations.members)
+
+
+def _known(name: str, robot: Robot, where: str) -> Axis:
+    names = variation.variable_names(robot)
+    if name not in names:
+        raise BadConfiguration(
+            f"{where}: neither a parameter of the robot nor a condition; {choices(name, names, 3)}"
+        )
+    return variation.Variation(robot, (name,)).axes[name]
+
+
+def _value(name: str, value: Any, where: str) -> float:
+    """A number; of the battery also true or false."""
+    return float(value) if name == "battery" and isinstance(value, bool) else stated_number(value, where)
+
+
+def _within(values: Float[np.ndarray, " n"], axis: Axis, where: str) -> None:
+    low, high = axis.bounds
+    for value in values:
+        if not low <= value <= high:
+            unit = "" if axis.unit in ("", "-") else f" {axis.unit}"
+            raise BadConfiguration(f"{where}: got {value:g}; expected {low:g} to {high:g}{unit} ({axis.meaning})")
+
+
+def _configuration(name: Any, robot: Robot, where: str) -> float:
+    if name not in robot.configurations.names:
+        raise BadConfiguration(
+            f"{where}: got {name!r}; the robot has no such configuration; {choices(str(name), robot.configurations)}"
+        )
+    return float(robot.configurations.index(name))
+
+
+# --- grids ------------------------------------------------------------------------------------------------------
+
+
+def _axis(name: str, stated: Any, robot: Robot, where: str) -> np.ndarray:
+    axis = _known(name, robot, where)
+    if name == CONFIGURATION:
+        names = (
+            list(robot.configurations.names) if stated == "all" else stated if isinstance(stated, list) else [stated]
+        )
+        values = np.array([_configuration(n, robot, where) for n in names])
+    elif isinstance(stated, Mapping):
+        values = _range(stated, where)
+    elif isinstance(stated, str):
+        values = np.array(configuration.axis(where, stated))
+    else:
+        values = np.array([_value(name, v, where) for v in (stated if isinstance(stated, list) else [stated])])
+    if not len(values):
+        raise BadConfiguration(f"{where}: got no values; expected at least one")
+    if len(values) > LONGEST:
+        raise BadConfiguration(f"{where}: got {len(values)} values; expected at most {LONGEST} (samples may be more)")
+    if len(np.unique(values)) < len(values):
+        raise BadConfiguration(f"{where}: got a value twice; expected different values")
+    _within(values, axis, where)
+    return values
+
+
+_RANGE = ("start", "stop", "number", "scale")
+
+
+def _range(stated: Mapping[str, Any], where: str) -> np.ndarray:
+    _keys(stated, _RANGE, ("start", "stop", "number"), where)
+    start, stop = (stated_number(stated[k], f"{where}.{k}") for k in ("start", "stop"))
+    number = _count(stated["number"], f"{where}.number", LONGEST)
+    scale = stated.get("scale", "linear")
+    if scale not in ("linear", "log"):
+        raise BadConfiguration(f"{where}.scale: got {scale!r}; allowed: linear, log")
+    if start > stop or (start == stop) != (number == 1):
+        raise BadConfiguration(
+            f"{where}: got start {start:g}, stop {stop:g}, number {number}; expected start below stop and at least 2 "
+            "values, or one value alone"
+        )
+    if scale == "log" and start <= 0:
+        raise BadConfiguration(f"{where}.start: got {start:g}; expected more than 0 with scale log")
+    return np.linspace(start, stop, number) if scale == "linear" else np.geomspace(start, stop, number)
+
+
+def _keys(stated: Mapping[str, Any], allowed: tuple[str, ...], needed: tuple[str, ...], where: str) -> None:
+    for key in stated:
+        if key not in allowed:
+            raise BadConfiguration(f"{where}.{key}: no such key; {choices(key, allowed)}")
+    for key in needed:
+        if key not in stated:
+            raise BadConfiguration(f"{where}: {key} is missing; expected {', '.join(needed)}")
+
+
+def _count(value: Any, where: str, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        raise BadConfiguration(f"{where}: got {value!r}; expected a whole number from 1 to {most}")
+    return value
+
+
+# --- fixed conditions -------------------------------------------------------------------------------------------
+
+
+def _fixed(stated: Mapping[str, Any], robot: Robot, where: str) -> tuple[dict[str, float], str | None]:
+    allowed = (*variation.CONDITIONS, SURFACE)
+    fixed: dict[str, float] = {}
+    surface = None
+    for name, value in stated.items():
+        place = f"{where}.{name}"
+        if name not in allowed:
+            raise BadConfiguration(f"{place}: no such condition; {choices(name, allowed)}")
+        if name == SURFACE:
+            if not isinstance(value, str) or (value not in SURFACES and robot.rig.scales_adhesion):
+                raise BadConfiguration(f"{place}: got {value!r}; {choices(str(value), SURFACES)}")
+            surface = str(value)
+        elif name == CONFIGURATION:
+            fixed[name] = _configuration(value, robot, place)
+        else:
+            fixed[name] = _value(name, value, place)
+            _within(np.array([fixed[name]]), _known(name, robot, place), place)
+    return fixed, surface
+
+
+# --- samples ----------------------------------------------------------------------------------------------------
+
+_SAMPLES = ("design", "number", "seed", "over", "posterior")
+
+
+def _samples(stated: Mapping[str, Any], robot: Robot, where: str, data: list[str]) -> Samples | None:
+    if not stated:
+        return None
+    _keys(stated, _SAMPLES, ("design", "number"), where)
+    design = stated["design"]
+    if not isinstance(design, str) or design not in DESIGNS:
+        raise BadConfiguration(f"{where}.design: got {design!r}; {choices(str(design), DESIGNS)}")
+    number = _count(stated["number"], f"{where}.number", 2**52)
+    seed = stated.get("seed", 0)
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise BadConfiguration(f"{where}.seed: got {seed!r}; expected a whole number from 0 to {2**32 - 1}")
+    over = stated.get("over", {})
+    if not isinstance(over, Mapping):
+        raise BadConfiguration(f"{where}.over: got {over!r}; expected a table of names with their distributions")
+    marginals = {name: _quantile(name, d, robot, f"{where}.over.{name}") for name, d in over.items()}
+    joint = None
+    if "posterior" in stated:
+        joint = _posterior(stated["posterior"], robot, f"{where}.posterior", data)
+    if not marginals and joint is None:
+        raise BadConfiguration(f"{where}: got no names; expected over, or a posterior")
+    return Samples(design, number, seed, marginals, joint)
+
+
+def _posterior(stated: Any, robot: Robot, where: str, data: list[str]) -> Joint:
+    from calibration.data import posterior
+
+    if not isinstance(stated, str):
+        raise BadConfiguration(f"{where}: got {stated!r}; expected a run folder of calibrate or loop")
+    path = Path(stated)
+    path = path / posterior.FILE if path.is_dir() else path
+    found = posterior.read(path)
+    found.check(robot, where)
+    data.append(str(path))
+    return found
+
+
+#: Numbers that each distribution states.
+DISTRIBUTIONS: dict[str, tuple[str, ...]] = {
+    "uniform": ("low", "high"),
+    "loguniform": ("low", "high"),
+    "normal": ("mean", "sd"),
+    "lognormal": ("median", "sd_log"),
+    "triangular": ("low", "mode", "high"),
+    "prior": (),
+}
+
+
+def _quantile(name: str, stated: Any, robot: Robot, where: str) -> Quantile:
+    """The quantile function of a distribution, cut off at the bounds of what is sampled."""
+    axis = _known(name, robot, where)
+    if name == CONFIGURATION:
+        raise BadConfiguration(f"{where}: cannot be sampled; expected it among axes or conditions")
+    table = {"distribution": stated} if isinstance(stated, str) else stated
+    kind = table.get("distribution") if isinstance(table, Mapping) else None
+    if not isinstance(kind, str) or kind not in DISTRIBUTIONS:
+        raise BadConfiguration(f"{where}.distribution: got {kind!r}; {choices(str(kind), DISTRIBUTIONS)}")
+    needed = DISTRIBUTIONS[kind]
+    _keys(table, ("distribution", *needed), needed, where)
+    numbers = {key: stated_number(table[key], f"{where}.{key}") for key in needed}
+    ordered = [numbers[key] for key in ("low", "mode", "high") if key in numbers]
+    if ordered != sorted(ordered) or (ordered and ordered[0] == ordered[-1]):
+        said = ", ".join(f"{key} {value:g}" for key, value in numbers.items())
+        raise BadConfiguration(f"{where}: got {said}; expected {' below '.join(k for k in needed)}")
+    for key in ("sd", "sd_log"):
+        if numbers.get(key, 1.0) <= 0:
+            raise BadConfiguration(f"{where}.{key}: got {numbers[key]:g}; expected more than 0")
+    _within(np.array([v for k, v in numbers.items() if not k.startswith("sd")]), axis, where)
+    if kind == "prior":
+        if not axis.prior_sd or axis.value is None:
+            others = ", ".join(k for k in DISTRIBUTIONS if k != kind)
+            raise BadConfiguration(f"{where}: {name} has no prior; expected one of {others}")
+        return _prior(name, robot)
+    return _cut(kind, numbers, axis.bounds, where)
+
+
+def _prior(name: str, robot: Robot) -> Quantile:
+    """The quantile function of a parameter's prior, the one with which `calibrate` and `sensitivity` work."""
+    from scipy.special import ndtri
+
+    from calibration.inference import priors
+
+    coordinates = priors.coordinates(robot, [name])
+
+    def quantile(u: np.ndarray) -> np.ndarray:
+        return in_blocks(coordinates.value, ndtri(u)[:, None])[:, 0]
+
+    return quantile
+
+
+def _cut(kind: str, numbers: dict[str, float], bounds: tuple[float, float], where: str) -> Quantile:
+    from scipy import special
+
+    if kind in ("uniform", "loguniform"):
+        low, high = numbers["low"], numbers["high"]
+        if kind == "uniform":
+            return lambda u: low + (high - low) * u
+        if low <= 0:
+            raise BadConfiguration(f"{where}.low: got {low:g}; expected more than 0 with loguniform")
+        return lambda u: low * np.exp(u * math.log(high / low))
+    if kind == "triangular":
+        low, mode, high = numbers["low"], numbers["mode"], numbers["high"]
+        rise = (mode - low) / (high - low)
+        return lambda u: np.where(
+            u < rise,
+            low + np.sqrt(u * (high - low) * (mode - low)),
+            high - np.sqrt((1 - u) * (high - low) * (high - mode)),
+        )
+    # normal in the value or in its logarithm: of the whole curve, the part between the bounds
+    if kind == "normal":
+        mean, sd = numbers["mean"], numbers["sd"]
+        first, last = (special.ndtr((b - mean) / sd) for b in bounds)
+        return lambda u: np.clip(mean + sd * special.ndtri(first + (last - first) * u), *bounds)
+    median, sd = numbers["median"], numbers["sd_log"]
+    if median <= 0:
+        raise BadConfiguration(f"{where}.median: got {median:g}; expected more than 0")
+    first, last = (special.ndtr(math.log(b / median) / sd) if b > 0 else 0.0 for b in bounds)
+    return lambda u: np.clip(median * np.exp(sd * special.ndtri(first + (last - first) * u)), *bounds)

@@ -1,0 +1,302 @@
+"""Chunks of a sweep on the workers of a dask scheduler: one worker a device, lost workers' chunks computed again.
+
+Workers send their chunks to the process that was started by hand, which alone writes; so they need no disk in common.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import importlib.util
+import itertools
+import pickle
+import sys
+import threading
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calibration.data.errors import BadConfiguration, InputError
+from sweeps.points.identity import code, differences, versions
+from sweeps.store import PACKAGES
+
+if TYPE_CHECKING:
+    from sweeps.points.scale import Job, Produced
+
+#: Longest wait for a scheduler to answer, and for it to have a worker [s].
+ANSWER, WORKER = 4.0, 60.0
+#: How often a chunk is given to another worker before the sweep ends.
+RETRIES = 5
+#: Chunks that wait at each worker beside the one that it computes.
+AHEAD = 1
+GONE = "--scheduler: it has gone away; start it again, and the same command goes on"
+
+
+class LostWorkers(InputError):
+    """The workers were lost for good; the sweep can be taken up again."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pool:
+    """A scheduler with its workers.
+
+    Attributes:
+        client: of dask; device: kind of the workers' devices.
+    """
+
+    client: Any
+    device: str
+
+    def close(self) -> None:
+        """Take leave of the scheduler."""
+        self.client.close()
+
+    def produce(self, job: Job, chunks: Iterable[int]) -> Produced:
+        """Chunks as the workers finish them; a chunk is computed again where its worker is lost.
+
+        Raises:
+            LostWorkers: a chunk's workers were lost too often, none was left for a minute, or the scheduler is gone.
+            BadConfiguration: a worker has another program, or another kind of device.
+        """
+        from distributed import CancelledError, KilledWorker, TimeoutError, as_completed
+
+        from sweeps.points.scale import Piece
+
+        work, left = _packed(job), iter(chunks)
+        name = hashlib.sha256(work).hexdigest()[:16]
+        expected = {**program(), "device": {"device": self.device}}
+        tried: dict[int, int] = {}
+        numbers: dict[str, int] = {}
+
+        def submit(chunk: int) -> Any:
+            tried[chunk] = tried.get(chunk, 0) + 1
+            key = f"chunk-{chunk}-{tried[chunk]}-{name}"
+            future = self.client.submit(compute, work, name, chunk, expected, key=key, retries=RETRIES)
+            numbers[future.key] = chunk
+            return future
+
+        def fill() -> None:
+            """Give the workers that there are now, some of which may have come later, enough to do."""
+            room = max(self._workers(), 1) * (1 + AHEAD) - len(numbers)
+            for chunk in itertools.islice(left, max(room, 0)):
+                under_way.add(submit(chunk))
+
+        under_way = as_completed(loop=self.client.loop)
+        fill()
+        while not under_way.is_empty():
+            try:
+                future = self._next(under_way)
+                chunk = numbers.pop(future.key)
+                arrays = self._result(future)
+            except TimeoutError as error:
+                raise LostWorkers(
+                    f"--scheduler: no worker has been there for {WORKER:g} s; start one, and the same command goes on"
+                ) from error
+            except (KilledWorker, CancelledError) as error:
+                if self.client.status != "running":
+                    raise LostWorkers(GONE) from error
+                if tried[chunk] > RETRIES:
+                    raise LostWorkers(
+                        f"--scheduler: chunk {chunk} lost its worker {tried[chunk]} times, perhaps short of memory; "
+                        "the same command goes on with workers that stay"
+                    ) from error
+                under_way.add(submit(chunk))
+                continue
+            future.release()
+            yield Piece(chunk, arrays)
+            fill()
+
+    def _workers(self) -> int:
+        """How many there are."""
+        try:
+            return len(self.client.scheduler_info(n_workers=-1)["workers"])
+        except Exception as error:  # whatever comes of asking one that is no more
+            raise LostWorkers(GONE) from error
+
+    def _next(self, under_way: Any) -> Any:
+        """The next finished future, however long it takes while some worker is there.
+
+        Raises:
+            TimeoutError: no worker for `WORKER` seconds.
+            LostWorkers: the scheduler is gone.
+        """
+        found: list[Any] = []
+        failed: list[BaseException] = []
+
+        def wait() -> None:
+            try:
+                found.append(next(under_way))
+            except BaseException as error:
+                failed.append(error)
+
+        thread = threading.Thread(target=wait, daemon=True)
+        thread.start()
+        while thread.is_alive():
+            thread.join(WORKER / 4)
+            if thread.is_alive() and not self._workers():
+                self.client.wait_for_workers(1, timeout=WORKER)
+        if failed:
+            raise failed[0]
+        return found[0]
+
+    def _result(self, future: Any) -> Any:
+        """What a finished future holds; where its worker is lost before it is fetched, what another one finds.
+
+        Raises:
+            TimeoutError, LostWorkers: as `_next`.
+        """
+        while True:
+            try:
+                return future.result(timeout=WORKER)
+            except TimeoutError:
+                if not self._workers():
+                    self.client.wait_for_workers(1, timeout=WORKER)
+
+
+def _packed(job: Job) -> bytes:
+    """A job as bytes, with the source of effects that are the user's own: workers need none of the user's files."""
+    import cloudpickle
+
+    own = {sys.modules[type(e).__module__] for e in job.robot.effects if not type(e).__module__.startswith("mmrjax.")}
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return bytes(cloudpickle.dumps(job))
+    finally:
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+def connect(address: str) -> Pool:
+    """A scheduler's workers, of one program and one kind of device.
+
+    Raises:
+        BadConfiguration: dask is not installed, nobody answers at the address, there is no worker, or workers differ
+            from this process or among each other.
+    """
+    if importlib.util.find_spec("distributed") is None:
+        raise BadConfiguration("--scheduler: needs dask; install mmrjax[cluster]")
+    client = _client(address)
+    try:
+        try:
+            client.wait_for_workers(1, timeout=ANSWER)
+        except TimeoutError:
+            raise BadConfiguration(
+                f"--scheduler: {address} has no workers; start one for each device, as dask worker {address} "
+                "--nthreads 1"
+            ) from None
+        here, kinds = program(), set()
+        for worker, (there, device) in client.run(introduce).items():
+            differ = differences(here, there)
+            if differ:
+                raise BadConfiguration(f"--scheduler: {worker} has another program; it differs in {differ}")
+            kinds.add(device)
+        if len(kinds) > 1:
+            raise BadConfiguration(
+                f"--scheduler: the workers have different devices, {', '.join(sorted(kinds))}; expected one kind"
+            )
+        return Pool(client, kinds.pop())
+    except BaseException:
+        client.close()
+        raise
+
+
+def _client(address: str) -> Any:
+    """A client of the scheduler at an address, in `ANSWER` seconds or not at all.
+
+    dask limits how long it waits for a connection, not for what is said over it; so it waits in a thread here.
+    """
+    import distributed
+
+    found: list[Any] = []
+    failed: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            found.append(distributed.Client(address, timeout=ANSWER, name="mmrjax sweep", set_as_default=False))
+        except BaseException as error:  # whatever comes of talking to something that is no scheduler
+            failed.append(error)
+
+    with _quiet():
+        asking = threading.Thread(target=ask, daemon=True)
+        asking.start()
+        asking.join(ANSWER + 0.5)
+    if found:
+        return found[0]
+    reason = (str(failed[0]).split("\n")[0] or type(failed[0]).__name__) if failed else "silence"
+    raise BadConfiguration(
+        f"--scheduler: got {address}; no scheduler answers there within {ANSWER:g} s ({reason}); expected the "
+        "address that dask scheduler prints, such as tcp://host:8786"
+    )
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what dask logs of a failed connection off the console: the error says it in one sentence."""
+    import logging
+
+    loggers = [logging.getLogger(name) for name in ("distributed.comm", "distributed.client", "distributed.core")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+# --- on the workers -------------------------------------------------------------------------------------------------
+
+_lock = threading.Lock()
+_compiled: dict[str, Any] = {}
+
+
+def program() -> dict[str, dict[str, str]]:
+    """Hash of each module, and the versions that numbers depend on."""
+    return {"code": code(), "versions": versions(PACKAGES)}
+
+
+@functools.cache
+def _start() -> None:
+    """Double precision and compiled programs kept, as in the command itself."""
+    from sweeps import compilation_cache
+
+    compilation_cache.enable()
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
+def introduce() -> tuple[dict[str, dict[str, str]], str]:
+    """What a worker runs, and on what."""
+    _start()
+    from sweeps.points.scale import device_kind
+
+    return program(), device_kind()
+
+
+def compute(work: bytes, name: str, chunk: int, expected: dict[str, Any]) -> dict[str, np.ndarray]:
+    """A chunk on this worker's devices; a job is unpacked and compiled once.
+
+    Args:
+        work: the job, packed; name: of it; expected: program and device of the other workers.
+
+    Raises:
+        BadConfiguration: this worker, which has come later than the others, is not like them.
+    """
+    there, device = introduce()
+    differ = differences(expected, {**there, "device": {"device": device}})
+    if differ:
+        raise BadConfiguration(f"--scheduler: a worker that came later has another program or device: {differ}")
+    from sweeps.points.scale import Compiled, fetched
+
+    with _lock:
+        if name not in _compiled:
+            _compiled.clear()
+            _compiled[name] = Compiled(pickle.loads(work))
+        compiled = _compiled[name]
+        return fetched(compiled(compiled.points(chunk)), compiled.job.blocks.count(chunk))

@@ -1,0 +1,113 @@
+"""The results of a store as one table, CSV or Parquet, written chunk by chunk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mmrjax import channels, outputs
+from mmrjax.power import COULOMB_PER_MAH
+from mmrjax.signals import FLAGS, STATUSES
+from mmrjax.variation import STATUS
+from sweeps.points.zarr_store import STORE, Layout
+
+#: Columns of conditions, as tables of runs and options have them, and the value of a unit of each in that of the
+#: store; what has no such column keeps its name.
+COLUMNS = {
+    "voltage": ("supply_voltage_V", 1.0),
+    "slope_deg": ("slope_deg", 1.0),
+    "payload": ("payload_kg", 1.0),
+    "total_mass": ("total_mass_kg", 1.0),
+    "motor_speed": ("motor_speed_rpm", channels.RPM),
+    "discharge": ("discharge_mAh", COULOMB_PER_MAH),
+}
+
+
+def export(kind: str, folder: Path, layout: Layout) -> Path:
+    """Write `runs.csv` or `runs.parquet` into a finished run folder; returns its path.
+
+    A row a point, in the order of the points; what is not finite is empty.
+    """
+    path = folder / f"runs.{kind}"
+    aside = path.with_name(path.name + ".writing")
+    try:
+        _WRITERS[kind](aside, tables(folder / STORE, layout))
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+    return path
+
+
+def tables(store: Path, layout: Layout) -> Iterator[Any]:
+    """The points of each chunk as an Arrow table."""
+    import pyarrow as pa
+    import zarr
+
+    group = zarr.open_group(store, mode="r")
+    design, blocks = layout.design, layout.blocks
+    columns = {row.name: row.column for row in outputs.table(channels.EVERY)}
+    for chunk in range(len(blocks)):
+        box = blocks.box(chunk)
+        shape = tuple(b.stop - b.start for b in box)
+        found: dict[str, Any] = {}
+        for k, (name, values) in enumerate(design.axes.items()):
+            along = values[box[k]][(slice(None),) + (None,) * (len(shape) - k - 1)]
+            flat = np.broadcast_to(along, shape).ravel()
+            words = layout.labels.get(name)
+            column, unit = COLUMNS.get(name, (name, 1.0))
+            found[column] = (
+                pa.array(flat / unit)
+                if words is None
+                else pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(words))
+            )
+        for name in design.samples.names if design.samples is not None else ():
+            drawn: Any = group[name]
+            column, unit = COLUMNS.get(name, (name, 1.0))
+            found[column] = pa.array(np.broadcast_to(drawn[box[-1]], shape).ravel() / unit)
+        for variable in layout.variables:
+            array: Any = group[variable.name]
+            flat = array[box].ravel()
+            if variable.name == STATUS:
+                found[STATUS] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), list(STATUSES))
+            elif np.dtype(variable.dtype).kind != "f":
+                names = [";".join(f for k, f in enumerate(FLAGS) if bits >> k & 1) for bits in range(1 << len(FLAGS))]
+                found[variable.name] = pa.DictionaryArray.from_arrays(flat.astype(np.int32), names)
+            else:
+                found[columns.get(variable.name, variable.name)] = pa.array(flat, from_pandas=True)
+        yield pa.table(found)
+
+
+def _csv(path: Path, parts: Iterator[Any]) -> None:
+    import pyarrow as pa
+    from pyarrow import csv
+
+    writer = None
+    for part in parts:
+        words = [pa.types.is_dictionary(f.type) for f in part.schema]
+        part = part.cast(
+            pa.schema([f.with_type(pa.string()) if w else f for f, w in zip(part.schema, words, strict=True)])
+        )
+        if writer is None:
+            writer = csv.CSVWriter(path, part.schema, write_options=csv.WriteOptions(quoting_style="needed"))
+        writer.write_table(part)
+    if writer is not None:
+        writer.close()
+
+
+def _parquet(path: Path, parts: Iterator[Any]) -> None:
+    from pyarrow import parquet
+
+    writer = None
+    for part in parts:
+        if writer is None:
+            writer = parquet.ParquetWriter(path, part.schema)
+        writer.write_table(part)
+    if writer is not None:
+        writer.close()
+
+
+_WRITERS = {"csv": _csv, "parquet": _parquet}

@@ -1,0 +1,126 @@
+"""Grids of operating points as tables of runs."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TypeVar
+
+import numpy as np
+
+from calibration.data.columns import Layout
+from calibration.data.errors import BadConfiguration, choices
+from calibration.data.runs import Runs
+from mmrjax.robot import Robot
+from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES
+from sweeps.config import GridPart
+from sweeps.inputs import check_configurations
+from sweeps.points import imposed
+
+G = TypeVar("G", bound=GridPart)
+
+#: Option that states an axis.
+OPTIONS = {
+    "voltages_V": "--voltages", "motor_speeds_rpm": "--motor-speeds", "payloads_kg": "--payloads",
+    "slopes_deg": "--slopes", "surface": "--surface",
+}  # fmt: skip
+#: Those that act on a vehicle alone.
+ON_GROUND = ("payloads_kg", "slopes_deg", "surface")
+#: Axis of what is imposed (`rig.IMPOSED`).
+AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm"}
+
+
+def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:
+    """The grid with every axis stated that the robot has.
+
+    What is imposed is that of Table 8 for the packaged robot; of a rig thirds of its limit (`sweeps.points.imposed`).
+    Payloads and slopes are those of Table 8 too, of a rig none and 0.
+
+    Args:
+        battery: whether the runs are on the battery, where the axis of voltages drops out.
+        notes: is given a sentence for what is taken of a rig's limits.
+
+    Raises:
+        BadConfiguration: an axis that the robot does not have, one that is neither stated nor follows from a limit,
+            or a surface or a configuration that there is not.
+    """
+    layout = Layout.of(robot)
+    check(config, robot)
+    own = AXIS[layout.imposed]
+    update: dict[str, object] = {"configurations": configurations(config, robot)}
+    if battery:
+        imposed.check_battery(robot)
+    elif getattr(config, own) is None:
+        update[own] = imposed.levels(robot, OPTIONS[own], notes)
+    if robot.has_ground:
+        table8 = robot.rig.inherits
+        update |= {
+            "payloads_kg": config.payloads_kg or (PAYLOADS_KG if table8 else (0.0,)),
+            "slopes_deg": config.slopes_deg or (SLOPES_DEG if table8 else (0.0,)),
+            "surface": config.surface or (BENCH if table8 else None),
+        }
+    return config.model_copy(update=update)
+
+
+def check(config: GridPart, robot: Robot) -> None:
+    """Refuse axes that a robot does not have.
+
+    Raises:
+        BadConfiguration: one of them, or a surface that is none of Table 5 where those are meant.
+    """
+    layout = Layout.of(robot)
+    for key in AXIS.values():
+        if key != AXIS[layout.imposed] and getattr(config, key) is not None:
+            raise BadConfiguration(imposed.refused(robot, OPTIONS[key], OPTIONS[AXIS[layout.imposed]]))
+    imposed.check_acting(robot, (OPTIONS[key] for key in ON_GROUND if getattr(config, key) is not None))
+    surface = config.surface
+    if surface is not None and robot.rig.scales_adhesion and surface not in SURFACES:
+        raise BadConfiguration(f"option surface: got {surface!r}; {choices(surface, SURFACES)}")
+
+
+def axes(config: GridPart, robot: Robot, battery: bool = False) -> dict[str, tuple[object, ...]]:
+    """Values of each axis of a grid by the column of a table, the slope last.
+
+    Args:
+        config: as `resolved` makes it; battery: whether the runs are on the battery.
+
+    Raises:
+        BadConfiguration: a configuration that the robot does not have.
+    """
+    layout = Layout.of(robot)
+    found: dict[str, tuple[object, ...]] = {
+        "configuration": configurations(config, robot),
+        layout.imposed_column: (math.nan,) if battery else getattr(config, AXIS[layout.imposed]),
+    }
+    ground = {"payload_kg": config.payloads_kg, "slope_deg": config.slopes_deg}
+    return found | {column: values for column, values in ground.items() if values}
+
+
+def grid(config: GridPart, robot: Robot, battery: bool = False) -> Runs:
+    """Every combination of the axes as a table of conditions, slope varying fastest.
+
+    Args:
+        config: as `resolved` makes it, or not yet; battery: whether the runs are on the battery.
+
+    Raises:
+        BadConfiguration: as `resolved`.
+    """
+    config = resolved(config, robot, battery)
+    values = axes(config, robot, battery)
+    points = list(itertools.product(*values.values()))
+    columns = {name: np.array(column) for name, column in zip(values, zip(*points, strict=True), strict=True)}
+    if config.surface is not None:
+        columns["surface"] = np.full(len(points), config.surface)
+    return Runs(source="the grid", columns=columns, layout=Layout.of(robot))
+
+
+def configurations(config: GridPart, robot: Robot) -> tuple[str, ...]:
+    """The configurations of a grid: those stated, each of which the robot has, or all of the robot's.
+
+    Raises:
+        BadConfiguration: one that the robot does not have.
+    """
+    if config.configurations is None:
+        return robot.configurations.names
+    check_configurations(robot, config.configurations, "configurations")
+    return config.configurations

@@ -1,0 +1,266 @@
+"""The engine of a sweep: chunks of one compiled shape over all local devices, written while the next is computed."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+from mmrjax import fidelities, outputs
+from mmrjax.variation import FLAGS, STATUS, Variation, evaluate
+from sweeps.points.axes import Plan, adhesions
+from sweeps.points.design import Blocks
+
+if TYPE_CHECKING:
+    from mmrjax.conditions import Conditions
+    from mmrjax.profile import Profile
+    from mmrjax.robot import Robot
+    from sweeps.points.zarr_store import SweepStore
+
+POINTS = "points"
+#: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
+WAITING = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """All that is needed to compute any chunk of a sweep, here or in another process.
+
+    Attributes:
+        robot: that is varied; model: fidelity, and its options.
+        outputs: names; storage: type that they are stored in.
+        profile: that every point follows, if any.
+    """
+
+    robot: Robot
+    model: str
+    options: Mapping[str, float]
+    plan: Plan
+    outputs: tuple[str, ...]
+    storage: str
+    blocks: Blocks
+    profile: Profile | None = None
+
+
+@dataclasses.dataclass
+class Times:
+    """Seconds spent by what overlaps: waiting for points and starting to compute them (on processors that is all of
+    computing); waiting for what is computed, fetching it from the device, writing it; and the whole."""
+
+    points: float = 0.0
+    start: float = 0.0
+    compute: float = 0.0
+    transfer: float = 0.0
+    write: float = 0.0
+    total: float = 0.0
+
+
+def device_kind() -> str:
+    """What the local devices are, in words."""
+    device = jax.local_devices()[0]
+    return f"{device.platform}: {device.device_kind}"
+
+
+def default_chunk(model: str, accelerator: bool, devices: int) -> int:
+    """Points of a chunk where none is stated, over all devices."""
+    return fidelities.facts(model).at_once(accelerator) * devices
+
+
+class Compiled:
+    """A job on the local devices: a program for chunks of one shape, split among the devices along the points."""
+
+    def __init__(self, job: Job, devices: list[Any] | None = None) -> None:
+        self.job = job
+        devices = jax.local_devices() if devices is None else devices
+        self.mesh = Mesh(np.array(devices), (POINTS,))
+        # Every device has the same number of points; the last ones stand for the chunk's last point again.
+        self.size = -(-job.blocks.points // len(devices)) * len(devices)
+        variation = Variation(job.robot, job.plan.design.names)
+        everywhere = NamedSharding(self.mesh, PartitionSpec())
+        self._variation, self._conditions = _placed((variation, job.plan.fixed()), everywhere)
+        self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
+        surface = None if job.plan.surface is None else adhesions(job.robot, job.plan.surface)
+        self._program = eqx.filter_jit(_program(job, surface, self.mesh))
+
+    def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
+        """Values of a chunk's points, the last ones repeated up to the compiled shape."""
+        values = self.job.plan.design.block(self.job.blocks.box(chunk))
+        if len(values) == self.size:
+            return values
+        return values[np.minimum(np.arange(self.size), len(values) - 1)]
+
+    def __call__(self, values: Float[np.ndarray, "points names"]) -> dict[str, Array]:
+        """Start computing; returns arrays of the compiled shape that may not be there yet."""
+        found: dict[str, Array] = self._program(
+            self._variation, self._conditions, jax.device_put(values, self._split)
+        )
+        return found
+
+
+def _placed(tree: Any, sharding: NamedSharding) -> Any:
+    arrays, rest = eqx.partition(tree, eqx.is_array)
+    return eqx.combine(jax.device_put(arrays, sharding), rest)
+
+
+def _program(
+    job: Job, surface: tuple[float, ...] | None, mesh: Mesh
+) -> Callable[[Variation, Conditions, Array], dict[str, Array]]:
+    """Outputs as they are stored: in the units of tables, in the stored type, statuses as bytes, flags as two."""
+    factors = {row.name: row.factor for row in outputs.table(job.robot.channels)}
+    names, options = job.outputs, dict(job.options)
+
+    def one_device(variation: Variation, conditions: Conditions, values: Array) -> dict[str, Array]:
+        if surface is not None:
+            _, at = variation.at(values, conditions)
+            ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
+            wide = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
+            conditions = dataclasses.replace(wide, adhesion=ratio)
+        found = evaluate(variation, job.model, values, conditions, options, names, job.profile)
+        stored = {n: (found[n] / factors.get(n, 1.0)).astype(job.storage) for n in names if n != FLAGS}
+        kinds = {STATUS: jnp.uint8, FLAGS: jnp.uint16}
+        bits = {n: found[n].astype(kind) for n, kind in kinds.items() if n in found}
+        return {**stored, **bits}
+
+    def program(variation: Variation, conditions: Conditions, values: Array) -> dict[str, Array]:
+        arrays, rest = eqx.partition((variation, conditions), eqx.is_array)
+
+        def part(arrays: Any, values: Array) -> dict[str, Array]:
+            variation, conditions = eqx.combine(arrays, rest)
+            return one_device(variation, conditions, values)
+
+        # Each device searches its own roots and steps its own runs: none waits for another inside a loop.
+        split = jax.shard_map(
+            part, mesh=mesh, in_specs=(PartitionSpec(), PartitionSpec(POINTS)), out_specs=PartitionSpec(POINTS),
+            check_vma=False,
+        )  # fmt: skip
+        return split(arrays, values)
+
+    return program
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A chunk under way.
+
+    Attributes:
+        chunk: its number; arrays: by variable, which may be on a device still.
+        values: of its points, a row each, where they are at hand.
+    """
+
+    chunk: int
+    arrays: Mapping[str, Any]
+    values: Float[np.ndarray, "points names"] | None = None
+
+
+Produced = Iterator[Piece]
+
+
+def produce(compiled: Compiled, chunks: Iterable[int], times: Times) -> Produced:
+    """Compute chunks on the local devices, in order, the points of the next being made meanwhile."""
+    with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="points") as maker:
+        ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
+        for chunk in chunks:
+            ahead.append((chunk, maker.submit(compiled.points, chunk)))
+            if len(ahead) > 1:
+                yield _started(compiled, *ahead.popleft(), times)
+        while ahead:
+            yield _started(compiled, *ahead.popleft(), times)
+
+
+def _started(compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], times: Times) -> Piece:
+    start = time.perf_counter()
+    values = points.result()
+    made = time.perf_counter()
+    arrays = compiled(values)
+    times.points += made - start
+    times.start += time.perf_counter() - made
+    return Piece(chunk, arrays, values)
+
+
+def fetched(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
+    """The first `count` values of each array, on this machine."""
+    return {name: np.asarray(values)[:count] for name, values in jax.device_get(dict(arrays)).items()}
+
+
+def drawn(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
+    """Values of the samples along a chunk, a row a name, where this chunk is the one that writes them."""
+    design, samples = job.plan.design, job.plan.design.samples
+    if samples is None or any(job.blocks.place(piece.chunk)[:-1]):
+        return None
+    along = job.blocks.box(piece.chunk)[-1]
+    if piece.values is not None:  # the samples vary fastest
+        return piece.values[: along.stop - along.start, len(design.axes) :].T
+    return samples.values(along.start, along.stop - along.start)
+
+
+def run(store: SweepStore, job: Job, chunks: Produced, advance: Callable[[float], None], times: Times) -> None:
+    """Write chunks as they come, in a thread of its own, so that the next is computed meanwhile.
+
+    Args:
+        store: begun; advance: called with the points of each chunk that is done.
+
+    Raises:
+        OSError: the disk is full, or the store cannot be written; chunks written before are kept.
+    """
+    waiting: queue.Queue[Piece | None] = queue.Queue(WAITING)
+    stop, failures = threading.Event(), list[BaseException]()
+    begun = time.perf_counter()
+
+    def write(piece: Piece) -> None:
+        start = time.perf_counter()
+        jax.block_until_ready(list(piece.arrays.values()))
+        computed = time.perf_counter()
+        count = job.blocks.count(piece.chunk)
+        here = fetched(piece.arrays, count)
+        there = time.perf_counter()
+        if stop.is_set():  # interrupted while it was computed
+            return
+        store.write(piece.chunk, here, drawn(job, piece))
+        times.compute += computed - start
+        times.transfer += there - computed
+        times.write += time.perf_counter() - there
+        advance(count)
+
+    def keep_writing() -> None:
+        while (piece := waiting.get()) is not None:
+            try:
+                if not stop.is_set():
+                    write(piece)
+            except BaseException as error:
+                failures.append(error)
+                stop.set()
+
+    writer = threading.Thread(target=keep_writing, name="writer", daemon=True)
+    writer.start()
+    try:
+        for piece in chunks:
+            waiting.put(piece)
+            if stop.is_set():
+                break
+        waiting.put(None)
+        writer.join()
+    except BaseException:
+        stop.set()
+        with contextlib.suppress(queue.Empty):  # the writer takes from it too
+            while True:
+                waiting.get_nowait()
+        waiting.put(None)
+        writer.join(5.0)  # what is written now is finished, what is still computed is not waited for
+        raise
+    finally:
+        times.total += time.perf_counter() - begun
+    if failures:
+        raise failures[0]

@@ -1,0 +1,50 @@
+"""How every command ends that leaves a run folder, once it has loaded, computed, written and printed."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from calibration.data.runs import Runs
+from sweeps import config as configuration
+from sweeps.config import RobotPart
+from sweeps.console import say
+from sweeps.store import DONE, SOME_NOT_CONVERGED, RunFolder
+
+Page = Callable[[Path], Any]
+
+
+def page(name: str, *of: Any, **known: Any) -> Page:
+    """The page of `sweeps/pages` by name, of what its `write` takes after the folder.
+
+    It is imported when it is written: figures cost half a second, which --no-report saves.
+    """
+    return lambda folder: importlib.import_module(f"sweeps.pages.{name}").write(folder, *of, **known)
+
+
+def leave(
+    folder: RunFolder,
+    config: RobotPart,
+    manifest: dict[str, Any],
+    *,
+    complete: bool,
+    page: Page | None = None,
+    runs: Runs | None = None,
+) -> int:
+    """Write the configuration and, unless it is not wanted, the page; move the folder into place and say where it is.
+
+    Args:
+        folder: with the command's own files, `robot.toml` among them.
+        manifest: what it says beside program, versions and hashes; runs: the table whose file's hash it has, if any.
+        complete: whether all is as asked.
+
+    Returns:
+        The exit code: 0, or 3 where not all is as asked.
+    """
+    folder.write_text("config.resolved.toml", configuration.as_toml(config))
+    if page is not None and getattr(config, "report", True):
+        page(folder.partial)
+    say(str(folder.finish(manifest, runs)))
+    return DONE if complete else SOME_NOT_CONVERGED

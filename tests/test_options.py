@@ -1,0 +1,148 @@
+"""Options of commands are what their configurations say: nothing of a field is stated twice."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+from calibration.data.errors import BadConfiguration
+from sweeps import cli, config, config_campaign, options
+
+KINDS = {
+    "simulate": (config.Simulate, config.OneRun),
+    "sweep": (config.Sweep, config_campaign.SharePart),
+    "compare": (config.Compare,),
+    "reproduce": (config.Reproduce,),
+    "render": (config.Render, config.OneRun),
+    "calibrate": (config.Calibrate, config.MembersPart),
+    "loop": (config.Loop, config.MembersPart),
+    "sensitivity": (config.Sensitivity,),
+    "resonance": (config.Resonance,),
+    "check": (config.Check,),
+    "size": (config.Size,),
+}
+HIDDEN = {
+    "sweep": {"--shard", "--scheduler"},
+    "calibrate": {"--population", "--generations", "--members"},
+    "loop": {"--population", "--generations", "--members", "--replicates"},
+}
+
+
+@pytest.fixture(scope="module")
+def parameters():
+    """Parameters of each command's parser by name."""
+    commands = typer.main.get_command(cli.app).commands
+    return {name: {p.name: p for p in command.params} for name, command in commands.items()}
+
+
+@pytest.fixture
+def said(monkeypatch, capsys):
+    """What `mmrjax ...` prints, the borders of its tables aside."""
+
+    def say(*words):
+        monkeypatch.setenv("COLUMNS", "200")
+        monkeypatch.setattr(sys, "argv", ["mmrjax", *words])
+        with pytest.raises(SystemExit):
+            cli.main()
+        out, err = capsys.readouterr()
+        return out + err
+
+    return say
+
+
+@pytest.mark.parametrize("command", KINDS)
+def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_says(command, parameters):
+    for kind in KINDS[command]:
+        for name, fact in kind.model_json_schema()["properties"].items():
+            if "const" in fact:
+                assert name not in parameters[command]
+                continue
+            shown = parameters[command][name]
+            assert fact["description"].rstrip(".").partition(" (")[0] in shown.help, name
+            unit = name.rpartition("_")[2]
+            assert unit not in options.UNITS or f"({unit})" in shown.help, name
+            assert all(choice in shown.help for choice in fact.get("enum", ()))
+            assert shown.default is None, name  # what is not given is the configuration's affair
+    assert {"config_file", "no_cache"} <= set(parameters[command])
+
+
+def test_units_bounds_choices_and_defaults_are_read_off_the_field():
+    def text(kind, name):
+        return options.described(name, options.facts(kind)[name]).replace("\\", "")
+
+    assert text(config.Sweep, "slopes_deg").endswith("  [-45 to 45]  [default: 0,5,10,15,20]")
+    assert text(config.Sweep, "discharge_mAh") == (
+        "Charge already taken from the battery (mAh).  [0 to 100000]  [default: 0]"
+    )
+    assert text(config.Loop, "prefer").endswith(": fit, held-out.  [default: fit]")
+    assert text(config.Resonance, "payloads_kg").endswith("[default: 0,1.5,3,5,6.5,8]")
+    assert "[above 0, at most 0.01]  [default: 0.0001]" in text(config.Simulate, "step_s")
+    assert text(config.Simulate, "battery") == "Supply from the on-board battery."
+    assert text(config.Simulate, "report") == "Write report.html.  [default: report]"
+
+
+@pytest.mark.parametrize("command", KINDS)
+def test_solver_options_are_hidden_until_all_are_asked_for(command, parameters, said):
+    hidden = {p.opts[0] for p in parameters[command].values() if getattr(p, "hidden", False)}
+    assert hidden == HIDDEN.get(command, set())
+    assert ("help_all" in parameters[command]) == bool(hidden)
+    if hidden:
+        short, whole = said(command, "--help"), said(command, "--help-all")
+        listed = [{line.split()[1] for line in text.splitlines() if "│ --" in line} for text in (short, whole)]
+        assert not listed[0] & hidden and listed[1] == listed[0] | hidden
+        assert f"Example: mmrjax {command}" in whole
+        assert said(command, "--help") == short  # nothing is left of it
+
+
+def _file(folder: Path, text: str) -> Path:
+    (folder / "c.toml").write_text(text)
+    return folder / "c.toml"
+
+
+def test_solver_table_of_a_file_is_read_and_options_win(tmp_path):
+    file = _file(tmp_path, 'seed = 3\n[solver]\nreplicates = 300\npopulation = 8\nmembers = "kept.npz"\n')
+    found = config.resolve(config.Loop, file, {}, config.MembersPart)
+    assert (found.seed, found.replicates, found.population) == (3, 300, 8)
+    assert config.resolve(config.Loop, file, {"population": 16}, config.MembersPart).population == 16
+    assert config.resolve_beside(config.MembersPart, file, {}).members == Path("kept.npz")
+    assert config.resolve_beside(config.MembersPart, file, {"members": "other"}).members == Path("other")
+    # what a former version left, whose keys all stand at the top, says the same
+    flat = _file(tmp_path, "seed = 3\nreplicates = 300\npopulation = 8\n")
+    assert config.resolve(config.Loop, flat, {}) == found
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "message"),
+    [
+        (config.Loop, "[solver]\nreplicate = 300\n", r"c.toml, solver.replicate: no such key; did you mean replicates"),
+        (config.Loop, "[solver]\nseed = 3\n", r"c.toml, solver.seed: no such key; allowed: replicates, population"),
+        (config.Check, "[solver]\nmembers = 3\n", r"c.toml, solver.members: no such key; this command has none"),
+        (config.Loop, "solver = 3\n", r"c.toml, solver: got 3; expected a table, \[solver\]"),
+        (config.Loop, "replicates = 400\n[solver]\nreplicates = 300\n", r"solver.replicates: the file states replicates"),
+        (config.Loop, "[solver]\nreplicates = 3\n", r"c.toml, replicates: got 3; input should be greater"),
+    ],
+)  # fmt: skip
+def test_solver_tables_that_cannot_be_are_refused_in_a_sentence(kind, text, message, tmp_path):
+    with pytest.raises(BadConfiguration, match=message):
+        config.resolve(kind, _file(tmp_path, text), {})
+
+
+def test_command_takes_its_solver_table(tmp_path, monkeypatch, said):
+    monkeypatch.chdir(tmp_path)
+    _file(tmp_path, '[solver]\nshard = "0/3"\n')
+    assert said("sweep", "--config", "c.toml").startswith("mmrjax: --shard: got 0/3; expected i/n")
+    _file(tmp_path, "[solver]\nshards = 3\n")
+    assert said("sweep", "c.toml").startswith("mmrjax: c.toml, solver.shards: no such key; did you mean shard?")
+    _file(tmp_path, "[solver]\npopulation = 3\n")
+    assert said("loop", "--config", "c.toml").startswith("mmrjax: c.toml, population: got 3; input should be")
+    assert [p.name for p in tmp_path.iterdir()] == ["c.toml"]
+
+
+def test_configuration_of_one_command_names_what_another_lacks(tmp_path, monkeypatch, said):
+    monkeypatch.chdir(tmp_path)
+    _file(tmp_path, 'model = "drive"\nduration_s = 0.0\n')
+    assert said("compare", "--config", "c.toml").startswith("mmrjax: c.toml, duration_s: got 0.0; ")
+    assert said("check", "--config", "c.toml").startswith("mmrjax: c.toml, model: no such key; ")
