@@ -166,8 +166,10 @@ def point(**given):
     "name",
     [
         "speed_m_s",
-        "slope_deg",
-        *(pytest.param(n, marks=pytest.mark.slow) for n in ("payload_kg", "endurance_min", "energy_per_metre_Wh")),
+        *(
+            pytest.param(n, marks=pytest.mark.slow)
+            for n in ("slope_deg", "payload_kg", "endurance_min", "energy_per_metre_Wh")
+        ),
     ],
 )
 def test_derivatives_are_differences(robot, name):

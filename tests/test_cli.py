@@ -602,6 +602,7 @@ def test_robot_with_one_configuration_simulates_and_sweeps_it(mmrjax, tmp_path, 
     assert code == 2 and "configurations: got 6T2A; the robot has no such configuration; allowed: crawler" in err
 
 
+@pytest.mark.slow
 def test_robot_with_one_configuration_is_compared(mmrjax, tmp_path, crawler):
     (tmp_path / "runs.csv").write_text(f"{HEADER}\ncrawler,15,12,0,5,2.75,4800,400\n")
     assert mmrjax("compare", "runs.csv", "--robot", crawler, "--out", "c")[0] == 0

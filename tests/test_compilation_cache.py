@@ -102,6 +102,7 @@ def test_cache_switched_off_has_no_place(word, monkeypatch):
     assert str(compilation_cache.describe()) == "off (MMRJAX_CACHE=off)"
 
 
+@pytest.mark.slow
 def test_process_with_cache_switched_off_keeps_nothing(tmp_path):
     done = process("off", XDG_CACHE_HOME=str(tmp_path), HOME=str(tmp_path))
     assert done["folder"] is None and done["kept"] == done["read"] == 0

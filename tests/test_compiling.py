@@ -37,7 +37,8 @@ def space_of(world, folder):
     return discover.pose(runs, robot, sd, settings_for(observer), library=library)
 
 
-@pytest.mark.parametrize("kind", [*(pytest.param(k, marks=pytest.mark.slow) for k in ("wheeled", "bench")), "linear"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["wheeled", "bench", "linear"])
 def test_two_rigs_of_one_structure_share_their_programs(tmp_path, kind):
     rng = np.random.default_rng([5, len(kind)])
     one = gr.world(rng, kind, rows=(33, 48))

@@ -70,8 +70,14 @@ def test_curve_is_level_beyond_its_ends_and_has_no_corner():
 @pytest.mark.parametrize(
     "law", [laws.law_declared, laws.law_linear, laws.law_unit, laws.law_readable], ids=lambda law: law.__name__[4:]
 )
-@EACH
+@pytest.mark.parametrize(
+    "effect",
+    [c if k % 9 == 0 or k == len(CURVES) - 1 else pytest.param(c, marks=pytest.mark.slow)
+     for k, c in enumerate(CURVES.values())],
+    ids=list(CURVES),
+)  # fmt: skip
 def test_curve_obeys(effect, law):
+    """In `make test` each of seven places with another of eight variables, and the last with two."""
     law(effect)
 
 

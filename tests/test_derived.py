@@ -67,6 +67,7 @@ def test_steepest_slope_that_sliding_ends_is_where_adhesion_is_used_up(robot, co
     assert float(found["steepest_slope"]) == pytest.approx(closed, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_steepest_slope_that_the_motors_end_is_where_the_robot_comes_to_stand(robot):
     weak = changed(robot, **{"6T2A__ground__friction__static": 2.5})
     conditions = asked(0, 2.0, payload=8.0)

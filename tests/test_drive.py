@@ -311,6 +311,7 @@ def test_drive_discharges_a_full_battery_to_its_clear_end(small):
 # --- batches ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_drive_batch_equals_loop(robot, table8, drive_table8, times_fine):
     single = jax.jit(drive)
     for k in (0, 64, 131, 179):

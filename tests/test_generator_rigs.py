@@ -211,6 +211,7 @@ def test_slopes_are_derivatives_of_the_readings(worlds):
             )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_posterior_of_what_nothing_shows_is_its_prior(worlds):
     """With the motor speed imposed and no voltage, nothing says more of the resistance than the file."""
     blind = [w for w in worlds if w.rig.wide and "motor_voltage" not in w.rig.channels]

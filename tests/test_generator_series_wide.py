@@ -161,10 +161,8 @@ def test_table_of_histories_passes_the_input_checks(quick, tmp_path):
         assert (made.label["missing"] > 0) == (w.missing > 0) and (made.label["outliers"] > 0) == (w.outliers > 0)
 
 
-FAST = ("event.speed",)
-
-
-@pytest.mark.parametrize("name", [n if n in FAST else pytest.param(n, marks=pytest.mark.slow) for n in sw.EVENTS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sw.EVENTS)
 def test_event_happens_at_the_same_instant_of_every_run(quick, name):
     w = brief(world("plain"), 0.25, 1)
     made = sw.case(w, [name], 10.0, seed=3)
@@ -215,6 +213,7 @@ def test_oracle_finds_a_mimic_and_none_for_a_law_of_its_own(quick):
     assert own["best_other"] > 3.0
 
 
+@pytest.mark.slow
 def test_noise_of_histories_is_a_factor_of_what_is_stated(quick):
     for factor in (2.0,):
         w = brief(world("plain", noise=factor), 0.4, 1)

@@ -77,6 +77,7 @@ def test_temperatures_in_closed_form_match_scipy(current):
     np.testing.assert_allclose(motor.temperatures_after(current, time, 40.0, 30.0), end, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_permissible_time_is_when_the_limit_is_reached():
     motor = Motor()
     permissible = jax.jit(

@@ -63,8 +63,10 @@ def test_import_loads_no_jax():
 
 @pytest.mark.parametrize(
     ("before", "variable", "precision"),
-    [("", {}, "float64"), ("import jax; ", {}, "float64"), ("import jax; ", {"JAX_ENABLE_X64": "0"}, "float32"),
-     ("", {"JAX_ENABLE_X64": "false"}, "float32"), ("", {"JAX_ENABLE_X64": "1"}, "float64")],
+    [("", {}, "float64"), ("import jax; ", {"JAX_ENABLE_X64": "0"}, "float32"),
+     *(pytest.param(*case, marks=pytest.mark.slow) for case in (
+         ("import jax; ", {}, "float64"), ("", {"JAX_ENABLE_X64": "false"}, "float32"),
+         ("", {"JAX_ENABLE_X64": "1"}, "float64")))],
 )  # fmt: skip
 def test_import_enables_double_precision_unless_the_variable_says_otherwise(before, variable, precision):
     code = f"{before}import mmrjax, jax.numpy as jnp; print(jnp.asarray(1.0).dtype, mmrjax.nominal().motor.resistance.dtype)"
@@ -244,6 +246,7 @@ def current(resistance, robot, runs, **options):
     return mm.simulate(mm.replace(robot, {"motor.resistance": resistance}), runs, **options).total_current
 
 
+@pytest.mark.slow
 def test_grad_and_forward_mode_go_through(robot):
     run = mm.Conditions(configuration="6T2A", voltage=24.0, slope_deg=5.0)
     x, h = jnp.asarray(0.611), 1e-5

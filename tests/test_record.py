@@ -37,7 +37,7 @@ def _table8() -> dict[str, np.ndarray]:
     return words | {k: np.array([float(r[k] or "nan") for r in rows]) for k in rows[0] if k != "configuration"}
 
 
-@pytest.mark.parametrize("name", ["steady", "drive", pytest.param("track", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["steady", *(pytest.param(n, marks=pytest.mark.slow) for n in ("drive", "track"))])
 def test_table8_is_as_recorded(name):
     was, robot = _table8(), nominal()
     conditions = Conditions(

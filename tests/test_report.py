@@ -223,6 +223,7 @@ def driven(robot, tmp_path_factory):
     return folder, (folder / "report.html").read_text(), batch
 
 
+@pytest.mark.slow
 def test_report_shows_the_runs_own_history_with_its_peak(driven):
     folder, page, batch = driven
     assert drawn(page) == {"history", "slip", "power"} and outside(folder) == []

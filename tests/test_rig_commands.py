@@ -119,7 +119,9 @@ SIMULATED = {
 }
 
 
-@pytest.mark.parametrize("case", SIMULATED)
+@pytest.mark.parametrize("case", [
+    k if k in ("bench, speed", "wheeled") else pytest.param(k, marks=pytest.mark.slow) for k in SIMULATED
+])  # fmt: skip
 def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_path, case):
     kind, speed, options, columns = SIMULATED[case]
     code, out, err = mmrjax("simulate", "--robot", of_kind(tmp_path, kind, speed), *options, "--out", "run")
@@ -132,7 +134,9 @@ def test_simulate_takes_what_a_rig_imposes_and_shows_its_channels(mmrjax, tmp_pa
     assert words_of_others(out, err, *left_in(tmp_path / "run")) == []
 
 
-@pytest.mark.parametrize("kind", ["bench", "pendulum", pytest.param("wheeled", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["bench", *(pytest.param(k, marks=pytest.mark.slow) for k in ("pendulum", "wheeled"))]
+)
 def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind):
     rig = of_kind(tmp_path, kind)
     code, out, err = mmrjax(

@@ -157,6 +157,7 @@ def test_shapley_effects_of_inputs_that_do_nothing_are_those_of_their_correlatio
     assert correlated(inputs, [3]) == (3,) and correlated(inputs, [2, 3]) == (0, 1, 2, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variances", [(0.02, 0.01), (0.01, 0.02)])
 def test_inputs_of_a_posterior_that_do_nothing_are_found_whatever_their_variance(robot, study, variances):
     coordinates = priors.coordinates(robot, (NAMES[0], NAMES[3]))
@@ -319,7 +320,8 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     (["--posterior"], 2, "--posterior: nominal has none; expected --robot FOLDER/robot.toml of calibrate or loop"),
     pytest.param(["--slopes", "40", "--outputs", "speed"], 2, "no operating point can be studied, since too many",
                  marks=pytest.mark.slow),
-    (["--parameters", "motor.inductance", "--outputs", "speed"], 2, "the derivative of every output by every input is zero"),
+    pytest.param(["--parameters", "motor.inductance", "--outputs", "speed"], 2,
+                 "the derivative of every output by every input is zero", marks=pytest.mark.slow),
     pytest.param(["--parameters", "motor.inductance"], 2, "the derivative of every output by every input is zero",
                  marks=pytest.mark.slow),
 ])  # fmt: skip

@@ -68,17 +68,23 @@ def test_base_fit_of_clean_starts_is_global_on_any_ground(monkeypatch, adhesion,
 # --- what the ends show ---------------------------------------------------------------------------------
 
 
-def ends_of(monkeypatch, adhesion, creep=0.02):
+@pytest.fixture(scope="module")
+def gripping():
+    """Six starts on a ground that holds, and the constants of their robot."""
+    with pytest.MonkeyPatch.context() as patch:
+        return on_ground(patch, (0.6, 0.6), 0.02)
+
+
+def ends_of(runs, p):
     """The ends of six starts on a ground, which of them slide, and what settled travel of the true robot shows."""
-    runs, p = on_ground(monkeypatch, adhesion, creep)
     problem = ANALYST.space(runs).bare
     ends = settled_ends.settled_ends(problem)
     truth, sound = g.readings(gs.starts(p), p)
     return ends, settled_ends._sliding(problem, ends), truth.T, sound
 
 
-def test_ends_of_runs_that_grip_are_those_of_settled_travel(monkeypatch):
-    ends, slides, truth, sound = ends_of(monkeypatch, (0.6, 0.6))
+def test_ends_of_runs_that_grip_are_those_of_settled_travel(gripping):
+    ends, slides, truth, sound = ends_of(*gripping)
     assert sound.all() and not slides.any()
     there = np.isfinite(ends.mean)
     assert there.sum() >= 15  # of six runs and three channels
@@ -91,13 +97,13 @@ def test_ends_of_runs_that_grip_are_those_of_settled_travel(monkeypatch):
 @pytest.mark.slow
 def test_a_run_that_slides_is_not_taken_for_settled(monkeypatch):
     """On a slope beyond its adhesion a robot spins its movers, and its steady state is none."""
-    _, slides, _, sound = ends_of(monkeypatch, (0.12, 0.6))
+    _, slides, _, sound = ends_of(*on_ground(monkeypatch, (0.12, 0.6), 0.02))
     assert not sound.all() and sound[3:].all()
     np.testing.assert_array_equal(slides, ~sound)
 
 
-def test_a_reading_that_still_changes_has_no_settled_end(monkeypatch):
-    runs, _ = on_ground(monkeypatch, (0.6, 0.6), 0.02)
+def test_a_reading_that_still_changes_has_no_settled_end(gripping):
+    runs, _ = gripping
     mine = runs["run_id"] == "start4"
     current = runs["total_current_A"].copy()
     current[mine] += 2.0 * runs["time_s"][mine]  # 2 A/s

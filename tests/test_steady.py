@@ -282,6 +282,7 @@ def speed_and_gradients(robot, rebuild):
     return evaluate
 
 
+@pytest.mark.slow
 def test_steady_bad_members_leave_neighbours_values_and_gradients(theta, speed_and_gradients):
     fields = ("voltage", "slope_deg", "payload", "configuration", "battery", "discharge", "adhesion")
     plain = dict(voltage=24.0, slope_deg=np.degrees(0.05), payload=2.0, configuration=0, battery=0.0, discharge=0.0)

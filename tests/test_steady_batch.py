@@ -140,7 +140,8 @@ PARAMETERS = ("motor.resistance", "6T2A.mass", "gearbox.ratio", "4W2T.ground.fri
 WANTED = ("total_current", "speed", "efficiency_chassis")
 
 
-@pytest.mark.parametrize("effects", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("effects", [False, True])
 def test_derivatives_in_reverse_are_those_forward(robot, effects):
     robot, runs = with_effects(robot) if effects else robot, Conditions(**MIXED)
     at = jnp.asarray([p.value for name in PARAMETERS for p in params.walk(robot) if p.name == name])

@@ -307,7 +307,7 @@ def stopping(monkeypatch, at, error):
     return lambda: monkeypatch.setattr(zarr_store, "write_file", honest)
 
 
-@pytest.mark.parametrize("at", [2, 5, 6, 7, 20, 33, 40])
+@pytest.mark.parametrize("at", [2, 6, 20, *(pytest.param(k, marks=pytest.mark.slow) for k in (5, 7, 33, 40))])
 def test_interrupted_sweep_goes_on_to_the_same_bits(sweep, whole, monkeypatch, tmp_path, at):
     heal = stopping(monkeypatch, at, KeyboardInterrupt())
     code, _, err = sweep("s")

@@ -85,6 +85,7 @@ def test_a_status_is_mirrored_with_voltage_and_slope():
     np.testing.assert_allclose(np.asarray(one.speed), -np.asarray(other.speed), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_robot_held_on_a_slope_stands_for_an_hour():
     kept = drive_batch(robots.nominal(), api.Conditions(0, [0.0, 0.3], [15.0, 15.0]), np.linspace(0.0, 3600.0, 5))
     assert [signals.STATUSES[k] for k in np.asarray(kept.result.status)] == ["stalled"] * 2

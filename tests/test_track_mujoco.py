@@ -112,6 +112,7 @@ def test_c_mujoco_shakes_alike():
     assert found["mean speed"]["C MuJoCo"] == pytest.approx(found["mean speed"]["MJX"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_wrong_mass_is_seen(robot, step_both):
     """The comparison can fail: one gram more, one step."""
     run = Conditions(**RUNS["tracked"])

@@ -244,7 +244,8 @@ def test_only_what_changes_has_a_value_an_instant(observer, runs):
     np.testing.assert_array_equal(c.voltage[k], expected)
 
 
-@pytest.mark.parametrize("balance", ["electrical", pytest.param("track", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("balance", ["electrical", "track"])
 def test_defects_of_all_knots_are_a_constant_defect(observer, balance):
     """Their linear response, through changes of conditions, against the derivative by an amplitude."""
     robot, effect = robots.nominal(), probe(balance)
