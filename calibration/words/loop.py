@@ -201,6 +201,12 @@ def standing(found: DiscoveryResult) -> str:
     return f"The names keep their significance {found.standing}."
 
 
+def stands(found: DiscoveryResult, effect: FoundEffect) -> str:
+    """`established`, or on which row an effect rests."""
+    row = None if found.support is None else found.support.rests_on(effect.name)
+    return "established" if row is None else f"tentative: row {row}"
+
+
 #: Why an effect is not plausible.
 RULED_OUT = {
     "power": "{0.name} would put power in",
