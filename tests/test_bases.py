@@ -104,6 +104,27 @@ def test_windows_cover_the_order_and_overlap_by_half():
         assert any(s[(order >= first) & (order < first + 2)].all() for s in shapes)
 
 
+def over_order(columns):
+    return [n for b in windows(columns, COUNTS) for n in b.names if n[1].startswith("order")]
+
+
+def test_windows_of_the_order_only_where_conditions_do_not_tell_it():
+    """Some runs one after the other of a grid are those at some of its conditions."""
+    assert over_order(shuffled(table())) and not over_order(table())
+
+
+def test_order_is_told_by_combinations_of_conditions():
+    """Voltages up with the one configuration and down with the other: no sum of their terms gives the order."""
+    columns = table()
+    wheeled = columns["configuration"] == "4W2T"
+    key = np.where(wheeled, columns["supply_voltage_V"], -columns["supply_voltage_V"])
+    sequence = np.lexsort((columns["slope_deg"], key, wheeled))
+    order = np.empty(len(key))
+    order[sequence] = np.arange(len(key))
+    assert collinearity({**columns, "order": order}, COUNTS) > COLLINEAR
+    assert not over_order({**columns, "order": order})
+
+
 def test_windows_of_histories_are_in_time_at_the_same_instants_of_all_runs():
     time = np.tile(np.linspace(0, 1.5, 30), 2)
     for basis in windows(table(time_s=time), COUNTS):

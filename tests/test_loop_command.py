@@ -21,8 +21,9 @@ import numpy as np
 import pytest
 from synthetic import FEW, small
 
-from calibration.data import effect_file
+from calibration.data import effect_file, robot_file
 from calibration.inference import bases as curves
+from mmrjax import params
 from mmrjax.effects import BY_NAME
 from sweeps import cli
 from sweeps.commands import loop as room
@@ -133,8 +134,19 @@ def test_command_ends_well_and_says_what_it_found(done):
     assert "fitting the base model" in done.answer.err and "fitting the base model" not in done.answer.out
     names = {p.name for p in (done.folder / "found").iterdir()}
     assert names == {
-        "config.resolved.toml", "figures", "manifest.json", "posterior.nc", "report.html", "result.json", "robot.toml", "rows.csv",
+        "config.resolved.toml", "figures", "fitted.toml", "manifest.json", "posterior.nc", "report.html", "result.json", "robot.toml", "rows.csv",
     }  # fmt: skip
+
+
+def test_what_is_written_predicts_and_the_refit_stands_beside_it(done):
+    said = done.result["prediction"]
+    assert said["written"] == "found" and said["gain"] > said["se"] > 0
+    refit, found = (robot_file.load(done.folder / "found" / f"{name}.toml") for name in ("fitted", "robot"))
+    assert not refit.effects and [e.name for e in found.effects] == [done.result["effects"][0]["name"]]
+    values = {p.name: float(p.value) for p in params.walk(refit)}
+    for name, shift in done.result["base_shift"].items():
+        if shift["unit"] == "-":
+            assert values[name] == pytest.approx(shift["before"], rel=1e-6)
 
 
 def test_result_has_the_schema_of_the_issue(done):
@@ -143,7 +155,7 @@ def test_result_has_the_schema_of_the_issue(done):
     jsonschema.validate(r, schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**r, "verdict": "perhaps"}, schema)
-    assert r["schema"] == "mmrjax.loop/1" and r["verdict"] in ("named", "class")
+    assert r["schema"] == "mmrjax.loop/2" and r["verdict"] in ("named", "class")
     (effect,) = r["effects"]
     assert {"name", "class", "balance", "equation", "parameters", "p_value", "score"} <= set(effect)
     assert effect["name"] == effect["class"][0] and "churning" in effect["class"]
@@ -192,8 +204,8 @@ def test_robot_is_accepted_by_the_other_commands(done):
     assert robot["effects"][name]["amplitude"] == pytest.approx(found, rel=1e-12)
     run = ["simulate", "--voltage", 33, "--no-report", "--force", "--out", "s"]
     shown = []
-    for robot_file in ("nominal", "found/robot.toml"):
-        assert mmrjax(done.folder, *run, "--robot", robot_file).code == 0
+    for given in ("nominal", "found/robot.toml"):
+        assert mmrjax(done.folder, *run, "--robot", given).code == 0
         with (done.folder / "s" / "runs.csv").open(newline="") as stream:
             shown.append(float(next(csv.DictReader(stream))["total_current_A"]))
     table = done.case.table

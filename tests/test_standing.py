@@ -15,11 +15,13 @@ from synthetic import SETTLED, STATED, Analyst, table
 
 from calibration.discovery import discover
 from calibration.discovery.candidates import Candidate, filled, fit_candidates, start
+from calibration.discovery.notes import NameSupport, NameTest
 from calibration.discovery.projection import Projection
+from calibration.discovery.score_tests import augment_with_columns
 from calibration.discovery.search import Search, diagnose
 from calibration.discovery.settings import settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
-from calibration.discovery.standing import _significance, cost_of_names, evidence_of_names, standing
+from calibration.discovery.standing import _root, _weakest_row, cost_of_names, evidence_of_names, standing
 from calibration.inference import bases
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers import Histories, SettledRuns
@@ -148,16 +150,42 @@ def test_cost_of_names_grows_with_the_library_and_their_number():
     )
 
 
-def test_significance_beside_columns_is_that_of_a_joint_fit(toy):
-    """The amplitude over its sd, against least squares with the columns beside."""
+def test_root_is_that_of_what_a_column_explains_beside_others(toy):
+    """Against the fall of χ² of least squares with the column and without, and without each row in turn."""
     rng = np.random.default_rng(4)
-    columns = rng.standard_normal((len(toy.readings), 3))
-    best = dataclasses.replace(names_of(np.eye(1), 3), z=np.append(np.asarray(toy.linear.residual)[-4:], np.zeros(7)))
-    got = _significance(SimpleNamespace(free=3), best, toy.linear, columns)  # the fourth coordinate is the amplitude
-    a = np.concatenate([np.concatenate([toy.slopes, columns], 1), np.eye(7)])
-    e = np.append(toy.readings, np.zeros(7))
-    z = -np.linalg.lstsq(a, e, rcond=None)[0]
-    assert got == [pytest.approx(z[3] / np.sqrt(np.linalg.inv(a.T @ a)[3, 3]), rel=1e-8)]
+    readings = len(toy.readings)
+    columns, signature = rng.standard_normal((readings, 3)), rng.standard_normal((readings, 1))
+    jacobian, residual = augment_with_columns(toy.linear, columns)
+
+    def fall(counts):
+        known = np.append(counts, np.ones(len(residual) - readings))[:, None]
+        whole = np.concatenate([jacobian, np.pad(signature, ((0, len(residual) - readings), (0, 0)))], 1)
+        left = [np.linalg.lstsq(known * a, -known[:, 0] * residual, rcond=None)[0] for a in (jacobian, whole)]
+        each = [known[:, 0] * (residual + a @ z) for a, z in zip((jacobian, whole), left, strict=True)]
+        return np.sum(each[0] ** 2) - np.sum(each[1] ** 2)
+
+    assert _root(jacobian, residual, signature) ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
+    space = SimpleNamespace(included=toy.counts, bare=SimpleNamespace(observe=SimpleNamespace(long=False)))
+    row, least = _weakest_row(space, jacobian, residual, signature)
+    falls = [fall(np.repeat(np.arange(toy.rows) != k, 3)) for k in range(toy.rows)]
+    assert row == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("root", "without", "evidence", "stands", "rests_on"),
+    [
+        (6.9, 5.8, 11.6, True, None),
+        (10.6, 4.3, 14.1, True, 10),  # it keeps less than 1/√3 of its root without that row
+        (4.0, 3.1, 0.0, True, 10),  # and is less than chance then
+        (3.2, 3.1, 50.0, False, 10),  # less than chance with all
+        (8.0, 7.0, -9.5, False, None),  # a curve in its place is the better explanation
+    ],
+)
+def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidence, stands, rests_on):
+    test = NameTest("a", root, 3.3, (), evidence, 10, without)
+    assert (test.stands, test.rests_on, test.established) == (stands, rests_on, stands and rests_on is None)
+    renumbered = NameSupport(True, tests=(test,)).numbered(np.arange(1, 21) * 2)
+    assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
 
 
 # --- settled runs ---------------------------------------------------------------------------------------
@@ -191,7 +219,7 @@ def stood(analyst, runs, effects):
 @pytest.mark.slow
 def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
     got, best, _ = stood(SETTLED, growing(monkeypatch, 20.0, 1), ("rolling_radius", "load_slip"))
-    assert not got.stands and (got.curves or got.why == "not adequate")
+    assert not got.stands and got.why
     true, same, after = stood(SETTLED, table(g.case(["rolling_radius", "load_slip"], 15.0, 1)), best.effects)
     assert true.stands and true.why == "" and same.key == best.key and not after.test.rejected_with_margin
 

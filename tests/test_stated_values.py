@@ -110,6 +110,6 @@ def test_verdict_lists_the_resistance_that_may_be_wrong(looks):
     assert found.verdict == "class"
     (members,), (stated,) = found.alike.members, found.alike.stated
     assert "series_resistance" in members and [s.name for s in stated] == ["motor.resistance"]
-    (missing,) = discover.summary(found).missing
+    (missing,) = discover.summary(found, np.arange(1, 100)).missing
     (value,) = missing.values
     assert missing.names == members and value.name == "motor.resistance" and f"{value.value:.1f}" == "1.4"

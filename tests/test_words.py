@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calibration.discovery import notes as of_loop
-from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, RuledOut, Summary
+from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, NameTest, RuledOut, Summary
 from calibration.discovery.result import Formula, Worse
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
@@ -232,6 +232,21 @@ SAMPLES = [
         "only 400 of 500 bootstrap tables could be fitted again; the thresholds are theirs",
     ),
     (
+        of_loop.RestsOn("vibration_slip", 10, 10.57, 4.3),
+        "vibration_slip rests on row 10 (10.6 σ with it, 4.3 σ without): make that run again, and runs at conditions on "
+        "either side of it",
+    ),
+    (
+        of_loop.Unwritten(True, 0.13, 0.42),
+        "the curve predicts runs that it has not seen no better than the refit (+0.13 ± 0.42 nat a reading): robot.toml "
+        "is the refit",
+    ),
+    (
+        of_loop.Unwritten(False, -0.2, 0.05),
+        "what was found predicts runs that it has not seen worse than the refit (-0.20 ± 0.05 nat a reading): robot.toml "
+        "is the refit",
+    ),
+    (
         of_loop.TooFewReplicates(100),
         "100 bootstrap tables are too few for every kind of evidence to count; use 500 or more",
     ),
@@ -330,10 +345,19 @@ OVER = CurveOver("slip", ("slope",))
             NameSupport(False, "curve alone", curves=(OVER,)),
             "one smooth curve in the balance slip over slope leaves nothing",
         ),
-        (NameSupport(False, "not adequate", ("a", "b")), "the fit with a and b is not adequate"),
         (
-            NameSupport(False, "lost", ("a",), (OVER, OVER)),
-            "beside smooth curves (balance slip over slope, balance slip over slope) a would explain nothing",
+            NameSupport(
+                False,
+                "lost",
+                ("a", "b"),
+                tests=(NameTest("a", 1.2, 3.41, (OVER,), 0.0), NameTest("b", 5.0, 3.41, (), -20.0)),
+            ),
+            "a explains 1.2 σ beside smooth curves (balance slip over slope), and chance reaches 3.4; a smooth curve in "
+            "its place is the better explanation than b",
+        ),
+        (
+            NameSupport(False, "one row", ("a",), tests=(NameTest("a", 5.0, 3.4, (), 9.0, 10, 2.0),)),
+            "a rests on row 10 alone",
         ),
         (NameSupport(True, "beside", curves=(OVER,)), "beside smooth curves (balance slip over slope)"),
     ],
@@ -349,6 +373,13 @@ def test_verdict_of_a_complete_model():
     assert loop.statement(Summary("none", 0.4, None, noise=(off,))) == f"{said} But {sentence(off)}"
     aside = loop.statement(Summary("none", 0.4, None, aside=10, of=100))
     assert aside == f"10 of 100 rows (10 %) lie off alone and are set aside. {said}"
+
+
+def test_verdict_tells_what_is_tentative():
+    sure, tentative = Missing(("a",), (), ("drop",)), Missing(("b",), (), ("slip",), 10)
+    assert loop.statement(Summary("named", 0.001, None, (sure, tentative))) == (
+        "Missing: a (family-wise p ≤ 0.001). Tentative, in the model since it predicts better: b, which rests on row 10."
+    )
 
 
 def test_verdict_lists_what_cannot_be_told_apart():

@@ -18,7 +18,7 @@ from calibration.data import own_mass
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import findings, menu, preference, scales
+from calibration.discovery import findings, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
@@ -35,9 +35,11 @@ from calibration.discovery.notes import (
     Missing,
     NameSupport,
     PhasesDiffer,
+    RestsOn,
     StillLacks,
     Summary,
     TooFewReplicates,
+    Unwritten,
 )
 from calibration.discovery.outliers import Screening, ahead, screen, screen_beside
 from calibration.discovery.posterior import of_curve, of_fit
@@ -46,10 +48,11 @@ from calibration.discovery.result import (
     FoundEffect,
     HeldOutAlternative,
     HiddenEffect,
+    ReadingsOfRows,
     Sensitivity,
 )
 from calibration.discovery.score_tests import bootstrap
-from calibration.discovery.search import Search, fewest, search
+from calibration.discovery.search import Search, diagnose, fewest, path, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import standing
 from calibration.inference import bases as bases_room
@@ -129,7 +132,7 @@ def discover(
             tell(Step("factors", (tuple(f"{f:g}" for f in FACTORS),)))
         verdicts = {f: others.submit(ready.trace, sd) for f, sd in sds.items()}
         found = assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell)
-        sensitivity = [in_short(f, verdict.result()) for f, verdict in verdicts.items()]
+        sensitivity = [in_short(f, verdict.result(), ready.numbers) for f, verdict in verdicts.items()]
     if silent:
         notes = (*notes, AssumedNoise(tuple(silent), noise_room.default(known.channels)))
     return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
@@ -352,7 +355,17 @@ def trace(
         progress(Step("alone"))
         screened = more
 
-    stood = standing(space, base, searched, left, bases, settings)
+    proposed = None
+    if best is not None and after is not None and after.test.rejected_with_margin and not space.bare.observe.long:
+        # No set leaves nothing: that which predicts as well as any is proposed, and the others are its rivals.
+        progress(Step("held out"))
+        few = prediction.smallest(space, runs, base, path(searched))
+        if few is not None and few is not best:
+            proposed = few, diagnose(space, few, bases, left.test.null, settings)
+    stood = standing(space, base, searched, left, bases, settings, proposed)
+    if stood.stands and proposed is not None:
+        searched = dataclasses.replace(searched, best=proposed[0], diagnosis=proposed[1])
+        best, after = proposed
     if not stood.stands and best is not None and len(best.effects) > 1:
         # One of them may stand where they do not together.
         fewer = fewest(space, searched, bases, left, settings)
@@ -476,15 +489,16 @@ def without_copies(runs: Runs) -> tuple[Runs, np.ndarray, list[Note]]:
     return runs.where(np.asarray(keep)), np.asarray(keep) + 1, [Copies(tuple(k + 1 for k in copies))]
 
 
-def in_short(factor: float, traced: LoopStages) -> Sensitivity:
+def in_short(factor: float, traced: LoopStages, numbers: np.ndarray) -> Sensitivity:
     """What the loop says with another noise."""
     adequate = not traced.ends.test.rejected_with_margin
-    return Sensitivity(factor, traced.verdict, summary(traced), traced.members, adequate)
+    return Sensitivity(factor, traced.verdict, summary(traced, numbers), traced.members, adequate)
 
 
-def summary(traced: LoopStages) -> Summary:
-    """The verdict of these stages, with what else its statement says."""
+def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
+    """The verdict of these stages, with what else its statement says; `numbers` as of `assemble_result`."""
     space, alike = traced.screened.base.space, traced.alike
+    support = None if traced.standing is None else traced.standing.numbered(numbers)
     best = None if traced.searched is None else traced.searched.best
     aside, counting = len(traced.screened.outliers), int(space.included.sum())
     many = aside > MANY * (aside + counting)
@@ -492,9 +506,9 @@ def summary(traced: LoopStages) -> Summary:
         traced.verdict,
         traced.left.test.p_value,
         traced.where,
-        missing=() if alike is None else missing(space, alike),
+        missing=() if alike is None else missing(space, alike, support),
         nearest=best.effects if traced.verdict == "unnamed" and best is not None else (),
-        support=traced.standing,
+        support=support,
         aside=aside if many else 0,
         of=aside + counting,
         noise=traced.sds.remarks if traced.sds.factors and traced.verdict == "none" else (),
@@ -502,8 +516,8 @@ def summary(traced: LoopStages) -> Summary:
     )
 
 
-def missing(space: CandidateSpace, alike: Classes) -> tuple[Missing, ...]:
-    """Each effect found, with what it cannot be told from."""
+def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
+    """Each effect found, with what it cannot be told from and the row that it rests on."""
     c, p = space.coordinates.base, space.free
     return tuple(
         Missing(
@@ -513,6 +527,7 @@ def missing(space: CandidateSpace, alike: Classes) -> tuple[Missing, ...]:
                 for s in shifts
             ),
             families,
+            None if support is None else support.rests_on(names[0]),
         )
         for names, shifts, families in zip(alike.members, alike.stated, alike.families, strict=True)
     )
@@ -558,6 +573,13 @@ def assemble_result(
     compared = traced.held_out
     if traced.alike is not None and not compared and not observe.long:
         compared = preference.compared(space, runs, best, traced.alike)
+    gain, kept = _gain(space, runs, seen), True
+    if gain is not None and (curve is not None or best is not base):
+        # What is written never predicts worse than the refit; a curve, which claims no cause, has to predict better.
+        kept = gain.mean > gain.se if curve is not None else gain.mean >= -prediction.WORSE
+    if not kept:
+        robot, converged = findings.proposed_robot(space, base), base.converged
+        posterior = of_fit(space, base.active, base.z, left.linear)
     progress(Step("next"))
     ladder = traced.searched.ladder if traced.searched is not None else ()
     near, too_large = findings.alternatives(
@@ -580,8 +602,11 @@ def assemble_result(
     unnamed = None if curve is None or where is None else findings.unnamed(curve, where, p, rows)
     result = DiscoveryResult(
         verdict=traced.verdict,
-        summary=summary(traced),
+        summary=summary(traced, numbers),
         robot=robot,
+        refit=findings.proposed_robot(space, base),
+        gain=gain,
+        written=kept,
         converged=converged,
         posterior=posterior,
         runs=runs,
@@ -599,7 +624,7 @@ def assemble_result(
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
-        support=traced.standing,
+        support=None if traced.standing is None else traced.standing.numbered(numbers),
         cluster=screened.cluster,
         residual_clusters=residual_clusters(_residuals(space, runs, ends.linear, seen.after, z), settings.seed),
         before=findings.evidence(left.test, adequate=not left.test.rejected),
@@ -624,6 +649,18 @@ def assemble_result(
     # What happens for a while is not everywhere alike.
     of_noise = traced.sds.remarks if traced.sds.factors or not traced.events else ()
     return dataclasses.replace(result, remarks=(*of_noise, *remarks(result)))
+
+
+def _gain(space: CandidateSpace, runs: Runs, seen: ReadingsOfRows) -> prediction.Gain | None:
+    """By how much what was found predicts better than the refit; None where nothing can be held out."""
+    if not seen.held_out:
+        return None
+    counts, kinds = space.weight[: len(runs)] > 0, space.bare.observe.blocks
+    before, after = (
+        prediction.scored({k: x[when] for k, x in seen.held_out.items()}, seen.measured, seen.sd, counts, runs, kinds)
+        for when in (0, 1)
+    )
+    return after.gain(before)
 
 
 def residuals_of(screened: Screening, runs: Runs) -> Residuals:
@@ -692,6 +729,12 @@ def remarks(found: DiscoveryResult) -> Notes:
         said.append(PhasesDiffer(wave.score_free_in_each_run, wave.score))
     if found.remains is not None:
         said.append(StillLacks(found.remains.place, found.remains.variable))
+    names = [e.name for e in found.effects]
+    for t in () if found.support is None else found.support.tests:
+        if t.rests_on is not None and t.effect in names:
+            said.append(RestsOn(t.effect, t.rests_on, t.root, t.root_without))
+    if not found.written and found.gain is not None:
+        said.append(Unwritten(found.unnamed is not None, found.gain.mean, found.gain.se))
     said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:

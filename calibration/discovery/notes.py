@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from calibration.inference.notes import NoiseOff, Note
 
@@ -23,6 +26,47 @@ class CurveOver(NamedTuple):
     variables: tuple[str, ...]
 
 
+#: Evidence by which a smooth curve of an effect's own equation has to be the better explanation [σ²].
+BETTER = 9.0
+#: Share of its root that an effect has to keep without any one row.
+KEPT = 1 / math.sqrt(3)
+
+
+@dataclasses.dataclass(frozen=True)
+class NameTest:
+    """An effect of a candidate, tested by itself at the fit of all the others.
+
+    Attributes:
+        effect: its name; root: of what it would explain there beside curves of other equations [σ]; needed: by chance
+            the strongest effect reaches that [σ]; curves: those beside.
+        evidence: twice the log of that for it over a smooth curve of its own equation, the best one [σ²].
+        row: number of the row without which the root is smallest, None where none was left out; root_without: then.
+    """
+
+    effect: str
+    root: float
+    needed: float
+    curves: tuple[CurveOver, ...]
+    evidence: float
+    row: int | None = None
+    root_without: float = math.inf
+
+    @property
+    def stands(self) -> bool:
+        """Whether it explains more than chance, and as much as any curve in its place."""
+        return self.root >= self.needed and self.evidence >= -BETTER
+
+    @property
+    def rests_on(self) -> int | None:
+        """Number of the row without which it would not stand; None where it needs none."""
+        return self.row if self.root_without < max(self.needed, KEPT * self.root) else None
+
+    @property
+    def established(self) -> bool:
+        """Whether it stands on all rows."""
+        return self.stands and self.rests_on is None
+
+
 @dataclasses.dataclass(frozen=True)
 class NameSupport:
     """Whether the names of a candidate stand.
@@ -30,13 +74,27 @@ class NameSupport:
     Attributes:
         stands: whether they do.
         why: a row of `words.loop.REASONS`: why not, or `beside` what; "" where there is nothing to say.
-        effects: that this is said of; curves: that were put beside, or do as well.
+        effects: that this is said of; curves: that were put beside, or do as well; tests: of each effect.
     """
 
     stands: bool
     why: str = ""
     effects: tuple[str, ...] = ()
     curves: tuple[CurveOver, ...] = ()
+    tests: tuple[NameTest, ...] = ()
+
+    def rests_on(self, effect: str) -> int | None:
+        """Number of the row that an effect rests on; None where it needs none, or was not tested."""
+        return next((t.rests_on for t in self.tests if t.effect == effect), None)
+
+    def numbered(self, numbers: np.ndarray) -> NameSupport:
+        """With rows called as messages call them.
+
+        Args:
+            numbers: of the rows in turn.
+        """
+        named = (t if t.row is None else dataclasses.replace(t, row=int(numbers[t.row - 1])) for t in self.tests)
+        return dataclasses.replace(self, tests=tuple(named))
 
 
 class FreedValue(NamedTuple):
@@ -49,12 +107,13 @@ class FreedValue(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Missing:
-    """An effect that was found: names that these data cannot tell apart, stated values that may be wrong instead, and
-    the families of the names."""
+    """An effect that was found: names that these data cannot tell apart, stated values that may be wrong instead, the
+    families of the names, and the number of the row that it rests on, which makes it tentative."""
 
     names: tuple[str, ...]
     values: tuple[FreedValue, ...]
     families: tuple[str, ...]
+    rests_on: int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -283,3 +342,23 @@ class TooWeak:
 
 
 Instruction = NothingPossible | NothingTells | CarryOut | MoreRuns | TooWeak
+
+
+@dataclasses.dataclass(frozen=True)
+class RestsOn(Note):
+    """An effect that stands by one row alone: the row's number, its root with it and without [σ]."""
+
+    effect: str
+    row: int
+    root: float
+    root_without: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Unwritten(Note):
+    """What was found predicts data held out worse than the refit does, or no better, and is not in the robot that is
+    written: a `curve`, or effects; by how much, and the standard error [nat a reading]."""
+
+    curve: bool
+    gain: float
+    se: float

@@ -15,6 +15,7 @@ from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
 from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOut, Summary
+from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
 from calibration.inference.details import Detail
 from calibration.inference.notes import HeldByPrior, Notes
@@ -25,9 +26,11 @@ from calibration.words.notes import sentence, sentences
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 
-SCHEMA = "mmrjax.loop/1"
+SCHEMA = "mmrjax.loop/2"
 #: The robot whose running gear the track model found.
 TRACK_FILE = "robot_track.toml"
+#: The robot fitted with nothing added.
+REFIT_FILE = "fitted.toml"
 #: Error at which a running gear is said to leave what remains.
 RESOLVED_ERROR = 0.01
 #: Prior sds beyond which a constant of the running gear is not plausible.
@@ -432,7 +435,9 @@ class DiscoveryResult:
 
     Attributes:
         verdict: `none`, `named`, `class` or `unnamed`; summary: with all that its statement says.
-        robot: the proposed one; converged: whether its fit is an optimum; posterior: of all that was fitted.
+        robot: the one that is written; refit: with nothing added; written: whether what was found is in it.
+        gain: of what was found over the refit, on data held out; None where nothing can be.
+        converged: whether the fit of that robot is an optimum; posterior: of all that was fitted.
         runs: the table; numbers: of its rows, as messages call them.
         included: whether a row counts; outliers, unusable: numbers of rows set aside.
         effects: found; unnamed: the discrepancy of that verdict; remains: what the effects leave.
@@ -466,6 +471,9 @@ class DiscoveryResult:
     verdict: str
     summary: Summary
     robot: Robot
+    refit: Robot
+    gain: Gain | None
+    written: bool
     converged: bool
     posterior: Posterior
     runs: Runs
@@ -552,7 +560,7 @@ class DiscoveryResult:
             "rows_used": int(self.included.sum()),
             "rows_unusable": list(self.unusable),
             "rows_outliers": list(self.outliers),
-            "effects": [_effect(e) for e in self.effects]
+            "effects": [_effect(e, self.support) for e in self.effects]
             + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
             "next_experiment": None if proposal is None else proposal.to_json(),
             "remains": None if self.remains is None else dataclasses.asdict(self.remains),
@@ -575,6 +583,12 @@ class DiscoveryResult:
             "held_out_by": held,
             "held_out_worse": [dataclasses.asdict(w) for w in self.held_out_worse],
             "alternatives_held_out": [dataclasses.asdict(a) for a in self.alternatives_held_out],
+            "prediction": {
+                "gain": None if self.gain is None else self.gain.mean,
+                "se": None if self.gain is None or not np.isfinite(self.gain.se) else self.gain.se,
+                "unit": "nat a reading",
+                "written": "found" if self.written else "refit",
+            },
             "adequate": {"before": self.before.adequate, "after": self.after.adequate},
             "evidence": {"before": _evidence(self.before), "after": _evidence(self.after)},
             "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
@@ -619,8 +633,9 @@ class DiscoveryResult:
         return table
 
     def save(self, folder: Path | str, robot_name: str = "") -> None:
-        """Write `result.json`, `rows.csv`, `posterior.nc` and `robot.toml` into a folder, and `robot_track.toml` too
-        where the track model was asked; `robot_name` is that of the robot that the loop began with."""
+        """Write `result.json`, `rows.csv`, `posterior.nc`, `robot.toml` and `fitted.toml` (with nothing added) into a
+        folder, and `robot_track.toml` too where the track model was asked; `robot_name` is that of the robot that the
+        loop began with."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "result.json", self.to_json())
@@ -628,6 +643,7 @@ class DiscoveryResult:
         held = [sentence(HeldByPrior(self.held_by_prior))] if self.held_by_prior else []
         note = "\n".join([words.header(self, robot_name), *held])
         robot_file.write(self.robot, folder / "robot.toml", note=note)
+        robot_file.write(self.refit, folder / REFIT_FILE, note=words.refit_header(self, robot_name))
         posterior.write(self.posterior, folder / posterior.FILE)
         if self.resolved is not None:
             robot_file.write(self.resolved.robot, folder / TRACK_FILE, note=self.resolved.statement)
@@ -653,10 +669,16 @@ class Sensitivity:
         return {n: getattr(self, n) for n in ("factor", "verdict", "statement", "classes", "adequate_after")}
 
 
-def _effect(e: FoundEffect) -> dict[str, Any]:
+def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
+    test = next((t for t in support.tests if t.effect == e.name), None) if support is not None else None
+    rests_on = None if test is None else test.rests_on
     return {
         "name": e.name,
         "class": [*e.members, *e.stated],
+        "standing": "established" if rests_on is None else "tentative",
+        "rests_on_row": rests_on,
+        "root": None if test is None else test.root,
+        "root_needed": None if test is None else test.needed,
         "families": list(e.families),
         "balance": e.balance,
         "unit": e.unit,

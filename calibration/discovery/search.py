@@ -93,6 +93,15 @@ def fewest(space: CandidateSpace, found: Search, bases: Bases, left: Diagnosis, 
     return Search(found.ladder, best, diagnose(space, best, bases, left.test.null, settings))
 
 
+def path(found: Search) -> list[Candidate]:
+    """The best plausible candidate of each number of effects, up to that of what the search proposes."""
+    if found.best is None:
+        return []
+    sizes = range(1, len(found.best.effects))
+    smaller = [_best([c for c in found.ladder if len(c.effects) == size]) for size in sizes]
+    return [*(c for c in smaller if c is not None), found.best]
+
+
 def own_p(gain: float, null: np.ndarray) -> float:
     """Share of bootstrap tables in which the strongest single effect explains as much [σ²], never below
     1 / (replicates + 1).

@@ -18,10 +18,10 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
-from calibration.discovery.notes import CurveOver, NameSupport
+from calibration.discovery.notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
 from calibration.discovery.score_tests import augment_with_columns, beside_columns, family_columns
-from calibration.discovery.search import Search
+from calibration.discovery.search import Search, diagnose, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.smooth import smooth, surface
 from calibration.inference import bases as bases_room
@@ -47,21 +47,27 @@ def equation(place: str) -> str:
 
 
 def standing(
-    space: CandidateSpace, base: Candidate, searched: Search, left: Diagnosis, bases: Bases, settings: Settings
+    space: CandidateSpace,
+    base: Candidate,
+    searched: Search,
+    left: Diagnosis,
+    bases: Bases,
+    settings: Settings,
+    proposed: Proposed | None = None,
 ) -> NameSupport:
-    """Whether the effects of the best candidate of a search may be named.
+    """Whether the effects of the best candidate of a search may be named, or those of another that is proposed.
 
     Args:
         left: what the base leaves.
     """
-    best, after = searched.best, searched.diagnosis
+    best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
     if best is None or after is None:
         return NameSupport(False, "implausible")
-    other = _ruled_out(space, base, best, searched.ladder, settings)
+    other = _ruled_out(space, base, searched.best or best, searched.ladder, settings)
     if other is not None:
         return NameSupport(False, "larger", other.effects)
     if after.test.rejected_with_margin:
-        return _beside_curves(space, base, best, left, after, bases, settings)
+        return _beside_curves(space, base, best, searched, left, after, bases, settings)
     return _against_curves(space, base, best, left.linear, bases, settings)
 
 
@@ -84,11 +90,17 @@ def cost_of_names(space: CandidateSpace, best: Candidate, settings: Settings) ->
 
     As of a curve, the prior of an amplitude is taken of the size that the data find most likely, which is its own.
     """
-    at = [space.free + slot for slot, name in enumerate(best.active) if name]
+    slots = [slot for slot, name in enumerate(best.active) if name]
+    sets = 2 * math.log(math.comb(len(space.library), len(slots)))
+    return sum(_cost_of(space, best, slot, settings) for slot in slots) + sets
+
+
+def _cost_of(space: CandidateSpace, best: Candidate, slot: int, settings: Settings) -> float:
+    """What the amplitude and the shape of an effect were free to take [σ²]."""
     sds = np.clip(np.asarray(best.sd), 1e-6, 1.0)
-    amplitudes = np.minimum(-2 * np.log(sds[at]), 1 + np.log1p((np.asarray(best.z)[at] / sds[at]) ** 2))
-    shapes = -2 * np.log(sds[[k + settings.slots for k in at]])
-    return float(np.sum(amplitudes) + np.sum(shapes) + 2 * math.log(math.comb(len(space.library), len(at))))
+    k = space.free + slot
+    amplitude = min(-2 * math.log(sds[k]), 1 + math.log1p((float(best.z[k]) / sds[k]) ** 2))
+    return float(amplitude - 2 * math.log(sds[k + settings.slots]))
 
 
 def evidence_of_names(space: CandidateSpace, base: Candidate, best: Candidate, settings: Settings) -> float:
@@ -160,46 +172,46 @@ def _linearly(space: CandidateSpace, best: Candidate, linear: Linearization, set
 # --- a fit that is not adequate: do the names keep their significance? -------------------------------------
 
 
+#: A candidate in the place of a search's best, and what it leaves.
+Proposed = tuple[Candidate, Diagnosis]
+
+
+def _equation(space: CandidateSpace, effect: str) -> str:
+    return equation(space.library[effect].channel or space.library[effect].balance)
+
+
 def _beside_curves(
     space: CandidateSpace,
     base: Candidate,
     best: Candidate,
+    searched: Search,
     left: Diagnosis,
     after: Diagnosis,
     bases: Bases,
     settings: Settings,
 ) -> NameSupport:
-    """Names beside the best smooth curves, as many as leave nothing: each has to keep its significance, and what is
-    left with both has to be noise.
-
-    Curves of other equations come first: a curve in a name's own takes away what it explains, whatever that is, so it
-    counts only where the others do not do. Where one curve alone does, no name is needed.
-    """
+    """Names where something is left that is beyond doubt: each has to stand by itself (`name_tests`), one at least on
+    all rows, and no curve alone may leave nothing."""
     names = bases_room.names(bases)
     for k in _strongest(left, names):
         found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
         if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(*names[k]),))
-    own = {equation(space.library[e].channel or space.library[e].balance) for e in best.effects}
-    chosen, test = _curves_beside(after.linear, after, bases, own, CURVES, settings)
-    if test.rejected_with_margin:
-        chosen, test = _curves_beside(after.linear, after, bases, set(), CURVES, settings)
-    if test.rejected_with_margin:
-        return NameSupport(False, "not adequate", best.effects)
-    columns = np.concatenate([family_columns(after.linear, bases, k) for k in chosen], 1)
-    significance = _significance(space, best, after.linear, columns)
-    needed = after.test.threshold("single")
-    lost = [e for e, t in zip(best.effects, significance, strict=True) if abs(t) < needed]
-    curves = tuple(_over(*names[k]) for k in chosen)
+    own = {_equation(space, e) for e in best.effects}
+    tests = name_tests(space, best, searched, bases, after, settings)
+    lost = tuple(t.effect for t in tests if not t.stands)
     if lost:
-        return NameSupport(False, "lost", tuple(lost), curves)
+        return NameSupport(False, "lost", lost, tests=tests)
+    if all(t.rests_on is not None for t in tests):
+        return NameSupport(False, "one row", best.effects, tests=tests)
     where = locate(left, bases, space.included)
-    if equation(where.place) in own & {equation(names[k][0]) for k in chosen}:
+    if equation(where.place) in own:
         # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
         if not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
-    return NameSupport(True, "beside", curves=curves)
+    curves = tuple(dict.fromkeys(c for t in tests for c in t.curves))
+    return NameSupport(True, "beside", curves=curves, tests=tests)
 
 
 def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
@@ -234,11 +246,94 @@ def _curves_beside(
     return chosen, test
 
 
-def _significance(space: CandidateSpace, best: Candidate, linear: Linearization, columns: np.ndarray) -> list[float]:
-    """Amplitude of each effect over its sd, with columns fitted beside (of prior sd 1 each)."""
-    jacobian, residual = augment_with_columns(linear, columns)
-    normal = jacobian.T @ jacobian
-    step = -np.linalg.solve(normal, jacobian.T @ residual)
-    sd = np.sqrt(np.diag(np.linalg.inv(normal)))
-    at = [space.free + slot for slot, name in enumerate(best.active) if name]
-    return [float((best.z[k] + step[k]) / sd[k]) for k in at]
+def name_tests(
+    space: CandidateSpace,
+    best: Candidate,
+    searched: Search,
+    bases: Bases,
+    after: Diagnosis,
+    settings: Settings,
+) -> tuple[NameTest, ...]:
+    """Each effect by itself, at the fit of the others: the root of its score beside the curves that all of them leave
+    in other equations, the row that it rests on most, and its evidence against curves of its own equation.
+
+    A score, and not an amplitude over its sd: where a shape is free too, that ratio stays small however much an
+    effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977); Davies, Biometrika 64 (1977)). Curves in its own
+    equation would take away what it explains, whatever that is; whether one of them does better is asked beside the
+    largest set that was searched for, since it would else stand for what that adds in the same equation.
+
+    Args:
+        after: what the fit with all of them leaves.
+    """
+    names, largest, tests = bases_room.names(bases), searched.best or best, []
+    fewer = {
+        e: c for e, c in zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True)
+    }
+    for effect, without in zip(best.effects, without_each(space, best, settings, searched.ladder), strict=True):
+        own = _equation(space, effect)
+        seen = diagnose(space, without, bases, after.test.null, settings)
+        chosen, _ = _curves_beside(after.linear, after, bases, {own}, CURVES, settings)
+        columns = np.concatenate([family_columns(seen.linear, bases, k) for k in chosen], 1)
+        mine = space.library.of == space.library.names.index(effect)
+        beside = *augment_with_columns(seen.linear, columns), np.asarray(seen.linear.signatures)[:, mine]
+        row, root_without = _weakest_row(space, *beside)
+        whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
+        tests.append(
+            NameTest(
+                effect,
+                _root(*beside),
+                after.test.threshold("single"),
+                tuple(_over(*names[k]) for k in chosen),
+                _evidence_over_curves(space, whole, others, effect, bases, after, settings),
+                row,
+                root_without,
+            )
+        )
+    return tuple(tests)
+
+
+def _evidence_over_curves(
+    space: CandidateSpace,
+    best: Candidate,
+    without: Candidate,
+    effect: str,
+    bases: Bases,
+    after: Diagnosis,
+    settings: Settings,
+) -> float:
+    """Twice the log of the evidence for an effect of a candidate over the best smooth curve of its equation [σ²].
+
+    Args:
+        without: the same fit without it.
+    """
+    linear = diagnose(space, without, bases, after.test.null, settings).linear
+    cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(len(space.library))
+    own = _equation(space, effect)
+    tried = [e for e, over in _curves(space, linear, bases, set()) if equation(over.place) == own]
+    return 2 * (without.cost - best.cost) - cost - max(tried, default=-math.inf) + 2 * math.log(max(len(tried), 1))
+
+
+def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
+    """Root of the most that one of several columns over the readings explains, all else fitted again [σ]."""
+    half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
+    left, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
+    a = np.sum(signatures**2, 0) - np.sum(inside**2, 0)
+    b = signatures.T @ left[: len(signatures)]
+    return float(np.max(np.abs(b) / np.sqrt(np.maximum(a, 1e-12))))
+
+
+def _weakest_row(
+    space: CandidateSpace, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
+) -> tuple[int | None, float]:
+    """Number of the row without which that root is smallest, and the root; of settled runs."""
+    if space.bare.observe.long:
+        return None, math.inf
+    size = len(signatures) // len(space.included)
+    least: tuple[int | None, float] = None, math.inf
+    for k in np.flatnonzero(space.included):
+        j, e, s = jacobian.copy(), residual.copy(), signatures.copy()
+        for x in (j, e, s):
+            x[size * k : size * (k + 1)] = 0.0
+        root = _root(j, e, s)
+        least = (int(k) + 1, root) if root < least[1] else least
+    return least

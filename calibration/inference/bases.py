@@ -57,6 +57,8 @@ EVERY_AXIS = ("supply_voltage_V", "slope_deg", "payload_kg")
 MOST_LEVELS = 6
 #: Share of the variance of the order that conditions explain from which drift cannot be told from them.
 COLLINEAR = 0.9
+#: Combinations of conditions, as a share of the runs, up to which each is a level in that.
+FEW_CELLS = 1 / 3
 #: Waves of histories: per turn of the driving pulley or wheel, and whether of the belt (168 teeth, 24 grousers
 #: around a pulley of 48 teeth).
 ORDERS: dict[str, tuple[float, bool]] = {
@@ -237,7 +239,7 @@ def window(variable: str) -> Window | None:
 
 def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> Bases:
     """Windows in time (at the same instants of all runs) or in the order of runs, and levels of conditions, in every
-    balance and channel.
+    balance and channel; in the order only where the conditions do not tell it.
 
     Args:
         columns: of the table; weight: 0 for rows that do not count, shape (rows,).
@@ -249,12 +251,14 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot 
     if axis is not None:
         x = np.asarray(columns[VARIABLES[axis]], float)
         low, high = x[counts].min(), x[counts].max()
+        # Some runs one after the other are then runs at some conditions, which have windows of their own.
+        sorted_runs = axis == "order" and collinearity(columns, weight, robot) > COLLINEAR
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
                 first = low + k * size / 2
                 inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
-                offered.append((axis, x, counts & inside))
+                offered.append((axis, x, counts & inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
         if VARIABLES[condition] not in axes_of(robot):
             continue
@@ -287,14 +291,21 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: R
     """Share of the variance of the order of runs that their conditions explain (R²): at 1 a drift from run to run
     cannot be told from what the conditions do.
 
-    Conditions are a level for each configuration and polynomials of what is imposed, slope and payload.
+    Conditions are a level for each combination of configuration, what is imposed and payload, where these are few
+    beside the runs, else a level for each configuration and polynomials of the others; and a polynomial of the slope.
     """
     there = weight > 0
     x = np.asarray(columns["order"], float)[there]
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
-    terms = [columns["configuration"][there] == name for name in np.unique(columns["configuration"][there])]
-    for column in axes_of(robot):
+    _, which = np.unique(np.asarray(columns["configuration"])[there], return_inverse=True)
+    others = [c for c in axes_of(robot) if c != VARIABLES["slope"]]
+    cells = np.stack([which, *(np.asarray(columns[c], float)[there] for c in others)], 1)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    few = cell.max() + 1 <= FEW_CELLS * len(x)
+    smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in axes_of(robot)) if few else axes_of(robot)
+    terms = list(np.eye(len(x))[cell.ravel() if few else which.ravel()].T)
+    for column in smooth:
         terms += list(legendre.legvander(scaled(columns[column], weight)[there], DEGREE)[:, 1:].T)
     matrix = np.stack(terms, 1).astype(float)
     left = x - matrix @ np.linalg.lstsq(matrix, x, rcond=None)[0]

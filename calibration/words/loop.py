@@ -17,11 +17,14 @@ from calibration.discovery.notes import (
     Led,
     LostReplicates,
     NameSupport,
+    NameTest,
     PhasesDiffer,
+    RestsOn,
     RuledOut,
     StillLacks,
     Summary,
     TooFewReplicates,
+    Unwritten,
 )
 from calibration.discovery.settings import FIT, HELD_OUT
 from calibration.inference import bases
@@ -66,7 +69,7 @@ def _verdict(said: Summary) -> str:
         if said.nearest:
             text += f" Nearest comes {' and '.join(said.nearest)}: {reason(said.support)}."
         return text
-    names = []
+    names, tentative = [], []
     for one in said.missing:
         text = one.names[0]
         if len(one.names) + len(one.values) > 1:
@@ -74,9 +77,13 @@ def _verdict(said: Summary) -> str:
             listed = ", ".join(one.names) if len(one.names) == 1 else f"one of {', '.join(one.names)}"
             values = [freed_value(v) for v in one.values]
             text = f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
-        names.append(text)
+        if one.rests_on is None:
+            names.append(text)
+        else:
+            tentative.append(f"{text}, which rests on row {one.rests_on}")
+    in_model = f" Tentative, in the model since it predicts better: {'; '.join(tentative)}." if tentative else ""
     left = "" if where is None else f" Something remains in the {bases.in_words(where.place)}."
-    return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{left}"
+    return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
 
 
 def _without_name(where: Location, p: float) -> str:
@@ -128,6 +135,12 @@ def header(found: DiscoveryResult, robot_name: str) -> str:
     return f"found by the loop{start} with {found.runs.source}: {found.statement}"
 
 
+def refit_header(found: DiscoveryResult, robot_name: str) -> str:
+    """What heads the file of the robot with nothing added."""
+    start = f" from {robot_name}" if robot_name else ""
+    return f"fitted by the loop{start} to {found.runs.source}, with nothing added"
+
+
 #: In the place of a formula.
 NO_FORMULA = "none: no term shows in these data"
 
@@ -140,8 +153,8 @@ REASONS = {
     "larger": "{effects} would explain more, but not at a plausible size",
     "better curve": "one smooth {curves} is the better explanation than {effects}",
     "curve alone": "one smooth {curves} leaves nothing",
-    "not adequate": "the fit with {effects} is not adequate",
-    "lost": "beside smooth curves ({over}) {effects} would explain nothing",
+    "lost": "{lost}",
+    "one row": "{effects} rests on row {rows} alone",
     "beside": "beside smooth curves ({over})",
 }
 
@@ -154,6 +167,19 @@ def reason(support: NameSupport | None) -> str:
         effects=" and ".join(support.effects),
         curves=" and ".join(map(_curve, support.curves)),
         over=", ".join(_over(c.place, *c.variables) for c in support.curves),
+        lost="; ".join(_lost(t) for t in support.tests if not t.stands),
+        rows=", ".join(dict.fromkeys(str(t.row) for t in support.tests)),
+    )
+
+
+def _lost(test: NameTest) -> str:
+    """Why an effect does not stand."""
+    if test.root >= test.needed:
+        return f"a smooth curve in its place is the better explanation than {test.effect}"
+    over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
+    return (
+        f"{test.effect} explains {test.root:.1f} σ beside smooth curves ({over}), and chance reaches "
+        f"{test.needed:.1f}"
     )
 
 
@@ -356,6 +382,24 @@ def led(note: Led) -> str:
         why = "is not as adequate" if asked else f"would come first by --prefer {HELD_OUT}, where adequate"
         said += f"; {names[note.best]} {why}"
     return said
+
+
+def rests_on(note: RestsOn) -> str:
+    """An effect that stands by one row alone."""
+    return (
+        f"{note.effect} rests on row {note.row} ({note.root:.1f} σ with it, {note.root_without:.1f} σ without): make "
+        "that run again, and runs at conditions on either side of it"
+    )
+
+
+def unwritten(note: Unwritten) -> str:
+    """Why what was found is not in the robot that is written."""
+    what = "the curve" if note.curve else "what was found"
+    how = "no better than" if note.curve and note.gain > 0 else "worse than"
+    return (
+        f"{what} predicts runs that it has not seen {how} the refit ({note.gain:+.2f} ± {note.se:.2f} nat a "
+        "reading): robot.toml is the refit"
+    )
 
 
 def lost_replicates(note: LostReplicates) -> str:

@@ -52,6 +52,8 @@ SAID: dict[type, Callable[[Any], str]] = {
     of_loop.Led: loop.led,
     of_loop.LostReplicates: loop.lost_replicates,
     of_loop.TooFewReplicates: loop.too_few_replicates,
+    of_loop.RestsOn: loop.rests_on,
+    of_loop.Unwritten: loop.unwritten,
     of_study.Sampling: sensitivity.sampling,
     of_study.PointsLeftOut: sensitivity.points_left_out,
     of_study.SampleLeftOut: sensitivity.sample_left_out,

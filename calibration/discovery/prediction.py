@@ -1,0 +1,131 @@
+"""What sets of effects predict of data that their fits have not seen, and which of them is proposed by that.
+
+One score serves all: the log density of every reading of every kind of block, by a fit without its block.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import gammaln
+
+from calibration.data.runs import Runs
+from calibration.discovery.active_set import CandidateSpace
+from calibration.discovery.candidates import Candidate
+from calibration.inference import blocks as blocks_room
+from calibration.inference.held_out import held_out
+
+#: Degrees of freedom of Student's t that a reading is scored by: one that is far off does not decide alone.
+FREEDOM = 4.0
+#: As how far off a reading counts that a fit does not predict, its robot sliding or failing there [σ].
+UNREACHED = 12.0
+#: By how much what is written may predict worse than the refit [nat a reading].
+WORSE = 0.05
+
+Readings = Float[np.ndarray, "rows channels"]
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOutScore:
+    """Scores of a fit.
+
+    Attributes:
+        by_kind: kind of block → log density of each reading, NaN where none counts; shape (rows, channels).
+        blocks: kind of block → index of each row's block, -1 for none.
+    """
+
+    by_kind: dict[str, Readings]
+    blocks: dict[str, np.ndarray]
+
+    def gain(self, over: HeldOutScore) -> Gain:
+        """How much better it is than another's, over the readings of both."""
+        each = np.stack([x - over.by_kind[kind] for kind, x in self.by_kind.items()])
+        scored = np.isfinite(each)
+        counts = scored.sum((0, 2))
+        rows = counts > 0
+        total = int(counts.sum())
+        if not total:
+            return Gain(0.0, np.inf)
+        mean = float(np.nansum(each) / total)
+        # Of rows, and of the blocks of each kind, whose readings share what was not seen.
+        off = np.nansum(each, (0, 2)) - mean * counts
+        groups = [np.arange(len(rows)), *self.blocks.values()]
+        return Gain(mean, max(_error(off[rows], by[rows]) for by in groups) / total)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gain:
+    """A difference of two scores and its standard error [nat a reading]."""
+
+    mean: float
+    se: float
+
+
+def _error(off: np.ndarray, groups: np.ndarray) -> float:
+    """Standard error of a sum whose terms belong together in groups."""
+    _, which = np.unique(groups, return_inverse=True)
+    count = which.max() + 1
+    sums = np.bincount(which, off)
+    return float(np.sqrt(np.sum(sums**2) * count / (count - 1))) if count > 1 else 0.0
+
+
+def scored(
+    reading: dict[str, Readings],
+    measured: Readings,
+    sd: Readings,
+    counts: Bool[np.ndarray, "rows channels"],
+    runs: Runs,
+    kinds: Sequence[str],
+) -> HeldOutScore:
+    """Scores of readings held out.
+
+    Args:
+        reading: kind of block → of each row, by a fit that has not seen its block; NaN where it predicts none.
+        counts: whether a reading does; kinds: of blocks, as of an observer.
+    """
+    by_kind, blocks = {}, {}
+    norm = gammaln((FREEDOM + 1) / 2) - gammaln(FREEDOM / 2) - 0.5 * np.log(FREEDOM * np.pi)
+    for kind, by in blocks_room.distinct(runs, kinds).items():
+        block = np.full(len(runs), -1)
+        for k, mask in enumerate(by.values()):
+            block[mask] = k
+        off = (reading[kind] - measured) / sd
+        off = np.where(np.isfinite(off), off, UNREACHED)
+        density = norm - np.log(sd) - (FREEDOM + 1) / 2 * np.log1p(off**2 / FREEDOM)
+        by_kind[kind] = np.where(counts & (block >= 0)[:, None], density, np.nan)
+        blocks[kind] = block
+    return HeldOutScore(by_kind, blocks)
+
+
+def score_of(space: CandidateSpace, runs: Runs, candidate: Candidate) -> HeldOutScore:
+    """Scores of a candidate, fitted anew without each block of every kind."""
+    data, rows, kinds = space.equipped.data, len(runs), space.bare.observe.blocks
+    measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
+    active = space.library.indices(candidate.active)
+    reading = {
+        kind: held_out(space.equipped, candidate.z, list(by.values()), active).reading
+        for kind, by in blocks_room.distinct(runs, kinds).items()
+    }
+    return scored(reading, measured, sd, counts, runs, kinds)
+
+
+def smallest(space: CandidateSpace, runs: Runs, base: Candidate, path: Sequence[Candidate]) -> Candidate | None:
+    """The smallest set of effects that predicts as well as the best one, to one standard error (the rule of Breiman,
+    Friedman, Olshen and Stone 1984, sec. 3.4.3); None where that is the base, or nothing can be held out.
+
+    Args:
+        path: candidates by the number of their effects.
+    """
+    if not blocks_room.distinct(runs, space.bare.observe.blocks):
+        return None
+    candidates = [base, *path]
+    scores = [score_of(space, runs, c) for c in candidates]
+    best = scores[max(range(len(scores)), key=lambda k: scores[k].gain(scores[0]).mean)]
+    for candidate, score in zip(candidates, scores, strict=True):
+        behind = best.gain(score)
+        if behind.mean <= behind.se or score is best:
+            return None if candidate is base else candidate
+    return None

@@ -1,0 +1,81 @@
+"""Scores of data held out: against SciPy's densities, and the set of effects that is chosen by them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calibration.data.runs import Runs
+from calibration.discovery import prediction
+from calibration.discovery.prediction import Gain, HeldOutScore, scored, smallest
+
+RNG = np.random.default_rng(2)
+SLOPES = np.repeat([0.0, 5.0, 10.0], 4)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rows = len(SLOPES)
+    columns = {
+        "configuration": np.full(rows, "6T2A"), "supply_voltage_V": np.tile([20.0, 30.0], rows // 2), "slope_deg": SLOPES,
+        "payload_kg": np.zeros(rows), "motor_speed_rpm": 900 + np.arange(rows, dtype=float),
+        "speed_mm_s": 700 + np.arange(rows, dtype=float),
+    }  # fmt: skip
+    return Runs("a table", columns)
+
+
+def test_score_is_the_log_density_and_what_is_not_reached_counts(runs):
+    measured, sd = RNG.standard_normal((12, 2)), RNG.uniform(0.5, 2.0, (12, 2))
+    reading = {kind: measured + sd * RNG.standard_normal((12, 2)) for kind in ("slope", "voltage")}
+    reading["slope"][3, 1] = np.nan
+    counts = np.ones((12, 2), bool)
+    counts[5] = False
+    found = scored(reading, measured, sd, counts, runs, ("slope", "voltage"))
+    for kind in reading:
+        off = np.where(np.isfinite(reading[kind]), reading[kind], measured + prediction.UNREACHED * sd)
+        wanted = stats.t.logpdf((off - measured) / sd, prediction.FREEDOM) - np.log(sd)
+        np.testing.assert_allclose(found.by_kind[kind], np.where(counts, wanted, np.nan), rtol=1e-12)
+    assert [len(set(found.blocks[kind])) for kind in ("slope", "voltage")] == [3, 2]
+
+
+def score(values, blocks):
+    return HeldOutScore({"slope": np.asarray(values, float)[:, None]}, {"slope": np.asarray(blocks)})
+
+
+def test_gain_has_the_error_of_rows_or_blocks_whichever_is_larger():
+    each = RNG.standard_normal(12)
+    alone = score(each, np.arange(12)).gain(score(np.zeros(12), np.arange(12)))
+    assert alone.mean == pytest.approx(each.mean()) and alone.se == pytest.approx(each.std(ddof=1) / np.sqrt(12))
+    alike = np.repeat(RNG.standard_normal(3), 4)  # the rows of a block share what was not seen
+    blocks = np.repeat(np.arange(3), 4)
+    found = score(alike, blocks).gain(score(np.zeros(12), blocks))
+    assert found.se == pytest.approx(alike[::4].std(ddof=1) / np.sqrt(3))
+
+
+@pytest.mark.parametrize(
+    ("gains", "chosen"),
+    [
+        ([0.5, 0.9, 1.0], 2),  # the third gains less than its error over the second
+        ([0.02, 0.03, 0.04], 0),  # none gains more than its error over nothing
+        ([0.9, -0.5, -2.0], 1),
+        ([0.1, 0.2, 3.0], 3),
+    ],
+)
+def test_smallest_set_within_one_error_of_the_best_is_chosen(monkeypatch, runs, gains, chosen):
+    noise = 0.6 * RNG.standard_normal((4, 12)) * np.array([[0.0], [1.0], [1.0], [1.0]])
+    noise -= noise.mean(1, keepdims=True)
+    candidates = [SimpleNamespace(effects=tuple("abc"[:k])) for k in range(4)]
+    scores = {c.effects: score(noise[k] + ([0.0, *gains])[k], np.arange(12)) for k, c in enumerate(candidates)}
+    monkeypatch.setattr(prediction, "score_of", lambda space, runs, c: scores[c.effects])
+    space = SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(blocks=("slope", "voltage"))))
+    found = smallest(space, runs, candidates[0], candidates[1:])
+    assert (found is None) if chosen == 0 else (found is candidates[chosen])
+
+
+def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
+    space = SimpleNamespace(bare=SimpleNamespace(observe=SimpleNamespace(blocks=())))
+    assert smallest(space, runs, None, [None]) is None
+    assert HeldOutScore({"slope": np.full((2, 1), np.nan)}, {"slope": np.arange(2)}).gain(
+        HeldOutScore({"slope": np.zeros((2, 1))}, {"slope": np.arange(2)})
+    ) == Gain(0.0, np.inf)
