@@ -17,7 +17,7 @@ from test_stated_values import made as leads
 
 from calibration.data.writing import finite
 from calibration.discovery.clusters import Cluster
-from calibration.discovery.notes import Asked, CurveOver, NameSupport, RuledOut
+from calibration.discovery.notes import Asked, NameSupport, NameTest, RuledOut
 from calibration.discovery.result import Alternative, Estimate, HiddenEffect, Resolved, StatedValue
 from calibration.inference.identifiability import HELD
 from calibration.words import loop as words
@@ -197,8 +197,9 @@ def test_what_happens_for_a_while_has_a_window(shown, capsys):
 def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_path):
     found = shown("churning", capsys).found
     cluster = Cluster("time", 0.6, 0.7, "", 12, 13, 1e-5)
+    test = NameTest(found.effects[0].name, 6.0, 3.3, (), 5.0, 7, 2.5)
     found = dataclasses.replace(
-        found, cluster=cluster, support=NameSupport(True, "beside", curves=(CurveOver("slip", ("slope",)),))
+        found, cluster=cluster, support=NameSupport(True, "beside", tests=(test,))
     )
     document = finite(found.to_json())
     jsonschema.validate(document, SCHEMA)
@@ -206,8 +207,12 @@ def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_
         "axis": "time", "low": 0.6, "high": 0.7, "level": "", "inside": 12, "of": 13, "p": 1e-5
     }  # fmt: skip
     page = Tables(written(tmp_path, found))
-    assert str(cluster) in page.text
-    assert "The names keep their significance beside smooth curves (slip over slope)." in page.text
+    assert words.cluster(cluster) in page.text
+    said = f"{test.effect} 6.0 σ (chance 3.3, without row 7 2.5)"
+    assert f"explains more than chance would: {said}." in page.text
+    told = document["effects"][0]
+    assert (told["standing"], told["rests_on_row"], told["root"]) == ("tentative", 7, 6.0)
+    assert "tentative, rests on row 7" in page.tables["effects"][1]
 
 
 def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):

@@ -359,7 +359,15 @@ OVER = CurveOver("slip", ("slope",))
             NameSupport(False, "one row", ("a",), tests=(NameTest("a", 5.0, 3.4, (), 9.0, 10, 2.0),)),
             "a rests on row 10 alone",
         ),
-        (NameSupport(True, "beside", curves=(OVER,)), "beside smooth curves (balance slip over slope)"),
+        (
+            NameSupport(
+                True,
+                "beside",
+                tests=(NameTest("a", 6.91, 3.27, (OVER,), 1.0, 11, 5.8), NameTest("b", 5.0, 3.27, (), 0.0)),
+            ),
+            "each by itself, at the fit of the others, explains more than chance would: a 6.9 σ (chance 3.3, without row 11 "
+            "5.8), b 5.0 σ (chance 3.3)",
+        ),
     ],
 )
 def test_why_names_stand_or_not(support, said):

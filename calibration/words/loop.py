@@ -155,7 +155,7 @@ REASONS = {
     "curve alone": "one smooth {curves} leaves nothing",
     "lost": "{lost}",
     "one row": "{effects} rests on row {rows} alone",
-    "beside": "beside smooth curves ({over})",
+    "beside": "each by itself, at the fit of the others, explains more than chance would: {strengths}",
 }
 
 
@@ -166,10 +166,16 @@ def reason(support: NameSupport | None) -> str:
     return REASONS[support.why].format(
         effects=" and ".join(support.effects),
         curves=" and ".join(map(_curve, support.curves)),
-        over=", ".join(_over(c.place, *c.variables) for c in support.curves),
+        strengths=", ".join(map(_strength, support.tests)),
         lost="; ".join(_lost(t) for t in support.tests if not t.stands),
         rows=", ".join(dict.fromkeys(str(t.row) for t in support.tests)),
     )
+
+
+def _strength(test: NameTest) -> str:
+    """How much an effect explains by itself, and what chance and the loss of a row leave of that."""
+    less = "" if test.row is None else f", without row {test.row} {test.root_without:.1f}"
+    return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
 
 
 def _lost(test: NameTest) -> str:
@@ -198,7 +204,7 @@ def standing(found: DiscoveryResult) -> str:
         return ""
     if found.verdict == "unnamed":
         return f"Why no name: {found.standing}."
-    return f"The names keep their significance {found.standing}."
+    return f"{found.standing[0].upper()}{found.standing[1:]}."
 
 
 def stands(found: DiscoveryResult, effect: FoundEffect) -> str:
