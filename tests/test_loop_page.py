@@ -198,9 +198,7 @@ def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_
     found = shown("churning", capsys).found
     cluster = Cluster("time", 0.6, 0.7, "", 12, 13, 1e-5)
     test = NameTest(found.effects[0].name, 6.0, 3.3, (), 5.0, 7, 2.5)
-    found = dataclasses.replace(
-        found, cluster=cluster, support=NameSupport(True, "beside", tests=(test,))
-    )
+    found = dataclasses.replace(found, cluster=cluster, support=NameSupport(True, "beside", tests=(test,)))
     document = finite(found.to_json())
     jsonschema.validate(document, SCHEMA)
     assert document["cluster"] == {

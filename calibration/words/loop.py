@@ -207,10 +207,10 @@ def standing(found: DiscoveryResult) -> str:
     return f"{found.standing[0].upper()}{found.standing[1:]}."
 
 
-def stands(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """`established`, or on which row an effect rests."""
+def called(found: DiscoveryResult, effect: FoundEffect) -> str:
+    """The name of an effect, and where it is tentative the row that it rests on."""
     row = None if found.support is None else found.support.rests_on(effect.name)
-    return "established" if row is None else f"tentative: row {row}"
+    return effect.name if row is None else f"{effect.name}\n(tentative: row {row})"
 
 
 #: Why an effect is not plausible.
