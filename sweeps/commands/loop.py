@@ -72,23 +72,14 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(rise)
     if found.effects:
         shown = Table(box=None, pad_edge=False)
-        headings = (
-            "effect",
-            "what is missing",
-            "amplitude",
-            "explains [σ²]",
-            "own p",
-            "standing",
-            "indistinguishable from",
-        )
         for heading in ("effect", "what is missing", "amplitude", "explains [σ²]", "own p", "indistinguishable from"):
             number = heading in ("amplitude", "explains [σ²]", "own p")
             shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
         for e in found.effects:
             a = e.parameters["amplitude"]
             shown.add_row(
-                said_of.called(found, e), ", or ".join(e.families), f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", f"{e.score:.0f}",
-                f"{e.p_value:.2g}", said_of.alike(e) or "-",
+                said_of.called(found, e), ", or ".join(e.families), f"{a.value:.3g} ± {a.sd:.2g} {a.unit}",
+                f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(e) or "-",
             )  # fmt: skip
         say(shown)
         say("explains: rise of χ² without it, all else fitted again; own p: among the strongest of the library")
