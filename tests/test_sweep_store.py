@@ -702,7 +702,7 @@ def test_four_devices_give_the_same_samples_and_results_to_1e_12(whole, tmp_path
 def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
     probe = (
         "import numpy as np, jax, mmrjax\n"
-        "from sweeps import axes, scale\n"
+        "from sweeps.points import axes, scale\n"
         "from sweeps.config_campaign import Campaign\n"
         "from sweeps.points.design import Blocks\n"
         "robot = mmrjax.nominal()\n"
