@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import balances, channels, outputs
@@ -268,8 +269,7 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
 def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
     """Refuse an arm that gravity pulls: it turns unevenly, or hangs where its friction lets it."""
     for k, (name, load) in enumerate(robot.configurations.items()):
-        pulled = bool(jnp.any(jnp.asarray(load.torque_gravity) > 0))
-        if pulled and bool(jnp.any(jnp.asarray(conditions.configuration) == k)):
+        if np.any(np.asarray(load.torque_gravity) > 0) and np.any(np.asarray(conditions.configuration) == k):
             raise ValueError(
                 f"{name} is an arm on which gravity acts with its angle (torque_gravity above 0), so it has no "
                 "steady state; follow it over time: --model drive, and tables with a column time_s"
