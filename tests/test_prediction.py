@@ -8,7 +8,10 @@ from scipy import stats
 
 from calibration.data.runs import Runs
 from calibration.discovery import prediction
+from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, scored, smallest
+from mmrjax import robots
+from sweeps.inputs import read_runs
 
 RNG = np.random.default_rng(2)
 SLOPES = np.repeat([0.0, 5.0, 10.0], 4)
@@ -79,3 +82,26 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
     assert HeldOutScore({"slope": np.full((2, 1), np.nan)}, {"slope": np.arange(2)}).gain(
         HeldOutScore({"slope": np.zeros((2, 1))}, {"slope": np.arange(2)})
     ) == Gain(0.0, np.inf)
+
+
+@pytest.mark.slow
+def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row():
+    """What is written predicts, on the rows that both reach, no worse than this, by kind of block [%]."""
+    robot = robots.nominal()
+    found = discover(read_runs("measured", robot, measured=True), robot)
+    assert found.verdict == "class" and found.written and found.gain.mean > found.gain.se
+    standing = {e.name: found.support.rests_on(e.name) for e in found.effects}
+    assert standing == {"series_resistance": None, "vibration_slip": 10}
+    assert "supply_sag" in found.effects[0].members and found.effects[0].families == (
+        "voltage drop that changes with current",
+    )
+    wanted = {
+        "slope": (3.5, 1.52, 1.8), "voltage_configuration": (4.6, 2.1, 3.3), "voltage": (4.7, 2.9, 3.5),
+        "configuration": (17.4, 2.0, 2.0),
+    }  # fmt: skip
+    measured = found.readings_of_rows.measured
+    for kind, (before, after) in found.readings_of_rows.held_out.items():
+        both = np.isfinite(before) & np.isfinite(after)
+        error = np.where(both, 100 * (after - measured) / after, np.nan)
+        rms = np.sqrt(np.nanmean(error**2, 0))
+        assert (rms < np.array(wanted[kind]) + 0.05).all(), (kind, rms)
