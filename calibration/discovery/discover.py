@@ -600,9 +600,10 @@ def assemble_result(
             space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
         )
     unnamed = None if curve is None or where is None else findings.unnamed(curve, where, p, rows)
+    said = summary(traced, numbers)
     result = DiscoveryResult(
         verdict=traced.verdict,
-        summary=summary(traced, numbers),
+        summary=said,
         robot=robot,
         refit=findings.proposed_robot(space, base),
         gain=gain,
@@ -624,7 +625,7 @@ def assemble_result(
         alternatives=near,
         implausible=too_large,
         hidden=concealed,
-        support=None if traced.standing is None else traced.standing.numbered(numbers),
+        support=said.support,
         cluster=screened.cluster,
         residual_clusters=residual_clusters(_residuals(space, runs, ends.linear, seen.after, z), settings.seed),
         before=findings.evidence(left.test, adequate=not left.test.rejected),

@@ -83,9 +83,14 @@ class NameSupport:
     curves: tuple[CurveOver, ...] = ()
     tests: tuple[NameTest, ...] = ()
 
+    def test_of(self, effect: str) -> NameTest | None:
+        """That of an effect; None where it was not tested."""
+        return next((t for t in self.tests if t.effect == effect), None)
+
     def rests_on(self, effect: str) -> int | None:
         """Number of the row that an effect rests on; None where it needs none, or was not tested."""
-        return next((t.rests_on for t in self.tests if t.effect == effect), None)
+        test = self.test_of(effect)
+        return None if test is None else test.rests_on
 
     def numbered(self, numbers: np.ndarray) -> NameSupport:
         """With rows called as messages call them.

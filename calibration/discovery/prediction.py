@@ -6,11 +6,11 @@ One score serves all: the log density of every reading of every kind of block, b
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import gammaln
 
 from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
@@ -87,7 +87,7 @@ def scored(
         counts: whether a reading does; kinds: of blocks, as of an observer.
     """
     by_kind, blocks = {}, {}
-    norm = gammaln((FREEDOM + 1) / 2) - gammaln(FREEDOM / 2) - 0.5 * np.log(FREEDOM * np.pi)
+    norm = math.lgamma((FREEDOM + 1) / 2) - math.lgamma(FREEDOM / 2) - 0.5 * math.log(FREEDOM * math.pi)
     for kind, by in blocks_room.distinct(runs, kinds).items():
         block = np.full(len(runs), -1)
         for k, mask in enumerate(by.values()):

@@ -670,13 +670,12 @@ class Sensitivity:
 
 
 def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
-    test = next((t for t in support.tests if t.effect == e.name), None) if support is not None else None
-    rests_on = None if test is None else test.rests_on
+    test = None if support is None else support.test_of(e.name)
     return {
         "name": e.name,
         "class": [*e.members, *e.stated],
-        "standing": "established" if rests_on is None else "tentative",
-        "rests_on_row": rests_on,
+        "standing": "established" if test is None or test.established else "tentative",
+        "rests_on_row": None if test is None else test.rests_on,
         "root": None if test is None else test.root,
         "root_needed": None if test is None else test.needed,
         "families": list(e.families),

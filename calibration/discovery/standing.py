@@ -210,8 +210,7 @@ def _beside_curves(
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
         if not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
-    curves = tuple(dict.fromkeys(c for t in tests for c in t.curves))
-    return NameSupport(True, "beside", curves=curves, tests=tests)
+    return NameSupport(True, "beside", tests=tests)
 
 
 def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
@@ -266,16 +265,17 @@ def name_tests(
         after: what the fit with all of them leaves.
     """
     names, largest, tests = bases_room.names(bases), searched.best or best, []
-    fewer = {
-        e: c for e, c in zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True)
-    }
-    for effect, without in zip(best.effects, without_each(space, best, settings, searched.ladder), strict=True):
+    fewer = dict(zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True))
+    each = without_each(space, best, settings, searched.ladder)
+    fits = {c.active: c for c in (*each, *(c for e, c in fewer.items() if e in best.effects))}
+    seen = {at: diagnose(space, c, bases, after.test.null, settings).linear for at, c in fits.items()}
+    for effect, without in zip(best.effects, each, strict=True):
         own = _equation(space, effect)
-        seen = diagnose(space, without, bases, after.test.null, settings)
+        linear = seen[without.active]
         chosen, _ = _curves_beside(after.linear, after, bases, {own}, CURVES, settings)
-        columns = np.concatenate([family_columns(seen.linear, bases, k) for k in chosen], 1)
+        columns = np.concatenate([family_columns(linear, bases, k) for k in chosen], 1)
         mine = space.library.of == space.library.names.index(effect)
-        beside = *augment_with_columns(seen.linear, columns), np.asarray(seen.linear.signatures)[:, mine]
+        beside = *augment_with_columns(linear, columns), np.asarray(linear.signatures)[:, mine]
         row, root_without = _weakest_row(space, *beside)
         whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
         tests.append(
@@ -284,7 +284,7 @@ def name_tests(
                 _root(*beside),
                 after.test.threshold("single"),
                 tuple(_over(*names[k]) for k in chosen),
-                _evidence_over_curves(space, whole, others, effect, bases, after, settings),
+                _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 row,
                 root_without,
             )
@@ -297,16 +297,15 @@ def _evidence_over_curves(
     best: Candidate,
     without: Candidate,
     effect: str,
+    linear: Linearization,
     bases: Bases,
-    after: Diagnosis,
     settings: Settings,
 ) -> float:
     """Twice the log of the evidence for an effect of a candidate over the best smooth curve of its equation [σ²].
 
     Args:
-        without: the same fit without it.
+        without: the same fit without it; linear: that one, linearised.
     """
-    linear = diagnose(space, without, bases, after.test.null, settings).linear
     cost = _cost_of(space, best, best.active.index(effect), settings) + 2 * math.log(len(space.library))
     own = _equation(space, effect)
     tried = [e for e, over in _curves(space, linear, bases, set()) if equation(over.place) == own]
