@@ -73,35 +73,35 @@ class Conditions(eqx.Module):
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
-            which = jnp.asarray(which).astype(int)
+            which = _number(which, int)
         given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
-        numbers = [jnp.asarray(v, float) for v in given]
+        numbers = [_number(v) for v in given]
         others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
-        optional = {name: jnp.asarray(value, float) for name, value in others.items() if value is not None}
+        optional = {name: _number(value) for name, value in others.items() if value is not None}
         shapes = [x.shape for x in (which, *numbers, *optional.values())]
         try:
-            shape = jnp.broadcast_shapes(*shapes)
+            shape = np.broadcast_shapes(*shapes)
         except ValueError:
             names = [f.name for f in dataclasses.fields(type(self)) if f.name not in (*others, "begin")]
             of = dict(zip([*names, *optional], shapes, strict=True))
             said = ", ".join(f"{name} {s}" for name, s in of.items() if s)
             raise ValueError(f"Conditions: shapes do not broadcast to one another: {said}") from None
-        self.configuration = (np if which.dtype.kind == "U" else jnp).broadcast_to(which, shape)
+        self.configuration = np.broadcast_to(which, shape) if which.dtype.kind == "U" else _broadcast(which, shape)
         # the same number for all is one array: most fields of a large batch are 0 or 1
         shared: dict[float, Array] = {}
         for k, value in enumerate(given):
             if not isinstance(value, float):
-                numbers[k] = jnp.broadcast_to(numbers[k], shape)
+                numbers[k] = _broadcast(numbers[k], shape)
                 continue
             if value not in shared:
-                shared[value] = jnp.broadcast_to(numbers[k], shape)
+                shared[value] = _broadcast(numbers[k], shape)
             numbers[k] = shared[value]
         self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
         self.order, self.duty, self.open = numbers[6:]
-        held = {name: jnp.broadcast_to(x, shape) for name, x in optional.items()}
+        held = {name: _broadcast(x, shape) for name, x in optional.items()}
         self.total_mass, self.motor_speed = held.get("total_mass"), held.get("motor_speed")
         self.motor_acceleration = held.get("motor_acceleration")
-        self.begin = None if begin is None else jnp.broadcast_to(jnp.asarray(begin, int), shape)
+        self.begin = None if begin is None else _broadcast(_number(begin, int), shape)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -126,6 +126,15 @@ class Conditions(eqx.Module):
         if which.size and which.min() < 0:
             robot.configurations.index(str(np.unique(self.configuration[which < 0])[0]))
         return dataclasses.replace(self, configuration=jnp.asarray(which))
+
+
+def _number(x: Any, kind: type = float) -> Any:
+    """Numbers of that kind, of NumPy where they are not JAX's yet: no operation of JAX is compiled for them."""
+    return jnp.asarray(x, kind) if isinstance(x, jax.Array) else np.asarray(x, kind)
+
+
+def _broadcast(x: Any, shape: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(x, shape) if isinstance(x, jax.Array) else jax.device_put(np.broadcast_to(x, shape))
 
 
 def indices(words: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -183,7 +183,7 @@ class Result(eqx.Module):
         raise AttributeError(f"{type(self).__name__} has no {name}")
 
 
-def done(status: Array) -> Array:
+def done(status: Any) -> Any:
     """Whether runs ended as their conditions ask, by their codes: an operating point with numbers."""
     return (status == CONVERGED) | (status == REVERSES)
 

@@ -135,8 +135,8 @@ def test_noise_is_of_the_channels_of_a_table(tmp_path, bench):
     columns = {c: x for c, x in made_up(bench).items() if "_sd_" not in c}
     runs = calibration.read_runs(written(tmp_path / "t.csv", columns), robot=bench)
     sizes = observers.kind(runs).sizes(runs)
-    known = noise.assumed(runs, sizes, "output_torque=0.05Nm")
-    assert known.source == ("assumed", "assumed", "stated") and (known.sd[:, 2] == 0.05).all()
+    known = noise.inferred(runs, sizes, "output_torque=0.05Nm")
+    assert known.source == ("series", "series", "stated") and (known.sd[:, 2] == 0.05).all()
     assert noise.default(runs.channels) == "current=2%,motor_speed=0.5%,output_torque=1%"
     assert known.scaled({"output_torque": 2.0}).sd[0].tolist() == [*known.sd[0, :2], 0.1]
     with pytest.raises(calibration.data.errors.BadConfiguration, match="--noise speed=1%: no such channel"):

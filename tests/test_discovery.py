@@ -398,7 +398,7 @@ def test_null_of_one_column_is_normal(clean):
 def test_bootstrap_of_the_measured_runs_settles():
     """Of tables drawn from the fit to the packaged data nearly all can be fitted again."""
     runs, settings = read_runs("measured"), dataclasses.replace(SETTLED.settings, replicates=128)
-    sd = noise.assumed(runs, SettledRuns.sizes(runs), None).sd
+    sd = noise.inferred(runs, SettledRuns.sizes(runs), None).sd
     space = discover.pose(runs, robots.nominal(), sd, settings, {}, SETTLED.library)
     screened = screen(fit_base(space, settings, "measured"), lambda b: discover.bases_at(runs, b), runs, settings)
     assert len(discover.diagnosis_of_base(screened, settings).test.null.single) >= 0.98 * settings.replicates

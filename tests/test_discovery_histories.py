@@ -300,7 +300,7 @@ def test_histories_that_do_not_start_from_rest_are_refused(runs):
 def test_assumed_noise_of_histories_does_not_vanish_at_the_start(runs):
     bare = {k: v for k, v in runs.columns.items() if "_sd_" not in k}
     made = Runs("bare", bare)
-    sd = noise.assumed(made, Histories.sizes(made)).sd
+    sd = noise.inferred(made, Histories.sizes(made)).sd
     assert (np.ptp(sd, axis=0) == 0).all()
     current = bare["total_current_A"]
     np.testing.assert_allclose(sd[0, 0], 0.02 * np.sqrt(np.mean(current**2)))

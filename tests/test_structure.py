@@ -595,7 +595,7 @@ def test_front_door_loads_nothing_heavy():
 #: What `calibrate`, `discover` and `foresee` do to a table and a robot inside, from instruments to the base fit.
 INNER = {
     "with_inferred_instruments", "with_surface_configurations", "of_surfaces", "with_table_mass",
-    "with_initial_states", "with_begins", "check_start", "assumed", "library_for", "settings_for", "without_copies",
+    "with_initial_states", "with_begins", "check_start", "inferred", "library_for", "settings_for", "without_copies",
     "pose", "fit_base", "trace", "discover_at",
 }  # fmt: skip
 #: Campaigns and notebooks that call a part of that all the same, and why.
@@ -642,8 +642,8 @@ def test_campaigns_and_notebooks_take_the_way_of_users():
 
 
 def test_a_campaign_of_its_own_way_is_found():
-    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.assumed(runs)"
-    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "assumed"]
+    bad = "space = pose(runs, robot)\nfound = discover.trace(runs, robot)\nnoise.inferred(runs)"
+    assert [name for _, name in inner_calls(bad)] == ["pose", "trace", "inferred"]
     assert not [*inner_calls("given = prepared(runs, robot)\ngiven.trace()\nprepared(runs).trace()\ncalibrate(runs)")]
 
 

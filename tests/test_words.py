@@ -16,9 +16,11 @@ from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.notes import Note, Shown, Step
 from calibration.inference.residual_clusters import LevelMean, ResidualCluster
+from calibration.inference.series_noise import SeriesNoise
 from calibration.sensitivity import notes as of_study
 from calibration.words import fits, loop, steps, tables
 from calibration.words.notes import SAID, in_words, sentence
+from mmrjax import channels
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes, and what is said of them.
@@ -188,6 +190,16 @@ SAMPLES = [
     (
         of_loop.AssumedNoise(("speed",), "speed=2%"),
         "no sd is stated for speed: speed=2% is assumed; state yours with --noise",
+    ),
+    (
+        of_loop.NoiseFromSeries(
+            (
+                SeriesNoise(channels.of("total_current"), 0.0639, False, 7.45, "slope_deg", 4),
+                SeriesNoise(channels.of("speed"), 0.0124, True, 7.44, "slope_deg", 4),
+            )
+        ),
+        "no sd is stated for total_current, speed: total current 0.064 A, speed 1.2 % are estimated from how readings "
+        "scatter along 4 series of slope_deg (7.4 degrees of freedom); state yours with --noise",
     ),
     (of_loop.Copies((3,)), "row 3 is an exact copy of an earlier one and counts once"),
     (of_loop.Copies((3, 4)), "rows 3, 4 are exact copies of earlier ones and count once"),

@@ -34,6 +34,7 @@ from calibration.discovery.notes import (
     LostReplicates,
     Missing,
     NameSupport,
+    NoiseFromSeries,
     PhasesDiffer,
     RestsOn,
     StillLacks,
@@ -51,7 +52,7 @@ from calibration.discovery.result import (
     ReadingsOfRows,
     Sensitivity,
 )
-from calibration.discovery.score_tests import bootstrap
+from calibration.discovery.score_tests import Statistics, bootstrap
 from calibration.discovery.search import Search, diagnose, fewest, path, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import standing
@@ -70,8 +71,9 @@ from mmrjax import channels, effects
 from mmrjax.effects import Effect
 from mmrjax.robot import Robot
 
-#: Factors on an assumed noise at which the verdict is looked at too.
-FACTORS = (0.5, 2.0)
+#: Factors on a noise that nobody states at which the verdict is looked at too: on what is assumed, and on what the
+#: table shows.
+FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 #: Times that rows are looked through for such as stand alone, with what was found.
 SCREENINGS = 4
 #: Share of the largest speed or voltage that is no noise about rest [-].
@@ -123,18 +125,20 @@ def discover(
     space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
     with ahead(space, functools.partial(bases_at, distinct), ready.settings):
         traced, notes = ready.trace(progress=tell), ready.notes
-    silent = [c.name for c, source in zip(known.channels, known.source, strict=True) if source == "assumed"]
-    sizes = observers.kind(distinct).sizes(distinct)
-    sds = {f: noise_room.assumed(distinct, sizes, noise, f) for f in FACTORS if silent}
+    silent = channels.names(known.silent)
+    factors = FACTORS.get(known.word, ())
     # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
-    with concurrent.futures.ThreadPoolExecutor(len(FACTORS)) as others:
-        if silent:
-            tell(Step("factors", (tuple(f"{f:g}" for f in FACTORS),)))
-        verdicts = {f: others.submit(ready.trace, sd) for f, sd in sds.items()}
+    with concurrent.futures.ThreadPoolExecutor(2) as others:
+        if factors:
+            tell(Step("factors", (tuple(f"{f:g}" for f in factors), known.word)))
+        verdicts = {f: others.submit(ready.trace, known.scaled(dict.fromkeys(silent, f)), of=traced) for f in factors}
         found = assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell)
         sensitivity = [in_short(f, verdict.result(), ready.numbers) for f, verdict in verdicts.items()]
-    if silent:
-        notes = (*notes, AssumedNoise(tuple(silent), noise_room.default(known.channels)))
+    assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
+    if assumed:
+        notes = (*notes, AssumedNoise(channels.names(assumed), noise_room.default(assumed)))
+    if known.along_series:
+        notes = (*notes, NoiseFromSeries(known.along_series))
     return dataclasses.replace(found, remarks=(*notes, *found.remarks), sensitivity=tuple(sensitivity))
 
 
@@ -159,10 +163,12 @@ class LoopInput:
     notes: Notes
     foreign: Notes
 
-    def trace(self, noise: Noise | None = None, progress: Tell = lambda note: None) -> LoopStages:
-        """The stages up to a verdict, with this noise or another."""
+    def trace(
+        self, noise: Noise | None = None, progress: Tell = lambda note: None, of: LoopStages | None = None
+    ) -> LoopStages:
+        """The stages up to a verdict, with this noise or another; `of` are those with the first one."""
         sds = self.noise if noise is None else noise
-        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress)
+        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, of)
 
 
 def prepared(
@@ -316,8 +322,12 @@ def trace(
     stated: Mapping[str, tuple[float, float]] | None = None,
     library: Library = effects.BY_NAME,
     progress: Tell = lambda note: None,
+    of: LoopStages | None = None,
 ) -> LoopStages:
     """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`.
+
+    What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages `of` the
+    same table with other sds are known, and the same rows count, their replicates serve.
 
     Where residuals are without structure and everywhere as many times the sds, it is the sds that are wrong: the
     stages go through again with such as the residuals show.
@@ -341,7 +351,8 @@ def trace(
     for _ in range(SCREENINGS):
         base, space, bases = screened.base.candidate, screened.base.space, screened.bases
         progress(Step("bootstrap", (settings.replicates,)))
-        left = diagnosis_of_base(screened, settings)
+        null = None if of is None or np.any(of.screened.base.space.weight != space.weight) else of.left.test.null
+        left = diagnosis_of_base(screened, settings, sds.noise.freedom, null)
         if not left.test.rejected and screened.cluster is None:
             return LoopStages("none", screened, left, sds)
         progress(Step("effects"))
@@ -463,14 +474,21 @@ def bases_at(runs: Runs, base: BaseFit) -> Bases:
     return problem.observe.bases(columns, base.space.included, robot)
 
 
-def diagnosis_of_base(screened: Screening, settings: Settings) -> Diagnosis:
-    """What the base leaves, tested against the bootstrap of itself."""
+def diagnosis_of_base(
+    screened: Screening, settings: Settings, freedom: np.ndarray | None = None, null: Statistics | None = None
+) -> Diagnosis:
+    """What the base leaves, tested against the bootstrap of itself.
+
+    Args:
+        freedom: degrees of freedom of the sd of each channel; null: replicates where they are known.
+    """
     space, base = screened.base.space, screened.base.candidate
     linear, scores, found = screened.diagnosed
-    null = bootstrap(
-        space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
-        settings.seed,
-    )  # fmt: skip
+    if null is None:
+        null = bootstrap(
+            space.bare, base.z[: space.free], linear, space.library.scored, screened.bases, settings.replicates,
+            settings.seed, freedom,
+        )  # fmt: skip
     return Diagnosis(linear, scores, AdequacyTest(found, null, settings))
 
 
@@ -523,8 +541,7 @@ def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) 
         Missing(
             names,
             tuple(
-                FreedValue(s.name, float(c.value(jnp.asarray(s.fit.z[:p]))[s.index]), c.units[s.index])
-                for s in shifts
+                FreedValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index]) for s in shifts
             ),
             families,
             None if support is None else support.rests_on(names[0]),

@@ -13,6 +13,7 @@ most of all pairs apart; where one experiment does not do, two.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 
@@ -32,10 +33,10 @@ from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
 from calibration.inference.normal_equations import cholesky, forward
-from calibration.inference.optimizers import informing
+from calibration.inference.optimizers import informing, linearised
 from calibration.inference.problem import Problem
 from mmrjax import channels
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SELDOM, compiled
 
 #: Alternatives are foreseen in batches of a multiple of this, so that most classes share what is compiled.
 PAD = 4
@@ -162,28 +163,29 @@ def alternatives(best: Candidate, found: Classes, *, stated: bool = True) -> dic
 # --- what they foresee ------------------------------------------------------------------------------
 
 
-@compiled
+@functools.partial(compiled, options=SELDOM)
 def _predicted(
-    problem: Problem, other: priors.Coordinates | None, batch: predicted.Batch, which: Array, z: Array
+    problem: Problem,
+    other: priors.Coordinates | None,
+    batch: predicted.Batch,
+    which: Array,
+    z: Array,
+    informed: Array,
 ) -> tuple[predicted.Predicted, Array]:
     """Readings of the menu, and ½ of what the fit leaves of their covariance, by alternative.
 
-    `other` are coordinates of what the table does not show at all, known by their priors alone.
+    `other` are coordinates of what the table does not show at all, known by their priors alone; `informed` the
+    Jacobian of what informs each fit.
     """
-    rows = informing(problem.data)
 
-    def one(w: Array, z: Float[Array, " coordinates"]) -> tuple[predicted.Predicted, Array]:
-        here = dataclasses.replace(problem, coordinates=problem.coordinates.with_effects(w))
-
-        def residual(x: Array) -> Array:
-            return jnp.concatenate([here.misfit(x, here.data), x - here.data.centre])
+    def one(w: Array, z: Float[Array, " coordinates"], informed: Array) -> tuple[predicted.Predicted, Array]:
+        here = problem.coordinates.with_effects(w)
 
         def reading(x: Array) -> tuple[Array, predicted.Predicted]:
-            base = here.base if other is None else other.robot(here.base, x[z.size :])
-            found = predicted.readings(here.coordinates.robot(base, x[: z.size]), batch)
+            base = problem.base if other is None else other.robot(problem.base, x[z.size :])
+            found = predicted.readings(here.robot(base, x[: z.size]), batch)
             return found.value, found
 
-        informed = jax.jacfwd(residual)(z)[rows]
         lower = cholesky(informed.T @ informed)
         wide = jnp.concatenate([z, jnp.zeros(0 if other is None else len(other))])
         slopes, found = jax.jacfwd(reading, has_aux=True)(wide)
@@ -191,7 +193,12 @@ def _predicted(
         exists = found.exists & jnp.all(jnp.isfinite(half), 1) & jnp.isfinite(found.value)
         return dataclasses.replace(found, exists=exists), half
 
-    return jax.vmap(one)(which, z)
+    return jax.vmap(one)(which, z, informed)
+
+
+def _informed(space: CandidateSpace, at: Candidate) -> Array:
+    problem = space.problem(at.active)
+    return linearised(problem, jnp.asarray(at.z), problem.data)[1][informing(problem.data)]
 
 
 def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings: Settings) -> PredictedReadings:
@@ -208,9 +215,12 @@ def predict(space: CandidateSpace, candidates: Mapping[str, Candidate], settings
     other = priors.coordinates(robot, more) if more else None
     active = jnp.asarray([space.library.indices(c.active) for c in those])
     z = jnp.asarray(np.stack([c.z for c in those]))
+    informed = jnp.stack([_informed(space, c) for c in those])
     within = reach_of(space, space.bare.robot(jnp.asarray(those[0].z[: space.free])))
     everything, shown = menu.menu(within), channels.names(space.bare.channels)
-    found, half = jax.device_get(_predicted(space.equipped, other, predicted.batch(everything, shown), active, z))
+    found, half = jax.device_get(
+        _predicted(space.equipped, other, predicted.batch(everything, shown), active, z, informed)
+    )
     found, half = jax.tree.map(lambda x: np.asarray(x)[: len(names)], (found, half))
     experiments, kept = _possible(everything, found, within, settings)
     medians = np.median(np.asarray(space.equipped.data.sd), 0)

@@ -49,8 +49,8 @@ from calibration.inference.errors import summary
 from calibration.inference.held_out import held_out
 from calibration.inference.identifiability import held_by_prior
 from calibration.inference.linearization import amplitude_of, shape_of, shape_scales, shaped
-from calibration.inference.optimizers import read
-from calibration.inference.problem import Problem
+from calibration.inference.optimizers import linearised, read
+from calibration.inference.problem import Observation, Problem
 from mmrjax import channels
 from mmrjax.balances import BALANCES
 from mmrjax.effects import Effect
@@ -116,9 +116,12 @@ def _parameters(space: CandidateSpace, best: Candidate, slot: int, settings: Set
     shape = shape_of(effect)
     if shape is not None:
         k, scales = p + settings.slots + slot, shape_scales(shape)
-        value, slope = jax.value_and_grad(lambda z: shaped(scales, z))(jnp.asarray(best.z[k]))
+        value, slope = _shaped(scales, best.z[k])
         values[shape.name] = Estimate(float(value), float(slope) * float(best.sd[k]), shape.spec.unit, bool(held[k]))
     return values
+
+
+_shaped = jax.jit(jax.value_and_grad(shaped, argnums=1))
 
 
 def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, name: str) -> Member:
@@ -132,7 +135,7 @@ def _member(space: CandidateSpace, best: Candidate, found: Classes, slot: int, n
 
 def _stated(space: CandidateSpace, best: Candidate, shift: Shift) -> StatedValue:
     coordinates, p, k = space.coordinates.base, space.free, shift.index
-    value = [float(coordinates.value(jnp.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
+    value = [float(coordinates.value(np.asarray(z))[k]) for z in (shift.fit.z[:p], np.zeros(p))]
     rise = float(2 * (shift.fit.cost - best.cost))
     return StatedValue(value[0], value[1], coordinates.units[k], float(shift.fit.z[k]), rise)
 
@@ -273,7 +276,7 @@ def base_shift(space: CandidateSpace, before: np.ndarray, after: np.ndarray, sd:
     """
     coordinates, p = space.coordinates.base, space.free
     z = [np.asarray(x[:p]) for x in (before, after)]
-    value = [np.asarray(coordinates.value(jnp.asarray(x))) for x in (np.zeros(p), *z)]
+    value = [coordinates.value(np.asarray(x)) for x in (np.zeros(p), *z)]
     slope = np.asarray(coordinates.slope(jnp.asarray(z[1])))
     fields, held = priors.known(space.bare.base), held_by_prior(sd)
     return {
@@ -343,13 +346,23 @@ class Fitted:
     z: np.ndarray
     active: tuple[int, ...] | None
 
+    def observation(self) -> Observation:
+        """What it says of every row."""
+        problem = self.problem
+        if self.active is not None:
+            which = problem.coordinates.with_effects(jnp.asarray(self.active))
+            problem = dataclasses.replace(problem, coordinates=which)
+        if problem.observe.long:
+            return read(problem, problem.robot(jnp.asarray(self.z)))
+        return linearised(problem, jnp.asarray(self.z), problem.data)[2]
+
 
 def readings(runs: Runs, sd: np.ndarray, before: Fitted, after: Fitted | None) -> ReadingsOfRows:
     """Fitted and held-out readings, for every kind of block; `after` None is the same as before."""
     rows = len(runs)
 
     def seen(fitted: Fitted) -> np.ndarray:
-        found = read(fitted.problem, fitted.problem.robot(jnp.asarray(fitted.z)))
+        found = fitted.observation()
         lost = fitted.problem.observe.unreachable(np.asarray(found.status))[:rows, None]
         return np.where(lost, np.nan, np.asarray(found.reading)[:rows])
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from calibration.inference.notes import NoiseOff, Note
+from calibration.inference.series_noise import SeriesNoise
 
 if TYPE_CHECKING:
     from calibration.discovery.clusters import Cluster
@@ -185,6 +186,13 @@ class AssumedNoise(Note):
 
     channels: tuple[str, ...]
     usual: str
+
+
+@dataclasses.dataclass(frozen=True)
+class NoiseFromSeries(Note):
+    """Channels whose sds nobody states, as the scatter along series shows them."""
+
+    noise: tuple[SeriesNoise, ...]
 
 
 @dataclasses.dataclass(frozen=True)

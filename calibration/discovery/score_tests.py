@@ -35,6 +35,8 @@ UNSETTLED = 0.05
 WIDE = 30.0
 #: Further columns are filled up to a multiple of this.
 FILLED = 36
+#: By which factors an estimated sd may be off.
+UNSURE = 0.3, 4.0
 #: Replicates in one batch of the bootstrap.
 CHUNK = 64
 
@@ -246,6 +248,7 @@ def bootstrap(
     bases: Bases,
     replicates: int,
     seed: int,
+    freedom: np.ndarray | None = None,
 ) -> Statistics:
     """Statistics of `replicates` tables drawn from the fitted base and fitted again; shape (replicates,).
 
@@ -254,10 +257,15 @@ def bootstrap(
     Args:
         problem: of the base alone, z its fit; linear: the same fit, linearised.
         seed: random seed.
+        freedom: degrees of freedom that the sd of each channel was estimated with, infinite where it is known; None
+            for all known. Each table is drawn with sds that such an estimate might have been of.
     """
     count = -(-replicates // CHUNK)
     keys = jax.random.key_data(jax.random.split(jax.random.key(seed), (count, CHUNK)))
-    drawn = problem.observe.draws(problem, jnp.asarray(z), linear, keys.reshape(count * CHUNK, -1)[:replicates])
+    drawn = problem.observe.draws(
+        problem, jnp.asarray(z), linear, keys.reshape(count * CHUNK, -1)[:replicates],
+        _factors(freedom, len(problem.channels), replicates, seed),
+    )  # fmt: skip
     # To whole batches: those that are repeated are cut off.
     drawn = jax.tree.map(lambda x: np.resize(np.asarray(x), (count, CHUNK, *x.shape[1:])), drawn)
 
@@ -270,6 +278,16 @@ def bootstrap(
         parts = [part(0), *cores.map(part, range(1, count))]
     whole = jax.tree.map(lambda *x: np.concatenate(x)[:replicates], *parts)
     return jax.tree.map(lambda x: x[whole.settled], whole)
+
+
+def _factors(freedom: np.ndarray | None, channels: int, replicates: int, seed: int) -> np.ndarray:
+    """True sds over estimated ones, √(ν / χ²_ν), shape (replicates, channels)."""
+    factors = np.ones((replicates, channels))
+    if freedom is not None:
+        random = np.random.default_rng(seed)
+        for k in np.flatnonzero(np.isfinite(freedom)):
+            factors[:, k] = np.sqrt(freedom[k] / random.chisquare(freedom[k], replicates))
+    return np.clip(factors, *UNSURE)
 
 
 @functools.partial(compiled, options=SMALL)

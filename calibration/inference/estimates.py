@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.columns import DRIVING
@@ -61,12 +60,12 @@ def parameters(
             are those of their profiles.
     """
     coordinates = posed.coordinates
-    at, sd = jnp.asarray(z), jnp.asarray(about.sd)
-    value, slope = np.asarray(coordinates.value(at)), np.asarray(coordinates.slope(at))
+    at, sd = np.asarray(z), np.asarray(about.sd)
+    value, slope = coordinates.value(at), np.asarray(coordinates.slope(at))
     linear = np.stack([coordinates.value(at + side * Z95 * sd) for side in (-1, 1)], 1)
-    median = np.asarray(coordinates.value(jnp.zeros_like(at)))
-    wide = np.stack([coordinates.value(jnp.full_like(at, side * Z95)) for side in (-1, 1)], 1)
-    other = None if beside is None else np.asarray(coordinates.value(jnp.asarray(beside)))
+    median = coordinates.value(np.zeros_like(at))
+    wide = np.stack([coordinates.value(np.full_like(at, side * Z95)) for side in (-1, 1)], 1)
+    other = None if beside is None else coordinates.value(np.asarray(beside))
     bound, fields = coordinates.beyond(z), priors.known(base)
     found = {}
     for k, name in enumerate(coordinates.names):
@@ -77,7 +76,7 @@ def parameters(
             is_open = (bool(profile.open[k, 0]), bool(profile.open[k, 1]))
         if k in scans:
             shift, is_open = np.array(scans[k].interval()), scans[k].open()
-            ends = [jnp.where(jnp.arange(len(z)) == k, x, at) for x in shift]
+            ends = [np.where(np.arange(len(z)) == k, x, at) for x in shift]
             interval = np.array([coordinates.value(end)[k] for end in ends])
         found[name] = Estimate(
             value=float(value[k]),

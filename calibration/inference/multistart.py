@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.inference import identifiability, scans
+from calibration.inference import identifiability, scans, series_noise
 from calibration.inference import noise as noise_room
 from calibration.inference import optimizers as fit
 from calibration.inference.noise import Noise
@@ -269,5 +269,5 @@ def _shares(posed: Problem, noise: Noise, z: np.ndarray) -> np.ndarray:
     error = np.where(weight > 0, error, 0.0)
     leverage = identifiability.analyse(posed, jnp.asarray(z)).leverage
     left = np.maximum(weight.sum(0) - leverage.sum(0), 1.0)
-    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / left), noise_room.FLOOR)
+    shares = np.maximum(np.sqrt(np.sum(error**2, 0) / left), series_noise.FLOOR)
     return np.where(noise.estimated, shares, np.nan)

@@ -8,14 +8,19 @@ import re
 from collections.abc import Iterable, Mapping
 
 import numpy as np
+from jaxtyping import Float
 
 from calibration.data.errors import BadConfiguration, BadData, choices
 from calibration.data.runs import Runs
+from calibration.inference import series_noise
+from calibration.inference.series_noise import SeriesNoise
 from mmrjax import channels
 from mmrjax.channels import Channel
 
-#: Shares of the reading that the estimate starts from and does not fall below [-].
-START, FLOOR = 0.02, 1e-3
+#: Share of the reading that the estimate starts from [-].
+START = 0.02
+#: Sources of sds that nobody states, and what they are called in messages.
+UNSTATED = {"assumed": "assumed", "series": "estimated"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,18 +31,31 @@ class Noise:
         channels: that the sds are of, in the order of arrays.
         sd: [SI], shape (rows, channels); the first guess where estimated, 1 where there is no reading.
         estimated: whether a channel's sd is to be estimated from the misfit, shape (channels,).
-        source: one word a channel: `columns`, `stated`, `estimated`, `assumed`, or `no readings`.
+        source: one word a channel: `columns`, `stated`, `estimated`, `series`, `assumed`, or `no readings`.
+        along_series: estimates, of the channels whose source is `series`.
     """
 
     channels: tuple[Channel, ...]
     sd: np.ndarray
     estimated: np.ndarray
     source: tuple[str, ...]
+    along_series: tuple[SeriesNoise, ...] = ()
 
     @property
     def word(self) -> str:
         """Where sds come from, for messages."""
-        return "assumed" if "assumed" in self.source else "stated"
+        return next((w for source, w in UNSTATED.items() if source in self.source), "stated")
+
+    @property
+    def silent(self) -> tuple[Channel, ...]:
+        """Channels whose sd nobody states."""
+        return tuple(c for c, source in zip(self.channels, self.source, strict=True) if source in UNSTATED)
+
+    @property
+    def freedom(self) -> Float[np.ndarray, " channels"]:
+        """Degrees of freedom that the sd of each channel is known with; infinite where it is stated or assumed."""
+        found = {s.channel: s.freedom for s in self.along_series}
+        return np.array([found.get(c, np.inf) for c in self.channels])
 
     def scaled(self, factors: Mapping[str, float]) -> Noise:
         """The same with the sds of channels times a factor, by name."""
@@ -123,8 +141,9 @@ def default(shown: Iterable[Channel]) -> str:
     return ",".join(f"{c.word}={100 * c.sd_share:g}%" for c in shown)
 
 
-def assumed(runs: Runs, sizes: np.ndarray, stated: str | None = None, factor: float = 1.0) -> Noise:
-    """As `of`, with `default` times `factor` where a channel's sd would have to be estimated.
+def inferred(runs: Runs, sizes: np.ndarray, stated: str | None = None) -> Noise:
+    """As `of`, but known before any fit: what would have to be estimated from the misfit is what the scatter along
+    series shows (`series_noise`), or `default` where the table has none.
 
     Raises:
         BadConfiguration, BadData: as `of`.
@@ -132,7 +151,15 @@ def assumed(runs: Runs, sizes: np.ndarray, stated: str | None = None, factor: fl
     known = of(runs, sizes, stated)
     if not known.estimated.any():
         return known
+    sd, words, series = known.sd.copy(), list(known.source), []
     guess = of(runs, sizes, default(runs.channels))
-    sd = np.where(known.estimated, factor * guess.sd, known.sd)
-    words = tuple("assumed" if e else w for e, w in zip(known.estimated, known.source, strict=True))
-    return Noise(runs.channels, sd, np.zeros(len(words), bool), words)
+    shown = (None,) * len(words) if runs.sampled else series_noise.estimate(runs, sizes)
+    for k in np.flatnonzero(known.estimated):
+        found = shown[k]
+        if found is None:
+            sd[:, k], words[k] = guess.sd[:, k], "assumed"
+        else:
+            sd[:, k] = np.where(np.isfinite(runs.measured()[:, k]), found.sd(sizes[:, k]), 1.0)
+            words[k] = "series"
+            series.append(found)
+    return Noise(runs.channels, sd, np.zeros(len(words), bool), tuple(words), tuple(series))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -36,8 +35,10 @@ def operating_readings(
     if mass is None:
         own = np.asarray([float(c.mass) for c in robot.configurations.members])
         mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
-    posed = dataclasses.replace(conditions, adhesion=jnp.full(runs, GRIPPING), total_mass=jnp.asarray(mass))
-    found = steady_batch(params.strong(robot), jax.tree.map(lambda x: jnp.asarray(x)[index], posed))
+    gripping, own_mass = jax.device_put((np.full(runs, GRIPPING), np.asarray(mass)))
+    posed = dataclasses.replace(conditions, adhesion=gripping, total_mass=own_mass)
+    padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
+    found = steady_batch(params.strong(robot), padded)
     reading = np.stack([np.asarray(found.reading[c]) for c in names or channels.names(robot.channels)], 1)[:runs]
-    moving = np.asarray(done(found.status))[:runs]
+    moving = done(np.asarray(found.status))[:runs]
     return np.where(moving[:, None], reading, np.nan)

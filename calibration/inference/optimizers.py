@@ -313,7 +313,7 @@ def _begin(problem: Problem, start: Z, data: Data) -> Progress:
     return begin_at(start, (jnp.zeros(size), jnp.zeros((size, start.shape[0])), seen))
 
 
-def _advance(problem: Problem, at: Progress, data: Data, pin: Pin, max_steps: int) -> Progress:
+def _advance(problem: Problem, at: Progress, data: Data, pin: Pin, max_steps: int | Numbers) -> Progress:
     """One step of a search. The model is evaluated in one place of the program, at the start of a step: what was
     accepted there is what the search returns, with its residuals, Jacobian and observation."""
     found = _evaluated(problem, data, pin)(at.ahead)
@@ -376,7 +376,7 @@ def _vacant(problem: Problem, members: Member) -> Progress:
 
 @functools.partial(compiled, options=SMALL)
 def _go_on(
-    problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: int
+    problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
     """Searches side by side until `enough` of them have ended, those that are `fresh` from their starts."""
     pin = no_pin(members.start.shape[-1])
@@ -406,7 +406,13 @@ def searches_refilled(problem: Problem, members: Member, max_steps: int, places:
     Returns:
         Where each search ended, and what the model says there.
     """
-    count = len(members.start)
+    found, (_, _, seen) = _refilled(problem, members, max_steps, places)
+    return found, seen
+
+
+def _refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Any]:
+    """The same, with the residuals, penalties with their signs, and their Jacobian where each search ended."""
+    count, most = len(members.start), np.asarray(max_steps)
     cores = min(CORES, -(-count // places))
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
     idle = _vacant(problem, first)
@@ -422,34 +428,54 @@ def searches_refilled(problem: Problem, members: Member, max_steps: int, places:
             own = jax.tree.map(lambda x: x[np.maximum(holds, 0)], members)
             running = int((holds >= 0).sum())
             enough = places - running + (max(1, places // 4) if waiting else running)
-            at, found = _go_on(problem, own, fresh, at, np.asarray(enough), max_steps)
-            over, found, seen = jax.device_get((at.over, found, at.found[2]))
+            at, found = _go_on(problem, own, fresh, at, np.asarray(enough), most)
+            over, found = jax.device_get((at.over, (found, at.found)))
             for place in np.flatnonzero(over & (holds >= 0)):
-                ended.append((holds[place], jax.tree.map(lambda x: x[place], (found, seen))))  # noqa: B023
+                ended.append((holds[place], jax.tree.map(lambda x: x[place], found)))  # noqa: B023
                 holds[place] = -1
         return ended
 
     if cores > 1:  # the program is made once, by a call that takes no step
-        _go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), max_steps)
+        _go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
     with concurrent.futures.ThreadPoolExecutor(cores) as pool:
         ended = dict(itertools.chain(*pool.map(some, range(cores))))
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
 def linearised(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """All that is asked of a rollout at z, in one program: residuals (misfit, then prior), Jacobian, observation."""
-    r, jacobian, seen = linearised_signed(problem, z, data)
-    return *counted(r, jacobian, penalties(data)), seen
+    """All that is asked of a model at z: residuals (misfit, then prior), their Jacobian, observation."""
+    r, jacobian, seen = (linearised_signed if problem.observe.long else _first_step)(problem, z, data)
+    return *_counting(r, jacobian, data), seen
+
+
+def _first_step(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
+    """The same with the signs of penalties, by the program that searches have compiled."""
+    active = getattr(problem.coordinates, "active", None)
+    own = [np.asarray(x)[None] for x in (z, data.weight, data.measured, data.centre)]
+    members = Member(own[0], own[1], own[2], own[3], None if active is None else np.asarray(active)[None])
+    _, found = _refilled(problem, members, 1, problem.observe.places(problem))
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), found)
+
+
+@functools.partial(compiled, options=SELDOM)
+def _counting(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+    return counted(*_known(r, jacobian, data), penalties(data))
+
+
+def _known(r: Array, jacobian: Array, data: Data) -> tuple[Array, Array]:
+    """Residuals and Jacobian; a row of that which is not finite counts as a reading that could not be computed."""
+    counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + jacobian.shape[1], bool)])
+    known = jnp.all(jnp.isfinite(jacobian), axis=1)
+    return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0)
 
 
 @compiled
 def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array, Observation]:
-    """`linearised` with the signs of penalties, and their slopes where they are negative too.
+    """`linearised` of a rollout with the signs of penalties, and their slopes where they are negative too.
 
     Where a rollout's step is too long for its friction law (V_s small beside μ_s) the run shakes and its
     derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
     """
-    counts = jnp.concatenate([data.weight.ravel() > 0, jnp.ones(data.measured.shape[0] + z.size, bool)])
 
     def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
         seen = problem.observation(z)
@@ -457,8 +483,7 @@ def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
         return r, (r, seen)
 
     jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
-    known = jnp.all(jnp.isfinite(jacobian), axis=1)
-    return jnp.where(known, r, MISSING * counts), jnp.where(known[:, None], jacobian, 0.0), seen
+    return *_known(r, jacobian, data), seen
 
 
 def evaluated(problem: Problem, z: Z, data: Data) -> Array:

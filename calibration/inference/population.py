@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from calibration.data.errors import BadConfiguration
 from calibration.inference import noise as noise_room
+from calibration.inference import series_noise
 from calibration.inference.noise import Noise
 from calibration.inference.notes import (
     Edge,
@@ -212,7 +213,7 @@ def most_probable(
     weight, size = np.asarray(posed.data.weight), noise.sd / noise_room.START
     error = np.where(weight > 0, (reading - np.asarray(posed.data.measured)) / size, 0.0)
     share = np.sqrt(np.sum(weight * error**2, -2) / np.maximum(weight.sum(0), 1.0))
-    return np.where(noise.estimated, np.hypot(share, noise_room.FLOOR), np.nan)
+    return np.where(noise.estimated, np.hypot(share, series_noise.FLOOR), np.nan)
 
 
 def objective(posed: Problem, noise: Noise) -> Objective:

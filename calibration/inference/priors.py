@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -66,9 +67,10 @@ SOFTNESS = 0.05  # of a prior sd: the width over which a bound is rounded off
 
 def held_within(u: Array, low: Array | np.ndarray, high: Array | np.ndarray, width: Array | np.ndarray) -> Array:
     """u + w S((low - u)/w) - w S((u - high)/w), S softplus, within low and high; w = 0 cuts there."""
-    w = jnp.where(jnp.asarray(width) > 0, width, 1.0)
-    soft = u + w * jax.nn.softplus((low - u) / w) - w * jax.nn.softplus((u - high) / w)
-    return jnp.clip(jnp.where(jnp.asarray(width) > 0, soft, u), low, high)  # also of rounding, far outside
+    xp = np if isinstance(u, np.ndarray) else jnp
+    w = xp.where(xp.asarray(width) > 0, width, 1.0)
+    soft = u + w * xp.logaddexp((low - u) / w, 0.0) - w * xp.logaddexp((u - high) / w, 0.0)
+    return xp.clip(xp.where(xp.asarray(width) > 0, soft, u), low, high)  # also of rounding, far outside
 
 
 class Coordinates(eqx.Module):
@@ -108,15 +110,15 @@ class Coordinates(eqx.Module):
         """(Follower, index of its leader, ratio) of each parameter that follows a free one."""
         return tuple((name, k, float(self.ratios[n])) for n, (name, k) in enumerate(self.followers))
 
-    def value(self, z: Float[Array, "... parameters"]) -> Float[Array, "... parameters"]:
-        """Parameters θ [SI] at coordinates z."""
-        u = self.location + self.spread * z
-        u = held_within(u, self.low, self.high, SOFTNESS * self.spread)
-        return jnp.where(jnp.asarray(self.scale), jnp.exp(u), u)
+    def value(self, z: Float[Array | np.ndarray, "... parameters"]) -> Any:
+        """Parameters θ [SI] at coordinates z; of NumPy where these are."""
+        xp, own = (np, jax.tree.map(np.asarray, self)) if isinstance(z, np.ndarray) else (jnp, self)
+        u = held_within(own.location + own.spread * z, own.low, own.high, SOFTNESS * own.spread)
+        return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """dθ/dz [SI]."""
-        return jax.jvp(self.value, (z,), (jnp.ones_like(z),))[1]
+        return jax.jvp(self.value, (jnp.asarray(z),), (jnp.ones_like(z),))[1]
 
     def robot(self, base: Robot, z: Float[Array, " parameters"]) -> Robot:
         """`base` with the free parameters, and those tied to them, at coordinates z."""
@@ -125,8 +127,9 @@ class Coordinates(eqx.Module):
 
     def beyond(self, z: np.ndarray) -> np.ndarray:
         """-1 or 1 where z lies on or beyond its lower or upper bound, else 0; shape (parameters,)."""
-        u = np.asarray(self.location + self.spread * z)
-        return np.where(u <= self.low, -1, np.where(u >= self.high, 1, 0))
+        own = jax.tree.map(np.asarray, self)
+        u = own.location + own.spread * z
+        return np.where(u <= own.low, -1, np.where(u >= own.high, 1, 0))
 
 
 @compiled

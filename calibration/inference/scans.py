@@ -88,7 +88,7 @@ def scanned(problem: Problem) -> tuple[int, ...]:
 def beyond_a_basin(problem: Problem) -> tuple[int, ...]:
     """Coordinates whose prior reaches beyond one basin of the misfit, as their fields say (`Spec.scanned`)."""
     fields, c = known(problem.base), problem.coordinates
-    values = [np.asarray(c.value(jnp.full(len(c), side * RANGE))) for side in (-1.0, 1.0)]
+    values = [c.value(np.full(len(c), side * RANGE)) for side in (-1.0, 1.0)]
     half = 0.5 * (values[1] - values[0])
     widths = [fields[n].spec.scanned if n in fields else None for n in c.names]
     return tuple(k for k, width in enumerate(widths) if width is not None and half[k] > width)

@@ -18,6 +18,7 @@ from calibration.discovery.notes import (
     LostReplicates,
     NameSupport,
     NameTest,
+    NoiseFromSeries,
     PhasesDiffer,
     RestsOn,
     RuledOut,
@@ -344,6 +345,23 @@ def resolved(found: Resolved) -> str:
 def assumed_noise(note: AssumedNoise) -> str:
     """Channels whose sds nobody states."""
     return f"no sd is stated for {', '.join(note.channels)}: {note.usual} is assumed; state yours with --noise"
+
+
+def noise_from_series(note: NoiseFromSeries) -> str:
+    """Channels whose sds are estimated along series."""
+    shown = [
+        f"{s.channel.label} {100 * s.size:.2g} %"
+        if s.share
+        else f"{s.channel.label} {s.size / s.channel.factor:.2g} {s.channel.unit}"
+        for s in note.noise
+    ]
+    along = dict.fromkeys(f"{s.count} series of {s.axis}" for s in note.noise)
+    freedom = min(s.freedom for s in note.noise)
+    return (
+        f"no sd is stated for {', '.join(s.channel.name for s in note.noise)}: {', '.join(shown)} are estimated "
+        f"from how readings scatter along {' and '.join(along)} ({freedom:.1f} degrees of freedom); state yours with "
+        "--noise"
+    )
 
 
 def copies(note: Copies) -> str:

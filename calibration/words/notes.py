@@ -45,6 +45,7 @@ SAID: dict[type, Callable[[Any], str]] = {
     of_fit.EndedAtEdge: fits.ended_at_edge,
     of_fit.ReadFromMembers: fits.read_from_members,
     of_loop.AssumedNoise: loop.assumed_noise,
+    of_loop.NoiseFromSeries: loop.noise_from_series,
     of_loop.Copies: loop.copies,
     of_loop.KeptOut: loop.kept_out,
     of_loop.PhasesDiffer: loop.phases_differ,

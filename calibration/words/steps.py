@@ -14,7 +14,7 @@ STEPS = {
     "alone": "rows stand alone beside what was found: the same without them",
     "alike": "what else explains as much as {}?",
     "held out": "which of those predicts best what a fit has not seen?",
-    "factors": "the verdict with {} times the assumed noise, beside:",
+    "factors": "the verdict with {} times the {} noise, beside:",
     "shape": "the shape of what is missing",
     "errors": "errors on data held out",
     "next": "the next experiment",

@@ -115,6 +115,6 @@ def print_discovery(found: DiscoveryResult) -> None:
             )
         )
     for other in found.sensitivity:
-        say(f"with {other.factor:g} times the assumed noise: {other.verdict}: {other.statement}")
+        say(f"with {other.factor:g} times that noise: {other.verdict}: {other.statement}")
     for note in found.notes:
         say(f"- {note}")

@@ -202,12 +202,13 @@ class Observer(eqx.Module):
     def linearise(self, problem: Problem, z: Array, data: Data, effects: tuple[ScoredEffect, ...]) -> Linearization:
         """Residuals, Jacobian and signatures at z."""
 
-    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array) -> Any:
+    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray) -> Any:
         """What replicates of the bootstrap begin with, leading axis the keys: the keys, or fits of tables drawn.
 
         Args:
             problem: of the base alone, at its fit z; linear: the same fit, linearised.
             keys: random, as numbers, shape (replicates, words).
+            factors: on the sds of each replicate, shape (replicates, channels).
         """
         return keys
 
@@ -243,6 +244,10 @@ class Observer(eqx.Module):
     def scan(self, problem: Problem, z: Array, data: Data, k: int, values: Array) -> tuple[Array, Array]:
         """Objective where coordinate k has each of `values` and the others have moved from z to where their
         linearisation has its minimum, shape (values,), and all coordinates then, (values, coordinates)."""
+        raise NotImplementedError
+
+    def places(self, problem: Problem) -> int:
+        """Searches of a problem side by side on a core, by `searches_refilled`."""
         raise NotImplementedError
 
     @abc.abstractmethod

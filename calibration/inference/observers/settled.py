@@ -213,13 +213,15 @@ class SettledRuns(Observer):
             residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown
         )
 
-    def draws(self, problem: Problem, z: Array, linear: Linearization, keys: Array) -> tuple[Array, Array, Array]:
+    def draws(
+        self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
+    ) -> tuple[Array, Array, Array]:
         """As the protocol says: readings and priors of each table, and its fit. Readings are drawn with their sds,
         and the bench values too: a prior is a measurement made beforehand. The refit is the search that found
         the fit, from the truth."""
         data, count = problem.data, len(keys)
         clean = data.measured + data.sd * linear.by_row()  # where a reading counts
-        measured, centre = jax.device_get(_drawn(clean, data.sd, z, keys))
+        measured, centre = jax.device_get(_drawn(clean, data.sd, z, keys, jnp.asarray(factors)))
         start, weight = (np.repeat(np.asarray(x)[None], count, 0) for x in (z, data.weight))
         members = Member(start, weight, measured, centre)
         refits, _ = searches_refilled(problem, members, self.policy.steps, self.places(problem))
@@ -279,11 +281,11 @@ def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarra
 
 
 @functools.partial(compiled, options=SELDOM)
-def _drawn(clean: Array, sd: Array, z: Array, keys: Array) -> tuple[Array, Array]:
-    """Readings and bench values of a table for each key."""
+def _drawn(clean: Array, sd: Array, z: Array, keys: Array, factors: Array) -> tuple[Array, Array]:
+    """Readings and bench values of a table for each key, its sds times its factors."""
 
-    def one(key: Array) -> tuple[Array, Array]:
+    def one(key: Array, factors: Array) -> tuple[Array, Array]:
         one, two = jax.random.split(jax.random.wrap_key_data(key))
-        return clean + sd * jax.random.normal(one, clean.shape), z + jax.random.normal(two, z.shape)
+        return clean + sd * factors * jax.random.normal(one, clean.shape), z + jax.random.normal(two, z.shape)
 
-    return jax.vmap(one)(keys)
+    return jax.vmap(one)(keys, factors)

@@ -213,8 +213,8 @@ def _with_adhesion(problem: Problem, z: np.ndarray, adhesion: float) -> np.ndarr
 def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
     """z with a share of its V_s, and what settled ends do not show in the nominal ratio to what they do."""
     c = problem.coordinates
-    value = np.array(c.value(jnp.asarray(z)))
-    nominal = np.asarray(c.value(jnp.zeros(len(c))))
+    value = np.array(c.value(np.asarray(z)))
+    nominal = c.value(np.zeros(len(c)))
     for k, name in enumerate(c.names):
         if name.endswith(CREEP):
             value[k] *= share
@@ -224,7 +224,7 @@ def _with_sliding(problem: Problem, z: np.ndarray, share: float) -> np.ndarray:
                 j = c.names.index(own)
                 value[k] = nominal[k] * value[j] / nominal[j]
     inside = np.where(c.scale, np.log(np.maximum(value, 1e-12)), value)
-    changed = value != np.asarray(c.value(jnp.asarray(z)))
+    changed = value != c.value(np.asarray(z))
     return np.where(changed, (inside - np.asarray(c.location)) / np.asarray(c.spread), z)
 
 

@@ -1,0 +1,136 @@
+"""Noise that nobody states, from the scatter of readings along series of conditions.
+
+Along a series, rows alike in every condition but one, what a model says is smooth: what a reading differs from the
+line between its neighbours is noise, and curvature where the steps are wide, which makes the estimate too large and
+never too small (second differences: von Neumann, Ann. Math. Stat. 12 (1941); Gasser, Sroka and Jennen-Steinmetz,
+Biometrika 73 (1986), for any spacing).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from calibration.data.columns import DRIVEN
+from calibration.data.instruments import step_of
+from calibration.data.runs import Runs
+from mmrjax.channels import Channel
+
+#: The axis whose series are taken where they are enough; else the one of most degrees of freedom.
+FIRST = "slope_deg"
+#: Share of a reading that its sd is not below [-].
+FLOOR = 1e-3
+#: Fewest degrees of freedom of an estimate.
+FEWEST = 4.0
+#: Scales, of the median, beyond which a difference holds a reading that is wrong, and the most of them, as a share.
+WRONG, MOST = 5.0, 0.25
+#: Columns that tell rows apart beside the axes.
+LABELS = ("configuration", "surface", "mode")
+
+
+@dataclasses.dataclass(frozen=True)
+class SeriesNoise:
+    """The noise of a channel.
+
+    Attributes:
+        channel: whose; size: sd, of the reading where it is a share of that, else [SI]; share: whether it is.
+        freedom: degrees of freedom of the estimate; axis: column along which the series are; count: how many.
+        least: sd that rounding alone leaves, by the step of the display [SI].
+    """
+
+    channel: Channel
+    size: float
+    share: bool
+    freedom: float
+    axis: str
+    count: int
+    least: float = 0.0
+
+    def sd(self, sizes: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Of readings of these sizes [SI]: no display shows less than its rounding, nor is a reading better than
+        `FLOOR` of itself."""
+        return np.maximum(self.size * sizes if self.share else self.size, np.maximum(self.least, FLOOR * sizes))
+
+
+def estimate(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[SeriesNoise | None, ...]:
+    """The noise of each channel; None where too few rows are along series.
+
+    Args:
+        sizes: of each reading [SI], that a share of the reading is of.
+    """
+    measured = runs.measured()
+    by_axis = {axis: _series(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
+    found: list[SeriesNoise | None] = []
+    for k, channel in enumerate(runs.channels):
+        each = [_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
+        enough = [e for e in each if e is not None and e.freedom >= FEWEST]
+        first = next((e for e in enough if e.axis == FIRST), None)
+        found.append(first or max(enough, key=lambda e: e.freedom, default=None))
+    return tuple(found)
+
+
+def _series(runs: Runs, axis: str) -> list[np.ndarray]:
+    """Rows of each series along an axis, three or more; one that goes backward is another one."""
+    others = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
+    driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]
+    keys: list[tuple] = [
+        (*(str(runs[c][row]) for c in others), *(float(np.sign(runs[c][row])) for c in driving))
+        for row in range(len(runs))
+    ]
+    together: dict[tuple, list[int]] = {}
+    for row, key in enumerate(keys):
+        together.setdefault(key, []).append(row)
+    if runs.has("mode"):
+        together = {k: rows for k, rows in together.items() if runs["mode"][rows[0]] == DRIVEN[0]}
+    return [np.array(rows) for rows in together.values() if len(rows) > 2]
+
+
+def _of_channel(
+    channel: Channel, measured: np.ndarray, sizes: np.ndarray, x: np.ndarray, axis: str, series: list[np.ndarray]
+) -> SeriesNoise | None:
+    """Of the form, constant or a share, under which the differences are the likelier."""
+    weights, used = _differences(measured, x, series)
+    if not used:
+        return None
+    difference = weights @ np.nan_to_num(measured)
+    least = float(step_of(measured) / np.sqrt(12))
+    forms = []
+    for share in (False, True):
+        scale = weights * (sizes if share else 1.0)
+        spread = np.sqrt(np.sum(scale**2, 1))
+        unit, scale = difference / spread, scale / spread[:, None]
+        sound = _sound(unit)
+        unit, scale = unit[sound], scale[sound]
+        count = len(unit)
+        size = float(np.sqrt(np.mean(unit**2)))
+        together = scale @ scale.T
+        freedom = count**2 / float(np.sum(together**2))
+        likely = -float(np.mean(np.log(np.maximum(size * spread[sound], np.finfo(float).tiny))))
+        forms.append((likely, SeriesNoise(channel, size, share, freedom, axis, used, least)))
+    return max(forms, key=lambda form: form[0])[1]
+
+
+def _differences(measured: np.ndarray, x: np.ndarray, series: list[np.ndarray]) -> tuple[np.ndarray, int]:
+    """What each reading between two others differs from the line between these, as weights of all readings, shape
+    (differences, rows); and how many series have any."""
+    found, used = [], 0
+    for rows in series:
+        rows = rows[np.isfinite(measured[rows])]
+        rows = rows[np.argsort(x[rows], kind="stable")]
+        before, at, after = rows[:-2], rows[1:-1], rows[2:]
+        wide = x[after] - x[before]
+        share = np.where(wide > 0, (x[after] - x[at]) / np.where(wide > 0, wide, 1.0), 0.5)
+        weights = np.zeros((len(at), len(measured)))
+        k = np.arange(len(at))
+        weights[k, at], weights[k, before], weights[k, after] = 1.0, -share, share - 1.0
+        found.append(weights)
+        used += bool(len(at))
+    return np.concatenate(found) if found else np.zeros((0, len(measured))), used
+
+
+def _sound(unit: np.ndarray) -> np.ndarray:
+    """Differences that hold no reading that is wrong: all, where they would be too many for that."""
+    sound = np.abs(unit) <= WRONG * 1.4826 * np.median(np.abs(unit))
+    return sound if np.mean(~sound) <= MOST else np.ones(len(unit), bool)

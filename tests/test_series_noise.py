@@ -1,0 +1,122 @@
+"""Noise that nobody states: estimates along series against the noise that tables were made with."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calibration.data.runs import Runs
+from calibration.data.table import Layout
+from calibration.discovery.score_tests import UNSURE, _factors
+from calibration.inference import noise, series_noise
+from calibration.inference.observers import SettledRuns
+from mmrjax import channels
+
+SLOPES = np.arange(0.0, 21.0, 5.0)
+
+
+def table(sd, share=False, slopes=SLOPES, seed=0, payloads=(0.0, 8.0), volts=(15.0, 33.0)):
+    """A table whose readings bend gently over the slope, of 0.5 to 6 A, with noise of this sd."""
+    volt, payload, slope = (x.ravel() for x in np.meshgrid(volts, payloads, slopes, indexing="ij"))
+    random = np.random.default_rng(seed)
+    clean = 0.5 + 0.1 * payload + 0.2 * slope + 2e-4 * slope**2
+    current = clean + sd * (clean if share else 1.0) * random.standard_normal(len(slope))
+    columns = {
+        "configuration": np.array(["4W2T"] * len(slope)),
+        "supply_voltage_V": volt,
+        "payload_kg": payload,
+        "slope_deg": slope,
+        "total_current_A": current,
+        "motor_speed_rpm": 350 * volt * (1 + 0.005 * random.standard_normal(len(slope))),
+        "speed_mm_s": np.full(len(slope), np.nan),
+    }
+    return Runs("made", columns, layout=Layout())
+
+
+def found(runs):
+    return series_noise.estimate(runs, np.nan_to_num(SettledRuns.sizes(runs), nan=1.0))
+
+
+def test_degrees_of_freedom_are_those_of_second_differences():
+    """Of a series of five, D Dᵀ has 6, -4, 1 along its diagonals: ν = (Σ 6)² / Σ of squares = 324 / 174."""
+    current, _, _ = found(table(0.05))
+    assert current.freedom == pytest.approx(4 * 324 / 174, rel=1e-9)
+    assert current.axis == "slope_deg" and current.count == 4
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_estimates_are_right_on_average_and_scatter_as_their_degrees_of_freedom_say(share):
+    sd = 0.03
+    each = [found(table(sd, share, seed=k))[0] for k in range(200)]
+    of_form = [e for e in each if e.share == share]
+    assert len(of_form) > 120  # of twenty rows the form is often, not always, seen
+    squares = np.array([(e.size / sd) ** 2 for e in of_form])
+    assert squares.mean() == pytest.approx(1.0, abs=0.15)
+    assert squares.var() == pytest.approx(2 / each[0].freedom, rel=0.5)
+
+
+def test_curvature_makes_it_larger_and_a_wrong_reading_does_not():
+    clean = found(table(0.05))[0].size
+    runs = table(0.05)
+    bent = {**runs.columns, "total_current_A": runs["total_current_A"] + 0.02 * runs["slope_deg"] ** 2}
+    assert found(dataclasses.replace(runs, columns=bent))[0].size > 3 * clean
+    current = runs["total_current_A"].copy()
+    current[7] += 5.0
+    wrong = dataclasses.replace(runs, columns={**runs.columns, "total_current_A": current})
+    assert found(wrong)[0].size < 2 * clean
+
+
+def test_uneven_steps_and_repeats_count_as_they_are():
+    """A straight line leaves nothing whatever its steps; of repeats, what they differ by."""
+    uneven = table(0.0, slopes=np.array([0.0, 1.0, 7.0, 9.0, 20.0]), seed=1)
+    straight = 1 + 0.1 * uneven["slope_deg"]
+    weights, used = series_noise._differences(
+        straight, uneven["slope_deg"], series_noise._series(uneven, "slope_deg")
+    )
+    assert used == 4 and np.abs(weights @ straight).max() < 1e-12
+    repeats = np.array([3.0, 3.0, 3.0])
+    weights, _ = series_noise._differences(np.array([1.0, 2.0, 4.0]), repeats, [np.arange(3)])
+    np.testing.assert_allclose(weights, [[-0.5, 1.0, -0.5]])
+
+
+def test_a_display_shows_nothing_finer_than_its_step():
+    runs = table(1e-4)
+    rounded = {**runs.columns, "total_current_A": np.round(runs["total_current_A"] / 0.05) * 0.05}
+    shown = found(dataclasses.replace(runs, columns=rounded))[0]
+    assert np.all(shown.sd(np.array([0.5, 6.0])) >= 0.05 / np.sqrt(12) * 0.999)
+    smooth = found(table(0.0, slopes=np.arange(5.0)))[0]  # as simulated
+    assert np.all(smooth.sd(np.array([0.5, 6.0])) >= series_noise.FLOOR * np.array([0.5, 6.0]))
+
+
+def test_rows_without_series_are_assumed_as_usual_and_stated_ones_stay():
+    runs = table(0.05)
+    random = np.random.default_rng(0)
+    scattered = {k: v if v.dtype.kind == "U" else v + 0.01 * random.random(len(v)) for k, v in runs.columns.items()}
+    alone = dataclasses.replace(runs, columns=scattered)
+    assert found(alone) == (None, None, None)
+    with np.errstate(invalid="ignore"):
+        known = noise.inferred(alone, SettledRuns.sizes(alone))
+        mine = noise.inferred(runs, SettledRuns.sizes(runs), "current=0.2A")
+    assert known.source == ("assumed", "assumed", "no readings") and known.word == "assumed"
+    assert np.all(np.isinf(known.freedom))
+    assert mine.source == ("stated", "series", "no readings") and mine.word == "estimated"
+    assert channels.names(mine.silent) == ("motor_speed",)
+    np.testing.assert_allclose(mine.sd[:, 0], 0.2)
+    assert mine.freedom[1] == mine.along_series[0].freedom
+
+
+def test_series_that_go_backward_are_others():
+    runs = table(0.05, volts=(-20.0, -10.0, 10.0, 20.0), slopes=np.zeros(1), payloads=(0.0,))
+    assert series_noise._series(runs, "supply_voltage_V") == []  # two and two
+    longer = table(0.05, volts=(-30.0, -20.0, -10.0, 10.0, 20.0, 30.0), slopes=np.zeros(1), payloads=(0.0,))
+    assert [len(s) for s in series_noise._series(longer, "supply_voltage_V")] == [3, 3]
+
+
+def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():
+    factors = _factors(np.array([7.45, np.inf]), 2, 20_000, seed=3)
+    assert np.all(factors[:, 1] == 1.0)
+    # 1 / f² is χ² / ν: mean 1, variance 2 / ν, but for what is cut off
+    assert np.mean(factors[:, 0] ** -2) == pytest.approx(1.0, abs=0.02)
+    assert np.var(factors[:, 0] ** -2) == pytest.approx(2 / 7.45, rel=0.05)
+    assert factors.min() >= UNSURE[0] and factors.max() <= UNSURE[1]
+    assert np.all(_factors(None, 3, 5, seed=0) == 1.0)
