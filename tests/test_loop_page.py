@@ -210,7 +210,7 @@ def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_
     assert f"explains more than chance would: {said}." in page.text
     told = document["effects"][0]
     assert (told["standing"], told["rests_on_row"], told["root"]) == ("tentative", 7, 6.0)
-    assert "tentative, rests on row 7" in page.tables["effects"][1]
+    assert "tentative: row 7" in page.tables["effects"][1]
 
 
 def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):

@@ -21,7 +21,14 @@ from calibration.discovery.score_tests import augment_with_columns
 from calibration.discovery.search import Search, diagnose
 from calibration.discovery.settings import settings_for
 from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, smooth, surface
-from calibration.discovery.standing import _root, _weakest_row, cost_of_names, evidence_of_names, standing
+from calibration.discovery.standing import (
+    _chosen_again,
+    _root,
+    _weakest_row,
+    cost_of_names,
+    evidence_of_names,
+    standing,
+)
 from calibration.inference import bases
 from calibration.inference.linearization import PROBED
 from calibration.inference.observers import Histories, SettledRuns
@@ -184,8 +191,89 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
 def test_name_stands_by_its_score_its_curves_and_its_rows(root, without, evidence, stands, rests_on):
     test = NameTest("a", root, 3.3, (), evidence, 10, without)
     assert (test.stands, test.rests_on, test.established) == (stands, rests_on, stands and rests_on is None)
+    assert not any(
+        dataclasses.replace(test, **bad).established
+        for bad in ({"again": 0.75}, {"larger": ("b",)}, {"remains": True})
+    )
     renumbered = NameSupport(True, tests=(test,)).numbered(np.arange(1, 21) * 2)
     assert renumbered.rests_on("a") == (None if rests_on is None else 20) and renumbered.rests_on("b") is None
+
+
+def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_it(toy):
+    """`a` is in two thirds of the rows, `b` in the last four: without a third of the rows of `a` it is still chosen;
+    where only `b` is left, `a` is not asked."""
+    readings, rows = len(toy.readings), np.arange(toy.rows)
+    at = np.repeat(rows, 3)
+    a, b = (np.where(mine, 1.0, 0.0)[:, None] for mine in (at < 12, at >= 16))
+    random = np.random.default_rng(2)
+    jacobian = np.concatenate([random.standard_normal((readings, 2)), np.eye(2)])
+    residual = np.append(2.0 * a[:, 0] + 2.5 * b[:, 0], np.zeros(2))
+
+    class Library(SimpleNamespace):
+        def __getitem__(self, name):
+            return SimpleNamespace(family=lambda: {"a": "drop", "b": "slip"}[name])
+
+    library = Library(names=("a", "b"), of=np.array([0, 1]))
+    space = SimpleNamespace(included=np.ones(toy.rows, bool), library=library)
+    both = np.concatenate([a, b], 1)
+    few, most, others = rows < 4, rows < 11, rows >= 16
+    again = lambda *blocks: _chosen_again(space, "a", (jacobian, residual, a), both, blocks)  # noqa: E731
+    assert again(few, others) == 1.0 and again(most) == 1.0 and again() == 1.0
+    b3 = np.append(2.0 * a[:, 0] * (at < 4) + 2.5 * b[:, 0], np.zeros(2))  # only the first rows show it
+    assert _chosen_again(space, "a", (jacobian, b3, a), both, (few, others)) == 0.5
+
+
+def candidate_of(*effects):
+    return Candidate(
+        filled(effects, SETTLED.settings), np.zeros(12), np.ones(12), 0.0, *[np.zeros(4)] * 2, True, True, True
+    )
+
+
+@pytest.mark.parametrize(
+    ("adequate", "established", "predicts", "model"),
+    [
+        (True, ("a", "b"), None, ("a", "b")),  # all stand: nothing is asked of data held out
+        (True, ("a",), None, ("a",)),  # the other neither stands nor predicts
+        (True, ("a",), ("a", "b"), ("a", "b")),  # or predicts, and is tentative
+        (True, (), ("b",), ("b",)),
+        (True, (), None, None),
+        (False, ("a",), ("a", "c"), ("a", "c")),
+        (False, (), ("a",), ("a",)),
+        (False, (), None, None),
+    ],
+)
+def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate, established, predicts, model):
+    best, few = candidate_of("a", "b"), None if predicts is None else candidate_of(*predicts)
+    seen = SimpleNamespace(test=SimpleNamespace(rejected_with_margin=not adequate, null=None))
+    asked = []
+
+    def judged(space, base, searched, left, bases, settings, proposed=None, blocks=()):
+        those = best if proposed is None else proposed[0]
+        asked.append(those.effects)
+        tests = [NameTest(e, 9.0 if e in established else 1.0, 3.0, (), 0.0) for e in those.effects]
+        return NameSupport(bool(established), "beside", tests=tuple(tests))
+
+    monkeypatch.setattr(discover, "standing", judged)
+    monkeypatch.setattr(discover.prediction, "smallest", lambda *a: few)
+    monkeypatch.setattr(discover, "diagnose", lambda *a: seen)
+    monkeypatch.setattr(discover, "start", lambda *a: None)
+    monkeypatch.setattr(
+        discover,
+        "fit_candidates",
+        lambda space, wanted, settings: [candidate_of(*(n for n in w if n)) for w, _ in wanted],
+    )
+    monkeypatch.setattr(discover.blocks_room, "distinct", lambda *a: {"slope": {"0": np.ones(3, bool)}})
+    bare = SimpleNamespace(observe=SimpleNamespace(long=False, blocks=("slope",)))
+    screened = SimpleNamespace(
+        base=SimpleNamespace(candidate=candidate_of(), space=SimpleNamespace(bare=bare)), bases=()
+    )
+    left = SimpleNamespace(test=SimpleNamespace(null=None), scores=None)
+    searched = Search((candidate_of("a"), candidate_of("b"), best), best, seen)
+    found, _, stood = discover.choose(None, screened, left, searched, SETTLED.settings, lambda note: None)
+    assert (None if found is None else tuple(sorted(found[0].effects))) == model
+    assert asked == [best.effects if adequate or few is None else few.effects]
+    if found is not None:
+        assert {e for e in found[0].effects if stood.established(e)} == set(established)
 
 
 # --- settled runs ---------------------------------------------------------------------------------------

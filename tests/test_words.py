@@ -11,7 +11,7 @@ import pytest
 
 from calibration.discovery import notes as of_loop
 from calibration.discovery.notes import CurveOver, FreedValue, Missing, NameSupport, NameTest, RuledOut, Summary
-from calibration.discovery.result import Formula, Worse
+from calibration.discovery.result import Formula, Sensitivity, Worse
 from calibration.inference import notes as of_fit
 from calibration.inference.lack_of_fit import Adequacy
 from calibration.inference.notes import Note, Shown, Step
@@ -323,7 +323,7 @@ def test_a_sentence_is_its_own_words_and_what_is_no_note_says_so():
 
 @pytest.mark.parametrize(
     ("kind", "rows"),
-    [("Step", steps.STEPS), ("Fact", fits.FACTS), ("NameSupport", loop.REASONS), ("RuledOut", loop.RULED_OUT)],
+    [("Step", steps.STEPS), ("Fact", fits.FACTS), ("RuledOut", loop.RULED_OUT)],
 )
 def test_names_of_rows_are_those_of_the_code(kind, rows):
     """A name without a row would fail only where it is said, and a row without a name is never said."""
@@ -335,6 +335,16 @@ def test_names_of_rows_are_those_of_the_code(kind, rows):
                     at = 0 if kind in ("Step", "Fact") else 1
                     used |= {node.args[at].value} if len(node.args) > at else {""}
     assert used | ({""} & set(rows)) == set(rows)
+
+
+def test_every_reason_and_every_doubt_has_its_words():
+    text = (ROOT / "calibration" / "discovery" / "standing.py").read_text(encoding="utf-8")
+    assert all(f'"{why}"' in text for why in loop.REASONS if why)
+    whys = {a.value for c in ast.walk(ast.parse(text)) if isinstance(c, ast.Call) for a in c.args[1:2]
+            if ast.unparse(c.func) == "NameSupport" and isinstance(a, ast.Constant)}  # fmt: skip
+    assert whys <= set(loop.REASONS)
+    worst = NameTest("a", 0.0, 3.0, (), -99.0, 1, 0.0, 0.0, ("b",), True)
+    assert set(worst.fails) == set(loop.DOUBTS) and not NameTest("a", 4.0, 3.0, (), 0.0).fails
 
 
 # --- verdicts -------------------------------------------------------------------------------------------
@@ -360,16 +370,17 @@ OVER = CurveOver("slip", ("slope",))
         (
             NameSupport(
                 False,
-                "lost",
-                ("a", "b"),
-                tests=(NameTest("a", 1.2, 3.41, (OVER,), 0.0), NameTest("b", 5.0, 3.41, (), -20.0)),
+                "none by itself",
+                tests=(
+                    NameTest("a", 1.2, 3.41, (OVER,), 0.0),
+                    NameTest("b", 5.0, 3.41, (), -20.0, 10, 2.0),
+                    NameTest("c", 5.0, 3.41, (), 9.0, again=0.75, larger=("d", "e"), remains=True),
+                ),
             ),
-            "a explains 1.2 σ beside smooth curves (balance slip over slope), and chance reaches 3.4; a smooth curve in "
-            "its place is the better explanation than b",
-        ),
-        (
-            NameSupport(False, "one row", ("a",), tests=(NameTest("a", 5.0, 3.4, (), 9.0, 10, 2.0),)),
-            "a rests on row 10 alone",
+            "a explains 1.2 σ beside smooth curves (balance slip over slope), and chance reaches 3.4; b is a worse "
+            "explanation than a smooth curve in its place and rests on row 10; c is chosen again in 75 % of the data "
+            "with a block left out, has a rival of an implausible size (d and e) and leaves something in its own "
+            "equation",
         ),
         (
             NameSupport(
@@ -396,9 +407,31 @@ def test_verdict_of_a_complete_model():
 
 
 def test_verdict_tells_what_is_tentative():
-    sure, tentative = Missing(("a",), (), ("drop",)), Missing(("b",), (), ("slip",), 10)
+    test = NameTest("b", 5.0, 3.4, (), 9.0, 10, 2.0)
+    sure, tentative = Missing(("a",), (), ("drop",)), Missing(("b",), (), ("slip",), False, test)
     assert loop.statement(Summary("named", 0.001, None, (sure, tentative))) == (
         "Missing: a (family-wise p ≤ 0.001). Tentative, in the model since it predicts better: b, which rests on row 10."
+    )
+    # where no name stands and it was not tested by itself, what speaks against all of them
+    curve = NameSupport(False, "curve alone", curves=(OVER,))
+    place = SimpleNamespace(place="slip", variable="slope", alike=("slip",), variables_alike=(), family="slip")
+    only = Missing(("b",), (), ("slip",), False)
+    said = loop.statement(Summary("unnamed", 0.001, place, (only,), support=curve))
+    assert "no effect of the library is established" in said
+    assert said.endswith("predicts better: b (one smooth curve in the balance slip over slope leaves nothing).")
+
+
+def test_verdicts_at_other_noise_are_one_sentence():
+    def other(factor, verdict, *missing):
+        return Sensitivity(factor, verdict, Summary(verdict, 0.01, None, missing), (), True)
+
+    sure, weak = Missing(("a", "c"), (), ("x",)), Missing(("b",), (), ("y",), False)
+    assert loop.at_other_noise(()) == ""
+    assert loop.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
+        "with 0.7 and with 1.4 times that noise class: a established, b tentative"
+    )
+    assert loop.at_other_noise([other(0.5, "unnamed", weak), other(2, "none")]) == (
+        "with 0.5 times that noise unnamed: b tentative; with 2 times that noise none"
     )
 
 

@@ -21,7 +21,7 @@ from calibration.data.runs import Runs
 from calibration.discovery import findings, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
-from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
+from calibration.discovery.candidates import BaseFit, Candidate, empty, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import Location, diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
@@ -53,10 +53,11 @@ from calibration.discovery.result import (
     Sensitivity,
 )
 from calibration.discovery.score_tests import Statistics, bootstrap
-from calibration.discovery.search import Search, diagnose, fewest, path, search
+from calibration.discovery.search import Search, diagnose, path, search
 from calibration.discovery.settings import FIT, HELD_OUT, Settings, settings_for
 from calibration.discovery.standing import standing
 from calibration.inference import bases as bases_room
+from calibration.inference import blocks as blocks_room
 from calibration.inference import noise as noise_room
 from calibration.inference import observers, preparation, priors
 from calibration.inference.bases import Bases
@@ -265,8 +266,16 @@ class LoopStages:
 
     @property
     def members(self) -> tuple[tuple[str, ...], ...]:
-        """Of each effect found, those that these data cannot tell from it, itself first."""
+        """Of each effect that is established, those that these data cannot tell from it, itself first."""
+        return tuple(m for m, name in zip(self._classes, self._named, strict=True) if name)
+
+    @property
+    def _classes(self) -> tuple[tuple[str, ...], ...]:
         return () if self.alike is None else self.alike.members
+
+    @property
+    def _named(self) -> list[bool]:
+        return [self.standing is None or self.standing.established(m[0]) for m in self._classes]
 
     @property
     def noise_factor(self) -> float | None:
@@ -275,9 +284,9 @@ class LoopStages:
 
     @property
     def families(self) -> tuple[str, ...]:
-        """Families of what was found: of the members of each class, or where something without a name is."""
-        if self.alike is not None:
-            return tuple(f for of in self.alike.families for f in of)
+        """Families of what is established: of the members of each class, or where something without a name is."""
+        if self.alike is not None and self.verdict != "unnamed":
+            return tuple(f for of, name in zip(self.alike.families, self._named, strict=True) if name for f in of)
         return () if self.where is None else (self.where.family,)
 
     @property
@@ -366,38 +375,72 @@ def trace(
         progress(Step("alone"))
         screened = more
 
-    proposed = None
-    if best is not None and after is not None and after.test.rejected_with_margin and not space.bare.observe.long:
-        # No set leaves nothing: that which predicts as well as any is proposed, and the others are its rivals.
-        progress(Step("held out"))
-        few = prediction.smallest(space, runs, base, path(searched))
-        if few is not None and few is not best:
-            proposed = few, diagnose(space, few, bases, left.test.null, settings)
-    stood = standing(space, base, searched, left, bases, settings, proposed)
-    if stood.stands and proposed is not None:
-        searched = dataclasses.replace(searched, best=proposed[0], diagnosis=proposed[1])
-        best, after = proposed
-    if not stood.stands and best is not None and len(best.effects) > 1:
-        # One of them may stand where they do not together.
-        fewer = fewest(space, searched, bases, left, settings)
-        by_itself = stood if fewer is None else standing(space, base, fewer, left, bases, settings)
-        if fewer is not None and by_itself.stands:
-            searched, stood = fewer, by_itself
-            best, after = searched.best, searched.diagnosis
-    if best is None or after is None or not stood.stands:
-        where = locate(left, bases, space.included)
+    where = locate(left, bases, space.included)
+    model, searched, stood = choose(runs, screened, left, searched, settings, progress)
+    if model is None:
         return LoopStages("unnamed", screened, left, sds, searched, where=where, standing=stood)
 
+    searched = dataclasses.replace(searched, best=model[0], diagnosis=model[1])
+    best, after = model
+    named = [stood.established(e) for e in best.effects]
     progress(Step("alike", (best.effects,)))
     alike = classes(space, base, best, searched.ladder, left, settings)
+    if not any(named):
+        return LoopStages("unnamed", screened, left, sds, searched, alike, where, standing=stood)
     compared: tuple[HeldOutAlternative, ...] = ()
     if settings.prefer == HELD_OUT:
         progress(Step("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
-    verdict = "named" if alike.single else "class"
+    alone = [len(m) + len(v) == 1 for m, v in zip(alike.members, alike.stated, strict=True)]
+    verdict = "named" if all(one for one, name in zip(alone, named, strict=True) if name) else "class"
     remains = locate(after, bases, space.included) if after.test.rejected_with_margin else None
     return LoopStages(verdict, screened, left, sds, searched, alike, remains, standing=stood, held_out=compared)
+
+
+def choose(
+    runs: Runs, screened: Screening, left: Diagnosis, searched: Search, settings: Settings, progress: Tell
+) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
+    """The effects that belong in the model: those whose names stand by themselves, and those of the smallest set that
+    predicts as well as any; None for none. With what was searched, and which names stand.
+
+    Where the largest set leaves nothing its effects are judged, else those of the set that predicts.
+
+    Args:
+        left: what the base leaves.
+    """
+    base, space, bases = screened.base.candidate, screened.base.space, screened.bases
+    best, after, long = searched.best, searched.diagnosis, space.bare.observe.long
+    if best is None or after is None:
+        return None, searched, standing(space, base, searched, left, bases, settings)
+    adequate = not after.test.rejected_with_margin
+    kinds = {} if long else blocks_room.distinct(runs, space.bare.observe.blocks)
+    blocks = [mask for by in kinds.values() for mask in by.values()]
+    stood = standing(space, base, searched, left, bases, settings, blocks=blocks) if adequate or long else None
+    if stood is not None and all(stood.established(e) for e in best.effects):
+        return (best, after), searched, stood
+    few = None
+    if not long:
+        progress(Step("held out"))
+        few = prediction.smallest(space, runs, base, path(searched))
+    if stood is None:
+        judged = best if few is None else few
+        proposed = judged, after if judged is best else diagnose(space, judged, bases, left.test.null, settings)
+        stood = standing(space, base, searched, left, bases, settings, proposed, blocks)
+    else:
+        proposed = best, after
+    names = [e for e in proposed[0].effects if stood.established(e)]
+    names += [e for e in (() if few is None else few.effects) if e not in names][: settings.slots - len(names)]
+    if not names:
+        return None, searched, stood
+    known = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]
+    if not known:
+        active = filled(names, settings)
+        begins = start(space, proposed[0], active, settings, left.scores)
+        known = fit_candidates(space, [(active, begins)], settings)
+        searched = dataclasses.replace(searched, ladder=(*searched.ladder, *known))
+    seen = next((d for c, d in (proposed, (best, after)) if c is known[0]), None)
+    return (known[0], seen or diagnose(space, known[0], bases, left.test.null, settings)), searched, stood
 
 
 # --- the stages that are no room of their own -----------------------------------------------------------
@@ -535,7 +578,7 @@ def summary(traced: LoopStages, numbers: np.ndarray) -> Summary:
 
 
 def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) -> tuple[Missing, ...]:
-    """Each effect found, with what it cannot be told from and the row that it rests on."""
+    """Each effect in the model, with what it cannot be told from and whether it is established."""
     c, p = space.coordinates.base, space.free
     return tuple(
         Missing(
@@ -544,7 +587,8 @@ def missing(space: CandidateSpace, alike: Classes, support: NameSupport | None) 
                 FreedValue(s.name, float(c.value(np.asarray(s.fit.z[:p]))[s.index]), c.units[s.index]) for s in shifts
             ),
             families,
-            None if support is None else support.rests_on(names[0]),
+            support is None or support.established(names[0]),
+            None if support is None else support.test_of(names[0]),
         )
         for names, shifts, families in zip(alike.members, alike.stated, alike.families, strict=True)
     )
@@ -575,25 +619,25 @@ def assemble_result(
     after, robot, z, sd = None, findings.proposed_robot(space, best), best.z, best.sd
     cost, converged = best.cost, best.converged
     posterior = of_fit(space, best.active, best.z, ends.linear)
-    if curve is not None:
+    if best is not base:
+        after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
+    elif curve is not None:
         after = findings.Fitted(curve.problem, curve.z, None)
         ends = diagnosis_beside(space, curve, screened.bases, left)
         robot, z, sd = curve.robot, curve.z, np.sqrt(np.diag(curve.covariance))
         posterior = of_curve(space, best.active, curve)
         cost, converged = curve.chi2[1] / 2, curve.converged
-    elif best is not base:
-        after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
 
     progress(Step("errors"))
     seen = findings.readings(runs, noise.sd, before, after)
     error = lambda simulated: findings.errors(space.bare, simulated, seen.measured, seen.sd, included)  # noqa: E731
     compared = traced.held_out
-    if traced.alike is not None and not compared and not observe.long:
+    if traced.alike is not None and traced.verdict != "unnamed" and not compared and not observe.long:
         compared = preference.compared(space, runs, best, traced.alike)
     gain, kept = _gain(space, runs, seen), True
     if gain is not None and (curve is not None or best is not base):
         # What is written never predicts worse than the refit; a curve, which claims no cause, has to predict better.
-        kept = gain.mean > gain.se if curve is not None else gain.mean >= -prediction.WORSE
+        kept = gain.mean > gain.se if best is base else gain.mean >= -prediction.WORSE
     if not kept:
         robot, converged = findings.proposed_robot(space, base), base.converged
         posterior = of_fit(space, base.active, base.z, left.linear)
@@ -609,9 +653,9 @@ def assemble_result(
     remains = None
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
-        remains = None if where is None else findings.whereabouts(where)
+        remains = None if where is None or traced.verdict == "unnamed" else findings.whereabouts(where)
     concealed: tuple[HiddenEffect, ...] = ()
-    if traced.alike is not None:
+    if traced.alike is not None and traced.verdict != "unnamed":
         ask = not observe.long
         concealed = findings.hidden_effects(
             space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
@@ -752,7 +796,7 @@ def remarks(found: DiscoveryResult) -> Notes:
         if t.rests_on is not None and t.effect in names:
             said.append(RestsOn(t.effect, t.rests_on, t.root, t.root_without))
     if not found.written and found.gain is not None:
-        said.append(Unwritten(found.unnamed is not None, found.gain.mean, found.gain.se))
+        said.append(Unwritten(not found.effects, found.gain.mean, found.gain.se))
     said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
     settled, asked = found.replicates, found.settings.replicates
     if settled < 0.9 * asked:

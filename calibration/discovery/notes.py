@@ -31,6 +31,9 @@ class CurveOver(NamedTuple):
 BETTER = 9.0
 #: Share of its root that an effect has to keep without any one row.
 KEPT = 1 / math.sqrt(3)
+#: Share of the blocks left out, of those that leave half of what is known of an effect, in which it has to be chosen
+#: again.
+AGAIN = 0.8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +45,9 @@ class NameTest:
             the strongest effect reaches that [σ]; curves: those beside.
         evidence: twice the log of that for it over a smooth curve of its own equation, the best one [σ²].
         row: number of the row without which the root is smallest, None where none was left out; root_without: then.
+        again: share of the informative blocks without which an effect of its family is still the strongest.
+        larger: effects of a set without it that is the better explanation, but not of a plausible size.
+        remains: whether the largest set that was searched for leaves something in its equation.
     """
 
     effect: str
@@ -51,6 +57,9 @@ class NameTest:
     evidence: float
     row: int | None = None
     root_without: float = math.inf
+    again: float = 1.0
+    larger: tuple[str, ...] = ()
+    remains: bool = False
 
     @property
     def stands(self) -> bool:
@@ -63,9 +72,22 @@ class NameTest:
         return self.row if self.root_without < max(self.needed, KEPT * self.root) else None
 
     @property
+    def fails(self) -> tuple[str, ...]:
+        """Rows of `words.loop.DOUBTS`: what speaks against it; empty where it is established."""
+        doubts = {
+            "chance": self.root < self.needed,
+            "curve": self.evidence < -BETTER,
+            "row": self.rests_on is not None,
+            "blocks": self.again < AGAIN,
+            "larger": bool(self.larger),
+            "remains": self.remains,
+        }
+        return tuple(doubt for doubt, holds in doubts.items() if holds)
+
+    @property
     def established(self) -> bool:
-        """Whether it stands on all rows."""
-        return self.stands and self.rests_on is None
+        """Whether nothing speaks against it."""
+        return not self.fails
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +95,7 @@ class NameSupport:
     """Whether the names of a candidate stand.
 
     Attributes:
-        stands: whether they do.
+        stands: whether one at least does.
         why: a row of `words.loop.REASONS`: why not, or `beside` what; "" where there is nothing to say.
         effects: that this is said of; curves: that were put beside, or do as well; tests: of each effect.
     """
@@ -87,6 +109,11 @@ class NameSupport:
     def test_of(self, effect: str) -> NameTest | None:
         """That of an effect; None where it was not tested."""
         return next((t for t in self.tests if t.effect == effect), None)
+
+    def established(self, effect: str) -> bool:
+        """Whether the name of an effect stands, by itself where it was tested so."""
+        test = self.test_of(effect)
+        return self.stands and (not self.tests if test is None else test.established)
 
     def rests_on(self, effect: str) -> int | None:
         """Number of the row that an effect rests on; None where it needs none, or was not tested."""
@@ -114,12 +141,13 @@ class FreedValue(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Missing:
     """An effect that was found: names that these data cannot tell apart, stated values that may be wrong instead, the
-    families of the names, and the number of the row that it rests on, which makes it tentative."""
+    families of the names, whether it is established, and its test by itself, None where there was none."""
 
     names: tuple[str, ...]
     values: tuple[FreedValue, ...]
     families: tuple[str, ...]
-    rests_on: int | None = None
+    established: bool = True
+    test: NameTest | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +157,7 @@ class Summary:
     Attributes:
         verdict: `none`, `named`, `class` or `unnamed`; p: family-wise.
         where: something is missing, or remains.
-        missing: the effects found.
+        missing: the effects found, established or tentative; `unnamed` has none that are established.
         nearest: effects that come nearest where none may be named; support: whether names stand.
         aside, of: rows that lie off alone where these are many, of how many; 0 else.
         noise: sds that are off, where that is all; cluster: what rows that lie off have in common.

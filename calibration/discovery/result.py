@@ -440,7 +440,8 @@ class DiscoveryResult:
         converged: whether the fit of that robot is an optimum; posterior: of all that was fitted.
         runs: the table; numbers: of its rows, as messages call them.
         included: whether a row counts; outliers, unusable: numbers of rows set aside.
-        effects: found; unnamed: the discrepancy of that verdict; remains: what the effects leave.
+        effects: in the model, established or tentative; unnamed: the discrepancy of that verdict; remains: what the
+            effects leave.
         next_experiment: what would tell more; None where nothing is left to tell apart.
         cannot_see: effects that the data cannot show; needs_histories: that only histories can; needs_reverse: that
             only runs both ways can.
@@ -674,7 +675,8 @@ def _effect(e: FoundEffect, support: NameSupport | None) -> dict[str, Any]:
     return {
         "name": e.name,
         "class": [*e.members, *e.stated],
-        "standing": "established" if test is None or test.established else "tentative",
+        "standing": "established" if support is None or support.established(e.name) else "tentative",
+        "doubts": [] if test is None else list(test.fails),
         "rests_on_row": None if test is None else test.rests_on,
         "root": None if test is None else test.root,
         "root_needed": None if test is None else test.needed,

@@ -81,18 +81,6 @@ def search(
     return Search(tuple(ladder), seen, diagnosis)
 
 
-def fewest(space: CandidateSpace, found: Search, bases: Bases, left: Diagnosis, settings: Settings) -> Search | None:
-    """The search with its best single effect in the place of what it proposes, None where there is none.
-
-    Args:
-        left: what the base leaves.
-    """
-    best = _best([c for c in found.ladder if len(c.effects) == 1])
-    if best is None:
-        return None
-    return Search(found.ladder, best, diagnose(space, best, bases, left.test.null, settings))
-
-
 def path(found: Search) -> list[Candidate]:
     """The best plausible candidate of each number of effects, up to that of what the search proposes."""
     if found.best is None:

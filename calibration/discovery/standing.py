@@ -8,6 +8,7 @@ is not adequate each has to keep its significance with the best curves beside it
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from calibration.discovery.candidates import Candidate
 from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.notes import CurveOver, NameSupport, NameTest
 from calibration.discovery.projection import Projection
-from calibration.discovery.score_tests import augment_with_columns, beside_columns, family_columns
+from calibration.discovery.score_tests import ABSORBED, augment_with_columns, beside_columns, family_columns
 from calibration.discovery.search import Search, diagnose, without_each
 from calibration.discovery.settings import Settings
 from calibration.discovery.smooth import smooth, surface
@@ -54,31 +55,44 @@ def standing(
     bases: Bases,
     settings: Settings,
     proposed: Proposed | None = None,
+    blocks: Sequence[np.ndarray] = (),
 ) -> NameSupport:
-    """Whether the effects of the best candidate of a search may be named, or those of another that is proposed.
+    """Which effects of the best candidate of a search may be named, or of another that is proposed.
+
+    A single effect that leaves nothing is weighed against curves alone; several, or one that leaves something, each
+    by itself (`name_tests`).
 
     Args:
-        left: what the base leaves.
+        left: what the base leaves; blocks: masks of rows that are left out in turn, each of shape (rows,).
     """
     best, after = (searched.best, searched.diagnosis) if proposed is None else proposed
     if best is None or after is None:
         return NameSupport(False, "implausible")
-    other = _ruled_out(space, base, searched.best or best, searched.ladder, settings)
-    if other is not None:
-        return NameSupport(False, "larger", other.effects)
-    if after.test.rejected_with_margin:
-        return _beside_curves(space, base, best, searched, left, after, bases, settings)
-    return _against_curves(space, base, best, left.linear, bases, settings)
+    better = _ruled_out(space, base, searched.best or best, searched.ladder, settings)
+    adequate = not after.test.rejected_with_margin
+    if len(best.effects) == 1 and adequate and better:
+        return NameSupport(False, "larger", better[0].effects)
+    found = _against_curves(space, base, best, left.linear, bases, settings) if adequate else NameSupport(True)
+    if len(best.effects) == 1 and adequate:
+        return found
+    if not adequate:
+        found = _one_curve(space, base, best, left, bases, settings)
+    tests = name_tests(space, best, searched, bases, after, settings, blocks, better)
+    if found.stands:
+        found = NameSupport(any(t.established for t in tests))
+        found = dataclasses.replace(found, why="beside" if found.stands else "none by itself")
+    return dataclasses.replace(found, tests=tests)
 
 
 def _ruled_out(
     space: CandidateSpace, base: Candidate, best: Candidate, ladder: Sequence[Candidate], settings: Settings
-) -> Candidate | None:
-    """A candidate that is the better explanation by its evidence and is ruled out by its size alone."""
+) -> list[Candidate]:
+    """Candidates that are the better explanation by their evidence and ruled out by their size alone, best first."""
     names = evidence_of_names(space, base, best, settings)
     ruled_out = [c for c in ladder if not c.plausible and np.isfinite(c.cost) and len(c.effects) <= len(best.effects)]
-    better = [c for c in ruled_out if evidence_of_names(space, base, c, settings) > names + settings.preferred]
-    return max(better, key=lambda c: evidence_of_names(space, base, c, settings), default=None)
+    evidence = {c.active: evidence_of_names(space, base, c, settings) for c in ruled_out}
+    better = [c for c in ruled_out if evidence[c.active] > names + settings.preferred]
+    return sorted(better, key=lambda c: -evidence[c.active])
 
 
 # --- an adequate fit: is a curve the better explanation? ---------------------------------------------------
@@ -180,37 +194,22 @@ def _equation(space: CandidateSpace, effect: str) -> str:
     return equation(space.library[effect].channel or space.library[effect].balance)
 
 
-def _beside_curves(
-    space: CandidateSpace,
-    base: Candidate,
-    best: Candidate,
-    searched: Search,
-    left: Diagnosis,
-    after: Diagnosis,
-    bases: Bases,
-    settings: Settings,
+def _one_curve(
+    space: CandidateSpace, base: Candidate, best: Candidate, left: Diagnosis, bases: Bases, settings: Settings
 ) -> NameSupport:
-    """Names where something is left that is beyond doubt: each has to stand by itself (`name_tests`), one at least on
-    all rows, and no curve alone may leave nothing."""
+    """Whether one curve alone leaves nothing, where the names of a candidate leave something that is beyond doubt."""
     names = bases_room.names(bases)
     for k in _strongest(left, names):
         found, _ = beside_columns(left.linear, bases, family_columns(left.linear, bases, k), [names[k][0]])
         if not AdequacyTest(found, left.test.null, settings).rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(*names[k]),))
-    own = {_equation(space, e) for e in best.effects}
-    tests = name_tests(space, best, searched, bases, after, settings)
-    lost = tuple(t.effect for t in tests if not t.stands)
-    if lost:
-        return NameSupport(False, "lost", lost, tests=tests)
-    if all(t.rests_on is not None for t in tests):
-        return NameSupport(False, "one row", best.effects, tests=tests)
     where = locate(left, bases, space.included)
-    if equation(where.place) in own:
+    if equation(where.place) in {_equation(space, e) for e in best.effects}:
         # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
         if not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
-    return NameSupport(True, "beside", tests=tests)
+    return NameSupport(True)
 
 
 def _strongest(left: Diagnosis, names: Sequence[tuple[str, str]]) -> list[int]:
@@ -252,9 +251,12 @@ def name_tests(
     bases: Bases,
     after: Diagnosis,
     settings: Settings,
+    blocks: Sequence[np.ndarray] = (),
+    better: Sequence[Candidate] = (),
 ) -> tuple[NameTest, ...]:
     """Each effect by itself, at the fit of the others: the root of its score beside the curves that all of them leave
-    in other equations, the row that it rests on most, and its evidence against curves of its own equation.
+    in other equations, the row that it rests on most, whether it is found without blocks of rows, and its evidence
+    against curves of its own equation.
 
     A score, and not an amplitude over its sd: where a shape is free too, that ratio stays small however much an
     effect explains (Hauck and Donner, J. Am. Stat. Assoc. 72 (1977); Davies, Biometrika 64 (1977)). Curves in its own
@@ -262,9 +264,13 @@ def name_tests(
     largest set that was searched for, since it would else stand for what that adds in the same equation.
 
     Args:
-        after: what the fit with all of them leaves.
+        after: what the fit with all of them leaves; blocks: as of `standing`.
+        better: candidates that are the better explanation and not of a plausible size.
     """
     names, largest, tests = bases_room.names(bases), searched.best or best, []
+    lacks = set[str]()
+    if searched.diagnosis is not None and searched.diagnosis.test.rejected_with_margin:
+        lacks = {equation(locate(searched.diagnosis, bases, space.included).place)}
     fewer = dict(zip(largest.effects, without_each(space, largest, settings, searched.ladder), strict=True))
     each = without_each(space, best, settings, searched.ladder)
     fits = {c.active: c for c in (*each, *(c for e, c in fewer.items() if e in best.effects))}
@@ -287,6 +293,9 @@ def name_tests(
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 row,
                 root_without,
+                _chosen_again(space, effect, beside, np.asarray(linear.signatures), blocks),
+                next((c.effects for c in better if effect not in c.effects), ()),
+                own in lacks,
             )
         )
     return tuple(tests)
@@ -314,11 +323,47 @@ def _evidence_over_curves(
 
 def _root(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> float:
     """Root of the most that one of several columns over the readings explains, all else fitted again [σ]."""
+    a, b = _left_of(jacobian, residual, signatures)
+    return float(np.max(np.abs(b) / np.sqrt(np.maximum(a, 1e-12))))
+
+
+def _left_of(jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of columns over the readings what a fit cannot imitate, squared, and what the residual has along that."""
     half = np.linalg.solve(np.linalg.cholesky(jacobian.T @ jacobian), jacobian.T)
     left, inside = residual - half.T @ (half @ residual), half[:, : len(signatures)] @ signatures
-    a = np.sum(signatures**2, 0) - np.sum(inside**2, 0)
-    b = signatures.T @ left[: len(signatures)]
-    return float(np.max(np.abs(b) / np.sqrt(np.maximum(a, 1e-12))))
+    return np.sum(signatures**2, 0) - np.sum(inside**2, 0), signatures.T @ left[: len(signatures)]
+
+
+def _chosen_again(
+    space: CandidateSpace,
+    effect: str,
+    beside: tuple[np.ndarray, ...],
+    signatures: np.ndarray,
+    blocks: Sequence[np.ndarray],
+) -> float:
+    """Share of the blocks without which an effect of its family is still the strongest of the library, of those that
+    leave half of what is known of it; 1 where there are none.
+
+    Args:
+        beside: Jacobian, residual and its own signatures, as `_root` takes them; signatures: of the library.
+    """
+    names, library = space.library.names, space.library
+    families = [library[name].family() for name in names]
+    mine, again = families[names.index(effect)], []
+    whole = _left_of(*beside)[0].max()
+    for out in blocks:
+        size = len(signatures) // len(space.included)
+        rows = np.repeat(np.concatenate([out, np.zeros(len(space.included) - len(out), bool)]), size)
+        j, e, own, every = (x.copy() for x in (*beside, signatures))
+        for x in (j, e, own, every):
+            x[: len(rows)][rows] = 0.0
+        if _left_of(j, e, own)[0].max() < 0.5 * whole:
+            continue
+        left, told = _left_of(j, e, every)
+        root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
+        root = np.where(left > ABSORBED**2 * np.sum(every**2, 0), root, 0.0)
+        again.append(families[library.of[int(np.argmax(root))]] == mine)
+    return float(np.mean(again)) if again else 1.0
 
 
 def _weakest_row(

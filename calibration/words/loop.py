@@ -16,6 +16,7 @@ from calibration.discovery.notes import (
     KeptOut,
     Led,
     LostReplicates,
+    Missing,
     NameSupport,
     NameTest,
     NoiseFromSeries,
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
         Errors,
         FoundEffect,
         Resolved,
+        Sensitivity,
         StatedValue,
         Worse,
     )
@@ -66,28 +68,58 @@ def _verdict(said: Summary) -> str:
     if said.verdict == "none":
         return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
     if said.verdict == "unnamed" and where is not None:
-        text = _without_name(where, p)
-        if said.nearest:
+        text = _without_name(where, p, "is established" if said.missing else "explains it")
+        if said.missing:
+            text += _tentative(said.missing, said.support)
+        elif said.nearest:
             text += f" Nearest comes {' and '.join(said.nearest)}: {reason(said.support)}."
         return text
-    names, tentative = [], []
-    for one in said.missing:
-        text = one.names[0]
-        if len(one.names) + len(one.values) > 1:
-            family = f"{one.families[0]}, " if len(one.families) == 1 else ""
-            listed = ", ".join(one.names) if len(one.names) == 1 else f"one of {', '.join(one.names)}"
-            values = [freed_value(v) for v in one.values]
-            text = f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
-        if one.rests_on is None:
-            names.append(text)
-        else:
-            tentative.append(f"{text}, which rests on row {one.rests_on}")
-    in_model = f" Tentative, in the model since it predicts better: {'; '.join(tentative)}." if tentative else ""
+    names = [_named(one) for one in said.missing if one.established]
+    in_model = _tentative([one for one in said.missing if not one.established], said.support)
     left = "" if where is None else f" Something remains in the {bases.in_words(where.place)}."
     return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
 
 
-def _without_name(where: Location, p: float) -> str:
+def brief(said: Summary) -> str:
+    """A verdict, and the effects in the model by their leaders."""
+    found = []
+    for word, established in (("established", True), ("tentative", False)):
+        names = [one.names[0] for one in said.missing if one.established == established]
+        found += [f"{', '.join(names)} {word}"] * bool(names)
+    return ": ".join([said.verdict, *[", ".join(found)] * bool(found)])
+
+
+def at_other_noise(found: Sequence[Sensitivity]) -> str:
+    """The verdicts with other noise, in a sentence; empty for none."""
+    same: dict[str, list[str]] = {}
+    for one in found:
+        same.setdefault(brief(one.summary), []).append(f"{one.factor:g}")
+    each = [f"with {' and with '.join(factors)} times that noise {words}" for words, factors in same.items()]
+    return "; ".join(each)
+
+
+def _named(one: Missing) -> str:
+    """An effect, with what it cannot be told from."""
+    if len(one.names) + len(one.values) == 1:
+        return one.names[0]
+    family = f"{one.families[0]}, " if len(one.families) == 1 else ""
+    listed = ", ".join(one.names) if len(one.names) == 1 else f"one of {', '.join(one.names)}"
+    values = [freed_value(v) for v in one.values]
+    return f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
+
+
+def _tentative(those: Sequence[Missing], support: NameSupport | None) -> str:
+    """Effects that are in the model without a name of their own, each with what speaks against it."""
+    if not those:
+        return ""
+    each = [
+        f"{_named(one)}, which {doubts(one.test)}" if doubts(one.test) else f"{_named(one)} ({reason(support)})"
+        for one in those
+    ]
+    return f" Tentative, in the model since it predicts better: {'; '.join(each)}."
+
+
+def _without_name(where: Location, p: float, no_effect: str) -> str:
     others = [bases.in_words(p).removeprefix("balance ") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""
@@ -95,7 +127,7 @@ def _without_name(where: Location, p: float) -> str:
     over = shown_over(where.variable) + (f" (as well {', '.join(well)})" if well else "")
     return (
         f"Something is missing in the {bases.in_words(where.place)}{also}, {over}{what}; no effect of the library "
-        f"explains it (family-wise p {p_value(p)})."
+        f"{no_effect} (family-wise p {p_value(p)})."
     )
 
 
@@ -154,8 +186,7 @@ REASONS = {
     "larger": "{effects} would explain more, but not at a plausible size",
     "better curve": "one smooth {curves} is the better explanation than {effects}",
     "curve alone": "one smooth {curves} leaves nothing",
-    "lost": "{lost}",
-    "one row": "{effects} rests on row {rows} alone",
+    "none by itself": "{lost}",
     "beside": "each by itself, at the fit of the others, explains more than chance would: {strengths}",
 }
 
@@ -168,8 +199,7 @@ def reason(support: NameSupport | None) -> str:
         effects=" and ".join(support.effects),
         curves=" and ".join(map(_curve, support.curves)),
         strengths=", ".join(map(_strength, support.tests)),
-        lost="; ".join(_lost(t) for t in support.tests if not t.stands),
-        rows=", ".join(dict.fromkeys(str(t.row) for t in support.tests)),
+        lost="; ".join(f"{t.effect} {doubts(t)}" for t in support.tests if t.fails),
     )
 
 
@@ -179,15 +209,24 @@ def _strength(test: NameTest) -> str:
     return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
 
 
-def _lost(test: NameTest) -> str:
-    """Why an effect does not stand."""
-    if test.root >= test.needed:
-        return f"a smooth curve in its place is the better explanation than {test.effect}"
-    over = ", ".join(_over(c.place, *c.variables) for c in test.curves)
-    return (
-        f"{test.effect} explains {test.root:.1f} σ beside smooth curves ({over}), and chance reaches "
-        f"{test.needed:.1f}"
-    )
+#: What speaks against an effect by itself: short, and in words.
+DOUBTS = {
+    "chance": ("chance", "explains {0.root:.1f} σ beside smooth curves ({over}), and chance reaches {0.needed:.1f}"),
+    "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
+    "row": ("row {0.rests_on}", "rests on row {0.rests_on}"),
+    "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
+    "larger": ("size", "has a rival of an implausible size ({larger})"),
+    "remains": ("equation", "leaves something in its own equation"),
+}
+
+
+def doubts(test: NameTest | None) -> str:
+    """What speaks against an effect by itself; empty for nothing."""
+    if test is None or not test.fails:
+        return ""
+    over, larger = ", ".join(_over(c.place, *c.variables) for c in test.curves), " and ".join(test.larger)
+    *first, last = [DOUBTS[d][1].format(test, over=over, larger=larger, again=100 * test.again) for d in test.fails]
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _curve(c: CurveOver) -> str:
@@ -209,9 +248,17 @@ def standing(found: DiscoveryResult) -> str:
 
 
 def called(found: DiscoveryResult, effect: FoundEffect) -> str:
-    """The name of an effect, and where it is tentative the row that it rests on."""
-    row = None if found.support is None else found.support.rests_on(effect.name)
-    return effect.name if row is None else f"{effect.name}\n(tentative: row {row})"
+    """The name of an effect, and where it is tentative what speaks against it."""
+    said = tentative(found, effect)
+    return f"{effect.name}\n({said})" if said else effect.name
+
+
+def tentative(found: DiscoveryResult, effect: FoundEffect) -> str:
+    """In a few words, what speaks against the name of an effect; empty where it is established."""
+    if found.support is None or found.support.established(effect.name):
+        return ""
+    test = found.support.test_of(effect.name)
+    return ": ".join(["tentative", *([", ".join(DOUBTS[d][0].format(test) for d in test.fails)] if test else [])])
 
 
 #: Why an effect is not plausible.

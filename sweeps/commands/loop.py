@@ -114,7 +114,7 @@ def print_discovery(found: DiscoveryResult) -> None:
                 rms(found.rows_table(), found.channels, ("before", "after", "held_out_before", "held_out_after"))
             )
         )
-    for other in found.sensitivity:
-        say(f"with {other.factor:g} times that noise: {other.verdict}: {other.statement}")
+    if found.sensitivity:
+        say(f"{said_of.at_other_noise(found.sensitivity)}")
     for note in found.notes:
         say(f"- {note}")

@@ -44,9 +44,9 @@ SECTIONS: dict[type[Detail], Section] = {EquationDefects: _run_by_run, TimeStati
 
 def alike(found: DiscoveryResult) -> list[str]:
     """Of each effect, and of a discrepancy without a name, what these data cannot tell from it, in words."""
-    if found.unnamed is not None:
-        return [", ".join(b for b in found.unnamed.balances_alike if b != found.unnamed.balance)]
-    return [words.alike(e) for e in found.effects]
+    curve = [] if found.unnamed is None else [found.unnamed]
+    without_name = [", ".join(b for b in c.balances_alike if b != c.balance) for c in curve]
+    return [*(words.alike(e) for e in found.effects), *without_name]
 
 
 def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
@@ -84,6 +84,8 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         standing=words.standing(found),
         ruled_out=words.ruled_out(found),
         alike=alike(found),
+        doubts=[words.tentative(found, e) for e in found.effects] + [""] * (found.unnamed is not None),
+        other_noise=words.at_other_noise(found.sensitivity),
         worse=words.worse(found.held_out_worse, found.errors_held_out),
         rows=first_rows(rows_of(found)),
         conditions=conditions(rows_of(found)),
