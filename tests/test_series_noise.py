@@ -71,7 +71,7 @@ def test_uneven_steps_and_repeats_count_as_they_are():
     uneven = table(0.0, slopes=np.array([0.0, 1.0, 7.0, 9.0, 20.0]), seed=1)
     straight = 1 + 0.1 * uneven["slope_deg"]
     weights, used = series_noise._differences(
-        straight, uneven["slope_deg"], series_noise._series(uneven, "slope_deg")
+        straight, uneven["slope_deg"], series_noise.series_of(uneven, "slope_deg")
     )
     assert used == 4 and np.abs(weights @ straight).max() < 1e-12
     repeats = np.array([3.0, 3.0, 3.0])
@@ -107,9 +107,9 @@ def test_rows_without_series_are_assumed_as_usual_and_stated_ones_stay():
 
 def test_series_that_go_backward_are_others():
     runs = table(0.05, volts=(-20.0, -10.0, 10.0, 20.0), slopes=np.zeros(1), payloads=(0.0,))
-    assert series_noise._series(runs, "supply_voltage_V") == []  # two and two
+    assert series_noise.series_of(runs, "supply_voltage_V") == []  # two and two
     longer = table(0.05, volts=(-30.0, -20.0, -10.0, 10.0, 20.0, 30.0), slopes=np.zeros(1), payloads=(0.0,))
-    assert [len(s) for s in series_noise._series(longer, "supply_voltage_V")] == [3, 3]
+    assert [len(s) for s in series_noise.series_of(longer, "supply_voltage_V")] == [3, 3]
 
 
 def test_replicates_are_drawn_with_sds_that_an_estimate_might_have_been_of():

@@ -24,7 +24,7 @@ from calibration.discovery.smooth import FALL, LENGTHS, PRODUCT, SIZES, WIDE, sm
 from calibration.discovery.standing import (
     _chosen_again,
     _root,
-    _weakest_row,
+    _weakest_run,
     cost_of_names,
     evidence_of_names,
     standing,
@@ -172,10 +172,15 @@ def test_root_is_that_of_what_a_column_explains_beside_others(toy):
         return np.sum(each[0] ** 2) - np.sum(each[1] ** 2)
 
     assert _root(jacobian, residual, signature) ** 2 == pytest.approx(fall(np.ones(readings)), rel=1e-8)
-    space = SimpleNamespace(included=toy.counts, bare=SimpleNamespace(observe=SimpleNamespace(long=False)))
-    row, least = _weakest_row(space, jacobian, residual, signature)
-    falls = [fall(np.repeat(np.arange(toy.rows) != k, 3)) for k in range(toy.rows)]
+    space, rows = SimpleNamespace(included=toy.counts), np.arange(toy.rows)
+    row, least = _weakest_run(space, toy.linear.runs(), jacobian, residual, signature)
+    falls = [fall(np.repeat(rows != k, 3)) for k in rows]
     assert row == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
+    runs = np.split(rows, 4)  # as of histories
+    run, least = _weakest_run(space, runs, jacobian, residual, signature)
+    falls = [fall(np.repeat(~np.isin(rows, run), 3)) for run in runs]
+    assert run == 1 + int(np.argmin(falls)) and least**2 == pytest.approx(min(falls), rel=1e-8)
+    assert _weakest_run(space, runs[:2], jacobian, residual, signature) == (None, math.inf)
 
 
 @pytest.mark.parametrize(

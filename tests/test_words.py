@@ -244,9 +244,19 @@ SAMPLES = [
         "only 400 of 500 bootstrap tables could be fitted again; the thresholds are theirs",
     ),
     (
-        of_loop.RestsOn("vibration_slip", 10, 10.57, 4.3),
-        "vibration_slip rests on row 10 (10.6 σ with it, 4.3 σ without): make that run again, and runs at conditions on "
-        "either side of it",
+        of_loop.RestsOn("slip", NameTest("slip", 10.57, 3.3, (), 0.0, 2, 4.3, what="run")),
+        "slip rests on run 2 (10.6 σ with it, 4.3 σ without): repeat run 2, and runs at conditions on either side of it",
+    ),
+    (
+        of_loop.RestsOn(
+            "slip",
+            NameTest("slip", 10.57, 3.3, (), 0.0, 10, 4.3),
+            {"configuration": "6T2A", "supply_voltage_V": 33.0, "slope_deg": 20.0},
+            "slope_deg",
+            (17.5, 22.5),
+        ),
+        "slip rests on row 10 (10.6 σ with it, 4.3 σ without): repeat row 10 (6T2A, 33 V, 20 deg), and run it at "
+        "slope_deg 17.5 and 22.5 too",
     ),
     (
         of_loop.Unwritten(True, 0.13, 0.42),

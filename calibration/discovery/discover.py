@@ -34,6 +34,7 @@ from calibration.discovery.notes import (
     LostReplicates,
     Missing,
     NameSupport,
+    NameTest,
     NoiseFromSeries,
     PhasesDiffer,
     RestsOn,
@@ -59,7 +60,7 @@ from calibration.discovery.standing import standing
 from calibration.inference import bases as bases_room
 from calibration.inference import blocks as blocks_room
 from calibration.inference import noise as noise_room
-from calibration.inference import observers, preparation, priors
+from calibration.inference import observers, preparation, priors, series_noise
 from calibration.inference.bases import Bases
 from calibration.inference.lack_of_fit import Residuals
 from calibration.inference.linearization import Linearization
@@ -414,13 +415,13 @@ def choose(
     if best is None or after is None:
         return None, searched, standing(space, base, searched, left, bases, settings)
     adequate = not after.test.rejected_with_margin
-    kinds = {} if long else blocks_room.distinct(runs, space.bare.observe.blocks)
+    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
     blocks = [mask for by in kinds.values() for mask in by.values()]
     stood = standing(space, base, searched, left, bases, settings, blocks=blocks) if adequate or long else None
     if stood is not None and all(stood.established(e) for e in best.effects):
         return (best, after), searched, stood
     few = None
-    if not long:
+    if not (long and stood is not None and stood.stands):  # refits of histories take long
         progress(Step("held out"))
         few = prediction.smallest(space, runs, base, path(searched))
     if stood is None:
@@ -794,7 +795,7 @@ def remarks(found: DiscoveryResult) -> Notes:
     names = [e.name for e in found.effects]
     for t in () if found.support is None else found.support.tests:
         if t.rests_on is not None and t.effect in names:
-            said.append(RestsOn(t.effect, t.rests_on, t.root, t.root_without))
+            said.append(_rests_on(found, t))
     if not found.written and found.gain is not None:
         said.append(Unwritten(not found.effects, found.gain.mean, found.gain.se))
     said += preference.remarks(found.alternatives_held_out, found.settings.prefer)
@@ -804,3 +805,21 @@ def remarks(found: DiscoveryResult) -> Notes:
     if 1 / (1 + settled) > min(found.settings.shares.values()):
         said.append(TooFewReplicates(settled))
     return tuple(said)
+
+
+def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
+    """What would tell whether a run that an effect rests on is right: it again, and half steps on either side of it
+    along a series that it is in."""
+    runs = found.runs
+    if test.what == "run":
+        return RestsOn(test.effect, test)
+    row = int(np.flatnonzero(found.numbers == test.row)[0])
+    columns = [c for c in ("configuration", *runs.axes) if runs.has(c)]
+    at = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}
+    for axis in sorted(runs.axes, key=lambda axis: axis != series_noise.FIRST):
+        series = next((rows for rows in series_noise.series_of(runs, axis) if row in rows), None)
+        x, here = np.unique(runs[axis][row if series is None else series]), float(runs[axis][row])
+        if len(x) > 1:
+            step = np.diff(x)[max(int(np.searchsorted(x, here)) - 1, 0)]
+            return RestsOn(test.effect, test, at, axis, (here - step / 2, here + step / 2))
+    return RestsOn(test.effect, test, at)

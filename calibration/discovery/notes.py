@@ -44,10 +44,12 @@ class NameTest:
         effect: its name; root: of what it would explain there beside curves of other equations [σ]; needed: by chance
             the strongest effect reaches that [σ]; curves: those beside.
         evidence: twice the log of that for it over a smooth curve of its own equation, the best one [σ²].
-        row: number of the row without which the root is smallest, None where none was left out; root_without: then.
+        row: number of the run without which the root is smallest, None where none was left out; root_without: then.
+            A settled run is a row of its table, see `what`.
         again: share of the informative blocks without which an effect of its family is still the strongest.
         larger: effects of a set without it that is the better explanation, but not of a plausible size.
         remains: whether the largest set that was searched for leaves something in its equation.
+        what: a run is called, `row` or `run`.
     """
 
     effect: str
@@ -60,6 +62,7 @@ class NameTest:
     again: float = 1.0
     larger: tuple[str, ...] = ()
     remains: bool = False
+    what: str = "row"
 
     @property
     def stands(self) -> bool:
@@ -126,7 +129,10 @@ class NameSupport:
         Args:
             numbers: of the rows in turn.
         """
-        named = (t if t.row is None else dataclasses.replace(t, row=int(numbers[t.row - 1])) for t in self.tests)
+        named = (
+            t if t.row is None or t.what == "run" else dataclasses.replace(t, row=int(numbers[t.row - 1]))
+            for t in self.tests
+        )
         return dataclasses.replace(self, tests=tuple(named))
 
 
@@ -387,12 +393,19 @@ Instruction = NothingPossible | NothingTells | CarryOut | MoreRuns | TooWeak
 
 @dataclasses.dataclass(frozen=True)
 class RestsOn(Note):
-    """An effect that stands by one row alone: the row's number, its root with it and without [σ]."""
+    """An effect that stands by one run alone, which would have to be made again, and others beside it.
+
+    Attributes:
+        effect: its name; test: of it.
+        conditions: column → what the run was at; axis: column along which others were made at the same conditions
+            otherwise, "" for none; beside: where along that others would tell most.
+    """
 
     effect: str
-    row: int
-    root: float
-    root_without: float
+    test: NameTest
+    conditions: dict[str, str | float] = dataclasses.field(default_factory=dict)
+    axis: str = ""
+    beside: tuple[float, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -282,7 +282,7 @@ def name_tests(
         columns = np.concatenate([family_columns(linear, bases, k) for k in chosen], 1)
         mine = space.library.of == space.library.names.index(effect)
         beside = *augment_with_columns(linear, columns), np.asarray(linear.signatures)[:, mine]
-        row, root_without = _weakest_row(space, *beside)
+        run, root_without = _weakest_run(space, linear.runs(), *beside)
         whole, others = (largest, fewer[effect]) if effect in fewer else (best, without)
         tests.append(
             NameTest(
@@ -291,11 +291,12 @@ def name_tests(
                 after.test.threshold("single"),
                 tuple(_over(*names[k]) for k in chosen),
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
-                row,
+                run,
                 root_without,
                 _chosen_again(space, effect, beside, np.asarray(linear.signatures), blocks),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 own in lacks,
+                "run" if space.bare.observe.long else "row",
             )
         )
     return tuple(tests)
@@ -352,11 +353,9 @@ def _chosen_again(
     mine, again = families[names.index(effect)], []
     whole = _left_of(*beside)[0].max()
     for out in blocks:
-        size = len(signatures) // len(space.included)
-        rows = np.repeat(np.concatenate([out, np.zeros(len(space.included) - len(out), bool)]), size)
-        j, e, own, every = (x.copy() for x in (*beside, signatures))
-        for x in (j, e, own, every):
-            x[: len(rows)][rows] = 0.0
+        kept = _kept(space, out, len(signatures))
+        every = signatures[kept]
+        j, e, own = _rest(kept, *beside)
         if _left_of(j, e, own)[0].max() < 0.5 * whole:
             continue
         left, told = _left_of(j, e, every)
@@ -366,18 +365,37 @@ def _chosen_again(
     return float(np.mean(again)) if again else 1.0
 
 
-def _weakest_row(
-    space: CandidateSpace, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
+def _weakest_run(
+    space: CandidateSpace,
+    runs: Sequence[np.ndarray],
+    jacobian: np.ndarray,
+    residual: np.ndarray,
+    signatures: np.ndarray,
 ) -> tuple[int | None, float]:
-    """Number of the row without which that root is smallest, and the root; of settled runs."""
-    if space.bare.observe.long:
-        return None, math.inf
-    size = len(signatures) // len(space.included)
+    """Number of the run without which that root is smallest, and the root; None of fewer than three runs.
+
+    Args:
+        runs: rows of each.
+    """
     least: tuple[int | None, float] = None, math.inf
-    for k in np.flatnonzero(space.included):
-        j, e, s = jacobian.copy(), residual.copy(), signatures.copy()
-        for x in (j, e, s):
-            x[size * k : size * (k + 1)] = 0.0
-        root = _root(j, e, s)
-        least = (int(k) + 1, root) if root < least[1] else least
+    counting = [(k, rows) for k, rows in enumerate(runs) if space.included[rows].any()]
+    for k, rows in counting if len(counting) > 2 else ():
+        out = np.zeros(len(space.included), bool)
+        out[rows] = True
+        root = _root(*_rest(_kept(space, out, len(signatures)), jacobian, residual, signatures))
+        least = (k + 1, root) if root < least[1] else least
     return least
+
+
+def _kept(space: CandidateSpace, out: np.ndarray, readings: int) -> np.ndarray:
+    """Readings that are left without some rows, which are padded behind; shape (readings,)."""
+    rows = np.concatenate([out, np.zeros(len(space.included) - len(out), bool)])
+    return np.repeat(~rows, readings // len(rows))
+
+
+def _rest(
+    kept: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, signatures: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of the readings that are kept, and of all that follows them."""
+    whole = np.concatenate([kept, np.ones(len(residual) - len(kept), bool)])
+    return jacobian[whole], residual[whole], signatures[kept]

@@ -199,6 +199,10 @@ class Linearization(eqx.Module):
         """What a curve may be over, by row [SI]: a signal, or what else the observer knows."""
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
+    def runs(self) -> list[np.ndarray]:
+        """Indices of the rows of each run; of settled runs each row is one."""
+        return list(np.arange(self.rows)[:, None])
+
     def turned(self) -> np.ndarray | None:
         """Angle of the driving shaft at every row since the start of its run [rad]; None where no run is followed."""
         return None

@@ -61,7 +61,7 @@ def estimate(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[Ser
         sizes: of each reading [SI], that a share of the reading is of.
     """
     measured = runs.measured()
-    by_axis = {axis: _series(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
+    by_axis = {axis: series_of(runs, axis) for axis in sorted(runs.axes, key=lambda axis: axis != FIRST)}
     found: list[SeriesNoise | None] = []
     for k, channel in enumerate(runs.channels):
         each = [_of_channel(channel, measured[:, k], sizes[:, k], runs[a], a, s) for a, s in by_axis.items()]
@@ -71,7 +71,7 @@ def estimate(runs: Runs, sizes: Float[np.ndarray, "rows channels"]) -> tuple[Ser
     return tuple(found)
 
 
-def _series(runs: Runs, axis: str) -> list[np.ndarray]:
+def series_of(runs: Runs, axis: str) -> list[np.ndarray]:
     """Rows of each series along an axis, three or more; one that goes backward is another one."""
     others = [c for c in (*LABELS, *runs.axes) if runs.has(c) and c != axis]
     driving = [c for c in (*runs.layout.axes[:1], "supply_voltage_V", "duty") if runs.has(c)]

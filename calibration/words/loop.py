@@ -205,7 +205,7 @@ def reason(support: NameSupport | None) -> str:
 
 def _strength(test: NameTest) -> str:
     """How much an effect explains by itself, and what chance and the loss of a row leave of that."""
-    less = "" if test.row is None else f", without row {test.row} {test.root_without:.1f}"
+    less = "" if test.row is None else f", without {test.what} {test.row} {test.root_without:.1f}"
     return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
 
 
@@ -213,7 +213,7 @@ def _strength(test: NameTest) -> str:
 DOUBTS = {
     "chance": ("chance", "explains {0.root:.1f} σ beside smooth curves ({over}), and chance reaches {0.needed:.1f}"),
     "curve": ("a curve", "is a worse explanation than a smooth curve in its place"),
-    "row": ("row {0.rests_on}", "rests on row {0.rests_on}"),
+    "row": ("{0.what} {0.rests_on}", "rests on {0.what} {0.rests_on}"),
     "blocks": ("blocks", "is chosen again in {again:.0f} % of the data with a block left out"),
     "larger": ("size", "has a rival of an implausible size ({larger})"),
     "remains": ("equation", "leaves something in its own equation"),
@@ -462,10 +462,17 @@ def led(note: Led) -> str:
 
 
 def rests_on(note: RestsOn) -> str:
-    """An effect that stands by one row alone."""
+    """An effect that stands by one run alone."""
+    test = note.test
+    at = ", ".join(v if isinstance(v, str) else f"{v:g} {c.rpartition('_')[2]}" for c, v in note.conditions.items())
+    run = f"{test.what} {test.rests_on}{f' ({at})' * bool(at)}"
+    beside = " and ".join(f"{x:g}" for x in note.beside)
+    others = (
+        f", and run it at {note.axis} {beside} too" if beside else ", and runs at conditions on either side of it"
+    )
     return (
-        f"{note.effect} rests on row {note.row} ({note.root:.1f} σ with it, {note.root_without:.1f} σ without): make "
-        "that run again, and runs at conditions on either side of it"
+        f"{note.effect} rests on {test.what} {test.rests_on} ({test.root:.1f} σ with it, {test.root_without:.1f} σ "
+        f"without): repeat {run}, and {others}"
     )
 
 

@@ -95,6 +95,9 @@ class HistoriesLinearization(Linearization):
     def places(self) -> np.ndarray:
         return np.unique(np.asarray(self.knots))
 
+    def runs(self) -> list[np.ndarray]:
+        return [rows[rows >= 0] for rows in np.asarray(self.rows_of)]
+
     def variable(self, name: str) -> np.ndarray:
         if name in bases_room.ORDERS:
             return bases_room.ORDERS[name][0] * np.asarray(self.angle)
