@@ -467,9 +467,7 @@ def rests_on(note: RestsOn) -> str:
     at = ", ".join(v if isinstance(v, str) else f"{v:g} {c.rpartition('_')[2]}" for c, v in note.conditions.items())
     run = f"{test.what} {test.rests_on}{f' ({at})' * bool(at)}"
     beside = " and ".join(f"{x:g}" for x in note.beside)
-    others = (
-        f", and run it at {note.axis} {beside} too" if beside else ", and runs at conditions on either side of it"
-    )
+    others = f"run it at {note.axis} {beside} too" if beside else "runs at conditions on either side of it"
     return (
         f"{note.effect} rests on {test.what} {test.rests_on} ({test.root:.1f} σ with it, {test.root_without:.1f} σ "
         f"without): repeat {run}, and {others}"
