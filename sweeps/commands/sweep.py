@@ -48,7 +48,7 @@ def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool
         table = run.evaluate(robot, runs, config, folder)
         print_counts(table)
         if drawn is not None and config.posterior is not None:
-            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
             uncertainty.say_intervals(table, found)
             table |= found.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
