@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import fidelities, missions, params
+from mmrjax import fidelities, params
 from mmrjax import outputs as table_of_outputs
 from mmrjax.channels import Channel
 from mmrjax.compiling import compiled
@@ -184,6 +184,8 @@ def _evaluate(
 
     def simulate(robot: Robot, conditions: Conditions) -> Run:
         if profile is not None:
+            from mmrjax import missions
+
             return missions.run(robot, conditions, profile)
         return fidelities.get(fidelity).run(robot, conditions, options)
 
@@ -227,6 +229,8 @@ def check_outputs(
         UsageError: lists the outputs that there are.
     """
     if profile is not None:
+        from mmrjax import missions  # which imports an integrator
+
         _known(names, missions.names())
         return
     if set(names) <= {*table_of_outputs.names(variation.robot.channels), FLAGS}:

@@ -32,6 +32,8 @@ from sweeps.points.scale import Job
 from sweeps.skeleton import Page
 from sweeps.store import RunFolder
 
+Table = dict[str, np.ndarray]
+
 
 @dataclasses.dataclass(frozen=True)
 class SimulationResult:
@@ -100,10 +102,14 @@ def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
 class Parts:
     """The chunks of a sweep whose results are one table: in memory, and in a run folder that is taken up again."""
 
-    def __init__(self, folder: RunFolder | None, name: str) -> None:
-        """Begin, or take up what an interrupted command left in its folder under this name."""
-        self._folder, self._name = folder, name
-        self.found: dict[int, dict[str, np.ndarray]] = {}
+    def __init__(self, folder: RunFolder | None, name: str, kept: Callable[[Table], Table] = dict) -> None:
+        """Begin, or take up what an interrupted command left in its folder under this name.
+
+        Args:
+            kept: what is kept of the outputs of a chunk.
+        """
+        self._folder, self._name, self._kept = folder, name, kept
+        self.found: dict[int, Table] = {}
 
     def _file(self, chunk: int) -> str:
         return f"{self._name}-{chunk:06d}"
@@ -117,13 +123,13 @@ class Parts:
 
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray], drawn: np.ndarray | None) -> None:
         """Keep a chunk."""
+        self.found[chunk] = self._kept(dict(arrays))
         if self._folder is not None:
-            self._folder.keep_chunk(self._file(chunk), dict(arrays))
-        self.found[chunk] = dict(arrays)
+            self._folder.keep_chunk(self._file(chunk), self.found[chunk])
 
 
 def computed(job: Job, parts: Parts, advance: Callable[[float], None]) -> dict[str, np.ndarray]:
-    """What comes out of every point of a job, in the units of tables, by name; shape (points,).
+    """What is kept of every chunk of a job, one after the other: outputs in the units of tables, shape (points,).
 
     Chunks that are there already are not computed again.
     """
@@ -133,7 +139,7 @@ def computed(job: Job, parts: Parts, advance: Callable[[float], None]) -> dict[s
     if left:
         scale.run(parts, job, scale.produce(scale.Compiled(job), left, times, advance), advance, times)
     every = [parts.found.pop(k) for k in range(len(blocks))]
-    return {name: np.concatenate([part.pop(name) for part in every]) for name in (*job.outputs, STATUS)}
+    return {name: np.concatenate([part.pop(name) for part in every]) for name in tuple(every[0])}
 
 
 def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None = None) -> Job:

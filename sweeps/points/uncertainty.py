@@ -60,12 +60,17 @@ def intervals(
     samples = Drawn(tuple(posterior.names), posterior.draw(draws, SEED).T)
     job = run.job_of(robot, runs, config, samples)
     slow = fidelities.facts(config.model).slow or draws * len(runs) > 100_000
+
+    def summary(found: run.Table) -> run.Table:
+        seen = {name: values.reshape(-1, draws) for name, values in found.items()}
+        there = np.isin(seen[STATUS], DONE) & np.isfinite(seen[robot.channels[0].name])
+        return _summary({o.column: seen[o.name] for o in outputs.table(robot.channels)}, there)
+
+    whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
+    parts = run.Parts(folder, "draws", summary if whole else dict)
     with progress(draws, quiet=not slow, doing="draws") as advance:
-        found = run.computed(job, run.Parts(folder, "draws"), lambda points: advance(points / len(runs)))
-    seen = {name: values.reshape(len(runs), draws) for name, values in found.items()}
-    there = np.isin(seen[STATUS], DONE) & np.isfinite(seen[robot.channels[0].name])
-    columns = {output.column: seen[output.name] for output in outputs.table(robot.channels)}
-    return Intervals(_summary(columns, there), draws, robot.channels)
+        found = run.computed(job, parts, lambda points: advance(points / len(runs)))
+    return Intervals(found if whole else summary(found), draws, robot.channels)
 
 
 def _summary(columns: dict[str, np.ndarray], there: np.ndarray) -> dict[str, np.ndarray]:
