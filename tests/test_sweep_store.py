@@ -23,8 +23,10 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
 from mmrjax.signals import STATUSES
 from sweeps import cli
-from sweeps.commands import campaign
+from sweeps.commands import sweep as command
+from sweeps.config_campaign import Campaign
 from sweeps.points import axes, identity, scale, zarr_store
+from sweeps.points.job import laid_out, prepare
 
 CONFIG = """report = false
 chunk = 40
@@ -184,7 +186,7 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
 
 def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
-    monkeypatch.setattr(campaign, "MARGIN", 10**18)
+    monkeypatch.setattr(command, "MARGIN", 10**18)
     code, _, said = mmrjax("sweep", "--slopes", "0,5", "--out", "s")
     assert code == 2 and "--out: the results would take" in said
     assert not list(tmp_path.iterdir())
@@ -547,7 +549,7 @@ def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
 
 def test_shares_hold_every_chunk_once():
     for chunks, n in ((12, 5), (3, 8), (7, 7), (1000, 3)):
-        held = [c for k in range(1, n + 1) for c in campaign.share((k, n), chunks)]
+        held = [c for k in range(1, n + 1) for c in command.share((k, n), chunks)]
         assert held == list(range(chunks))
 
 
@@ -565,9 +567,9 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
 @pytest.fixture(scope="module")
 def layout():
     """Three chunks of one point each."""
-    config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
+    config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
     robot = robots.nominal()
-    return campaign.laid_out(config, campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x"))
+    return laid_out(config, prepare(config, robot, axes.plan(config, robot, "x"), "x"))
 
 
 @pytest.fixture
@@ -795,10 +797,10 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
 
 
 def test_layout_counts_its_bytes_without_writing(whole):
-    config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
+    config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
     robot = robots.nominal()
-    job = campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
-    layout = campaign.laid_out(config, job)
+    job = prepare(config, robot, axes.plan(config, robot, "x"), "x")
+    layout = laid_out(config, job)
     assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up
     assert dataclasses.replace(layout, variables=()).size == 3 * 8
 
