@@ -56,12 +56,12 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
     """Configuration and job of a sweep."""
     import jax
 
-    from mmrjax import channels, robots
+    from mmrjax import channels, fidelities, robots
     from sweeps.config_campaign import Campaign
-    from sweeps.points import axes, scale
+    from sweeps.points import axes
     from sweeps.points.job import prepare
 
-    chunk = arguments.chunk or scale.default_chunk(arguments.model, jax.default_backend() != "cpu", devices)
+    chunk = arguments.chunk or fidelities.facts(arguments.model).at_once(jax.default_backend() != "cpu") * devices
     config = Campaign(
         model=arguments.model, chunk=min(chunk, points), storage=arguments.storage, outputs=channels.USUAL,
         duration_s=arguments.duration if arguments.model != "steady" else None,
@@ -121,7 +121,7 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         begin = time.perf_counter()
         store = SweepStore(folder / "s", {}, layout)
         store.begin()
-        scale.run(store, job, scale.produce(compiled, range(len(job.blocks)), times), lambda _: None, times)
+        scale.run(store.write, job, scale.produce(compiled, range(len(job.blocks)), times), lambda _: None, times)
         total = time.perf_counter() - begin
         statuses = command.statuses(store.done().values())
         store.close()

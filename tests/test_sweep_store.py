@@ -509,7 +509,7 @@ def test_interrupt_is_not_replaced_where_the_writer_empties_the_queue(monkeypatc
 
     monkeypatch.setattr(scale.queue, "Queue", Raced)
     with pytest.raises(KeyboardInterrupt):
-        scale.run(None, None, interrupted(), print, scale.Times())
+        scale.run(print, None, interrupted(), print, scale.Times())
 
 
 # --- shares -------------------------------------------------------------------------------------------------------

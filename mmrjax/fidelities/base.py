@@ -163,11 +163,6 @@ class Fidelity:
         return self.facts.options
 
     @property
-    def chunk(self) -> int:
-        """Runs in one vmapped call."""
-        return self.facts.chunk
-
-    @property
     def effort(self) -> Effort:
         """What a calibration through it does where nobody states it."""
         return self.facts.effort

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from rich.table import Table
 
@@ -92,10 +91,9 @@ def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None,
 
         pool = cluster.connect(options.scheduler)
     try:
-        devices = 1 if pool is not None else len(jax.local_devices())
         device = scale.device_kind() if pool is None else pool.device
         wanted = options.outputs or config.outputs or usual(config, robot)
-        chunk = config.chunk or scale.default_chunk(config.model, not device.startswith("cpu"), devices)
+        chunk = config.chunk or scale.default_chunk(config.model, None if pool is None else device)
         config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
         job = prepare(config, robot, plan, where)
         layout = laid_out(config, job)
@@ -230,10 +228,13 @@ def simulate(store: SweepStore, job: scale.Job, options: How, pool: Any) -> None
     if before:
         tell(f"{store.partial}: goes on after {before:,} of {total:,} points")
     times = scale.Times()
-    chunks = pool.produce(job, left) if pool is not None else scale.produce(scale.Compiled(job), left, times)
     try:
         with progress(total, quiet=False, done=before, rate=True) as advance:
-            scale.run(store, job, chunks, advance, times)
+            if pool is not None:
+                chunks = pool.produce(job, left)
+            else:
+                chunks = scale.produce(scale.Compiled(job), left, times, advance)
+            scale.run(store.write, job, chunks, advance, times)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -99,47 +99,34 @@ def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
 
 
-class Parts:
-    """The chunks of a sweep whose results are one table: in memory, and in a run folder that is taken up again."""
+def computed(
+    job: Job,
+    folder: RunFolder | None,
+    name: str,
+    advance: Callable[[float], None],
+    kept: Callable[[Table], Table] = dict,
+) -> Table:
+    """What is kept of every chunk of a job, one after the other.
 
-    def __init__(self, folder: RunFolder | None, name: str, kept: Callable[[Table], Table] = dict) -> None:
-        """Begin, or take up what an interrupted command left in its folder under this name.
-
-        Args:
-            kept: what is kept of the outputs of a chunk.
-        """
-        self._folder, self._name, self._kept = folder, name, kept
-        self.found: dict[int, Table] = {}
-
-    def _file(self, chunk: int) -> str:
-        return f"{self._name}-{chunk:06d}"
-
-    def has(self, chunk: int) -> bool:
-        """Whether a chunk is there."""
-        part = None if self._folder is None else self._folder.chunk(self._file(chunk))
-        if part is not None:
-            self.found[chunk] = part
-        return part is not None
-
-    def write(self, chunk: int, arrays: Mapping[str, np.ndarray], drawn: np.ndarray | None) -> None:
-        """Keep a chunk."""
-        self.found[chunk] = self._kept(dict(arrays))
-        if self._folder is not None:
-            self._folder.keep_chunk(self._file(chunk), self.found[chunk])
-
-
-def computed(job: Job, parts: Parts, advance: Callable[[float], None]) -> dict[str, np.ndarray]:
-    """What is kept of every chunk of a job, one after the other: outputs in the units of tables, shape (points,).
-
-    Chunks that are there already are not computed again.
+    Args:
+        folder: holds chunks under this name; those that an interrupted command left there are not computed again.
+        kept: what is kept of the outputs of a chunk, by default all: in the units of tables, shape (points,).
     """
-    blocks, times = job.blocks, scale.Times()
-    left = [k for k in range(len(blocks)) if not parts.has(k)]
-    advance(job.plan.design.points - sum(map(blocks.count, left)))
+    chunks = range(len(job.blocks))
+    files = [f"{name}-{k:06d}" for k in chunks]
+    found = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
+    left, times = [k for k in chunks if k not in found], scale.Times()
+    advance(sum(map(job.blocks.count, found)))
+
+    def keep(chunk: int, arrays: Table, _: Any) -> None:
+        found[chunk] = kept(arrays)
+        if folder is not None:
+            folder.keep_chunk(files[chunk], found[chunk])
+
     if left:
-        scale.run(parts, job, scale.produce(scale.Compiled(job), left, times, advance), advance, times)
-    every = [parts.found.pop(k) for k in range(len(blocks))]
-    return {name: np.concatenate([part.pop(name) for part in every]) for name in tuple(every[0])}
+        scale.run(keep, job, scale.produce(scale.Compiled(job), left, times, advance), advance, times)
+    every = [found.pop(k) for k in chunks]
+    return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
 
 
 def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None = None) -> Job:
@@ -152,7 +139,8 @@ def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None
     refuse(robot, rows, config)
     plan = Plan.of_rows(jax.tree.map(np.asarray, rows), samples)
     wanted = (*outputs.names(robot.channels), FLAGS_CODE, *fidelities.get(config.model).columns)
-    blocks = Blocks.of(plan.design.shape, config.runs_at_once)
+    chunk = getattr(config, "chunk", None) or scale.default_chunk(config.model)
+    blocks = Blocks.of(plan.design.shape, chunk)
     return Job(robot, config.model, config.options, plan, wanted, "float64", blocks)
 
 
@@ -171,12 +159,10 @@ def evaluate(
         advance: called with the number of runs done since its last call; of a chunk under way, its share. None:
             a bar on stderr where it takes long.
     """
-    if advance is None:
-        slow = fidelities.facts(config.model).slow or len(runs) > config.runs_at_once
-        with bar(len(runs), quiet=not slow) as advance:
-            return evaluate(robot, runs, config, folder, advance)
     job = job_of(robot, runs, config)
-    found = computed(job, Parts(folder, "chunk"), advance)
+    slow = fidelities.facts(config.model).slow or len(job.blocks) > 1
+    with bar(len(runs), quiet=not slow or advance is not None) as own:
+        found = computed(job, folder, "chunk", advance or own)
     columns = {row.column: found[row.name] for row in outputs.table(robot.channels)}
     further = {name: found[name] for name in fidelities.get(config.model).columns}
     return {**conditions(robot, runs), **columns, **outputs.codes(found[STATUS], found[FLAGS_CODE]), **further}

@@ -14,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
 
 POINTS = "points"
+#: Chunks of more points on a device are filled up to a multiple, so that designs of all sizes share few programs.
+SHARED = 16_384
 #: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
 WAITING = 1
 
@@ -78,9 +80,10 @@ def device_kind() -> str:
     return f"{device.platform}: {device.device_kind}"
 
 
-def default_chunk(model: str, accelerator: bool, devices: int) -> int:
-    """Points of a chunk where none is stated, over all devices."""
-    return fidelities.facts(model).at_once(accelerator) * devices
+def default_chunk(model: str, device: str | None = None) -> int:
+    """Points of a chunk where none is stated, over all local devices, or on one of a kind elsewhere."""
+    count = len(jax.local_devices()) if device is None else 1
+    return fidelities.facts(model).at_once(not (device or device_kind()).startswith("cpu")) * count
 
 
 class Compiled:
@@ -91,7 +94,9 @@ class Compiled:
         devices = jax.local_devices() if devices is None else devices
         self.mesh = Mesh(np.array(devices), (POINTS,))
         # Every device has the same number of points; the last ones stand for the chunk's last point again.
-        self.size = -(-job.blocks.points // len(devices)) * len(devices)
+        each = -(-job.blocks.points // len(devices))
+        each = each if each < SHARED else -(-each // SHARED) * SHARED
+        self.size = each * len(devices)
         names = tuple(name for name in job.plan.design.names if name != ROW)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
         self._variation, self._fixed = _placed((Variation(job.robot, names), job.plan.fixed()), everywhere)
@@ -223,14 +228,8 @@ class Piece:
 
 Produced = Iterator[Piece]
 Advance = Callable[[float], None]
-
-
-class Store(Protocol):
-    """Keeps chunks."""
-
-    def write(self, chunk: int, arrays: Mapping[str, np.ndarray], drawn: np.ndarray | None) -> Any:
-        """Keep a chunk: values of its points by variable, and of its samples as `drawn` gives them."""
-        ...
+#: Keeps a chunk by its number: values of its points by variable, and of its samples as `drawn` gives them.
+Keep = Callable[[int, dict[str, np.ndarray], np.ndarray | None], Any]
 
 
 def produce(compiled: Compiled, chunks: Iterable[int], times: Times, advance: Advance | None = None) -> Produced:
@@ -293,11 +292,11 @@ def drawn(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
     return samples.values(along.start, along.stop - along.start)
 
 
-def run(store: Store, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
+def run(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
     """Write chunks as they come, in a thread of its own, so that the next is computed meanwhile.
 
     Args:
-        store: where they are kept, begun; advance: called with the points of each chunk that is done.
+        keep: writes one; advance: called with the points of each chunk that is done.
 
     Raises:
         OSError: the disk is full, or the store cannot be written; chunks written before are kept.
@@ -315,7 +314,7 @@ def run(store: Store, job: Job, chunks: Produced, advance: Advance, times: Times
         there = time.perf_counter()
         if stop.is_set():  # interrupted while it was computed
             return
-        store.write(piece.chunk, here, drawn(job, piece))
+        keep(piece.chunk, here, drawn(job, piece))
         times.compute += computed - start
         times.transfer += there - computed
         times.write += time.perf_counter() - there

@@ -67,9 +67,10 @@ def intervals(
         return _summary({o.column: seen[o.name] for o in outputs.table(robot.channels)}, there)
 
     whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
-    parts = run.Parts(folder, "draws", summary if whole else dict)
     with progress(draws, quiet=not slow, doing="draws") as advance:
-        found = run.computed(job, parts, lambda points: advance(points / len(runs)))
+        found = run.computed(
+            job, folder, "draws", lambda points: advance(points / len(runs)), summary if whole else dict
+        )
     return Intervals(found if whole else summary(found), draws, robot.channels)
 
 
