@@ -256,7 +256,9 @@ def _started(
     made = time.perf_counter()
     if compiled.in_parts and advance is not None:
         count = compiled.job.blocks.count(chunk)
-        piece = Piece(chunk, compiled(values, shares(advance, count)), values, count)
+        told = shares(advance, count)
+        piece = Piece(chunk, compiled(values, told), values, count)
+        told(1.0)
     else:
         piece = Piece(chunk, compiled(values), values)
     times.points += made - start
