@@ -109,7 +109,7 @@ class Compiled:
         )  # fmt: skip
         # What takes long in one call is run in parts, between which it says how far it is and can be interrupted.
         slow = fidelities.facts(job.model).slow and job.profile is None
-        self.in_parts = slow and len(devices) == 1 and surface is None and not self._variation.varies_robot
+        self.in_parts = slow and len(devices) == 1 and not self._variation.varies_robot
         self._program = _one_device_kept if len(devices) == 1 else eqx.filter_jit(_split_among(self.mesh))
 
     def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
@@ -132,10 +132,10 @@ class Compiled:
             which, values = values[:, 0].astype(int), values[:, 1:]
             conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which], self._split), rows)
         placed = jax.device_put(values, self._split)
-        if self.in_parts and told is not None:
-            robot, conditions = self._variation.at(placed, conditions)
-            conditions = _wide(conditions, len(values))
-            run = fidelities.get(self.job.model).run(robot, conditions, self.job.options, told)
+        if self.in_parts:
+            conditions = _on_surface(self._variation, conditions, placed, self._asked.surface)
+            robot, conditions = self._variation.at(placed, _wide(conditions, len(values)))
+            run = fidelities.get(self.job.model).run(robot, conditions, self.job.options, told or _not_told)
             return _stored(pick(run, robot.channels, self.job.outputs), self._asked)
         found: dict[str, Array] = self._program(self._variation, conditions, placed, self._asked, self.job.profile)
         return found
@@ -165,14 +165,26 @@ def _wide(conditions: Conditions, points: int) -> Conditions:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
 
 
+def _not_told(share: float) -> None:
+    pass
+
+
+def _on_surface(
+    variation: Variation, conditions: Conditions, values: Array, surface: tuple[float, ...] | None
+) -> Conditions:
+    """Conditions of points with the adhesion of their configurations on a surface, if one is stated."""
+    if surface is None:
+        return conditions
+    _, at = variation.at(values, conditions)
+    ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
+    return dataclasses.replace(_wide(conditions, len(values)), adhesion=ratio)
+
+
 def _one_device(
     variation: Variation, conditions: Conditions, values: Array, asked: _Asked, profile: Profile | None
 ) -> dict[str, Array]:
     """Outputs of points as they are stored."""
-    if asked.surface is not None:
-        _, at = variation.at(values, conditions)
-        ratio = jnp.asarray(asked.surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
-        conditions = dataclasses.replace(_wide(conditions, len(values)), adhesion=ratio)
+    conditions = _on_surface(variation, conditions, values, asked.surface)
     names = tuple(name for name, _ in asked.factors)
     found = evaluate(variation, asked.model, values, conditions, dict(asked.options), names, profile)
     return _stored(found, asked)
