@@ -712,11 +712,17 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
         "job = scale.Job(robot, 'steady', {}, plan, ('speed',), 'float64', Blocks.of((5,), 5))\n"
         "compiled = scale.Compiled(job)\n"
         "found = compiled(compiled.points(0))['speed']\n"
-        "print(len(found.sharding.device_set), [s.data.shape for s in found.addressable_shards], tuple(found.sharding.spec))"
+        "print(len(found.sharding.device_set), [s.data.shape for s in found.addressable_shards], tuple(found.sharding.spec))\n"
+        "rows = mmrjax.Conditions(voltage=np.array([15.0, 20, 24, 28, 33]))\n"
+        "job = scale.Job(robot, 'steady', {}, axes.Plan.of_rows(rows), ('speed',), 'float64', Blocks.of((5,), 5))\n"
+        "compiled = scale.Compiled(job)\n"
+        "table = compiled(compiled.points(0))['speed']\n"
+        "print(len(table.sharding.device_set), bool((table == found).all()))"
     )
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True)
-    assert done.stdout.strip() == "4 [(2,), (2,), (2,), (2,)] ('points',)", done.stderr
+    said = ["4 [(2,), (2,), (2,), (2,)] ('points',)", "4 True"]  # a plan; the rows of a table
+    assert done.stdout.splitlines() == said, done.stderr
 
 
 def test_chunks_share_one_compilation(sweep, compilations):
