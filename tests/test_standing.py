@@ -314,7 +314,7 @@ def test_two_slips_do_not_stand_for_a_law_that_the_library_lacks(monkeypatch):
     got, best, _ = stood(SETTLED, growing(monkeypatch, 20.0, 1), ("rolling_radius", "load_slip"))
     assert not got.stands and got.why
     true, same, after = stood(SETTLED, table(g.case(["rolling_radius", "load_slip"], 15.0, 1)), best.effects)
-    assert true.stands and true.why == "" and same.key == best.key and not after.test.rejected_with_margin
+    assert true.stands and true.why == "beside" and same.key == best.key and not after.test.rejected_with_margin
 
 
 @pytest.mark.slow
