@@ -46,7 +46,10 @@ RATINGS = {
     "battery.delay_cutoff": (0.0, 1e3, "s", "how long a cell may be below it, since a start draws more; assumed"),
     "battery.current_limit": (1e-3, 1e4, "A", "largest current that a cell may give; not stated: none"),
     "battery.current_charge": (0.0, 1e4, "A", "largest current that a cell may take; not stated: none"),
+    "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell whose curvature and slope are stated"),
 }
+#: The parabola of a cell's no-load voltage; stated beside a capacity it is that of a cell of this capacity.
+CURVE = {"battery.curvature", "battery.slope"}
 #: What a robot has or has not, which no fit can free: meaning.
 SWITCHES = {
     "gearbox.mesh_theory": "load driving the motor loses 2 - 1/η of the mesh's theory, else η",
@@ -272,6 +275,8 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     ratings = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
+    if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless it is said otherwise
+        ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     known = {p.name: p for p in params.walk(robot)}
     for name, value in stated.items():
@@ -303,6 +308,9 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     _check_pairs(robot, where)
     if notes is not None and "battery.voltage_cutoff" in values and (remark := power.cutoff_remark(robot.battery)):
         notes.append(f"{where}, battery.voltage_cutoff: {remark}")
+    shapes = CURVE | {"battery.capacity_curve"}
+    if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
+        notes.append(f"{where}, battery.curvature: {remark}")
     return _with_backlash(robot, where)
 
 
@@ -421,7 +429,8 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
     for name, (_, _, unit, what) in RATINGS.items():
         part, _, key = name.partition(".")
         rating = getattr(getattr(robot, part), key)
-        if rating is not None and (whole or rating != getattr(getattr(nothing, part), key)):
+        beside = key == "capacity_curve" and bool(tables[part])  # else it would follow from the capacity
+        if rating is not None and (whole or beside or rating != getattr(getattr(nothing, part), key)):
             tables[part].append(f"{key} = {rating!r}  # [{unit}] {what if whole else what.partition(';')[0]}")
     for name, what in SWITCHES.items():
         part, _, key = name.partition(".")

@@ -68,6 +68,7 @@ FLAGS = {
     "gearbox_overload": "more torque than the gearbox may carry for long",
     "too_hot": "winding hotter than permitted",
     "demand_missed": "a demanded speed was not reached",
+    "voltage_rising": "a cell's voltage that rises as it discharges: the parabola of its curve has turned up",
 }
 
 
