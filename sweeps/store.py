@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
     from sweeps.config import RobotPart
 
-#: Exit codes of a command that is done: all runs converged, or some did not.
-DONE, SOME_NOT_CONVERGED = 0, 3
+#: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
+#: requirement that is missed and any verdict are answers.
+DONE, SOLVER_FAILED = 0, 3
 #: Packages whose versions are part of a result.
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "lineax", "diffrax", "numpy")
 

@@ -37,7 +37,7 @@ from sweeps.points import axes, grid, scale
 from sweeps.points.design import Blocks
 from sweeps.points.identity import Identity, identity
 from sweeps.points.zarr_store import ABSENT, STORE, Done, Layout, SweepStore, Variable
-from sweeps.store import DONE, SOME_NOT_CONVERGED, default_path, digest, provenance
+from sweeps.store import DONE, SOLVER_FAILED, default_path, digest, provenance
 
 #: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
 ASKED = 48
@@ -360,7 +360,7 @@ def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job,
     counts = statuses(done.values())
     print_counts(counts)
     say(str(store.path))
-    return DONE if words.settled(counts) == job.plan.design.points else SOME_NOT_CONVERGED
+    return DONE if words.solved(counts) else SOLVER_FAILED
 
 
 def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:

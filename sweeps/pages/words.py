@@ -83,9 +83,9 @@ SETTLED = ("converged", "reverses")
 UNDER_WAY = (*SETTLED, "rolls_back", "not_settled")
 
 
-def settled(counted: Mapping[str, int]) -> int:
-    """How many runs ended as their conditions ask, of counts by status."""
-    return sum(counted[status] for status in SETTLED)
+def solved(counted: Mapping[str, int]) -> bool:
+    """Whether the solver gave an answer to every run, of counts by status."""
+    return not counted.get("failed")
 
 
 #: What a requirement's quantity may come to beside a status of a run: in one line.
