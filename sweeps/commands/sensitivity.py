@@ -176,6 +176,8 @@ def print_sensitivity(found: SensitivityResult) -> None:
     """What decides which output, what does not matter, what to measure next; for a person."""
     say(found.statement())
     title = f"{words.METHODS[found.method]}, {len(found.points)} operating points"
+    if found.evaluations:
+        title += f", {found.evaluations:,} model evaluations"
     shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for heading in ("", "first", "second", "third"):
         shown.add_column(heading)
