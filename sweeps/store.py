@@ -78,13 +78,15 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: Any) -> None:
         """Leave nothing behind where the command was refused, or interrupted before a chunk was done.
 
         What else an interrupt leaves is taken up again.
         """
         if kind is None:
             return
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(self.partial)
         vain = issubclass(kind, KeyboardInterrupt) and not any((self.partial / "chunks").glob("*.npz"))
         if vain or issubclass(kind, InputError):
             shutil.rmtree(self.partial, ignore_errors=True)
@@ -101,13 +103,13 @@ class RunFolder:
         """Keep a finished chunk for a run that is taken up again."""
         file = self.partial / "chunks" / f"{name}.npz"
         aside = file.with_suffix(".writing")
-        with aside.open("wb") as stream:
+        with writing.naming(file), aside.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file."""
-        (self.partial / name).write_text(text, encoding="utf-8")
+        writing.write_text(self.partial / name, text)
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file; what is not finite becomes null."""

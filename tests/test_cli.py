@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -347,7 +348,10 @@ BAD_RUNS = {
         "column speed_mm_s is missing; is spede_mm_s meant?",
     ),
     "no channel": (HEADER.split(",total_current_A")[0] + "\n6T2A,15,13.1,0,5", "no column of a channel"),
-    "slope": (f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400", "runs.csv row 1, slope_deg: got 95; expected -45 to 45"),
+    "slope": (
+        f"{HEADER}\n6T2A,15,13.1,0,95,2.75,4800,400",
+        "runs.csv row 1, slope_deg: got 95; is it in percent? then name the column slope_percent; expected -45 to 45",
+    ),
     "NaN": (f"{HEADER}\n6T2A,15,13.1,0,5,nan,4800,400", "row 1, total_current_A: got nan"),
     "configuration": (f"{HEADER}\n5T,15,13.1,0,5,1,4800,400", "row 1, configuration: got 5T"),
 }
@@ -380,6 +384,28 @@ def test_run_folder_is_replaced_only_when_told(mmrjax, tmp_path):
     assert mmrjax(*one)[0] == 2
     assert mmrjax(*one, "--slope", "5", "--force")[0] == 0
     assert table(tmp_path / "r" / "runs.csv")[0]["slope_deg"] == "5"
+
+
+def test_full_disk_names_the_file_whichever_it_is(mmrjax, tmp_path, monkeypatch):
+    """What the system says of a full disk names none."""
+    honest = Path.write_text
+
+    def full(path, text, **options):
+        if path.name == "result.json":
+            raise OSError(28, "No space left on device")
+        return honest(path, text, **options)
+
+    monkeypatch.setattr(Path, "write_text", full)
+    code, _, err = mmrjax("simulate", "--no-report", "--out", "r")
+    assert code == 2 and "r.partial/result.json: No space left on device" in err
+
+    def picture(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", honest)
+    monkeypatch.setattr("sweeps.pages.runs.write", picture)
+    code, _, err = mmrjax("simulate", "--out", "r")
+    assert code == 2 and "r.partial: No space left on device" in err
 
 
 def test_full_disk_leaves_no_run_folder(mmrjax, tmp_path, monkeypatch):

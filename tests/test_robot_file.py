@@ -297,3 +297,12 @@ def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
     ]
     robot = robot_file.change(robots.nominal(), {"battery.capacity": 30_670.0}, where="--set", notes=(quiet := []))
     assert quiet == [] and float(robot.battery.voltage_empty) == float(robots.nominal().battery.voltage_empty)
+
+
+def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path):
+    (tmp_path / "bad.toml").write_text("[motor]\nresistance = -1\nresistence = 0.6\n[gearbox]\nratio = 'x'\n")
+    with pytest.raises(BadConfiguration) as error:
+        robot_file.read(tmp_path / "bad.toml")
+    said = str(error.value)
+    assert said.startswith("bad.toml, motor.resistance: got -1; expected 0.001 to 1000 ohm")
+    assert "; also motor.resistence: no such parameter" in said and "; also gearbox.ratio: got 'x'; expected" in said

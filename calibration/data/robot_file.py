@@ -16,6 +16,7 @@ from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadConfiguration, choices, is_number, number, toml_content, toml_text
+from calibration.data.writing import write_text
 from mmrjax import effects, params, power, robots
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
@@ -279,22 +280,9 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
         ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     known = {p.name: p for p in params.walk(robot)}
-    for name, value in stated.items():
-        if name not in known:
-            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
-        spec = known[name].spec
-        low, high = spec.bounds
-        allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
-        if not is_number(value):
-            form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
-            raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed}{form}")
-        if name == "gearbox.ratio" and 0 < value < 1:
-            raise BadConfiguration(
-                f"{where}, {name}: got {number(value)}; expected turns of the motor for one of the output, at least "
-                f"1; is {number(1 / value)} meant?"
-            )
-        if not math.isfinite(value) or not low <= value <= high:
-            raise BadConfiguration(f"{where}, {name}: got {number(value)}; expected {allowed}")
+    refused = [f"{name}: {why}" for name, value in stated.items() if (why := _refused(name, value, known))]
+    if refused:
+        raise BadConfiguration(f"{where}, {'; also '.join(refused)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
     robot = rig_file.moved_priors(robot, stated)
     robot = dataclasses.replace(
@@ -312,6 +300,26 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
         notes.append(f"{where}, battery.curvature: {remark}")
     return _with_backlash(robot, where)
+
+
+def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
+    """Why a parameter cannot be stated so; empty: it can."""
+    if name not in known:
+        return f"no such parameter; {_parameters(name, known)}"
+    spec = known[name].spec
+    low, high = spec.bounds
+    allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
+    if not is_number(value):
+        form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
+        return f"got {value!r}; expected a number, {allowed}{form}"
+    if name == "gearbox.ratio" and 0 < value < 1:
+        return (
+            f"got {number(value)}; expected turns of the motor for one of the output, at least 1; is "
+            f"{number(1 / value)} meant?"
+        )
+    if not math.isfinite(value) or not low <= value <= high:
+        return f"got {number(value)}; expected {allowed}"
+    return ""
 
 
 def _with_backlash(robot: Robot, where: str) -> Robot:
@@ -445,7 +453,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         if not (whole or table or title in robot.configurations):
             continue
         lines += ["", f"[{title}]", *table]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _start(robot: Robot) -> Robot:

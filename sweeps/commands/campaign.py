@@ -147,6 +147,8 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
             surfaces.
     """
     source = profiles.read(name)
+    for note in source.notes:
+        tell(note)
     if source.surface is not None:
         raise BadConfiguration(
             f"{where}, profile: got {source.source} with the column surface; expected the surface in conditions"
