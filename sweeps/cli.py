@@ -417,6 +417,21 @@ def rig_check(
     return room.check(file, data, tuple(effects or ()), json)
 
 
+@app.command(epilog="Example: mmrjax explain series_resistance")
+def explain(
+    name: Annotated[
+        str | None, typer.Argument(help="An effect, status, flag, output, channel or parameter; none lists them.")
+    ] = None,
+    effects: _Effects = None,
+    no_cache: _NoCache = False,
+) -> int:
+    """Say what a name means: equation, source, typical size, what it looks like in data, how to test for it."""
+    _start_jax(no_cache)
+    from sweeps.commands import explain as room
+
+    return room.explain(name, tuple(effects or ()))
+
+
 @app.command()
 def doctor(no_cache: _NoCache = False) -> int:
     """Check this installation: versions, devices, the compilation cache, a solved run, a writable folder."""

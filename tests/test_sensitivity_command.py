@@ -308,6 +308,7 @@ def test_posterior_of_a_robot_is_its_inputs_and_gives_runs_their_uncertainty(mmr
     (["--method", "guess"], 2, "option method: got 'guess'; input should be one of local, sobol, morris"),
     (["--parameters", "motor.resistence"], 2, "--parameters motor.resistence: no such parameter; did you mean motor.res"),
     (["--parameters", "moter.*"], 2, "--parameters moter.*: no parameters below it; did you mean motor.*?"),
+    (["--outputs", "current"], 2, "--outputs current: no such output; did you mean total_current? allowed: total_"),
     (["--outputs", "sped"], 2, "--outputs sped: no such output; did you mean speed? allowed: total_current"),
     (["--evaluations", "10"], 2, "--evaluations: got 10; expected 1000 or more"),
     (["--vary", "voltage=28:20"], 2, "--vary voltage: got 28 to 20; expected a range within -100 to 100 V"),

@@ -405,7 +405,7 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
 
 
 def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
-    """What to do with a unit beside a number; `mine`: the column's own, `named`: columns by the units they may have."""
+    """What to do with a unit beside a number; `mine`: the column's own, `named`: columns by their units."""
     unit = units.spelled(_UNITS.get(written.lower(), written))
     if unit == mine:
         return f"write {value}, the unit stands in the column's name; "
