@@ -56,12 +56,12 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
     """Configuration and job of a sweep."""
     import jax
 
-    from mmrjax import channels, robots
-    from sweeps.commands import campaign
+    from mmrjax import channels, fidelities, robots
     from sweeps.config_campaign import Campaign
-    from sweeps.points import axes, scale
+    from sweeps.points import axes
+    from sweeps.points.job import prepare
 
-    chunk = arguments.chunk or scale.default_chunk(arguments.model, jax.default_backend() != "cpu", devices)
+    chunk = arguments.chunk or fidelities.facts(arguments.model).at_once(jax.default_backend() != "cpu") * devices
     config = Campaign(
         model=arguments.model, chunk=min(chunk, points), storage=arguments.storage, outputs=channels.USUAL,
         duration_s=arguments.duration if arguments.model != "steady" else None,
@@ -69,7 +69,7 @@ def prepared(arguments: argparse.Namespace, points: int, devices: int) -> tuple[
     )  # fmt: skip
     robot = robots.nominal()
     plan = axes.plan(config, robot, "benchmark")
-    return config, campaign.prepare(config, robot, plan, "benchmark")
+    return config, prepare(config, robot, plan, "benchmark")
 
 
 def against_cpu(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -102,8 +102,9 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
     """One sweep into a store on disk; its times."""
     import jax
 
-    from sweeps.commands import campaign
+    from sweeps.commands import sweep as command
     from sweeps.points import scale
+    from sweeps.points.job import laid_out
     from sweeps.points.zarr_store import SweepStore
 
     devices = jax.local_devices() if devices is None else devices
@@ -116,13 +117,13 @@ def sweep(arguments: argparse.Namespace, points: int, devices: list[Any] | None 
         begin = time.perf_counter()
         scale.fetched(compiled(compiled.points(0)), 1)
         first = time.perf_counter() - begin
-        times, layout = scale.Times(), campaign.laid_out(config, job)
+        times, layout = scale.Times(), laid_out(config, job)
         begin = time.perf_counter()
         store = SweepStore(folder / "s", {}, layout)
         store.begin()
-        scale.run(store, job, scale.produce(compiled, range(len(job.blocks)), times), lambda _: None, times)
+        scale.run(store.write, job, scale.produce(compiled, range(len(job.blocks)), times), lambda _: None, times)
         total = time.perf_counter() - begin
-        statuses = campaign.statuses(store.done().values())
+        statuses = command.statuses(store.done().values())
         store.close()
     finally:
         shutil.rmtree(folder)

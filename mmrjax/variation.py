@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import fidelities, missions, params
+from mmrjax import fidelities, params
 from mmrjax import outputs as table_of_outputs
 from mmrjax.channels import Channel
 from mmrjax.compiling import compiled
@@ -184,21 +184,24 @@ def _evaluate(
 
     def simulate(robot: Robot, conditions: Conditions) -> Run:
         if profile is not None:
+            from mmrjax import missions
+
             return missions.run(robot, conditions, profile)
         return fidelities.get(fidelity).run(robot, conditions, options)
 
     if not variation.varies_robot:
-        return _picked(simulate(*variation.at(values, conditions)), shown, names)
+        return pick(simulate(*variation.at(values, conditions)), shown, names)
 
     def one(values: Array, conditions: Conditions) -> Run:
         robot, point = variation.at(values, conditions)
         run = simulate(robot, jax.tree.map(lambda x: x[None], point))
         return jax.tree.map(lambda x: x[0], run)
 
-    return _picked(jax.vmap(one)(values, conditions), shown, names)
+    return pick(jax.vmap(one)(values, conditions), shown, names)
 
 
-def _picked(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
+def pick(run: Run, shown: tuple[Channel, ...], names: tuple[str, ...]) -> dict[str, Array]:
+    """Outputs of a batch by name, as `evaluate` returns them, of a rig that shows these channels."""
     rows = {row.name: row for row in table_of_outputs.table(shown)}
     _known(names, (*rows, *run.columns))
     found = {n: rows[n].get(run.result) if n in rows else run.columns[n] for n in names if n != FLAGS}
@@ -226,6 +229,8 @@ def check_outputs(
         UsageError: lists the outputs that there are.
     """
     if profile is not None:
+        from mmrjax import missions  # which imports an integrator
+
         _known(names, missions.names())
         return
     if set(names) <= {*table_of_outputs.names(variation.robot.channels), FLAGS}:

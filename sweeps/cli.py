@@ -194,15 +194,10 @@ def sweep(
     varies, as a grid or sampled (docs/sweeps.md). An interrupted sweep goes on with the same command and the same
     --out.
     """
-    how = config_campaign.how(told.beside.shard, told.beside.scheduler, export, dry_run)
-    wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))
-    if zarr or wanted or how != config_campaign.How() or not isinstance(told.config, config.Sweep):
-        from sweeps.commands import campaign
-
-        return campaign.store_sweep(told.config, told.where, out, force, how, wanted)
+    how = config_campaign.how(told.beside.shard, told.beside.scheduler, export, dry_run, zarr, outputs)
     from sweeps.commands import sweep as room
 
-    return room.sweep(told.config, told.where, out, force)
+    return room.sweep(told.config, told.where, out, force, how)
 
 
 @_command(config.Compare, example="mmrjax compare measured --robot sm1 --set 6T2A.ground.friction.static=0.6")

@@ -124,11 +124,6 @@ class FidelityPart(ModelPart):
         facts = fidelities.facts(self.model)
         return facts.resolved(**{option.name: getattr(self, f"{option.name}_s") for option in facts.options})
 
-    @property
-    def runs_at_once(self) -> int:
-        """Runs in one vmapped call."""
-        return fidelities.facts(self.model).chunk
-
 
 class BatchPart(FidelityPart):
     """How many runs at once; None takes the fidelity's."""
@@ -136,13 +131,9 @@ class BatchPart(FidelityPart):
     chunk: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = about(
         None,
         "Runs in one vmapped call",
-        usual=", ".join(f"{name} {facts.chunk}" for name, facts in fidelities.TABLE.items()),
+        usual=", ".join(f"{name} {facts.at_once(accelerator=False)}" for name, facts in fidelities.TABLE.items())
+        + " on processors",
     )
-
-    @property
-    def runs_at_once(self) -> int:
-        """Runs in one vmapped call."""
-        return self.chunk or super().runs_at_once
 
 
 class SupplyPart(Part):

@@ -59,20 +59,30 @@ class SharePart(Part):
 
 @dataclasses.dataclass(frozen=True)
 class How:
-    """How a sweep is run, which does not change its numbers.
+    """How a sweep is run and kept, which does not change its numbers.
 
     Attributes:
         shard: this process's share of the chunks, k of n; scheduler: address of a dask scheduler.
         export: further files, of `EXPORTS`; dry_run: say what would be done, and write nothing.
+        zarr: write a store, also of a small grid; outputs: of it, in place of those of the configuration.
     """
 
     shard: tuple[int, int] | None = None
     scheduler: str | None = None
     export: tuple[str, ...] = ()
     dry_run: bool = False
+    zarr: bool = False
+    outputs: tuple[str, ...] = ()
 
 
-def how(shard: str | None, scheduler: str | None, export: Sequence[str] | None, dry_run: bool) -> How:
+def how(
+    shard: str | None,
+    scheduler: str | None,
+    export: Sequence[str] | None,
+    dry_run: bool,
+    zarr: bool,
+    outputs: str | None,
+) -> How:
     """The options of a sweep, checked.
 
     Raises:
@@ -89,7 +99,8 @@ def how(shard: str | None, scheduler: str | None, export: Sequence[str] | None, 
             raise BadConfiguration(f"--export: got {kind}; {choices(kind, EXPORTS)}")
     if share is not None and scheduler is not None:
         raise BadConfiguration("--shard: got it beside --scheduler, which shares out the chunks itself; expected one")
-    return How(share, scheduler, tuple(dict.fromkeys(export or ())), dry_run)
+    wanted = () if outputs is None else tuple(name.strip() for name in outputs.split(","))
+    return How(share, scheduler, tuple(dict.fromkeys(export or ())), dry_run, zarr, wanted)
 
 
 def is_campaign(file: Path | None) -> bool:

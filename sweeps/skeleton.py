@@ -11,7 +11,7 @@ from calibration.data.runs import Runs
 from sweeps import config as configuration
 from sweeps.config import RobotPart
 from sweeps.console import say
-from sweeps.store import DONE, SOLVER_FAILED, RunFolder
+from sweeps.store import DONE, SOLVER_FAILED, Folder
 
 Page = Callable[[Path], Any]
 
@@ -25,11 +25,11 @@ def page(name: str, *of: Any, **known: Any) -> Page:
 
 
 def leave(
-    folder: RunFolder,
+    folder: Folder,
     config: RobotPart,
     manifest: dict[str, Any],
     *,
-    solved: bool,
+    solved: bool = True,
     page: Page | None = None,
     runs: Runs | None = None,
 ) -> int:

@@ -31,12 +31,72 @@ DONE, SOLVER_FAILED = 0, 3
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "lineax", "diffrax", "numpy")
 
 
-class RunFolder:
+class Folder:
+    """What a command leaves, in `path` + `.partial` until it is whole and moved into place."""
+
+    def __init__(self, path: Path) -> None:
+        """The folder that is to appear at `path`.
+
+        Raises:
+            BadConfiguration: no name of a folder.
+        """
+        if not path.name:
+            raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
+        self.path, self.partial = path, path.with_name(path.name + ".partial")
+        self.started = datetime.datetime.now(datetime.UTC)
+
+    def refuse_taken(self, force: bool) -> None:
+        """Refuse a path that holds something already.
+
+        Args:
+            force: whether a run folder is to be replaced.
+
+        Raises:
+            BadConfiguration: it does.
+        """
+        taken = self.path.is_file() or (self.path.is_dir() and any(self.path.iterdir()))
+        if taken and not (force and (self.path / "manifest.json").is_file()):
+            hint = "--force replaces a run folder" if self.path.is_dir() else "it is a file"
+            raise BadConfiguration(f"--out: {self.path} exists already; choose another path ({hint})")
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file."""
+        writing.write_text(self.partial / name, text)
+
+    def write_json(self, name: str, content: dict[str, Any]) -> None:
+        """Write a JSON file; what is not finite becomes null."""
+        writing.write_json(self.partial / name, content)
+
+    def write_table(self, name: str, columns: dict[str, np.ndarray]) -> None:
+        """Write a table as CSV; what is not finite becomes an empty cell."""
+        writing.write_table(self.partial / name, columns)
+
+    def finish(self, manifest: dict[str, Any], runs: Runs | None = None) -> Path:
+        """Write the manifest and move the folder into place; returns its path.
+
+        Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added.
+        """
+        hashes = {"robot": digest((self.partial / "robot.toml").read_bytes()), **manifest.get("hashes", {})}
+        if runs is not None and runs.digest:
+            hashes[runs.source] = runs.digest
+        now = datetime.datetime.now(datetime.UTC)
+        times = {
+            "started": self.started.isoformat(timespec="seconds"),
+            "seconds": round((now - self.started).total_seconds(), 3),
+        }
+        self.write_json("manifest.json", {**provenance(), **times, **manifest, "hashes": hashes})
+        return self.move_into_place()
+
+    def move_into_place(self) -> Path:
+        """The finished folder, where it is to appear."""
+        raise NotImplementedError
+
+
+class RunFolder(Folder):
     """A folder that appears at `path` only when `finish` is called.
 
-    Until then everything is in `path` + `.partial`. If the command is stopped, the same command with the
-    same configuration finds its finished chunks there and goes on; with another configuration the partial
-    folder is begun anew.
+    If the command is stopped, the same command with the same configuration finds its finished chunks in `partial`
+    and goes on; with another configuration the partial folder is begun anew.
     """
 
     def __init__(self, path: Path, identity: dict[str, Any], *, force: bool = False) -> None:
@@ -50,16 +110,9 @@ class RunFolder:
         Raises:
             BadConfiguration: `path` holds something already, or cannot be written.
         """
-        if not path.name:
-            raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
-        self.path = path
-        self.partial = path.with_name(path.name + ".partial")
-        self.started = datetime.datetime.now(datetime.UTC)
+        super().__init__(path)
         self._force = force
-        taken = path.is_file() or (path.is_dir() and any(path.iterdir()))
-        if taken and not (force and (path / "manifest.json").is_file()):
-            hint = "--force replaces a run folder" if path.is_dir() else "it is a file"
-            raise BadConfiguration(f"--out: {path} exists already; choose another path ({hint})")
+        self.refuse_taken(force)
         self._digest = digest(json.dumps(identity, sort_keys=True, default=str).encode())
         mark = self.partial / "identity"
         foreign = self.partial.exists() and not mark.is_file()
@@ -107,37 +160,8 @@ class RunFolder:
             np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
 
-    def write_text(self, name: str, text: str) -> None:
-        """Write a text file."""
-        writing.write_text(self.partial / name, text)
-
-    def write_json(self, name: str, content: dict[str, Any]) -> None:
-        """Write a JSON file; what is not finite becomes null."""
-        writing.write_json(self.partial / name, content)
-
-    def write_table(self, name: str, columns: dict[str, np.ndarray]) -> None:
-        """Write a table as CSV; what is not finite becomes an empty cell."""
-        writing.write_table(self.partial / name, columns)
-
-    def finish(self, manifest: dict[str, Any], runs: Runs | None = None) -> Path:
-        """Write the manifest, drop the chunks, and move the folder into place; returns its path.
-
-        Hashes of the folder's `robot.toml` and of the file that `runs` came from, if any, are added.
-        """
-        hashes = {"robot": digest((self.partial / "robot.toml").read_bytes())}
-        if runs is not None and runs.digest:
-            hashes[runs.source] = runs.digest
-        manifest = {**manifest, "hashes": hashes}
-        now = datetime.datetime.now(datetime.UTC)
-        self.write_json(
-            "manifest.json",
-            {
-                **provenance(),
-                "started": self.started.isoformat(timespec="seconds"),
-                "seconds": round((now - self.started).total_seconds(), 3),
-                **manifest,
-            },
-        )
+    def move_into_place(self) -> Path:
+        """Drop the chunks, and move the folder to where it is to appear."""
         shutil.rmtree(self.partial / "chunks")
         (self.partial / "identity").unlink()
         if self.path.is_dir():

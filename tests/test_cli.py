@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 
 from calibration.data.errors import BadConfiguration
 from sweeps import cli, config
-from sweeps.points import run
+from sweeps.points import scale
 
 MMRJAX = [sys.executable, "-c", "from sweeps.cli import main; main()"]
 HEADER = (
@@ -291,7 +292,7 @@ def test_track_run_is_interrupted_while_it_runs_and_leaves_nothing(mmrjax, tmp_p
 
 def test_shares_of_a_batch_add_up_to_its_runs():
     told = []
-    share = run.shares(told.append, 180)
+    share = scale.shares(told.append, 180)
     for k in range(21):
         share(k / 20)
     share(1.0)
@@ -421,21 +422,26 @@ def test_full_disk_leaves_no_run_folder(mmrjax, tmp_path, monkeypatch):
 def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatch):
     arguments = ["sweep", "--slopes", "0:9:1", "--voltages", "24", "--configurations", "6T2A", "--chunk", "10",
                  "--no-report", "--out", "s"]  # fmt: skip
-    simulated, honest = [], run.simulate
+    simulated, honest = [], scale.Compiled.__call__
 
-    def interrupted(robot, conditions, settings, progress):
+    def interrupted(compiled, values, *told):
         if len(simulated) == 3:
+            while not any((tmp_path / "s.partial" / "chunks").glob("*.npz")):
+                time.sleep(0.001)  # the first is being written meanwhile
             raise KeyboardInterrupt
-        simulated.append(conditions.shape)
-        return honest(robot, conditions, settings, progress)
+        simulated.append(len(values))
+        return honest(compiled, values, *told)
 
-    monkeypatch.setattr(run, "simulate", interrupted)
+    monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
     code, _, err = mmrjax(*arguments)
     assert code == 130 and "goes on where it stopped" in err
     assert not (tmp_path / "s").exists() and (tmp_path / "s.partial").exists()
-    monkeypatch.setattr(run, "simulate", lambda *a: (simulated.append(a[1].shape), honest(*a))[1])
+    kept = len(list((tmp_path / "s.partial" / "chunks").glob("*.npz")))
+    assert 0 < kept <= 3
+    simulated.clear()
+    monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (simulated.append(len(a[1])), honest(*a))[1])
     assert mmrjax(*arguments)[0] == 0
-    assert simulated == [(10,)] * 6  # three before, three after: none twice
+    assert simulated == [10] * (6 - kept)  # none twice
     resumed = (tmp_path / "s" / "runs.csv").read_text()
     assert mmrjax(*arguments[:-2], "--chunk", "60", "--out", "t")[0] == 0
     assert resumed == (tmp_path / "t" / "runs.csv").read_text()
@@ -443,24 +449,27 @@ def test_interrupted_sweep_goes_on_where_it_stopped(mmrjax, tmp_path, monkeypatc
 
 
 def test_interrupt_before_anything_is_done_leaves_nothing(mmrjax, tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "simulate", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (_ for _ in ()).throw(KeyboardInterrupt))
     assert mmrjax("sweep", "--no-report", "--out", "s")[0] == 130
     assert not any(tmp_path.iterdir())
 
 
 def test_partial_folder_of_another_run_is_not_taken_up(mmrjax, tmp_path, monkeypatch):
     arguments = ["sweep", "--slopes", "0:9:1", "--chunk", "60", "--no-report", "--out", "s"]
-    honest, calls = run.simulate, []
+    honest, calls = scale.Compiled.__call__, []
+    kept = tmp_path / "s.partial" / "chunks" / "chunk-000000.npz"
 
     def interrupted(*call):
         if calls:
+            while not kept.exists():
+                time.sleep(0.001)  # it is being written meanwhile
             raise KeyboardInterrupt
         calls.append(call)
         return honest(*call)
 
-    monkeypatch.setattr(run, "simulate", interrupted)
-    assert mmrjax(*arguments)[0] == 130 and (tmp_path / "s.partial" / "chunks" / "chunk-000000.npz").exists()
-    monkeypatch.setattr(run, "simulate", honest)
+    monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
+    assert mmrjax(*arguments)[0] == 130 and kept.exists()
+    monkeypatch.setattr(scale.Compiled, "__call__", honest)
     mmrjax(*arguments, "--set", "motor.resistance=0.9")
     mmrjax(*arguments[:-1], "t", "--set", "motor.resistance=0.9")
     assert (tmp_path / "s" / "runs.csv").read_text() == (tmp_path / "t" / "runs.csv").read_text()

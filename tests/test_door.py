@@ -76,7 +76,7 @@ def test_nothing_is_computed_outside_of_compiled_code(robot, primitives):
 
 
 def test_chunks_and_shapes_are_made_by_compiled_code_too(robot, primitives, monkeypatch):
-    facts = dataclasses.replace(fidelities.facts("steady"), chunk_stored=(4, 4))
+    facts = dataclasses.replace(fidelities.facts("steady"), chunk=(4, 4))
     monkeypatch.setitem(fidelities.TABLE, "steady", facts)
     runs = mm.Conditions(voltage=np.linspace(10.0, 30.0, 10).reshape(2, 5))
     for _ in range(2):

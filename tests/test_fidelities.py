@@ -35,7 +35,12 @@ def short(fidelity: Fidelity) -> dict[str, float]:
 
 def knows_itself(fidelity: Fidelity, robot) -> None:
     facts = fidelity.facts
-    assert fidelity.name in fidelities.TABLE and facts.description and facts.chunk >= 1 and facts.effort.starts >= 1
+    assert (
+        fidelity.name in fidelities.TABLE
+        and facts.description
+        and facts.at_once(False) >= 1
+        and facts.effort.starts >= 1
+    )
     assert all(0 < option.default <= option.most and option.meaning and option.unit for option in facts.options)
     assert fidelity.resolved() == {option.name: option.default for option in facts.options}
     assert (fidelity.histories is not None) == facts.histories
@@ -196,7 +201,11 @@ def test_facts_need_no_jax_and_steady_no_mujoco(code, absent):
 
 def test_facts_state_what_the_command_line_needs():
     assert fidelities.NAMES == ("steady", "drive", "track")
-    assert [fidelities.facts(name).chunk for name in fidelities.NAMES] == [16384, 4096, 512]
+    assert [fidelities.facts(name).chunk for name in fidelities.NAMES] == [
+        (262144, 4194304),
+        (4096, 65536),
+        (512, 16384),
+    ]
     assert [fidelities.facts(name).resolved() for name in fidelities.NAMES] == [
         {}, {"duration": 30.0}, {"duration": 1.5, "step": 1e-4},
     ]  # fmt: skip

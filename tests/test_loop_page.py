@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -211,6 +212,48 @@ def test_cluster_and_names_that_stand_beside_curves_are_said(shown, capsys, tmp_
     told = document["effects"][0]
     assert (told["standing"], told["rests_on_row"], told["root"]) == ("tentative", 7, 6.0)
     assert "tentative: row 7" in page.tables["effects"][1]
+
+
+def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
+    """Whether the model is complete, what was found and how sure that is, errors before and after, what to look at."""
+    got = shown("churning", capsys)
+    found, page = got.found, got.page
+    (effect,) = found.effects
+    assert words.answer(found) == f"No: missing is a {effect.families[0]}." and words.answer(found) in page.text
+    a = effect.parameters["amplitude"]
+    assert page.tables["found"][1] == [
+        f"{effect.families[0]}{effect.name}", f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", "established",
+        words.alike(effect) or "-",
+    ]  # fmt: skip
+    stated, again, with_it = page.tables["summary"][1:]
+    assert [line[0] for line in (stated, again, with_it)] == ["as stated", "fitted again", "with what was found"]
+    for k, c in enumerate(c.name for c in found.channels):
+        seen, unseen = found.errors[1][c], next(iter(found.errors_held_out.values()))[1][c]
+        assert with_it[1 + k].startswith(f"{seen['rms_percent']:.1f} % ({unseen['rms_percent']:.1f} %)")
+        better = found.errors[1][c]["rms_percent"] < found.errors[0][c]["rms_percent"] - 0.05
+        assert with_it[1 + k].endswith("↓") == better
+    head = got.text[: got.text.index("The verdict in full")]
+    assert all(line in page.text for line in words.use_it(found)) and len(words.use_it(found)) == len(
+        found.errors_held_out
+    )
+    assert len(re.sub(r"<[^>]+>", " ", head[head.index("<h1>") :]).split()) < 220
+    weak = NameTest(effect.name, 6.0, 3.3, (), 5.0, 7, 2.5)
+    tentative = dataclasses.replace(found, support=NameSupport(False, "beside", tests=(weak,)))
+    assert words.answer(tentative) == f"No: perhaps a {effect.families[0]}."
+    assert words.how_sure(tentative, effect) == "tentative: it predicts, but rests on row 7"
+    assert words.answer(dataclasses.replace(found, verdict="none", effects=())).startswith("Yes")
+
+
+def test_reading_that_weighs_most_is_named(shown, capsys):
+    found = shown("churning", capsys).found
+    seen, row = found.readings_of_rows, int(np.flatnonzero(found.included)[3])
+    after = seen.measured + 0.5 * seen.sd
+    after[row, 1] += 40 * seen.sd[row, 1]
+    off = dataclasses.replace(found, written=True, readings_of_rows=dataclasses.replace(seen, after=after))
+    said = words.largest_share(off)
+    assert said.startswith(f"motor speed of row {found.numbers[row]} ({found.runs['configuration'][row]}, ")
+    even = dataclasses.replace(seen, after=seen.measured + 0.5 * seen.sd)
+    assert words.largest_share(dataclasses.replace(off, readings_of_rows=even)) == ""
 
 
 def test_what_a_name_could_hide_is_said(shown, capsys, tmp_path):

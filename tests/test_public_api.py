@@ -262,9 +262,7 @@ def in_fours(monkeypatch):
         sizes.append((names, conditions.shape))
         return whole.outputs(robot, conditions, names)
 
-    monkeypatch.setitem(
-        fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), chunk_stored=(4, 4))
-    )
+    monkeypatch.setitem(fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), chunk=(4, 4)))
     few = dataclasses.replace(whole, run=run, outputs=some)
     monkeypatch.setattr("mmrjax.fidelities.steady.FIDELITY", few)
     return sizes

@@ -19,9 +19,9 @@ from test_sweep_store import CONFIG, arrays
 
 from calibration.data.errors import BadConfiguration
 from mmrjax import robots
-from sweeps.commands import campaign
 from sweeps.config_campaign import Campaign
 from sweeps.points import axes, cluster, identity, scale
+from sweeps.points.job import prepare
 
 pytest.importorskip("distributed")
 
@@ -190,7 +190,7 @@ def job():
     """Ten chunks of one point each."""
     config = Campaign(axes={"voltage": [*range(15, 25)]}, chunk=1, outputs=("speed",))
     robot = robots.nominal()
-    return campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
+    return prepare(config, robot, axes.plan(config, robot, "x"), "x")
 
 
 @pytest.mark.slow

@@ -23,8 +23,10 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady
 from mmrjax.signals import STATUSES
 from sweeps import cli
-from sweeps.commands import campaign
+from sweeps.commands import sweep as command
+from sweeps.config_campaign import Campaign
 from sweeps.points import axes, identity, scale, zarr_store
+from sweeps.points.job import laid_out, prepare
 
 CONFIG = """report = false
 chunk = 40
@@ -184,7 +186,7 @@ def test_outputs_of_a_grid_are_chosen_by_an_option(mmrjax, tmp_path):
 
 def test_large_grid_that_is_refused_leaves_nothing(mmrjax, tmp_path, monkeypatch):
     monkeypatch.setattr("sweeps.commands.sweep.TABLE", 3)
-    monkeypatch.setattr(campaign, "MARGIN", 10**18)
+    monkeypatch.setattr(command, "MARGIN", 10**18)
     code, _, said = mmrjax("sweep", "--slopes", "0,5", "--out", "s")
     assert code == 2 and "--out: the results would take" in said
     assert not list(tmp_path.iterdir())
@@ -507,7 +509,7 @@ def test_interrupt_is_not_replaced_where_the_writer_empties_the_queue(monkeypatc
 
     monkeypatch.setattr(scale.queue, "Queue", Raced)
     with pytest.raises(KeyboardInterrupt):
-        scale.run(None, None, interrupted(), print, scale.Times())
+        scale.run(print, None, interrupted(), print, scale.Times())
 
 
 # --- shares -------------------------------------------------------------------------------------------------------
@@ -547,7 +549,7 @@ def test_rest_of_lost_shares_is_done_by_the_command_without(sweep, whole):
 
 def test_shares_hold_every_chunk_once():
     for chunks, n in ((12, 5), (3, 8), (7, 7), (1000, 3)):
-        held = [c for k in range(1, n + 1) for c in campaign.share((k, n), chunks)]
+        held = [c for k in range(1, n + 1) for c in command.share((k, n), chunks)]
         assert held == list(range(chunks))
 
 
@@ -565,9 +567,9 @@ def test_share_that_another_process_works_on_is_refused(sweep, monkeypatch, tmp_
 @pytest.fixture(scope="module")
 def layout():
     """Three chunks of one point each."""
-    config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
+    config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=1, outputs=("speed",))
     robot = robots.nominal()
-    return campaign.laid_out(config, campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x"))
+    return laid_out(config, prepare(config, robot, axes.plan(config, robot, "x"), "x"))
 
 
 @pytest.fixture
@@ -710,11 +712,17 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
         "job = scale.Job(robot, 'steady', {}, plan, ('speed',), 'float64', Blocks.of((5,), 5))\n"
         "compiled = scale.Compiled(job)\n"
         "found = compiled(compiled.points(0))['speed']\n"
-        "print(len(found.sharding.device_set), [s.data.shape for s in found.addressable_shards], tuple(found.sharding.spec))"
+        "print(len(found.sharding.device_set), [s.data.shape for s in found.addressable_shards], tuple(found.sharding.spec))\n"
+        "rows = mmrjax.Conditions(voltage=np.array([15.0, 20, 24, 28, 33]))\n"
+        "job = scale.Job(robot, 'steady', {}, axes.Plan.of_rows(rows), ('speed',), 'float64', Blocks.of((5,), 5))\n"
+        "compiled = scale.Compiled(job)\n"
+        "table = compiled(compiled.points(0))['speed']\n"
+        "print(len(table.sharding.device_set), bool((table == found).all()))"
     )
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True)
-    assert done.stdout.strip() == "4 [(2,), (2,), (2,), (2,)] ('points',)", done.stderr
+    said = ["4 [(2,), (2,), (2,), (2,)] ('points',)", "4 True"]  # a plan; the rows of a table
+    assert done.stdout.splitlines() == said, done.stderr
 
 
 def test_chunks_share_one_compilation(sweep, compilations):
@@ -795,10 +803,10 @@ def test_somebody_elses_folder_is_left_alone(sweep, tmp_path):
 
 
 def test_layout_counts_its_bytes_without_writing(whole):
-    config = campaign.Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
+    config = Campaign(axes={"voltage": [15, 24, 33]}, chunk=2, outputs=("speed",))
     robot = robots.nominal()
-    job = campaign.prepare(config, robot, axes.plan(config, robot, "x"), "x")
-    layout = campaign.laid_out(config, job)
+    job = prepare(config, robot, axes.plan(config, robot, "x"), "x")
+    layout = laid_out(config, job)
     assert layout.size == 2 * 2 * 9 + 3 * 8  # chunks are filled up
     assert dataclasses.replace(layout, variables=()).size == 3 * 8
 

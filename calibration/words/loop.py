@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from calibration.discovery.notes import (
     DRAW,
     Asked,
@@ -160,6 +162,72 @@ def cluster(c: Cluster) -> str:
     """What rows that lie off have in common."""
     where = f"at {c.axis} {c.level}" if c.level else f"at {c.axis} {c.low:.3g} to {c.high:.3g}"
     return f"{c.inside} of {c.of} rows that lie off stand together {where} (p = {c.p:.1g})"
+
+
+# --- the first screen -----------------------------------------------------------------------------------
+
+
+def answer(found: DiscoveryResult) -> str:
+    """Whether the model is complete, in a sentence."""
+    if found.verdict == "none":
+        return "Yes, as far as these runs can show: what the fitted model leaves is noise."
+    sure, weak = ([e for e in found.effects if is_established(found, e) == want] for want in (True, False))
+    lacks = found.unnamed
+    if lacks is not None and not weak:
+        place = bases.in_words(lacks.channel or lacks.balance)
+        return f"No. Something is missing in the {place}, and nothing in the library explains it."
+    parts = [f"missing is {' and '.join(map(_kind_of, sure))}"] * bool(sure)
+    parts += [f"{'perhaps also' if sure else 'perhaps'} {' and '.join(map(_kind_of, weak))}"] * bool(weak)
+    return f"No: {'; '.join(parts)}."
+
+
+def _kind_of(effect: FoundEffect) -> str:
+    """`a voltage drop that changes with current`."""
+    return f"a {' or '.join(effect.families)}"
+
+
+def is_established(found: DiscoveryResult, effect: FoundEffect) -> bool:
+    """Whether the name of an effect stands by itself."""
+    return found.support is None or found.support.established(effect.name)
+
+
+def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
+    """How sure an effect is, in a few words."""
+    test = None if found.support is None else found.support.test_of(effect.name)
+    if is_established(found, effect):
+        known = "" if test is None else f": {test.root:.1f} σ, where chance reaches {test.needed:.1f}"
+        return f"established{known}"
+    return f"tentative: it predicts, but {doubts(test)}" if doubts(test) else "tentative"
+
+
+def use_it(found: DiscoveryResult) -> list[str]:
+    """How well the robot that is written predicts runs that its fit has not seen, by kind of block."""
+    lines, when = [], 1 if found.written else 0
+    for kind, both in found.errors_held_out.items():
+        rows = max(int(e["rows"]) for e in both[when].values())
+        each = [f"{channels.of(c).label} {e['rms_percent']:.1f} %" for c, e in both[when].items() if e["rows"]]
+        few = f" ({rows} of {len(found.runs)} rows)" if rows < len(found.runs) else ""
+        lines.append(f"At another {blocks_room.in_words(kind)}: {', '.join(each)}{few}.")
+    return lines
+
+
+def largest_share(found: DiscoveryResult) -> str:
+    """The reading that weighs most in what is left; empty where none stands out."""
+    seen, runs = found.readings_of_rows, found.runs
+    after = seen.after if found.written else seen.before
+    squares = np.where(found.included[:, None], ((after - seen.measured) / seen.sd) ** 2, np.nan)
+    total = float(np.nansum(squares))
+    if not total > 0 or (share := 100 * float(np.nanmax(squares)) / total) < SHARE:
+        return ""
+    row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
+    columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
+    at = ", ".join(str(x) if isinstance(x, str) else f"{x:g} {c.rpartition('_')[2]}" for c, x in columns.items())
+    label = found.channels[k].label
+    return f"{label} of row {found.numbers[row]} ({at}) makes {share:.0f} % of the squares that are left: is it right"
+
+
+#: Share of what is left from which one reading is worth a look [%].
+SHARE = 10.0
 
 
 def header(found: DiscoveryResult, robot_name: str) -> str:

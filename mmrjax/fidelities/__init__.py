@@ -54,9 +54,7 @@ class Facts:
     Attributes:
         module: that holds its `FIDELITY`.
         description: one line.
-        chunk: runs in one vmapped call.
-        chunk_stored: runs in one call where there are many, in a sweep into a store (a file a chunk) or from Python:
-            on a processor, and on an accelerator; None: `chunk`.
+        chunk: runs in one call where there are many; a pair where it is another on an accelerator.
         effort: of a calibration through it.
         options: that it has.
         rollout: whether it integrates over time; searches through it then run one by one, and end sooner.
@@ -69,10 +67,9 @@ class Facts:
 
     module: str
     description: str
-    chunk: int
+    chunk: int | tuple[int, int]
     effort: Effort
     options: tuple[Option, ...] = ()
-    chunk_stored: tuple[int, int] | None = None
     rollout: bool = False
     histories: bool = False
     computes: tuple[str, ...] = ()
@@ -82,7 +79,7 @@ class Facts:
 
     def at_once(self, accelerator: bool) -> int:
         """Runs in one call where there are many, on processors or on an accelerator."""
-        return self.chunk if self.chunk_stored is None else self.chunk_stored[accelerator]
+        return self.chunk if isinstance(self.chunk, int) else self.chunk[accelerator]
 
     def resolved(self, **given: float | None) -> dict[str, float]:
         """Every option by name: as given, else (absent or None) its default.
@@ -118,15 +115,13 @@ TABLE: dict[str, Facts] = {
     "steady": Facts(
         "mmrjax.fidelities.steady",
         "the operating point as a root of the balances, with implicit derivatives",
-        chunk=16_384,
-        chunk_stored=(262_144, 4_194_304),
+        chunk=(262_144, 4_194_304),
         effort=Effort(starts=64, profiles=True, blocks=True),
     ),
     "drive": Facts(
         "mmrjax.fidelities.drive",
         "the ODE of drives and chassis, with slip, inductance and battery",
-        chunk=4_096,
-        chunk_stored=(4_096, 65_536),
+        chunk=(4_096, 65_536),
         effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration(30.0, 86_400.0),),
         rollout=True,
@@ -135,8 +130,7 @@ TABLE: dict[str, Facts] = {
     "track": Facts(
         "mmrjax.fidelities.track",
         "half a robot as multibody dynamics in MuJoCo MJX, its contacts resolved one by one",
-        chunk=512,
-        chunk_stored=(512, 16_384),
+        chunk=(512, 16_384),
         effort=Effort(starts=1, profiles=False, blocks=False),
         options=(_duration(1.5, 3600.0), _STEP),
         rollout=True,

@@ -132,6 +132,7 @@ class Fidelity:
         run: results of a batch, as sweeps make them.
         outputs: those of a batch that are named alone [SI], of `outputs.table`, and `status`, which is quicker than
             `run`; None where it would not be. A fidelity that has it has no options.
+        columns: names of what its runs have beside (`Run.columns`).
         histories: a batch from standstill, kept over time; None where there is no time.
         check: refuses, with ValueError, what some run of any batch could not bear; before the first is simulated.
         cautions: what to know before the settled readings of a calibrated robot are trusted, a sentence each.
@@ -144,6 +145,7 @@ class Fidelity:
     histories: Simulate | None = None
     check: Callable[[Robot, Conditions, Mapping[str, float]], None] = _nothing_to_refuse
     cautions: Callable[[Robot, Conditions], list[str]] = _nothing_to_say
+    columns: tuple[str, ...] = ()
 
     @property
     def facts(self) -> Facts:
@@ -159,11 +161,6 @@ class Fidelity:
     def options(self) -> tuple[Option, ...]:
         """Options that it has."""
         return self.facts.options
-
-    @property
-    def chunk(self) -> int:
-        """Runs in one vmapped call."""
-        return self.facts.chunk
 
     @property
     def effort(self) -> Effort:

@@ -370,4 +370,12 @@ def _too_stiff(robot: Robot, conditions: Conditions) -> list[str]:
     ]
 
 
-FIDELITY = Fidelity("track", settled=_settled, run=_run, histories=_histories, check=_check, cautions=_too_stiff)
+FIDELITY = Fidelity(
+    "track",
+    settled=_settled,
+    run=_run,
+    histories=_histories,
+    check=_check,
+    cautions=_too_stiff,
+    columns=("guide_share",),
+)

@@ -49,7 +49,7 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
         notes = [*missing(comparison, stated.channels), *said]
         print_comparison(comparison, summary, stated.channels, notes, sized=runs.layout.crosses_zero)
         if drawn is not None and config.posterior is not None:
-            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
             uncertainty.say_intervals(table, found)
             table |= found.columns
             ends = (uncertainty.SD, uncertainty.LOWER, uncertainty.UPPER)

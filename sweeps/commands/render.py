@@ -16,7 +16,7 @@ from sweeps import config as configuration
 from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
-from sweeps.points import imposed, run
+from sweeps.points import imposed, run, scale
 from sweeps.store import DONE, SOLVER_FAILED
 
 
@@ -44,7 +44,7 @@ def render(
     if not robot.rig.inherits and not capabilities.stated(robot, "running_gear."):
         tell("the robot's file states no running_gear: wheelbase, belt and masses within are those of an example")
     with progress(1, quiet=False) as advance:
-        told = run.shares(advance, 1)
+        told = scale.shares(advance, 1)
         trajectory = track_batch(robot, conditions, duration=options["duration"], step=options["step"], progress=told)
         told(1.0)
     trajectory, conditions = jax.tree.map(lambda x: x[0], (trajectory, conditions))

@@ -36,7 +36,7 @@ from sweeps.config import GridPart
 from sweeps.console import progress, say
 from sweeps.inputs import check_configurations, load_robot
 from sweeps.pages import words
-from sweeps.points import imposed, run
+from sweeps.points import imposed, run, scale
 from sweeps.points.grid import grid
 from sweeps.results.resonance import SLOW, ResonanceResult, span
 from sweeps.skeleton import leave, page
@@ -127,7 +127,7 @@ def _rippled(
             count, name = min(size, total - first), f"chunk-{first // size:06d}"
             part = folder.chunk(name)
             if part is None:
-                told = run.shares(advance, count)
+                told = scale.shares(advance, count)
                 chosen = jax.tree.map(lambda x, rows=rows: x[rows], conditions)
                 options = {key: config.options[key] for key in ("duration", "step")}
                 ended = track_batch(robot, chosen, rolling=True, progress=told, **options)

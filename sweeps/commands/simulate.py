@@ -24,7 +24,7 @@ from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
 from sweeps.pages import words
-from sweeps.points import run, uncertainty
+from sweeps.points import run, scale, uncertainty
 from sweeps.skeleton import page
 from sweeps.store import RunFolder, open_folder
 
@@ -64,7 +64,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         notes = remarks(robot, table)
         found = None
         if drawn is not None and config.posterior is not None:
-            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
             table |= found.columns
         print_runs({key: value[:_SHOWN] for key, value in capabilities.of(robot, table).items()}, robot.channels)
         for note in notes:
@@ -94,7 +94,7 @@ def _simulated(
     conditions = run.commanded(robot, runs, config)
     run.refuse(robot, conditions, config)
     with progress(len(runs), quiet=not fidelity.facts.slow) as advance:
-        told = run.shares(advance, len(runs))
+        told = scale.shares(advance, len(runs))
         batch = jax.device_get(fidelity.histories(robot, conditions, config.options, told))
         told(1.0)
     assert batch.history is not None  # the fidelity was asked for it

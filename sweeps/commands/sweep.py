@@ -1,66 +1,325 @@
-"""The command `sweep`: every combination of a grid, in vmapped batches."""
+"""The command `sweep`: a grid or a plan of any number of points, into a table of runs or a Zarr store."""
 
 from __future__ import annotations
 
+import dataclasses
+import errno
 import math
+import shutil
+import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.table import Table
 
-from sweeps import config as configuration
-from sweeps.console import say, tell
+from calibration.data import profiles, robot_file
+from calibration.data.errors import BadConfiguration, InputError
+from calibration.data.robot_file import RobotFile
+from mmrjax import fidelities
+from mmrjax.signals import STATUSES
+from sweeps import config_campaign, skeleton
+from sweeps.config import Sweep
+from sweeps.config_campaign import Campaign, How
+from sweeps.console import progress, say, tell
 from sweeps.inputs import beside_robot, load_robot
 from sweeps.pages import words
-from sweeps.points import run, uncertainty
-from sweeps.points.grid import axes, grid, resolved
-from sweeps.points.zarr_store import STORE
+from sweeps.points import axes, grid, run, scale, uncertainty
+from sweeps.points.design import Blocks
+from sweeps.points.identity import Identity, identity
+from sweeps.points.job import laid_out, prepare, usual
+from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
 from sweeps.skeleton import page
-from sweeps.store import open_folder
+from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
 TABLE = 100_000
+#: Bytes that are to stay free on the disk beside a store.
+MARGIN = 64 * 2**20
+#: Points on which the time of a slow fidelity is estimated.
+PROBED = 64
+NOTHING_SPECIAL = How()
 
 
-def sweep(config: configuration.Sweep, where: str, out: Path | None, force: bool) -> int:
-    """Simulate a grid and leave a run folder, of more than `TABLE` runs one with a store; returns the exit code.
+def sweep(config: Campaign | Sweep, where: str, out: Path | None, force: bool, options: How = NOTHING_SPECIAL) -> int:
+    """Simulate a design and leave a run folder, of a grid of up to `TABLE` runs with a table; returns the exit code.
 
     Args:
         config: the configuration; where: its file, for messages; out: the run folder; force: replace one.
+        options: of a store; with any of them a small grid leaves one too.
     """
     file = load_robot(config)
-    robot = file.robot
+    if not isinstance(config, Sweep):
+        return _into_store(config, file, where, out, force, options)
     notes: list[str] = []
-    stated = config
-    config = resolved(stated, robot, stated.battery, notes)
-    count = math.prod(map(len, axes(config, robot, config.battery).values()))
-    if count > TABLE and config.posterior is None:
-        from sweeps.commands import campaign
-
+    resolved = grid.resolved(config, file.robot, config.battery, notes)
+    count = math.prod(map(len, grid.axes(resolved, file.robot, config.battery).values()))
+    small = options == NOTHING_SPECIAL and (count <= TABLE or config.posterior is not None)
+    if options == NOTHING_SPECIAL and not small:
         tell(f"{count:,} points: {STORE} in place of runs.csv, which a sweep of at most {TABLE:,} has; the same "
              "command with --export csv writes it too")  # fmt: skip
-        return campaign.store_sweep(stated, where, out, force)
     for note in notes:
         tell(note)
-    runs = grid(config, robot, config.battery)
+    if small:
+        return _into_table(resolved, file, out, force)
+    of_grid = resolved.model_copy(update={"configurations": config.configurations})
+    return _into_store(config_campaign.of_grid(of_grid), file, where, out, force, options)
+
+
+def _into_table(config: Sweep, file: RobotFile, out: Path | None, force: bool) -> int:
+    robot = file.robot
+    runs = grid.grid(config, robot, config.battery)
     drawn = None if config.posterior is None else beside_robot(file)
     with open_folder("sweep", config, robot, out, force) as folder:
         table = run.evaluate(robot, runs, config, folder)
-        print_counts(table)
+        print_counts(run.counts(table), "runs")
         if drawn is not None and config.posterior is not None:
-            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior)
+            found = uncertainty.intervals(robot, drawn, runs, config, config.posterior, folder)
             uncertainty.say_intervals(table, found)
             table |= found.columns
         result = run.SimulationResult("sweep", config.model, robot, runs, table)
         return run.leave(folder, config, result, page("sweep", file, model=config.model, runs=table))
 
 
-def print_counts(table: dict[str, np.ndarray]) -> None:
-    """How the runs ended, in words."""
-    shown = Table(title=f"{len(table['status'])} runs", title_justify="left")
-    for heading in ("status", "runs", "meaning"):
-        shown.add_column(heading, justify="right" if heading == "runs" else "left")
-    for status, count in run.counts(table).items():
+def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None, force: bool, options: How) -> int:
+    robot = file.robot
+    plan = axes.plan(config, robot, where)
+    pool = None
+    if options.scheduler is not None and not options.dry_run:
+        from sweeps.points import cluster
+
+        pool = cluster.connect(options.scheduler)
+    try:
+        device = scale.device_kind() if pool is None else pool.device
+        wanted = options.outputs or config.outputs or usual(config, robot)
+        chunk = config.chunk or scale.default_chunk(config.model, None if pool is None else device)
+        config = config.model_copy(update={"chunk": chunk, "outputs": wanted})
+        job = prepare(config, robot, plan, where)
+        layout = laid_out(config, job)
+        path = out or default_path("sweep")
+        if options.dry_run:
+            dry_run(job, layout, path)
+            return DONE
+        files = [*([config.robot] if Path(config.robot).is_file() else []), *config.effects, *plan.data]
+        files += [config.profile] if config.profile is not None and config.profile not in profiles.PACKAGED else []
+        same = identity(config, robot, files, device)
+        store = SweepStore(path, same, layout, force=force)
+        try:
+            if not store.finished:
+                simulate(store, job, options, pool)
+            return finish(store, config, file, job, same, options)
+        except (InputError, KeyboardInterrupt):
+            if options.shard is None:
+                store.abandon()
+            raise
+        finally:
+            store.close()
+    finally:
+        if pool is not None:
+            pool.close()
+
+
+# --- before ---------------------------------------------------------------------------------------------------------
+
+
+def dry_run(job: scale.Job, layout: Layout, path: Path) -> None:
+    """Say how many points, chunks and bytes a sweep is, and how long it would take; nothing is written."""
+    compiled = scale.Compiled(job)
+    blocks, slow = job.blocks, fidelities.facts(job.model).slow
+    if slow and blocks.points > PROBED:
+        small = Blocks.of(job.plan.design.shape, PROBED)
+        compiled = scale.Compiled(dataclasses.replace(job, blocks=small))
+    spent = []
+    for _ in range(2 if slow else 4):  # the first compiles
+        start = time.perf_counter()
+        scale.fetched(compiled(compiled.points(0)), 1)
+        spent.append(time.perf_counter() - start)
+    each = min(spent[1:]) / compiled.size
+    design = job.plan.design
+    shown = Table(show_header=False)
+    dimensions = " x ".join(f"{n} {name}" for n, name in zip(design.shape, design.dimensions, strict=True))
+    free = _free(path)
+    rows = {
+        "points": f"{design.points:,} ({dimensions})",
+        "chunks": f"{len(blocks):,} of {blocks.points:,} points on {device_words(compiled)}",
+        "store": f"{amount(layout.size)} (uncompressed); free {amount(free)} in {_existing(path)}",
+        "time": f"about {duration(each * blocks.points * len(blocks))} once compiled, {1 / each:,.0f} points/s "
+        f"(timed here on {compiled.size:,} points); compiling {duration(max(spent[0] - spent[1], 0.0))}",
+    }
+    for heading, text in rows.items():
+        shown.add_row(heading, text)
+    say(shown)
+    _refuse_without_space(layout.size, 1.0, path)
+
+
+def device_words(compiled: scale.Compiled) -> str:
+    """«2 x cpu: cpu»."""
+    return f"{compiled.mesh.size} x {scale.device_kind()}"
+
+
+def _existing(path: Path) -> Path:
+    path = path.absolute().parent
+    while not path.exists():
+        path = path.parent
+    return path
+
+
+def _free(path: Path) -> int:
+    return shutil.disk_usage(_existing(path)).free
+
+
+def _refuse_without_space(size: int, share: float, path: Path) -> None:
+    """Refuse a sweep whose results would not fit.
+
+    Args:
+        size: of the whole store [bytes]; share: of it that is still to be written.
+    """
+    needed, free = math.ceil(size * share) + MARGIN, _free(path)
+    if needed > free:
+        raise BadConfiguration(
+            f"--out: the results would take {amount(needed)} (uncompressed); {_existing(path)} has {amount(free)} "
+            'free; choose another disk, fewer points or outputs, or storage = "float32"'
+        )
+
+
+def amount(size: float) -> str:
+    """Bytes as a person reads them."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if size < 1000 or unit == "TB":
+            return f"{size:.3g} {unit}" if size < 1e6 else f"{size:,.0f} {unit}"
+        size /= 1000
+    raise AssertionError
+
+
+def duration(seconds: float) -> str:
+    """Seconds as a person reads them."""
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.2g} s"
+
+
+# --- the run --------------------------------------------------------------------------------------------------------
+
+
+def share(shard: tuple[int, int] | None, chunks: int) -> range:
+    """Chunks of the k-th of n shares."""
+    k, n = shard or (1, 1)
+    return range((k - 1) * chunks // n, k * chunks // n)
+
+
+def simulate(store: SweepStore, job: scale.Job, options: How, pool: Any) -> None:
+    """Compute and write the chunks of this process's share that are not done.
+
+    Raises:
+        BadConfiguration: no room on the disk, before anything is computed, or in the middle; the scheduler's workers
+            are lost for good.
+    """
+    store.begin(options.shard or (1, 1))
+    done = store.done()
+    mine = share(options.shard, len(job.blocks))
+    left = [k for k in mine if k not in done]
+    _refuse_without_space(store.layout.size, len(left) / len(job.blocks), store.path)
+    if not left:
+        return
+    total = sum(job.blocks.count(k) for k in mine)
+    before = total - sum(job.blocks.count(k) for k in left)
+    if before:
+        tell(f"{store.partial}: goes on after {before:,} of {total:,} points")
+    times = scale.Times()
+    try:
+        with progress(total, quiet=False, done=before, rate=True) as advance:
+            if pool is not None:
+                chunks = pool.produce(job, left)
+            else:
+                chunks = scale.produce(scale.Compiled(job), left, times, advance)
+            scale.run(store.write, job, chunks, advance, times)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        written = len(store.done())
+        raise DiskFull(
+            f"{store.partial}: {error.strerror} after {written} of {len(job.blocks)} chunks; free some space, and "
+            "the same command goes on from there"
+        ) from error
+
+
+class DiskFull(InputError):
+    """No space left in the middle of a sweep, which can be taken up again."""
+
+
+def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity, options: How) -> int:
+    """Write what a whole sweep leaves, and move it into place; say how far it is where it is not whole."""
+    left = False
+    if not store.finished:
+        with store.last() as left:
+            if left:
+                leave(store, config, file, job, same)
+    done = store.done()
+    if not store.finished:
+        say(f"{len(done)} of {len(job.blocks)} chunks of {store.partial} are done; the last share finishes the sweep "
+            "or the same command without --shard")  # fmt: skip
+        return DONE
+    if options.export:
+        from sweeps.points import export
+
+        for kind in options.export:
+            tell(str(export.export(kind, store.path, store.layout)))
+    counts = statuses(done.values())
+    if not left:
+        print_counts(counts, "points")
+        say(str(store.path))
+    return DONE if words.solved(counts) else SOLVER_FAILED
+
+
+def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:
+    """Everything of a run folder beside the store, which is moved into place."""
+    robot_file.write(job.robot, store.partial / "robot.toml", note=f"the robot of this sweep, from {config.robot}")
+    found = summary(store.layout, job, store.done().values())
+    store.write_json("result.json", found)
+    print_counts(found["statuses"], "points")
+    manifest = {"statuses": found["statuses"], "seed": config.samples.get("seed", 0), "hashes": same["data"]}
+    skeleton.leave(store, config, manifest, page=page("campaign", file, store.layout, found))
+
+
+def summary(layout: Layout, job: scale.Job, done: Iterable[Done]) -> dict[str, Any]:
+    """`result.json`."""
+    done = list(done)
+    units = {v.name: v.attributes["units"] for v in layout.variables if "units" in v.attributes}
+    names = [name for name in job.outputs if name in units]
+    ranges = {name: [d.ranges[name] for d in done if name in d.ranges] for name in names}
+    return {
+        "schema": "mmrjax.sweep_store/1",
+        "store": STORE,
+        "model": job.model,
+        "points": job.plan.design.points,
+        "dimensions": dict(zip(job.plan.design.dimensions, job.plan.design.shape, strict=True)),
+        "samples": list(job.plan.design.samples.names) if job.plan.design.samples is not None else [],
+        "statuses": statuses(done),
+        "outputs": {
+            name: {
+                "unit": units[name],
+                "least": min((low for low, _ in found), default=None),
+                "greatest": max((high for _, high in found), default=None),
+            }
+            for name, found in ranges.items()
+        },
+    }
+
+
+def statuses(done: Iterable[Done]) -> dict[str, int]:
+    """How many points ended in each status; every status is named."""
+    total = np.sum([d.statuses for d in done], axis=0, dtype=int)
+    return dict(zip(STATUSES, np.broadcast_to(total, len(STATUSES)).tolist(), strict=True))
+
+
+def print_counts(counts: Mapping[str, int], things: str) -> None:
+    """How the runs or points ended, in words."""
+    shown = Table(title=f"{sum(counts.values()):,} {things}", title_justify="left")
+    for heading in ("status", things, "meaning"):
+        shown.add_column(heading, justify="right" if heading == things else "left")
+    for status, count in counts.items():
         if count:
-            shown.add_row(status, str(count), words.STATUSES[status].why)
+            shown.add_row(status, f"{count:,}", words.STATUSES[status].why)
     say(shown)

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calibration.data.columns import Layout
 from calibration.discovery.result import DiscoveryResult
+from calibration.inference import blocks
 from calibration.inference.details import Detail, EquationDefects, TimeStatistics
+from calibration.inference.notes import FarFromPrior
 from calibration.words import loop as words
+from calibration.words.notes import sentence
 from sweeps.pages import cluster_figures, loop_figures
 from sweeps.pages.page import Album, columns, conditions, first_rows, render, rms, words_shown
+
+#: Change of an rms error that is marked [%].
+NOTABLE = 0.05
 
 Section = Callable[[Album, DiscoveryResult], None]
 
@@ -49,6 +56,47 @@ def alike(found: DiscoveryResult) -> list[str]:
     return [*(words.alike(e) for e in found.effects), *without_name]
 
 
+def findings(found: DiscoveryResult) -> list[dict[str, str]]:
+    """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
+    listed = []
+    for e in found.effects:
+        a = e.parameters["amplitude"]
+        size = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}"
+        sure, other = words.how_sure(found, e), words.alike(e)
+        listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
+    return listed
+
+
+def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
+    """Errors as stated, fitted again, and with what was found: seen, and unseen by the first kind of block, marked
+    where those seen are better or worse than in the line before."""
+    unseen = next(iter(found.errors_held_out.values()), ({}, {}))
+    lines = [("as stated", found.errors_as_stated, {}), ("fitted again", found.errors[0], unseen[0])]
+    if found.verdict != "none":
+        lines.append(("with what was found", found.errors[1], unseen[1]))
+    shown, before = [], dict[str, float]()
+    for what, seen, held in lines:
+        cells = []
+        for c, e in seen.items():
+            other = f" ({held[c]['rms_percent']:.1f} %)" if c in held and held[c]["rows"] else ""
+            change = e["rms_percent"] - before.get(c, e["rms_percent"])
+            arrow, mark = ("", "") if not abs(change) >= NOTABLE else (" ↓", "good") if change < 0 else (" ↑", "bad")
+            cells.append({"text": f"{e['rms_percent']:.1f} %{other}{arrow}" if e["rows"] else "-", "mark": mark})
+        before = {c: float(e["rms_percent"]) for c, e in seen.items()}
+        reached = max((int(e["rows"]) for e in seen.values()), default=0)
+        shown.append({"what": what, "cells": cells, "reached": f"{reached}/{len(found.runs)}"})
+    return shown
+
+
+def check_first(found: DiscoveryResult) -> list[str]:
+    """What to look at before the robot is used: the reading that weighs most, parameters that moved too far, and what
+    the table contradicts."""
+    far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior)]
+    against = [note for note in found.remarks if isinstance(note, str)]
+    said = [words.largest_share(found), *far, *against[:1]]
+    return [f"{text[0].upper()}{text[1:].rstrip('.')}{'?' if k == 0 else '.'}" for k, text in enumerate(said) if text]
+
+
 def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
     """Write `report.html` and `figures/` for a pass of the loop.
 
@@ -77,7 +125,13 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         "loop.html.j2",
         album,
         of_channels=found.channels,
-        title=f"What {words_shown(Path(robot_name).name)} lacks against {Path(found.runs.source).name}",
+        title=f"Is the {words_shown(Path(robot_name).name)} model complete?",
+        answer=words.answer(found),
+        findings=findings(found),
+        summary=summary(found),
+        seen_by=next((blocks.in_words(kind) for kind in found.errors_held_out), "nothing"),
+        use_it=words.use_it(found),
+        check_first=check_first(found),
         document=found.to_json(),
         p=words.p_value(found.before.p_value),
         cluster="" if found.cluster is None else words.cluster(found.cluster),

@@ -21,7 +21,7 @@ from mmrjax.variation import Axis
 from sweeps import config as configuration
 from sweeps.config_campaign import Campaign
 from sweeps.points import imposed
-from sweeps.points.design import DESIGNS, Design, Joint, Samples, in_blocks
+from sweeps.points.design import DESIGNS, ROW, Design, Drawn, Joint, Samples, in_blocks
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
@@ -47,6 +47,7 @@ class Plan:
         conditions: those that do not vary, by name, `configuration` as an index.
         surface: of Table 5, which scales the adhesion by configuration; None where adhesion is stated or varies.
         data: files that the design came from, beside the configuration.
+        rows: conditions of the runs of a table, among which the axis `ROW` counts.
     """
 
     design: Design
@@ -54,6 +55,12 @@ class Plan:
     conditions: dict[str, float]
     surface: str | None = None
     data: tuple[str, ...] = ()
+    rows: Conditions | None = None
+
+    @staticmethod
+    def of_rows(rows: Conditions, samples: Drawn | None = None) -> Plan:
+        """The runs of a table, of shape (runs,), each crossed with every sample."""
+        return Plan(Design({ROW: np.arange(rows.shape[0], dtype=float)}, samples), {}, {}, rows=rows)
 
     def fixed(self) -> Conditions:
         """The conditions that do not vary, of shape ()."""

@@ -19,6 +19,8 @@ from jaxtyping import Float, Int, UInt64
 
 #: Dimension of the sampled points in a store.
 SAMPLE = "sample"
+#: The axis along which the runs of a table are counted.
+ROW = "run"
 
 
 class Joint(Protocol):
@@ -88,6 +90,27 @@ class Samples:
         return np.array(rows)[:, first - begin : first - begin + count]
 
 
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """Sampled points that are at hand.
+
+    Attributes:
+        names: what is sampled; table: its values, a row a name.
+    """
+
+    names: tuple[str, ...]
+    table: Float[np.ndarray, "names points"]
+
+    @property
+    def number(self) -> int:
+        """How many points there are."""
+        return self.table.shape[1]
+
+    def values(self, first: int, count: int) -> Float[np.ndarray, "names points"]:
+        """Values of `count` points from number `first` on, a row a name."""
+        return self.table[:, first : first + count]
+
+
 def in_blocks(
     values: Callable[[Any], Any],
     normal_scores: Float[np.ndarray, "points coordinates"],
@@ -113,7 +136,7 @@ class Design:
     """
 
     axes: dict[str, np.ndarray]
-    samples: Samples | None = None
+    samples: Samples | Drawn | None = None
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Runs many operating points in chunks of one vmapped call, and leaves the table of what came out."""
+"""The runs of a table as a sweep, and the table of what came out."""
 
 from __future__ import annotations
 
@@ -18,13 +18,21 @@ from mmrjax.fidelities.base import Run
 from mmrjax.power import COULOMB_PER_MAH
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
+from mmrjax.variation import FLAGS as FLAGS_CODE
+from mmrjax.variation import STATUS
 from sweeps import capabilities, skeleton
 from sweeps import config as configuration
 from sweeps.config import FidelityPart, Part, SupplyPart
 from sweeps.console import progress as bar
 from sweeps.pages import words
+from sweeps.points import scale
+from sweeps.points.axes import Plan
+from sweeps.points.design import Blocks, Drawn
+from sweeps.points.scale import Job
 from sweeps.skeleton import Page
 from sweeps.store import RunFolder
+
+Table = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,16 +74,6 @@ class SimulationResult:
         }
 
 
-def simulate(
-    robot: Robot, conditions: Conditions, config: FidelityPart, progress: Callable[[float], None]
-) -> dict[str, np.ndarray]:
-    """One batch in the fidelity that the configuration names: the columns that it adds to its runs.
-
-    `progress` is called with the share that is done, by a fidelity that takes long.
-    """
-    return ended(robot, fidelities.get(config.model).run(robot, conditions, config.options, progress))
-
-
 def ended(robot: Robot, batch: Run) -> dict[str, np.ndarray]:
     """The columns of how a batch of runs ended, with those of its fidelity alone."""
     result, further = jax.device_get((batch.result, batch.columns))
@@ -101,57 +99,73 @@ def commanded(robot: Robot, runs: Runs, config: Part) -> Conditions:
     return runs.conditions(robot, battery=float(config.battery), discharge=config.discharge_mAh * COULOMB_PER_MAH)
 
 
+def computed(
+    job: Job,
+    folder: RunFolder | None,
+    name: str,
+    advance: Callable[[float], None],
+    kept: Callable[[Table], Table] = dict,
+) -> Table:
+    """What is kept of every chunk of a job, one after the other.
+
+    Args:
+        folder: holds chunks under this name; those that an interrupted command left there are not computed again.
+        kept: what is kept of the outputs of a chunk, by default all: in the units of tables, shape (points,).
+    """
+    chunks = range(len(job.blocks))
+    files = [f"{name}-{k:06d}" for k in chunks]
+    found = {} if folder is None else {k: part for k in chunks if (part := folder.chunk(files[k])) is not None}
+    left, times = [k for k in chunks if k not in found], scale.Times()
+    advance(sum(map(job.blocks.count, found)))
+
+    def keep(chunk: int, arrays: Table, _: Any) -> None:
+        found[chunk] = kept(arrays)
+        if folder is not None:
+            folder.keep_chunk(files[chunk], found[chunk])
+
+    if left:
+        scale.run(keep, job, scale.produce(scale.Compiled(job), left, times, advance), advance, times)
+    every = [found.pop(k) for k in chunks]
+    return {column: np.concatenate([part.pop(column) for part in every]) for column in tuple(every[0])}
+
+
+def job_of(robot: Robot, runs: Runs, config: FidelityPart, samples: Drawn | None = None) -> Job:
+    """Every output of the runs of a table, each with every sample if there are any.
+
+    Raises:
+        BadConfiguration: a run that the fidelity could not bear.
+    """
+    rows = commanded(robot, runs, config)
+    refuse(robot, rows, config)
+    plan = Plan.of_rows(jax.tree.map(np.asarray, rows), samples)
+    wanted = (*outputs.names(robot.channels), FLAGS_CODE, *fidelities.get(config.model).columns)
+    chunk = getattr(config, "chunk", None) or scale.default_chunk(config.model)
+    blocks = Blocks.of(plan.design.shape, chunk)
+    return Job(robot, config.model, config.options, plan, wanted, "float64", blocks)
+
+
 def evaluate(
     robot: Robot,
     runs: Runs,
     config: FidelityPart,
-    folder: RunFolder,
+    folder: RunFolder | None,
     advance: Callable[[float], None] | None = None,
 ) -> dict[str, np.ndarray]:
     """Simulate every run and return the table of conditions and outcomes.
 
     Chunks already in the folder (of an interrupted run of the same configuration) are not simulated again.
-    The last chunk is filled up with its last run, so that all chunks share one compilation.
 
     Args:
         advance: called with the number of runs done since its last call; of a chunk under way, its share. None:
             a bar on stderr where it takes long.
     """
-    if advance is None:
-        slow = fidelities.facts(config.model).slow or len(runs) > config.runs_at_once
-        with bar(len(runs), quiet=not slow) as advance:
-            return evaluate(robot, runs, config, folder, advance)
-    size = min(config.runs_at_once, len(runs))
-    refuse(robot, commanded(robot, runs, config), config)
-    parts = []
-    for first in range(0, len(runs), size):
-        rows = np.minimum(np.arange(first, first + size), len(runs) - 1)
-        count = min(size, len(runs) - first)
-        name = f"chunk-{first // size:06d}"
-        part = folder.chunk(name)
-        if part is None:
-            told = shares(advance, count)
-            part = simulate(robot, commanded(robot, runs.where(rows), config), config, told)
-            part = {key: value[:count] for key, value in part.items()}
-            folder.keep_chunk(name, part)
-            told(1.0)
-        else:
-            advance(count)
-        parts.append(part)
-    outcome = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    return {**conditions(robot, runs), **outcome}
-
-
-def shares(advance: Callable[[float], None], count: int) -> Callable[[float], None]:
-    """A function to be told what share of `count` runs is done so far, which passes on how many that adds."""
-    so_far = 0.0
-
-    def told(share: float) -> None:
-        nonlocal so_far
-        advance(count * share - so_far)
-        so_far = count * share
-
-    return told
+    job = job_of(robot, runs, config)
+    slow = fidelities.facts(config.model).slow or len(job.blocks) > 1
+    with bar(len(runs), quiet=not slow or advance is not None) as own:
+        found = computed(job, folder, "chunk", advance or own)
+    columns = {row.column: found[row.name] for row in outputs.table(robot.channels)}
+    further = {name: found[name] for name in fidelities.get(config.model).columns}
+    return {**conditions(robot, runs), **columns, **outputs.codes(found[STATUS], found[FLAGS_CODE]), **further}
 
 
 def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:

@@ -1,4 +1,8 @@
-"""The engine of a sweep: chunks of one compiled shape over all local devices, written while the next is computed."""
+"""The engine of every sweep: chunks of one compiled shape over all local devices, kept while the next is computed.
+
+A grid, a plan, the rows of a table and draws of a posterior are designs of points; a Zarr store and the chunks of a
+run folder keep what comes out.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,17 +24,19 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from mmrjax import fidelities, outputs
-from mmrjax.variation import FLAGS, STATUS, Variation, evaluate
+from mmrjax.compiling import compiled
+from mmrjax.conditions import Conditions
+from mmrjax.profile import Profile
+from mmrjax.variation import FLAGS, STATUS, Variation, evaluate, pick
 from sweeps.points.axes import Plan, adhesions
-from sweeps.points.design import Blocks
+from sweeps.points.design import ROW, Blocks
 
 if TYPE_CHECKING:
-    from mmrjax.conditions import Conditions
-    from mmrjax.profile import Profile
     from mmrjax.robot import Robot
-    from sweeps.points.zarr_store import SweepStore
 
 POINTS = "points"
+#: Chunks of more points on a device are filled up to a multiple, so that designs of all sizes share few programs.
+SHARED = 16_384
 #: Chunks that may wait for the writer, besides the one that it writes and the one that is computed.
 WAITING = 1
 
@@ -74,9 +80,10 @@ def device_kind() -> str:
     return f"{device.platform}: {device.device_kind}"
 
 
-def default_chunk(model: str, accelerator: bool, devices: int) -> int:
-    """Points of a chunk where none is stated, over all devices."""
-    return fidelities.facts(model).at_once(accelerator) * devices
+def default_chunk(model: str, device: str | None = None) -> int:
+    """Points of a chunk where none is stated, over all local devices, or on one of a kind elsewhere."""
+    count = len(jax.local_devices()) if device is None else 1
+    return fidelities.facts(model).at_once(not (device or device_kind()).startswith("cpu")) * count
 
 
 class Compiled:
@@ -87,13 +94,23 @@ class Compiled:
         devices = jax.local_devices() if devices is None else devices
         self.mesh = Mesh(np.array(devices), (POINTS,))
         # Every device has the same number of points; the last ones stand for the chunk's last point again.
-        self.size = -(-job.blocks.points // len(devices)) * len(devices)
-        variation = Variation(job.robot, job.plan.design.names)
+        each = -(-job.blocks.points // len(devices))
+        each = each if each < SHARED else -(-each // SHARED) * SHARED
+        self.size = each * len(devices)
+        names = tuple(name for name in job.plan.design.names if name != ROW)
         everywhere = NamedSharding(self.mesh, PartitionSpec())
-        self._variation, self._conditions = _placed((variation, job.plan.fixed()), everywhere)
+        self._variation, self._fixed = _placed((Variation(job.robot, names), job.plan.fixed()), everywhere)
         self._split = NamedSharding(self.mesh, PartitionSpec(POINTS))
+        factors = {row.name: row.factor for row in outputs.table(job.robot.channels)}
         surface = None if job.plan.surface is None else adhesions(job.robot, job.plan.surface)
-        self._program = eqx.filter_jit(_program(job, surface, self.mesh))
+        self._asked = _Asked(
+            job.model, tuple(job.options.items()), tuple((n, factors.get(n, 1.0)) for n in job.outputs), job.storage,
+            surface,
+        )  # fmt: skip
+        # What takes long in one call is run in parts, between which it says how far it is and can be interrupted.
+        slow = fidelities.facts(job.model).slow and job.profile is None
+        self.in_parts = slow and len(devices) == 1 and not self._variation.varies_robot
+        self._program = _one_device_kept if len(devices) == 1 else eqx.filter_jit(_split_among(self.mesh))
 
     def points(self, chunk: int) -> Float[np.ndarray, "points names"]:
         """Values of a chunk's points, the last ones repeated up to the compiled shape."""
@@ -102,12 +119,41 @@ class Compiled:
             return values
         return values[np.minimum(np.arange(self.size), len(values) - 1)]
 
-    def __call__(self, values: Float[np.ndarray, "points names"]) -> dict[str, Array]:
-        """Start computing; returns arrays of the compiled shape that may not be there yet."""
-        found: dict[str, Array] = self._program(
-            self._variation, self._conditions, jax.device_put(values, self._split)
-        )
+    def __call__(
+        self, values: Float[np.ndarray, "points names"], told: Callable[[float], None] | None = None
+    ) -> dict[str, Array]:
+        """Start computing; returns arrays of the compiled shape that may not be there yet.
+
+        Args:
+            told: called with the share that is done, where `in_parts`.
+        """
+        conditions, rows = self._fixed, self.job.plan.rows
+        if rows is not None:
+            which, values = values[:, 0].astype(int), values[:, 1:]
+            conditions = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[which], self._split), rows)
+        placed = jax.device_put(values, self._split)
+        if self.in_parts:
+            conditions = _on_surface(self._variation, conditions, placed, self._asked.surface)
+            robot, conditions = self._variation.at(placed, _wide(conditions, len(values)))
+            run = fidelities.get(self.job.model).run(robot, conditions, self.job.options, told or _not_told)
+            return _stored(pick(run, robot.channels, self.job.outputs), self._asked)
+        found: dict[str, Array] = self._program(self._variation, conditions, placed, self._asked, self.job.profile)
         return found
+
+
+class _Asked(NamedTuple):
+    """What is computed of each point, by a fidelity with its options, and how it is stored.
+
+    Attributes:
+        factors: of each output, the SI value of its unit in tables.
+        surface: adhesion of each configuration as a ratio to the bench's.
+    """
+
+    model: str
+    options: tuple[tuple[str, float], ...]
+    factors: tuple[tuple[str, float], ...]
+    storage: str
+    surface: tuple[float, ...] | None
 
 
 def _placed(tree: Any, sharding: NamedSharding) -> Any:
@@ -115,38 +161,64 @@ def _placed(tree: Any, sharding: NamedSharding) -> Any:
     return eqx.combine(jax.device_put(arrays, sharding), rest)
 
 
-def _program(
-    job: Job, surface: tuple[float, ...] | None, mesh: Mesh
-) -> Callable[[Variation, Conditions, Array], dict[str, Array]]:
-    """Outputs as they are stored: in the units of tables, in the stored type, statuses as bytes, flags as two."""
-    factors = {row.name: row.factor for row in outputs.table(job.robot.channels)}
-    names, options = job.outputs, dict(job.options)
+def _wide(conditions: Conditions, points: int) -> Conditions:
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (points,)), conditions)
 
-    def one_device(variation: Variation, conditions: Conditions, values: Array) -> dict[str, Array]:
-        if surface is not None:
-            _, at = variation.at(values, conditions)
-            ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
-            wide = jax.tree.map(lambda x: jnp.broadcast_to(x, values.shape[:1]), conditions)
-            conditions = dataclasses.replace(wide, adhesion=ratio)
-        found = evaluate(variation, job.model, values, conditions, options, names, job.profile)
-        stored = {n: (found[n] / factors.get(n, 1.0)).astype(job.storage) for n in names if n != FLAGS}
-        kinds = {STATUS: jnp.uint8, FLAGS: jnp.uint16}
-        bits = {n: found[n].astype(kind) for n, kind in kinds.items() if n in found}
-        return {**stored, **bits}
 
-    def program(variation: Variation, conditions: Conditions, values: Array) -> dict[str, Array]:
-        arrays, rest = eqx.partition((variation, conditions), eqx.is_array)
+def _not_told(share: float) -> None:
+    pass
 
-        def part(arrays: Any, values: Array) -> dict[str, Array]:
-            variation, conditions = eqx.combine(arrays, rest)
-            return one_device(variation, conditions, values)
+
+def _on_surface(
+    variation: Variation, conditions: Conditions, values: Array, surface: tuple[float, ...] | None
+) -> Conditions:
+    """Conditions of points with the adhesion of their configurations on a surface, if one is stated."""
+    if surface is None:
+        return conditions
+    _, at = variation.at(values, conditions)
+    ratio = jnp.asarray(surface)[jnp.broadcast_to(at.configuration, values.shape[:1])]
+    return dataclasses.replace(_wide(conditions, len(values)), adhesion=ratio)
+
+
+def _one_device(
+    variation: Variation, conditions: Conditions, values: Array, asked: _Asked, profile: Profile | None
+) -> dict[str, Array]:
+    """Outputs of points as they are stored."""
+    conditions = _on_surface(variation, conditions, values, asked.surface)
+    names = tuple(name for name, _ in asked.factors)
+    found = evaluate(variation, asked.model, values, conditions, dict(asked.options), names, profile)
+    return _stored(found, asked)
+
+
+_one_device_kept = compiled(_one_device)
+
+
+def _stored(found: Mapping[str, Array], asked: _Asked) -> dict[str, Array]:
+    """Outputs in the units of tables, in the stored type, statuses as bytes, flags as two."""
+    stored = {n: (found[n] / factor).astype(asked.storage) for n, factor in asked.factors if n != FLAGS}
+    kinds = {STATUS: jnp.uint8, FLAGS: jnp.uint16}
+    return {**stored, **{n: found[n].astype(kind) for n, kind in kinds.items() if n in found}}
+
+
+def _split_among(mesh: Mesh) -> Callable[..., dict[str, Array]]:
+    """`_one_device` on each of several, its share of the points each."""
+
+    def program(
+        variation: Variation, conditions: Conditions, values: Array, asked: _Asked, profile: Profile | None
+    ) -> dict[str, Array]:
+        arrays, rest = eqx.partition((variation, profile), eqx.is_array)
+        each = PartitionSpec(POINTS) if conditions.shape else PartitionSpec()
+
+        def part(arrays: Any, conditions: Conditions, values: Array) -> dict[str, Array]:
+            variation, profile = eqx.combine(arrays, rest)
+            return _one_device(variation, conditions, values, asked, profile)
 
         # Each device searches its own roots and steps its own runs: none waits for another inside a loop.
         split = jax.shard_map(
-            part, mesh=mesh, in_specs=(PartitionSpec(), PartitionSpec(POINTS)), out_specs=PartitionSpec(POINTS),
+            part, mesh=mesh, in_specs=(PartitionSpec(), each, PartitionSpec(POINTS)), out_specs=PartitionSpec(POINTS),
             check_vma=False,
         )  # fmt: skip
-        return split(arrays, values)
+        return split(arrays, conditions, values)
 
     return program
 
@@ -157,37 +229,65 @@ class Piece:
 
     Attributes:
         chunk: its number; arrays: by variable, which may be on a device still.
-        values: of its points, a row each, where they are at hand.
+        values: of its points, a row each, where they are at hand; told: points of it that count as done already.
     """
 
     chunk: int
     arrays: Mapping[str, Any]
     values: Float[np.ndarray, "points names"] | None = None
+    told: float = 0.0
 
 
 Produced = Iterator[Piece]
+Advance = Callable[[float], None]
+#: Keeps a chunk by its number: values of its points by variable, and of its samples as `drawn` gives them.
+Keep = Callable[[int, dict[str, np.ndarray], np.ndarray | None], Any]
 
 
-def produce(compiled: Compiled, chunks: Iterable[int], times: Times) -> Produced:
-    """Compute chunks on the local devices, in order, the points of the next being made meanwhile."""
+def produce(compiled: Compiled, chunks: Iterable[int], times: Times, advance: Advance | None = None) -> Produced:
+    """Compute chunks on the local devices, in order, the points of the next being made meanwhile.
+
+    Args:
+        advance: called with how many more points are done, of chunks that are computed in parts.
+    """
     with concurrent.futures.ThreadPoolExecutor(1, thread_name_prefix="points") as maker:
         ahead = deque[tuple[int, concurrent.futures.Future[Any]]]()
         for chunk in chunks:
             ahead.append((chunk, maker.submit(compiled.points, chunk)))
             if len(ahead) > 1:
-                yield _started(compiled, *ahead.popleft(), times)
+                yield _started(compiled, *ahead.popleft(), times, advance)
         while ahead:
-            yield _started(compiled, *ahead.popleft(), times)
+            yield _started(compiled, *ahead.popleft(), times, advance)
 
 
-def _started(compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], times: Times) -> Piece:
+def _started(
+    compiled: Compiled, chunk: int, points: concurrent.futures.Future[Any], times: Times, advance: Advance | None
+) -> Piece:
     start = time.perf_counter()
     values = points.result()
     made = time.perf_counter()
-    arrays = compiled(values)
+    if compiled.in_parts and advance is not None:
+        count = compiled.job.blocks.count(chunk)
+        told = shares(advance, count)
+        piece = Piece(chunk, compiled(values, told), values, count)
+        told(1.0)
+    else:
+        piece = Piece(chunk, compiled(values), values)
     times.points += made - start
     times.start += time.perf_counter() - made
-    return Piece(chunk, arrays, values)
+    return piece
+
+
+def shares(advance: Advance, count: int) -> Callable[[float], None]:
+    """A function to be told what share of `count` runs is done so far, which passes on how many that adds."""
+    so_far = 0.0
+
+    def told(share: float) -> None:
+        nonlocal so_far
+        advance(count * share - so_far)
+        so_far = count * share
+
+    return told
 
 
 def fetched(arrays: Mapping[str, Any], count: int) -> dict[str, np.ndarray]:
@@ -206,11 +306,11 @@ def drawn(job: Job, piece: Piece) -> Float[np.ndarray, "names points"] | None:
     return samples.values(along.start, along.stop - along.start)
 
 
-def run(store: SweepStore, job: Job, chunks: Produced, advance: Callable[[float], None], times: Times) -> None:
+def run(keep: Keep, job: Job, chunks: Produced, advance: Advance, times: Times) -> None:
     """Write chunks as they come, in a thread of its own, so that the next is computed meanwhile.
 
     Args:
-        store: begun; advance: called with the points of each chunk that is done.
+        keep: writes one; advance: called with the points of each chunk that is done.
 
     Raises:
         OSError: the disk is full, or the store cannot be written; chunks written before are kept.
@@ -228,11 +328,11 @@ def run(store: SweepStore, job: Job, chunks: Produced, advance: Callable[[float]
         there = time.perf_counter()
         if stop.is_set():  # interrupted while it was computed
             return
-        store.write(piece.chunk, here, drawn(job, piece))
+        keep(piece.chunk, here, drawn(job, piece))
         times.compute += computed - start
         times.transfer += there - computed
         times.write += time.perf_counter() - there
-        advance(count)
+        advance(count - piece.told)
 
     def keep_writing() -> None:
         while (piece := waiting.get()) is not None:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.posterior import Posterior
 from calibration.data.runs import Runs
-from mmrjax import fidelities, outputs, params
+from mmrjax import fidelities, outputs
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
-from mmrjax.signals import done
+from mmrjax.signals import DONE
+from mmrjax.variation import STATUS
 from sweeps.config import FidelityPart
 from sweeps.console import progress, say
 from sweeps.points import run
+from sweeps.points.design import Drawn
+from sweeps.store import RunFolder
 
 #: What is added to the column of an output: standard deviation, ends of the 95 % interval.
 SD, LOWER, UPPER = "_sd", "_lower", "_upper"
@@ -45,8 +46,10 @@ class Intervals:
         return self.columns[column + SD]
 
 
-def intervals(robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPart, draws: int) -> Intervals:
-    """Simulate every run with so many robots drawn from the posterior.
+def intervals(
+    robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPart, draws: int, folder: RunFolder | None = None
+) -> Intervals:
+    """Simulate every run with so many robots drawn from the posterior: a sweep of the runs crossed with the draws.
 
     It is the uncertainty of what the model says, without the noise of a reading. Each draw is one robot for all runs.
     Draws that do not converge at a run count for nothing there; `SHARE` says how many do.
@@ -54,41 +57,36 @@ def intervals(robot: Robot, posterior: Posterior, runs: Runs, config: FidelityPa
     Returns:
         For every output's column its sd and the ends of its 95 % interval, NaN where fewer than two draws converge.
     """
-    values = posterior.draw(draws, SEED)
-    fidelity, size = fidelities.get(config.model), min(config.runs_at_once, len(runs))
-    rows_of = outputs.table(robot.channels)
-    columns = [o.column for o in rows_of]
-    seen = np.full((draws, len(runs), len(columns)), np.nan)
-    robot = params.strong(robot)
-    with progress(draws, quiet=not (fidelity.facts.slow or draws * len(runs) > 100_000), doing="draws") as advance:
-        for d, theta in enumerate(values):
-            drawn = params.replace(robot, {n: jnp.asarray(x) for n, x in zip(posterior.names, theta, strict=True)})
-            for first in range(0, len(runs), size):
-                rows = np.minimum(np.arange(first, first + size), len(runs) - 1)
-                conditions = run.commanded(robot, runs.where(rows), config)
-                result = jax.device_get(fidelity.run(drawn, conditions, config.options, None).result)
-                count = min(size, len(runs) - first)
-                there = np.asarray(done(result.status))[:count]
-                for j, output in enumerate(rows_of):
-                    reading = np.asarray(output.get(result))[:count] / output.factor
-                    seen[d, first : first + count, j] = np.where(there, reading, np.nan)
-            advance(1)
-    return Intervals(_summary(seen, columns), draws, robot.channels)
+    samples = Drawn(tuple(posterior.names), posterior.draw(draws, SEED).T)
+    job = run.job_of(robot, runs, config, samples)
+    slow = fidelities.facts(config.model).slow or draws * len(runs) > 100_000
+
+    def summary(found: run.Table) -> run.Table:
+        seen = {name: values.reshape(-1, draws) for name, values in found.items()}
+        there = np.isin(seen[STATUS], DONE) & np.isfinite(seen[robot.channels[0].name])
+        return _summary({o.column: seen[o.name] for o in outputs.table(robot.channels)}, there)
+
+    whole = job.blocks.size[-1] == draws  # of a run all draws are in one chunk, which is kept in short
+    with progress(draws, quiet=not slow, doing="draws") as advance:
+        found = run.computed(
+            job, folder, "draws", lambda points: advance(points / len(runs)), summary if whole else dict
+        )
+    return Intervals(found if whole else summary(found), draws, robot.channels)
 
 
-def _summary(seen: np.ndarray, columns: list[str]) -> dict[str, np.ndarray]:
-    there = np.isfinite(seen[..., 0])
-    enough = there.sum(0) >= 2
+def _summary(columns: dict[str, np.ndarray], there: np.ndarray) -> dict[str, np.ndarray]:
+    """Spread of each column over draws; arrays of shape (runs, draws), `there`: where a draw converges."""
+    enough = there.sum(1) >= 2
     found: dict[str, np.ndarray] = {}
-    for j, column in enumerate(columns):
-        x = np.where(enough, seen[..., j], 0.0)
-        low, high = np.nanquantile(x, QUANTILES, axis=0)
-        spread = np.nanstd(x, 0, ddof=1)
+    for column, values in columns.items():
+        x = np.where(enough[:, None], np.where(there, values, np.nan), 0.0)
+        low, high = np.nanquantile(x, QUANTILES, axis=1)
+        spread = np.nanstd(x, 1, ddof=1)
         found |= {
             column + end: np.where(enough, value, np.nan)
             for end, value in ((SD, spread), (LOWER, low), (UPPER, high))
         }
-    return {**found, SHARE: there.mean(0)}
+    return {**found, SHARE: there.mean(1)}
 
 
 def say_intervals(table: dict[str, np.ndarray], found: Intervals) -> None:

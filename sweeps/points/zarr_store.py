@@ -26,6 +26,7 @@ from mmrjax.signals import STATUSES
 from mmrjax.variation import STATUS
 from sweeps.points.design import SAMPLE, Blocks, Design
 from sweeps.points.identity import Identity, differences
+from sweeps.store import Folder
 
 STORE = "results.zarr"
 #: Folder in which files are written before they are moved into place.
@@ -88,7 +89,7 @@ class Done:
     ranges: Mapping[str, tuple[float, float]]
 
 
-class SweepStore:
+class SweepStore(Folder):
     """The folder of a sweep, `path` + `.partial` until it is whole, shared by the processes of a job array."""
 
     def __init__(self, path: Path, identity: Identity, layout: Layout, *, force: bool = False) -> None:
@@ -98,9 +99,7 @@ class SweepStore:
             BadConfiguration: `path` holds something else, or a sweep of another identity (the message says where they
                 differ), or another process is at work on what `force` would replace.
         """
-        if not path.name:
-            raise BadConfiguration(f"--out: got {str(path)!r}; expected the name of a folder")
-        self.path, self.partial = path, path.with_name(path.name + ".partial")
+        super().__init__(path)
         self.layout = layout
         self.finished = False
         self._journal: TextIO | None = None
@@ -112,10 +111,7 @@ class SweepStore:
         if (path / "identity.json").is_file() and (not force or (cut_short and not self._differs(path))):
             self._take_finished()
             return
-        taken = path.is_file() or (path.is_dir() and any(path.iterdir()))
-        if taken and not (force and (path / "manifest.json").is_file()):
-            hint = "--force replaces a run folder" if path.is_dir() else "it is a file"
-            raise BadConfiguration(f"--out: {path} exists already; choose another path ({hint})")
+        self.refuse_taken(force)
         ours = (self.partial / "lock").is_file()
         if self.partial.exists() and not ours and any(self.partial.iterdir()):
             raise BadConfiguration(

@@ -1,0 +1,140 @@
+"""The job of a plan: what is asked of each point, checked before the first is simulated, and how a store holds it."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data import profiles
+from calibration.data.errors import BadConfiguration
+from mmrjax import __version__, channels, fidelities, outputs
+from mmrjax.errors import UsageError
+from mmrjax.profile import Profile
+from mmrjax.robot import Robot
+from mmrjax.signals import FLAGS, STATUSES
+from mmrjax.variation import STATUS, Variation, check_outputs
+from sweeps.config_campaign import Campaign
+from sweeps.console import tell
+from sweeps.points import axes, scale
+from sweeps.points.design import Blocks
+from sweeps.points.zarr_store import ABSENT, Layout, Variable
+
+#: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
+ASKED = 48
+
+
+def usual(config: Campaign, robot: Robot) -> tuple[str, ...]:
+    """Outputs of a store where none are stated: what the instruments show, over a profile what it comes to."""
+    if config.profile is None:
+        return channels.names(robot.channels)
+    from mmrjax import missions  # which imports an integrator
+
+    return missions.USUAL
+
+
+def prepare(config: Campaign, robot: Robot, plan: axes.Plan, where: str) -> scale.Job:
+    """The job of a resolved configuration.
+
+    Raises:
+        BadConfiguration: an output that the fidelity does not have, or a point that it cannot bear.
+    """
+    variation = Variation(robot, plan.design.names)
+    profile = None if config.profile is None else _profile(config.profile, robot, plan, where)
+    repeated = [name for k, name in enumerate(config.outputs) if name in config.outputs[:k]]
+    if repeated:
+        raise BadConfiguration(f"{where}, outputs: got {repeated[0]} twice; expected each once")
+    taken = [name for name in config.outputs if name in plan.design.names]
+    if taken:
+        raise BadConfiguration(f"{where}, outputs: got {taken[0]}, which varies; expected what comes out of a run")
+    try:
+        check_outputs(variation, config.model, plan.fixed(), config.options, config.outputs, profile)
+    except UsageError as error:
+        raise BadConfiguration(f"{where}, {error}") from error
+    assert config.chunk is not None
+    blocks = Blocks.of(plan.design.shape, config.chunk)
+    _bearable(variation, config, plan)
+    return scale.Job(robot, config.model, config.options, plan, config.outputs, config.storage, blocks, profile)
+
+
+def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
+    """The profile that every point follows.
+
+    Raises:
+        BadData: as `profiles.read`.
+        BadConfiguration: it states what the plan states too, a supply voltage where a point is on the battery, or
+            surfaces.
+    """
+    source = profiles.read(name)
+    for note in source.notes:
+        tell(note)
+    if source.surface is not None:
+        raise BadConfiguration(
+            f"{where}, profile: got {source.source} with the column surface; expected the surface in conditions"
+        )
+    if source.begins:
+        raise BadConfiguration(f"{where}, profile: got {source.source} with a start; points of a sweep begin at rest")
+    for field in source.values:
+        if field in (*plan.conditions, *plan.design.names):
+            raise BadConfiguration(
+                f"{where}, {field}: got it beside {source.source}, which states it; expected one of the two"
+            )
+    on_battery = plan.conditions.get("battery", 0.0) or "battery" in plan.design.names
+    source.check_source(bool(on_battery))
+    return source.profile(robot, plan.fixed())
+
+
+def _bearable(variation: Variation, config: Campaign, plan: axes.Plan) -> None:
+    """Ask the fidelity about points spread over the design, its corners among them.
+
+    Raises:
+        BadConfiguration: one that it cannot bear.
+    """
+    fidelity = fidelities.get(config.model)
+    if not config.options:
+        return
+    shape = plan.design.shape
+    ends = itertools.product(*({0, n - 1} for n in shape[:4]))
+    corners = [(*end, *(0 for _ in shape[4:])) for end in ends]
+    spread = np.linspace(0, plan.design.points - 1, ASKED).astype(np.int64)
+    numbers = np.unique([*spread, *(int(np.ravel_multi_index(c, shape)) for c in corners)])
+    for values in plan.design.at(numbers):
+        robot, conditions = variation.at(jnp.asarray(values), plan.fixed())
+        try:
+            fidelity.check(robot, jax.tree.map(lambda x: jnp.asarray(x)[None], conditions), config.options)
+        except ValueError as error:
+            at = ", ".join(f"{n} {v:g}" for n, v in zip(plan.design.names, values, strict=True))
+            raise BadConfiguration(f"--model {config.model}: at {at}: {error}") from error
+
+
+def laid_out(config: Campaign, job: scale.Job) -> Layout:
+    """Arrays of the store of a job, with units and long names."""
+    rows: dict[str, Any] = {row.name: row for row in outputs.table(job.robot.channels)}
+    if job.profile is not None:
+        from mmrjax import missions
+
+        rows |= {row.column: row for row in missions.OUTPUTS}
+    variables = []
+    for name in job.outputs:
+        if name == "flags":
+            about = {"long_name": "limits exceeded", "flag_masks": [1 << k for k in range(len(FLAGS))]}
+            variables.append(Variable(name, "uint16", {**about, "flag_meanings": " ".join(FLAGS)}))
+            continue
+        unit, label = (rows[name].unit, rows[name].label) if name in rows else ("-", name.replace("_", " "))
+        variables.append(Variable(name, config.storage, {"units": _unit(unit), "long_name": label}))
+    meanings = {"flag_values": [*range(len(STATUSES)), ABSENT], "flag_meanings": " ".join((*STATUSES, "absent"))}
+    variables.append(Variable(STATUS, "uint8", {"long_name": "how the run ended", **meanings}))
+    known = job.plan.axes
+    coordinates = {name: {"units": _unit(axis.unit), "long_name": axis.meaning} for name, axis in known.items()}
+    for name in {axes.CONFIGURATION} & set(coordinates):
+        del coordinates[name]["units"]
+    labels = {axes.CONFIGURATION: job.robot.configurations.names}
+    about = {"title": "sweep of a robot", "source": f"mmrjax {__version__}, {job.model}"}
+    return Layout(job.plan.design, job.blocks, tuple(variables), coordinates, labels, about, config.compression)
+
+
+def _unit(unit: str) -> str:
+    return "1" if unit in ("-", "") else unit

@@ -1,0 +1,141 @@
+"""Tables of runs and draws of a posterior as sweeps: their points, chunks that are taken up again, runs in parts."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calibration.data.posterior import NORMAL, Posterior
+from calibration.data.runs import Runs
+from mmrjax import fidelities, params, robots
+from mmrjax.fidelities.steady import steady_batch
+from sweeps import config
+from sweeps.points import run, scale, uncertainty
+from sweeps.points.design import Drawn
+from sweeps.store import RunFolder
+
+NAMES = ("motor.resistance", "motor.friction_coulomb")
+DRAWS = 12
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return robots.nominal()
+
+
+@pytest.fixture(scope="module")
+def runs(robot):
+    """Of both configurations; the last one slides."""
+    columns = {
+        "configuration": np.array(["6T2A", "4W2T", "6T2A", "6T2A"]), "supply_voltage_V": np.array([24.0, 33.0, 15.0, 24.0]),
+        "payload_kg": np.array([0.0, 3.0, 8.0, 0.0]), "slope_deg": np.array([0.0, 5.0, 5.0, 20.0]),
+    }  # fmt: skip
+    return Runs("a table", columns)
+
+
+@pytest.fixture(scope="module")
+def posterior(robot):
+    value = {p.name: float(p.value) for p in params.walk(robot)}
+    centre, none = np.array([value[n] for n in NAMES]), np.zeros(2)
+    return Posterior(
+        coordinates=NAMES, units=("ohm", "N·m"), mean=none, covariance=np.array([[1.0, 0.8], [0.8, 1.0]]), location=centre,
+        spread=0.05 * centre, low=0.1 * centre, high=10 * centre, softness=none, kinds=(NORMAL,) * 2,
+    )  # fmt: skip
+
+
+def chunked(chunk):
+    return config.Sweep(chunk=chunk)
+
+
+def same(one, other, rtol=0.0):
+    assert list(one) == list(other)
+    for name, values in other.items():
+        if values.dtype.kind == "f":
+            np.testing.assert_allclose(one[name], values, rtol=rtol, err_msg=name)
+        else:
+            assert np.array_equal(one[name], values), name
+
+
+def test_points_of_a_table_are_its_runs_each_with_every_draw(robot, runs, posterior):
+    drawn = Drawn(posterior.names, posterior.draw(DRAWS, 0).T)
+    job = run.job_of(robot, runs, chunked(5), drawn)
+    assert job.plan.design.shape == (4, DRAWS) and job.blocks.size == (1, 4)
+    points = job.plan.design.block((slice(1, 3), slice(2, 5)))
+    np.testing.assert_array_equal(points[:, 0], np.repeat([1.0, 2.0], 3))
+    np.testing.assert_array_equal(points[:, 1:], np.tile(posterior.draw(DRAWS, 0)[2:5], (2, 1)))
+
+
+@pytest.mark.parametrize("chunk", [None, 3])
+def test_table_has_each_run_as_it_is_by_itself(robot, runs, chunk):
+    found = run.evaluate(robot, runs, chunked(chunk), None)
+    alone = run.ended(robot, run.Run(steady_batch(robot, runs.conditions(robot))))
+    same({name: found[name] for name in alone}, alone, rtol=1e-12)
+    assert found["status"].tolist() == ["converged"] * 3 + ["slides"]
+    assert found["total_mass_kg"][1] == float(robot.configurations.members[1].mass) + 3
+
+
+def test_draws_have_the_intervals_of_robots_simulated_one_by_one(robot, runs, posterior):
+    found = uncertainty.intervals(robot, posterior, runs, chunked(None), DRAWS)
+    each = [
+        run.evaluate(params.replace(robot, dict(zip(NAMES, theta, strict=True))), runs, chunked(None), None)
+        for theta in posterior.draw(DRAWS, uncertainty.SEED)
+    ]
+    speeds = np.array([table["speed_mm_s"] for table in each])
+    np.testing.assert_allclose(found.sd("speed_mm_s")[:3], speeds.std(0, ddof=1)[:3], rtol=1e-9)
+    low = np.quantile(speeds[:, :3], uncertainty.QUANTILES[0], axis=0)
+    np.testing.assert_allclose(found.columns["speed_mm_s_lower"][:3], low, rtol=1e-12)
+    assert found.columns[uncertainty.SHARE].tolist() == [1, 1, 1, 0] and np.isnan(found.sd("speed_mm_s")[3])
+
+
+def test_chunks_of_draws_change_no_interval(robot, runs, posterior):
+    """Of a run all draws in one chunk, some runs in each; and a run's draws in three."""
+    whole = uncertainty.intervals(robot, posterior, runs, chunked(2 * DRAWS), DRAWS)
+    parted = uncertainty.intervals(robot, posterior, runs, chunked(4), DRAWS)
+    same(whole.columns, parted.columns, rtol=1e-9)
+
+
+def test_interrupted_draws_are_taken_up(robot, runs, posterior, tmp_path, monkeypatch):
+    whole = uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS)
+    folder, computed, honest = RunFolder(tmp_path / "r", {}), [], scale.Compiled.__call__
+
+    def interrupted(compiled, values, *told):
+        if len(computed) == 2:
+            raise KeyboardInterrupt
+        computed.append(compiled)
+        return honest(compiled, values, *told)
+
+    monkeypatch.setattr(scale.Compiled, "__call__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+    kept = len(list((tmp_path / "r.partial" / "chunks").glob("draws-*.npz")))
+    assert kept <= 2
+    computed.clear()
+    monkeypatch.setattr(scale.Compiled, "__call__", lambda *a: (computed.append(1), honest(*a))[1])
+    same(uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder).columns, whole.columns)
+    assert len(computed) == 4 - kept
+    again = uncertainty.intervals(robot, posterior, runs, chunked(DRAWS), DRAWS, folder)
+    assert len(computed) == 4 - kept  # nothing is left to do
+    same(again.columns, whole.columns)
+
+
+def test_what_takes_long_runs_in_parts_and_says_how_far_it_is(robot, runs, monkeypatch):
+    from mmrjax.fidelities import steady
+
+    honest = steady.FIDELITY
+
+    def in_two(robot, conditions, options, progress=None):
+        progress(0.5)
+        return honest.run(robot, conditions, options)
+
+    plain, said = run.evaluate(robot, runs, chunked(2), None), []
+    monkeypatch.setitem(fidelities.TABLE, "steady", dataclasses.replace(fidelities.facts("steady"), slow=True))
+    monkeypatch.setattr(steady, "FIDELITY", dataclasses.replace(honest, run=in_two))
+    found = run.evaluate(robot, runs, chunked(2), None, said.append)
+    same(found, plain, rtol=1e-12)
+    assert said.count(1.0) == 4 and sum(said) == 4  # two chunks, two parts each
+
+
+def test_chunks_of_many_points_are_filled_up_to_share_programs(robot, runs):
+    many = dataclasses.replace(runs, columns={k: np.tile(v, 4200) for k, v in runs.columns.items()})
+    sizes = [scale.Compiled(run.job_of(robot, r, chunked(None))).size for r in (runs, many)]
+    assert sizes == [4, 2 * scale.SHARED]
