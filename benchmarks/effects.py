@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from calibration.words import effects as words
 from mmrjax import balances, channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import ALL, Effect
@@ -142,26 +143,9 @@ def _number(value: float) -> str:
     return "0" if abs(value) < 5e-4 else f"{value:+.2g}" if abs(value) < 10 else f"{value:+.0f}"
 
 
-def _about(effect: type[Effect]) -> tuple[str, str, str]:
-    """Equation, what it stands for, and source, each on one line."""
-    text, _, source = (effect.__doc__ or "").partition("Source:")
-    equation, meaning = (" ".join(part.split()).replace("|", "∣") for part in text.split("\n\n")[:2])
-    return equation.rstrip("."), meaning, " ".join(source.split()).replace("|", "∣")
-
-
-def _declared(effect: type[Effect]) -> str:
-    """What it declares beside its equation, in words."""
-    words = [
-        "dissipative" * effect.dissipative,
-        "in histories alone" * effect.transient,
-        f"settles to `{effect.settles_to}`" * bool(effect.settles_to),
-        "on the battery alone" * effect.needs_battery,
-        "in runs both ways alone" * effect.needs_reverse,
-        "odd in travel" * effect.odd_in_travel,
-        f"on {effect.movers} alone" * bool(effect.movers),
-        f"rests on `{', '.join(effect.rests_on)}`" * bool(effect.rests_on),
-    ]
-    return ", ".join(filter(None, words)) or "-"
+def _about(effect: type[Effect]) -> tuple[str, ...]:
+    """Equation, what it stands for, and source, as cells of a table."""
+    return tuple(text.replace("|", "∣") for text in words.about(effect))
 
 
 def page() -> str:
@@ -197,9 +181,10 @@ def page() -> str:
         )
         where = effect.balance + (f": {effect.channel}" if effect.channel else "")
         low, high = spec.bounds
+        declared = ", ".join(words.declared(effect)) or "-"
         lines.append(
             f"| `{effect.name}` | {where} | {effect.family()} | {_about(effect)[0]} | {spec.unit} | "
-            f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {_declared(effect)} |"
+            f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {declared} |"
         )
     lines += [
         "",

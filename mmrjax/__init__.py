@@ -19,6 +19,10 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from calibration import calibrate as calibrate
+    from calibration import discover as discover
+    from calibration import read_robot as read_robot
+    from calibration import read_runs as read_runs
     from mmrjax.conditions import Conditions as Conditions
     from mmrjax.effects import Effect as Effect
     from mmrjax.errors import UsageError as UsageError
@@ -28,6 +32,7 @@ if TYPE_CHECKING:
     from mmrjax.robots import nominal as nominal
     from mmrjax.signals import STATUSES as STATUSES
     from mmrjax.simulation import simulate as simulate
+    from sweeps import sweep as sweep
 
 #: Where each public name lives.
 _HOME = {
@@ -42,6 +47,15 @@ _HOME = {
     "simulate": "simulation",
 }
 
+#: Names of the layers above, which one door gives too; they are imported when they are asked for, and never before.
+_ABOVE = {
+    "calibrate": "calibration",
+    "discover": "calibration",
+    "read_robot": "calibration",
+    "read_runs": "calibration",
+    "sweep": "sweeps",
+}
+
 __all__ = [
     "STATUSES",
     "Conditions",
@@ -50,9 +64,14 @@ __all__ = [
     "Robot",
     "UsageError",
     "__version__",
+    "calibrate",
+    "discover",
     "nominal",
+    "read_robot",
+    "read_runs",
     "replace",
     "simulate",
+    "sweep",
 ]
 
 if "JAX_ENABLE_X64" not in os.environ:
@@ -63,9 +82,10 @@ if "JAX_ENABLE_X64" not in os.environ:
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    home = _ABOVE.get(name) or (f"{__name__}.{_HOME[name]}" if name in _HOME else None)
+    if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    value = getattr(importlib.import_module(home), name)
     globals()[name] = value
     return value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -13,6 +14,16 @@ class UsageError(ValueError):
 def choices(word: str, allowed: Iterable[str], most: int = 1) -> str:
     """«did you mean X? allowed: ...» for an unknown word; up to `most` that are near it."""
     allowed = list(allowed)
-    near = difflib.get_close_matches(word, allowed, most)
-    hint = f"did you mean {', '.join(near)}? " if near else ""
+    found = near(word, allowed, most)
+    hint = f"did you mean {', '.join(found)}? " if found else ""
     return f"{hint}allowed: {', '.join(allowed)}"
+
+
+def near(word: str, allowed: Iterable[str], most: int = 1) -> list[str]:
+    """Up to `most` of the words that are near one, whatever their capitals: first, in their order, those that have it
+    as a part (`current` is one of `total_current`)."""
+    folded = {a.casefold(): a for a in allowed}
+    wanted = word.casefold()
+    parts = [f for f in folded if wanted in re.split(r"[._ -]", f)]
+    close = difflib.get_close_matches(wanted, folded, max(most, 1))
+    return [folded[f] for f in dict.fromkeys([*([wanted] if wanted in folded else []), *parts, *close])][:most]

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mmrjax.errors import near
+
 #: A number, or an array of numbers: one of a batch, or a tracer.
 Scalar = Float[Array, "..."] | float
 #: An index, or an array of indices.
@@ -134,6 +136,23 @@ def _walk(component: eqx.Module, prefix: str) -> Iterator[Parameter]:
                 yield from _walk(member, f"{name}.{member.name}.")
 
 
+def table(component: eqx.Module) -> str:
+    """Every parameter with value and unit, a line for each part; of a batch or a tracer its shape."""
+    parts: dict[str, list[str]] = {}
+    for p in walk(component):
+        part, _, key = p.name.rpartition(".")
+        unit = "" if p.spec.unit == "-" else f" {p.spec.unit}"
+        parts.setdefault(part, []).append(f"{key} {shown(p.value)}{unit}")
+    return "\n".join(f"  {part}: {', '.join(lines)}" for part, lines in parts.items())
+
+
+def shown(value: Any) -> str:
+    """A number to six digits; of an array its shape."""
+    if isinstance(value, jax.core.Tracer) or not isinstance(value, jax.Array | np.ndarray | np.number | float | int):
+        return str(value)
+    return f"{float(value):.6g}" if np.ndim(value) == 0 else f"array{list(np.shape(value))}"
+
+
 M = TypeVar("M", bound=eqx.Module)
 
 
@@ -141,11 +160,14 @@ def replace(component: M, values: dict[str, Any]) -> M:
     """Return `component` with the named parameters replaced; values may be tracers or batches.
 
     Raises:
-        KeyError: a name is no parameter of `component`.
+        KeyError: a name is no parameter of `component`; the message says what is near it.
     """
-    unknown = set(values) - {p.name for p in walk(component)}
+    known = [p.name for p in walk(component)]
+    unknown = sorted(set(values) - set(known))
     if unknown:
-        raise KeyError(f"no such parameter: {', '.join(sorted(unknown))}")
+        meant = [near(name, known, 3) for name in unknown]
+        hints = [f"{n} (did you mean {', '.join(m)}?)" if m else n for n, m in zip(unknown, meant, strict=True)]
+        raise KeyError(f"no such parameter: {', '.join(hints)}")
     return _replace(component, values, "")
 
 

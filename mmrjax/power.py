@@ -12,10 +12,16 @@ from mmrjax.tables import COULOMB_PER_MAH
 __all__ = ["COULOMB_PER_MAH", "Battery"]
 
 
-class Battery(eqx.Module):
-    """Cells in series, each with a parabola over its discharge; Tables 1 and A4.
+#: Capacity of the paper's cell [C], whose discharge Table 1 describes.
+CAPACITY = 2200 * COULOMB_PER_MAH
 
-    U_b = n (A C_b² + B C_b + U'_b0 - I_b R_b), eqs. (9), (12), (13), with I_b = I_s + I_p, eq. (10).
+
+class Battery(eqx.Module):
+    """Cells in series, each with a parabola over the share of its capacity that is taken; Tables 1 and A4.
+
+    U_b = n (A q² + B q + U'_b0 - I_b R_b), eqs. (9), (12), (13), with I_b = I_s + I_p, eq. (10), and
+    q = C_b C_n / C: A and B are those of a cell of capacity C_n. The paper's cell has C = C_n, so q = C_b; one of
+    another capacity falls as far over its own.
     """
 
     curvature: Scalar = parameter(
@@ -59,13 +65,14 @@ class Battery(eqx.Module):
         source="Table A4",
     )
     capacity: Scalar = parameter(
-        2200 * COULOMB_PER_MAH,
+        CAPACITY,
         unit="C",
         meaning="charge at which the battery is empty",
         bounds=(1.0, 1e6),
         relative_sd=0.05,
         source="type designation XP2200SL: 2200 mAh",
     )
+    capacity_curve: float = eqx.field(default=CAPACITY, static=True)  # C_n, of the cell whose A and B these are [C]
     cells: int = eqx.field(default=8, static=True)
     voltage_charge: float = eqx.field(default=4.2, static=True)  # highest of a cell [V], Section 3.3: fully charged
     voltage_cutoff: float = eqx.field(
@@ -77,11 +84,21 @@ class Battery(eqx.Module):
 
     def voltage_no_load(self, discharge: Scalar) -> Scalar:
         """No-load voltage of one cell [V] after `discharge` [C], eq. (13)."""
-        return self.curvature * discharge**2 + self.slope * discharge + self.voltage_full
+        taken = self._on_curve(discharge)
+        return self.curvature * taken**2 + self.slope * taken + self.voltage_full
+
+    def _on_curve(self, discharge: Scalar) -> Scalar:
+        """Charge at which a cell of capacity C_n has given the same share of its own, q [C]."""
+        return discharge * (self.capacity_curve / self.capacity)
+
+    def rises(self, discharge: Scalar) -> Bool[Array, "..."]:
+        """Whether the no-load voltage rises as the battery discharges further: eq. (13) has turned up."""
+        return jnp.asarray(2 * self.curvature * self._on_curve(discharge) + self.slope > 0)
 
     def energy(self, discharge: Scalar) -> Scalar:
         """What the whole battery has given at no-load voltage [J] after `discharge` [C]: the integral of eq. (13)."""
-        per_charge = (self.curvature / 3 * discharge + self.slope / 2) * discharge + self.voltage_full
+        taken = self._on_curve(discharge)
+        per_charge = (self.curvature / 3 * taken + self.slope / 2) * taken + self.voltage_full
         return self.cells * per_charge * discharge
 
     def current(self, total_current: Scalar) -> Scalar:
@@ -102,7 +119,7 @@ class Battery(eqx.Module):
         return self.voltage_no_load(self.capacity)
 
     def empty(self, discharge: Scalar) -> Bool[Array, "..."]:
-        """Whether the charge taken [C] has reached the capacity; the parabola (13) turns up past it."""
+        """Whether the charge taken [C] has reached the capacity."""
         return jnp.asarray(discharge >= self.capacity)
 
 
@@ -123,6 +140,17 @@ def cutoff_remark(battery: Battery) -> str | None:
         return None
     acts = f"it acts only beyond {(empty - cutoff) / resistance:.3g} A" if resistance > 0 else "it never acts"
     return f"{cutoff:g} V is below the {empty:.3g} V of an empty cell without load: {acts}"
+
+
+def curve_remark(battery: Battery) -> str | None:
+    """What to know of a parabola (13) that turns up before the battery is empty; None: it falls. Not traceable."""
+    if not bool(battery.rises(battery.capacity)):
+        return None
+    share = -float(battery.slope) / (2 * float(battery.curvature)) / battery.capacity_curve
+    return (
+        f"with this curvature and slope a cell's voltage rises again once {100 * share:.3g} % of its capacity is "
+        f"taken (capacity_curve: {battery.capacity_curve:g} C)"
+    )
 
 
 def voltage_source(

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from mmrjax import channels
+from mmrjax import channels, params
 from mmrjax.channels import Channel
 from mmrjax.chassis import Chassis
 from mmrjax.driver import Driver
@@ -96,6 +96,11 @@ class Robot(eqx.Module):
     running_gear: RunningGear = eqx.field(default_factory=RunningGear)
     driver: Driver = eqx.field(default_factory=Driver)
     rig: Rig = eqx.field(default_factory=Rig)
+
+    def __repr__(self) -> str:
+        effects = "".join(f", {e.name}" for e in self.effects)
+        head = f"Robot: {', '.join(self.configurations)}; {params.shown(self.sides)} motors driven alike{effects}"
+        return f"{head}\n{params.table(self)}"
 
     def for_equations(self) -> Robot:
         """Without what only files, priors and reports read."""

@@ -24,8 +24,8 @@ app = typer.Typer(
     name="mmrjax", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="Simulate a small tracked or wheeled robot's drive and running gear, and set it against measured runs.\n\n"
-    "[bold]Exit codes[/bold]: 0 done; 1 internal error; 2 usage or configuration; 3 done, but some runs did not "
-    "converge (their status says why); 4 bad data; 130 interrupted (the same command takes it up again).",
+    "[bold]Exit codes[/bold]: 0 done, whatever the answer; 1 internal error; 2 usage or configuration; 3 done, but a "
+    "solver failed; 4 bad data; 130 interrupted (the same command takes it up again).",
 )  # fmt: skip
 
 
@@ -59,6 +59,7 @@ def _command(
     kind: type[config.Part],
     *,
     example: str,
+    failure: str = "the solver failed at some runs (status failed). Runs that stall or slide are answers: 0",
     beside: type[config.Part] | None = None,
     arguments: tuple[str, ...] = (),
     resolve: Callable[[Path | None, dict[str, Any]], config.Part] | None = None,
@@ -68,7 +69,8 @@ def _command(
     Its function is called with `Told`, once jax is ready, and with its own options and arguments by name.
 
     Args:
-        kind: of the configuration; beside: of what changes no number, of which a file has `[solver]` alone.
+        kind: of the configuration; failure: what exit code 3 means.
+        beside: of what changes no number, of which a file has `[solver]` alone.
         arguments: fields that are arguments; a `plan` of the function's own is the file, as --config is.
         resolve: in place of `config.resolve`.
     """
@@ -105,12 +107,13 @@ def _command(
         run.__signature__ = inspect.Signature(everything)  # type: ignore[attr-defined]
         run.__annotations__ = {p.name: p.annotation for p in everything}
         del run.__wrapped__  # whose annotations are not these
-        app.command(epilog=f"Example: {example}")(run)
+        app.command(epilog=f"Example: {example}\n\nExit code 3: {failure}.")(run)
         return function
 
     return of
 
 
+_AT_CORNER = "the solver failed at the worst corner"
 #: Parameters of commands that stand after those of their configurations.
 _LAST = ("out", "force")
 
@@ -257,6 +260,8 @@ def render(
     config.Calibrate,
     beside=config.MembersPart,
     example="mmrjax calibrate measured --noise current=2%,motor_speed=0.5%,speed=1% --out fitted",
+    failure="the search, or one without a block, did not converge, or the solver failed at a row. A fit that is not "
+    "adequate and rows that slide are answers: 0",
 )
 def calibrate(
     told: Told,
@@ -279,6 +284,7 @@ def calibrate(
     config.Loop,
     beside=config.MembersPart,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
+    failure="the fit that is proposed did not converge. Every verdict is an answer: 0",
 )
 def loop(
     told: Told,
@@ -334,22 +340,28 @@ def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
     config.Check,
     arguments=("requirements",),
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",
+    failure=f"{_AT_CORNER}. A requirement that is missed is an answer: 0; result.json counts them",
 )
 def check(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Hold a robot against requirements: pass or fail with margin, each at the worst corner of its envelope.
 
-    Of each that is missed it says what change of one parameter would meet it. Exit code 3: one is missed.
+    Of each that is missed it says what change of one parameter would meet it.
     """
     from sweeps.commands import check as room
 
     return room.check(told.config, out, force)
 
 
-@_command(config.Size, arguments=("requirements",), example="mmrjax size requirements.toml --pareto mass,energy")
+@_command(
+    config.Size,
+    arguments=("requirements",),
+    example="mmrjax size requirements.toml --pareto mass,energy",
+    failure=f"{_AT_CORNER} of the best. That no design meets all is an answer: 0",
+)
 def size(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Search motor, gearbox, ratio, radius and cells for a robot that meets requirements, with the makers' parts.
 
-    Leaves the best as robot.toml, alternatives, what binds each motor. Exit code 3: no design meets all of them.
+    Leaves the best as robot.toml, alternatives, what binds each motor.
     """
     from sweeps.commands import size as room
 
@@ -398,6 +410,21 @@ def rig_check(
     from sweeps.commands import rig_check as room
 
     return room.check(file, data, tuple(effects or ()), json)
+
+
+@app.command(epilog="Example: mmrjax explain series_resistance")
+def explain(
+    name: Annotated[
+        str | None, typer.Argument(help="An effect, status, flag, output, channel or parameter; none lists them.")
+    ] = None,
+    effects: _Effects = None,
+    no_cache: _NoCache = False,
+) -> int:
+    """Say what a name means: equation, source, typical size, what it looks like in data, how to test for it."""
+    _start_jax(no_cache)
+    from sweeps.commands import explain as room
+
+    return room.explain(name, tuple(effects or ()))
 
 
 @app.command()

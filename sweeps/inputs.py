@@ -91,6 +91,8 @@ def read_runs(
 
         observers.kind(runs).check_settled(runs)
     runs.configurations(robot)
+    for note in runs.notes:
+        tell(note)
     if runs.unknown:
         tell(f"{runs.source}: not used: {', '.join(runs.unknown)}")
     return runs

@@ -11,7 +11,7 @@ from calibration.data.runs import Runs
 from sweeps import config as configuration
 from sweeps.config import RobotPart
 from sweeps.console import say
-from sweeps.store import DONE, SOME_NOT_CONVERGED, Folder
+from sweeps.store import DONE, SOLVER_FAILED, Folder
 
 Page = Callable[[Path], Any]
 
@@ -29,7 +29,7 @@ def leave(
     config: RobotPart,
     manifest: dict[str, Any],
     *,
-    complete: bool = True,
+    solved: bool = True,
     page: Page | None = None,
     runs: Runs | None = None,
 ) -> int:
@@ -38,13 +38,13 @@ def leave(
     Args:
         folder: with the command's own files, `robot.toml` among them.
         manifest: what it says beside program, versions and hashes; runs: the table whose file's hash it has, if any.
-        complete: whether all is as asked.
+        solved: whether every solver gave an answer.
 
     Returns:
-        The exit code: 0, or 3 where not all is as asked.
+        The exit code: 0, or 3 where a solver failed.
     """
     folder.write_text("config.resolved.toml", configuration.as_toml(config))
     if page is not None and getattr(config, "report", True):
         page(folder.partial)
     say(str(folder.finish(manifest, runs)))
-    return DONE if complete else SOME_NOT_CONVERGED
+    return DONE if solved else SOLVER_FAILED

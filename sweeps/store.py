@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
     from sweeps.config import RobotPart
 
-#: Exit codes of a command that is done: all runs converged, or some did not.
-DONE, SOME_NOT_CONVERGED = 0, 3
+#: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
+#: requirement that is missed and any verdict are answers.
+DONE, SOLVER_FAILED = 0, 3
 #: Packages whose versions are part of a result.
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "optimistix", "lineax", "diffrax", "numpy")
 
@@ -60,7 +61,7 @@ class Folder:
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file."""
-        (self.partial / name).write_text(text, encoding="utf-8")
+        writing.write_text(self.partial / name, text)
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a JSON file; what is not finite becomes null."""
@@ -130,13 +131,15 @@ class RunFolder(Folder):
     def __enter__(self) -> RunFolder:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *_: Any) -> None:
         """Leave nothing behind where the command was refused, or interrupted before a chunk was done.
 
         What else an interrupt leaves is taken up again.
         """
         if kind is None:
             return
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(self.partial)
         vain = issubclass(kind, KeyboardInterrupt) and not any((self.partial / "chunks").glob("*.npz"))
         if vain or issubclass(kind, InputError):
             shutil.rmtree(self.partial, ignore_errors=True)
@@ -153,7 +156,7 @@ class RunFolder(Folder):
         """Keep a finished chunk for a run that is taken up again."""
         file = self.partial / "chunks" / f"{name}.npz"
         aside = file.with_suffix(".writing")
-        with aside.open("wb") as stream:
+        with writing.naming(file), aside.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
 

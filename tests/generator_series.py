@@ -14,7 +14,7 @@ from typing import Any
 
 import generator as g
 import numpy as np
-from reference import CELLS, SIDES, G
+from reference import CELLS, NOMINAL, SIDES, G
 
 STEP = 2e-4  # [s]; the armature's time constant is 1.9e-4 s, the method is stable to 2.7 of them
 FINER = 8  # times smaller steps through the first 20 ms
@@ -99,7 +99,8 @@ def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str,
     s.sign, sign_V = _soft_sign(s.V_teor, 0.1 * V_s), _soft_sign(s.V, 0.1 * V_s)
     m = c.mass / SIDES
     N = s.N = m * G * np.cos(c.slope)
-    cell = p["battery.curvature"] * s.C_b**2 + p["battery.slope"] * s.C_b + p["battery.voltage_full"]
+    q = s.C_b * NOMINAL["battery.capacity"] / p["battery.capacity"]
+    cell = p["battery.curvature"] * q**2 + p["battery.slope"] * q + p["battery.voltage_full"]
     I_b = SIDES * s.I + p["battery.current_other"]  # (10)
     U = np.where(battery > 0.5, CELLS * (cell - I_b * p["battery.resistance"]), c.U) - extra("supply")
     L = p["motor.inductance"] + extra("inductance")

@@ -82,9 +82,13 @@ NOMINAL: dict[str, float] = {
 # --- power source -----------------------------------------------------------------------------------
 
 
-def battery_voltage(I_s, C_b, A, B, U0, R_b, I_p):
-    """U_b [V], eqs. (9), (10), (12), (13), after the charge C_b [C] at motor current I_s [A]."""
+def battery_voltage(I_s, C_b, A, B, U0, R_b, I_p, C=1.0, C_n=1.0):
+    """U_b [V], eqs. (9), (10), (12), (13), after the charge C_b [C] at motor current I_s [A].
+
+    A and B are of a cell of capacity C_n; one of capacity C falls as far over its own.
+    """
     I_b = I_s + I_p
+    C_b = C_b / C * C_n
     return sum((A * C_b**2 + B * C_b + U0) - I_b * R_b for _ in range(CELLS))
 
 
@@ -271,7 +275,8 @@ class Side:
         """U_e [V]."""
         if not self.battery:
             return self.U
-        return CELLS * (self.A * C_b * C_b + self.B * C_b + self.U0 - (SIDES * I + self.I_p) * self.R_b)
+        q = C_b / self.full * NOMINAL["battery.capacity"]
+        return CELLS * (self.A * q * q + self.B * q + self.U0 - (SIDES * I + self.I_p) * self.R_b)
 
     def efficiency(self, A, B, sign):
         """η_rm driving, 1/η_rm driven, 1 at rest and in between, from motor torque less idle loss A and load B."""

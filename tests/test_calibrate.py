@@ -25,10 +25,13 @@ from calibration.data.errors import BadConfiguration, BadData
 from calibration.inference import noise, observers, priors
 from calibration.inference import optimizers as fit
 from calibration.inference.calibrate import calibrate
-from calibration.inference.notes import Constant, Unmeasured
+from calibration.inference.notes import Constant, SamePredictions, Unmeasured
 from calibration.inference.observers import SettledRuns
+from calibration.inference.remarks import remarks
+from calibration.inference.result import HeldOut
 from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
+from sweeps.commands.calibrate import print_calibration
 from sweeps.pages import calibration as calibration_page
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -138,6 +141,20 @@ def test_result_is_by_name_and_says_all_of_a_parameter(found):
     assert found.tied["6T2A.ground.friction.dynamic"].leader == "6T2A.ground.friction.static"
     assert found.main_blocks is found.held_out["slope"]
     assert set(found.held_out["slope"].blocks) == {"0.0", "5.0", "10.0", "15.0", "20.0"}
+
+
+def test_blocks_that_tell_nothing_of_their_own_are_said_and_not_shown(found, capsys):
+    """Three identical rows of the table were once printed without a word."""
+    reading = {name: r.after for name, r in found.readings.items()}
+    other = {name: r.after + 0.02 * r.sd for name, r in found.readings.items()}
+    held = [HeldOut(found.errors_after, (), {}, x) for x in (reading, other, reading, reading)]
+    kinds = ("voltage_configuration", "slope", "voltage", "payload")
+    found = dataclasses.replace(found, held_out=dict(zip(kinds, held, strict=True)))
+    assert found.held_out_alike == {"voltage_configuration": ("voltage", "payload"), "slope": ()}
+    assert SamePredictions("voltage_configuration", ("voltage", "payload")) in remarks(found)
+    print_calibration(found)
+    shown = capsys.readouterr().out
+    assert "held out by slope" in shown and "by voltage and configuration" in shown and "by payload" not in shown
 
 
 def test_rows_have_every_row(found):

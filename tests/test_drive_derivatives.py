@@ -103,11 +103,8 @@ def test_drive_bad_members_leave_neighbours_derivatives_alone(rebuild, theta, sc
 
 # --- no parameter that can be freed is dead ---------------------------------------------------------
 
-#: Parameters that no number of either fidelity depends on smoothly, and why.
-ONLY_THROUGH_A_STATUS = {"battery.capacity": "a threshold: it decides `battery_empty`, see test_drive_statuses"}
 #: Parameters that leave the steady state alone, and why.
 NOT_IN_STEADY = {
-    "battery.capacity": "a threshold",
     "motor.inductance": "no voltage across it at constant current",
     "motor.inertia": "no torque at constant speed",
     "6T2A.inertia": "no torque at constant speed",
@@ -139,7 +136,7 @@ def test_every_free_parameter_changes_drive(free, theta, jacobians):
             seen = np.abs(d) > 1e-8 * (np.abs(v) + 1e-3)
             alive |= seen.any(tuple(range(d.ndim - 1)))
     dead = {n for n, a in zip(names, alive, strict=True) if not a}
-    assert dead == set(ONLY_THROUGH_A_STATUS) | set(ALIVE_WITH) | _elsewhere(names)
+    assert dead == set(ALIVE_WITH) | _elsewhere(names)
 
 
 def _elsewhere(names):

@@ -40,6 +40,9 @@ def rated(robot):
         ({"speed_motor": 1300.0}, {"gearbox_overspeed", "motor_overspeed"}),
         ({"torque_gear": -6.3}, {"gearbox_overload"}),
         ({"speed_sliding": -0.03}, {"slips"}),
+        ({"discharge": 12_800.0}, set()),  # the parabola turns at 12 857 C
+        ({"discharge": 12_900.0}, {"voltage_rising"}),
+        ({"discharge": 12_900.0, "battery": 0.0}, set()),
     ],
 )
 def test_limits_that_an_instant_exceeds(rated, changed, flags):

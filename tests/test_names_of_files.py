@@ -199,7 +199,7 @@ def command(folder: Path, *arguments: Any) -> SimpleNamespace:
         patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
         with pytest.raises(SystemExit) as end:
             cli.main()
-    assert end.value.code in (0, None, 3), err.getvalue()
+    assert end.value.code in (0, None), err.getvalue()
     return SimpleNamespace(code=end.value.code, out=out.getvalue(), err=err.getvalue())
 
 

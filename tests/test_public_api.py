@@ -17,6 +17,7 @@ import pytest
 import test_fidelities
 
 import mmrjax as mm
+from calibration.data.errors import BadConfiguration
 from mmrjax import channels, fidelities, outputs, params, robots
 from mmrjax.effects import ALL
 from mmrjax.fidelities.drive import drive_batch
@@ -59,6 +60,54 @@ def test_five_lines():
 
 def test_import_loads_no_jax():
     assert python("import sys, mmrjax; print('jax' in sys.modules, 'numpy' in sys.modules)") == "False False\n"
+
+
+def test_layers_above_are_imported_when_they_are_asked_for_and_not_before():
+    """`mm.simulate` loads none of them; the names of `_ABOVE` are theirs."""
+    loaded = "sorted({m.partition('.')[0] for m in sys.modules} & {'calibration', 'sweeps', 'pydantic'})"
+    code = (
+        f"import sys, mmrjax as mm; mm.simulate; dir(mm); print({loaded}); mm.calibrate; print({loaded}); mm.sweep; "
+        f"print({loaded}, mm.calibrate.__module__, mm.sweep.__module__)"
+    )
+    first, second, third = python(code).splitlines()
+    assert first == "[]" and second == "['calibration']" and third.startswith("['calibration', 'pydantic', 'sweeps']")
+    assert third.endswith("calibration.inference.calibrate sweeps.points.door")
+    assert set(mm._ABOVE) == set(mm.__all__) - set(mm._HOME) - {"__version__"}
+
+
+def test_a_sweep_is_its_grid_simulated(robot):
+    found = mm.sweep(robot, configurations="4W2T", voltages=[15, 24], payloads=2.0, slopes_deg=[0.0, 5.0])
+    assert found.shape == (4,) and found.conditions.slope_deg.tolist() == [0.0, 5.0, 0.0, 5.0]
+    alone = mm.simulate(robot, mm.Conditions("4W2T", voltage=24.0, payload=2.0, slope_deg=5.0))
+    np.testing.assert_allclose(found.total_current[3], alone.total_current, rtol=1e-12)
+    assert mm.sweep(robot).shape == (180,)  # Table 8
+    with pytest.raises(BadConfiguration, match="6T2B; the robot has no such configuration; did you mean 6T2A"):
+        mm.sweep(robot, configurations=["6T2B"])
+    with pytest.raises(mm.UsageError, match=r"slope_deg\[1\]: got 95; expected -45 to 45"):
+        mm.sweep(robot, configurations="6T2A", voltages=24.0, payloads=0.0, slopes_deg=[0, 95])
+
+
+def test_a_robot_shows_values_and_units(robot):
+    text = repr(dataclasses.replace(robot, effects=(ALL[0](amplitude=0.1),)))
+    assert text.startswith("Robot: 6T2A, 4W2T; 2 motors driven alike, mass_error\n")
+    assert (
+        "  motor: resistance 0.611 ohm, inductance 0.000119 H" in text and "effects.mass_error: amplitude 0.1" in text
+    )
+    assert all(f"{p.name.rpartition('.')[2]} " in text for p in params.walk(robot))
+    batch = mm.replace(robot, {"motor.resistance": jnp.ones(3)})
+    assert "resistance array[3] ohm" in repr(batch)
+    traced = []
+    jax.jit(lambda r: traced.append(repr(mm.replace(robot, {"motor.resistance": r}))) or r)(0.5)
+    assert "Tracer" in traced[0] or "JitTracer" in traced[0]
+
+
+def test_a_wrong_name_of_a_parameter_is_answered_by_what_is_near(robot):
+    with pytest.raises(KeyError, match=r"no such parameter: motor\.resistanse \(did you mean motor\.resistance"):
+        mm.replace(robot, {"motor.resistanse": 0.5})
+    with pytest.raises(
+        KeyError, match=r"friction_coulomb \(did you mean motor\.friction_coulomb, gearbox\.friction_c"
+    ):
+        mm.replace(robot, {"friction_coulomb": 0.5})
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def test_simulate_over_time_draws_the_channels_of_the_rig(mmrjax, tmp_path, kind
     code, out, err = mmrjax(
         "simulate", "--robot", rig, "--voltage", "3", "--model", "drive", "--duration", "0.5", "--out", "run"
     )  # fmt: skip
-    assert code in (0, 3), err  # an arm still moves
+    assert code == 0, err  # an arm still moves
     history = rows_of(tmp_path / "run" / "history.csv")
     shafts = {"motor_speed_rpm", "output_angle_deg"}
     assert (shafts <= set(history[0])) == (kind != "wheeled") and len(history) > 100
@@ -156,7 +156,7 @@ def test_a_profile_turns_a_bench(mmrjax, tmp_path):
     code, out, err = mmrjax(
         "simulate", "--robot", of_kind(tmp_path, "bench"), "--profile", "turn.csv", "--out", "run"
     )  # fmt: skip
-    assert code in (0, 3), err
+    assert code == 0, err
     course = rows_of(tmp_path / "run" / "history.csv")
     assert (
         "demanded_motor_speed_rpm" in course[0]
@@ -300,7 +300,7 @@ def test_a_vehicle_is_drawn(mmrjax, tmp_path):
         "render", "x.png", "--robot", rig, "--voltage", "12", "--duration", "0.2",
         "--begin", "0.1",
     )  # fmt: skip
-    assert code in (0, 3) and (tmp_path / "x.png").stat().st_size > 1000, err
+    assert code == 0 and (tmp_path / "x.png").stat().st_size > 1000, err
     assert "states no running_gear" in err and words_of_others(out, err) == []
 
 

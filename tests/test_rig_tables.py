@@ -160,7 +160,11 @@ REFUSED = {
         r"no column of a channel; expected at least one of to",
     ),
     "an empty file": (bench, "", r"the file is empty; expected a header with motor_speed_rpm, total_current_A"),
-    "not a number": (bench, f"{BENCH}1000,nan\n", r"row 1, total_current_A: got nan; expected -2000 to 2000"),
+    "not a number": (
+        bench,
+        f"{BENCH}1000,nan\n",
+        r"row 1, total_current_A: got nan; leave the cell empty where there is no reading; expected -2000 to 2000",
+    ),
     "in its own unit": (
         bench,
         "motor_speed_rpm,total_current_mA\n9,3e6\n",

@@ -264,3 +264,45 @@ def test_robot_file_knows_what_it_states(tmp_path):
     assert values(found.robot) == values(robot_file.load(str(path)))
     packaged = robot_file.find("sm1")
     assert not packaged.stated and packaged.name == "sm1" and values(packaged.robot) == values(robots.sm1())
+
+
+def test_a_stated_curve_is_that_of_the_capacity_beside_it(tmp_path):
+    """So what a file with a capacity and a curve of its own means is eq. (13); a capacity alone keeps the paper's."""
+    path, again = tmp_path / "mine.toml", tmp_path / "again.toml"
+    for text, of in (
+        ("capacity = 18000.0\ncurvature = 1e-9\nslope = -4e-5", 18_000.0),
+        ("capacity = 18000.0\ncurvature = 1e-9\nslope = -4e-5\ncapacity_curve = 9000.0", 9000.0),
+        ("capacity = 18000.0", 7920.0),
+        ("slope = -1e-4", 7920.0),
+    ):
+        path.write_text(f"[battery]\n{text}\n")
+        battery = robot_file.read(path).battery
+        assert battery.capacity_curve == of
+        robot_file.write(robot_file.read(path), again)
+        assert robot_file.read(again).battery == battery
+        start = 'base = "none"\nchannels = ["total_current"]\n[motor]\nresistance = 1.0\ntorque_constant = 0.05\n'
+        load = '[gearbox]\nratio = 10\nefficiency_load = 0.8\n[arm]\nload = "shaft"\ninertia = 1e-3\nloss_coulomb = 0.01\n'
+        path.write_text(f"{start}{load}[battery]\n{text}\n")
+        robot_file.write(robot_file.read(path), again)
+        assert robot_file.read(again).battery == robot_file.read(path).battery
+        assert robot_file.read(again).battery.capacity_curve == of
+
+
+def test_a_curve_that_turns_up_is_said_where_a_file_states_it(tmp_path):
+    (tmp_path / "up.toml").write_text("[battery]\ncurvature = 1e-8\n")
+    robot_file.read(tmp_path / "up.toml", notes=(notes := []))
+    assert notes == [
+        "up.toml, battery.curvature: with this curvature and slope a cell's voltage rises again once 87.7 % of its "
+        "capacity is taken (capacity_curve: 7920 C)"
+    ]
+    robot = robot_file.change(robots.nominal(), {"battery.capacity": 30_670.0}, where="--set", notes=(quiet := []))
+    assert quiet == [] and float(robot.battery.voltage_empty) == float(robots.nominal().battery.voltage_empty)
+
+
+def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path):
+    (tmp_path / "bad.toml").write_text("[motor]\nresistance = -1\nresistence = 0.6\n[gearbox]\nratio = 'x'\n")
+    with pytest.raises(BadConfiguration) as error:
+        robot_file.read(tmp_path / "bad.toml")
+    said = str(error.value)
+    assert said.startswith("bad.toml, motor.resistance: got -1; expected 0.001 to 1000 ohm")
+    assert "; also motor.resistence: no such parameter" in said and "; also gearbox.ratio: got 'x'; expected" in said

@@ -5,6 +5,7 @@ import pytest
 
 from calibration.data import runs as records
 from calibration.data.errors import BadData
+from mmrjax import robots
 from mmrjax.conditions import Conditions
 
 HEADER = (
@@ -96,11 +97,14 @@ REFUSED = {
         HEADER.replace("slope_deg", "slope_degr") + "\n" + ROW,
         r"slope_deg is missing; is slope_degr meant",
     ),
-    "misspelt optional column": (f"{HEADER},total_current_sd_a\n{ROW},1", r"did you mean total_current_sd_A"),
+    "misspelt optional column": (f"{HEADER},total_current_sd_AA\n{ROW},1", r"did you mean total_current_sd_A"),
     "repeated column": (f"{HEADER},slope_deg\n{ROW},5", r"column slope_deg stands 2 times"),
     "extra cell": (f"{HEADER}\n{ROW},7", r"row 1: got 9 cells; the header has 8"),
     "missing cell": (f"{HEADER}\n{ROW}\n6T2A,15", r"row 2: got 2 cells"),
-    "slope of 95": (f"{HEADER}\n{ROW.replace(',5,', ',95,')}", r"row 1, slope_deg: got 95; expected -45 to 45"),
+    "slope of 95": (
+        f"{HEADER}\n{ROW.replace(',5,', ',95,')}",
+        r"row 1, slope_deg: got 95; is it in percent\? then name the column slope_percent; expected -45 to 45",
+    ),
     "speed in m/s is a number, mass negative is not": (
         f"{HEADER}\n{ROW.replace('13.1', '-13.1')}",
         r"row 1, total_mass_kg: got -13\.1; expected 0\.1 to 500",
@@ -109,7 +113,10 @@ REFUSED = {
         f"{HEADER}\n{ROW.replace(',15,', ',0,')}",
         r"row 1, supply_voltage_V: got 0; expected a voltage, in a table of readings",
     ),
-    "NaN": (f"{HEADER}\n{ROW.replace('2.75', 'nan')}", r"row 1, total_current_A: got nan; expected -2000 to 2000"),
+    "NaN": (
+        f"{HEADER}\n{ROW.replace('2.75', 'nan')}",
+        r"row 1, total_current_A: got nan; leave the cell empty where there is no reading; expected -2000 to 2000",
+    ),
     "infinity": (f"{HEADER}\n{ROW.replace('4800', 'inf')}", r"motor_speed_rpm: got inf"),
     "no number": (
         f"{HEADER}\n{ROW.replace('4800', 'fast')}",
@@ -147,3 +154,120 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     (tmp_path / "picture.csv").write_bytes(b"\x89PNG\xff\xfe")
     with pytest.raises(BadData, match="cannot be read as a UTF-8"):
         records.read(tmp_path / "picture.csv")
+
+
+# --- as spreadsheets and people write them -----------------------------------------------------------
+
+
+def written(tmp_path, text):
+    (tmp_path / "runs.csv").write_text(text, encoding="utf-8")
+    return tmp_path / "runs.csv"
+
+
+def test_semicolons_and_decimal_commas_are_taken_and_said(tmp_path):
+    usual = records.read(written(tmp_path, f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n"))
+    for text, said in (
+        (f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace(".", ","), "semicolons, and"),
+        (f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", "\t"), "tabs; read so"),
+    ):
+        found = records.read(written(tmp_path, text))
+        for column in usual.columns:
+            np.testing.assert_array_equal(found[column], usual[column])
+        assert len(found.notes) == 1 and f"runs.csv: columns are separated by {said}" in found.notes[0]
+    assert usual.notes == ()
+
+
+def test_commas_and_points_in_one_column_are_refused(tmp_path):
+    text = f"{HEADER}\n{ROW}\n6T2A,33,21.1,8,0,3.2,11590,970\n".replace(",", ";").replace("2.75", "2,75")
+    with pytest.raises(
+        BadData, match=r"runs\.csv, total_current_A: got 2,75 and 3\.2; expected decimal commas or points"
+    ):
+        records.read(written(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("column", "cell", "says"),
+    [
+        (
+            "supply_voltage_V",
+            "24V",
+            "got 24V; write 24, the unit stands in the column's name; expected a number, -100",
+        ),
+        ("supply_voltage_V", "24 volts", "got 24 volts; write 24, the unit stands in"),
+        (
+            "supply_voltage_V",
+            "24000",
+            r"got 24000; is it in mV\? then name the column supply_voltage_mV; expected -100",
+        ),
+        (
+            "total_current_A",
+            "2750 mA",
+            "write numbers alone, in A, or name the column total_current_mA; expected a num",
+        ),
+        (
+            "total_current_A",
+            "275000",
+            r"is it in mA\? then name the column total_current_mA; expected -2000 to 2000",
+        ),
+        ("payload_kg", "1500", r"is it in g\? then name the column payload_g; expected 0 to 300"),
+        ("payload_kg", "1500 g", "write numbers alone, in kg, or name the column payload_g"),
+        ("slope_deg", "5 %", "write numbers alone, in deg, or name the column slope_percent"),
+        ("slope_deg", "5 furlongs", "write the number alone, in deg; expected a number, -45 to 45"),
+        ("slope_deg", "nan", "got nan; expected -45 to 45"),
+        ("motor_speed_rpm", "n/a", "leave the cell empty where there is no reading; expected a number"),
+        ("motor_speed_rpm", "1e9", r"got 1e9; expected -30000 to 30000"),
+    ],
+)
+def test_units_and_words_in_cells_get_a_hint(tmp_path, column, cell, says):
+    row = dict(zip(HEADER.split(","), ROW.split(","), strict=True)) | {column: cell}
+    with pytest.raises(BadData, match=rf"^runs\.csv row 1, {column}: .*{says}"):
+        records.read(written(tmp_path, f"{HEADER}\n{','.join(row.values())}\n"))
+
+
+def test_all_bad_cells_are_said_at_once_the_first_row_first(tmp_path):
+    rows = [ROW, ROW.replace("4800", "fast"), ROW, ROW.replace("15", "-500").replace("2.75", "nan")]
+    with pytest.raises(BadData) as error:
+        records.read(written(tmp_path, "\n".join([HEADER, *rows])))
+    said = str(error.value)
+    assert said.startswith("runs.csv row 2, motor_speed_rpm: got fast; expected a number")
+    assert said.index("; also row 4, supply_voltage_V: got -500") < said.index("; row 4, total_current_A: got nan")
+    with pytest.raises(BadData, match=r"; and 12 more$"):
+        records.read(written(tmp_path, "\n".join([HEADER, *[ROW.replace("4800", "fast")] * 20])))
+
+
+def test_capitals_of_columns_and_configurations_are_taken_and_said(tmp_path):
+    text = f"{HEADER}\n{ROW}\n".replace("slope_deg", "Slope_Deg").replace("6T2A", "6t2a")
+    found = records.read(written(tmp_path, text), robot=robots.nominal())
+    assert found["slope_deg"].tolist() == [5.0] and found["configuration"].tolist() == ["6T2A"]
+    assert found.notes == (
+        "runs.csv: column Slope_Deg is read as slope_deg", "runs.csv: configuration 6t2a is read as 6T2A",
+    )  # fmt: skip
+
+
+def test_what_a_table_lacks_is_said_before_it_is_used(tmp_path):
+    header = f"{HEADER.replace(',motor_speed_rpm', '')},run_id"
+    rows = [ROW.replace(",4800", "") + f",{run}" for run in "abac"]
+    rows[1] = rows[1].replace("2.75", "")
+    found = records.read(written(tmp_path, "\n".join([header, *rows])), robot=robots.nominal())
+    assert found.notes == (
+        "runs.csv: 1 of 4 cells of total_current_A are empty, the first in row 2; they weigh nothing",
+        "runs.csv: no column motor_speed_rpm; nothing is known of its channel",
+        "runs.csv: run_id a stands in rows 1, 3; without time_s every row is a run of its own",
+    )
+
+
+def test_a_command_says_it_on_stderr_before_it_fits(mmrjax, tmp_path, monkeypatch):
+    text = f"{HEADER}\n{ROW}\n{ROW.replace('2.75', '')}\n"
+    (tmp_path / "runs.csv").write_text(text.replace(",", ";"))
+
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    for command in ("calibrate", "loop", "compare"):
+        monkeypatch.setattr("sweeps.commands.calibrate.run", stopped)
+        monkeypatch.setattr("sweeps.commands.loop.discover", stopped)
+        err = mmrjax(command, "runs.csv", "--no-report", "--out", command)[2]
+        assert (
+            "separated by semicolons" in err
+            and "1 of 2 cells of total_current_A are empty, the first in row 2" in err
+        )

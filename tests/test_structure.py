@@ -94,8 +94,25 @@ def rooms_have_names_of_their_own(path: PurePosixPath, tree: ast.Module) -> Iter
             yield 1, f"a room named {part}"
 
 
+#: The one exception: names of the layers above that `import mmrjax` gives too, imported when they are asked for.
+DOOR = ("mmrjax/__init__.py", "_ABOVE")
+#: Where else their names stand: whose modules a compiled program is named after.
+NAMED = {DOOR, ("mmrjax/programs.py", "OWN")}
+
+
 def layers_import_those_before_them(path: PurePosixPath, tree: ast.Module) -> Iterator[Breach]:
     layer = path.parts[0]
+    if path.as_posix() == DOOR[0]:  # what annotations alone need, and names of modules in one table
+        tree = ast.Module(
+            [n for n in tree.body if not (isinstance(n, ast.If) and "TYPE_CHECKING" in ast.unparse(n.test))], []
+        )
+    place, above = places(tree), LAYERS[LAYERS.index(layer) + 1 :]
+    for node in ast.walk(tree):
+        named = (
+            isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.partition(".")[0] in above
+        )
+        if layer == LAYERS[0] and named and (path.as_posix(), place.get(id(node))) not in NAMED:
+            yield node.lineno, f"{layer} imports {node.value}"
     for name, line in imports(tree, ".".join(path.parent.parts)):
         if name.partition(".")[0] in LAYERS[LAYERS.index(layer) + 1 :]:
             yield line, f"{layer} imports {name}"
@@ -173,6 +190,7 @@ REPRODUCTION = ("sweeps", "paper")
 #: what shows slip.
 SPELLED = {
     ("calibration/discovery/menu.py", "TURNING, STANDING"),
+    ("calibration/words/effects.py", "CHECKED_BY"),  # which act checks which instrument
     ("calibration/inference/bases.py", "VARIABLES"),
     ("calibration/inference/blocks.py", "BLOCKS"),  # what is imposed may be a channel's column
     ("calibration/inference/observers/settled_ends.py", "_sliding"),  # the two that show slip
@@ -445,6 +463,9 @@ def test_structure_holds():
 BAD = {
     "mmrjax imports calibration": ("mmrjax/bad.py", "from calibration import fit"),
     "mmrjax imports sweeps.points.run": ("mmrjax/models/bad.py", "def f():\n    import sweeps.points.run"),
+    "mmrjax imports calibration 2": ("mmrjax/bad.py", "from importlib import import_module as f\nf('calibration')"),
+    "mmrjax imports calibration 3": ("mmrjax/__init__.py", "_ABOVE = {'a': 'calibration'}\nimport calibration"),
+    "mmrjax imports sweeps": ("mmrjax/__init__.py", "_ABOVE = {'a': 'sweeps'}\ndef f():\n    return 'sweeps'"),
     "calibration imports sweeps": ("calibration/bad.py", "from sweeps import grid"),
     "mmrjax imports sweeps.points.grid": (
         "mmrjax/bad.py",
@@ -534,6 +555,7 @@ BAD = {
 #: What no rule may mind.
 GOOD = {
     "mmrjax/balances.py": "def f(e, r, s):\n    return e.term(r, s)\n",
+    "mmrjax/__init__.py": "_ABOVE = {'f': 'calibration'}\nif TYPE_CHECKING:\n    from calibration import f as f\n",
     "mmrjax/tables.py": "TRACKED, WHEELED = '6T2A', '4W2T'\n",
     "calibration/__init__.py": "",
     "calibration/data/table.py": "'''On 6T2A and 4W2T.'''\ndef f(t):\n    return {'time_s': t['time_s'], 'row': 1}\n",

@@ -148,6 +148,11 @@ SAMPLES = [
         "held out by voltage and configuration: 2 of 20 rows have no prediction, because the robot fitted without them "
         "slides there; the errors leave them out",
     ),
+    (
+        of_fit.SamePredictions("voltage_configuration", ("voltage", "payload")),
+        "held out by voltage or by payload: the same predictions as held out by voltage and configuration, which stand "
+        "for them; these runs do not vary them apart",
+    ),
     (of_fit.BlockNotConverged("slope"), "a search without a block of slope did not converge"),
     (of_fit.Agreement(1, 1, 0, 0.0, 0), "one search"),
     (of_fit.Agreement(1, 0, 0, 0.0, 1), "one search, which did not converge"),

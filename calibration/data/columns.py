@@ -261,6 +261,10 @@ class Layout:
             found[column] = Meaning(column, column, quantity, own or "")
         return found
 
+    def spellings(self) -> tuple[str, ...]:
+        """Every name that a column of a file may have and that means something, in any unit."""
+        return (*self._by_name(), *(column for _, column, _ in self.mapped))
+
     def expected(self, column: str) -> str:
         """The column, and where the robot's file says that it is read from."""
         theirs = next((their for mine, their, _ in self.mapped if _standard(self._by_name(), mine) == column), None)

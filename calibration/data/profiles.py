@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
 import math
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data import units
+from calibration.data import delimited, units
 from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
 from calibration.data.units import Quantity
 from mmrjax import channels
@@ -90,6 +89,7 @@ class ProfileTable:
         linear, cycles: as of `mmrjax.profile.Profile`.
         digest: SHA-256 of the file.
         begins: fields of `Start` that it states [SI, °C]; rolling speed, temperatures of winding and housing.
+        notes: sentences on how the file was read.
     """
 
     source: str
@@ -102,6 +102,7 @@ class ProfileTable:
     cycles: int
     digest: str
     begins: dict[str, float] = dataclasses.field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def start(self) -> Start | None:
@@ -210,12 +211,10 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
     lines = [line for line in lines if line]
     above = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
     settings = _settings(name, lines[:above])
-    rows = [[cell.strip() for cell in row] for row in csv.reader(lines[above:])]
+    rows, notes = delimited.cells(name, lines[above:])
     if not rows:
         raise BadData(f"{name}: the file is empty; expected a header with time_s and rows")
     header, body = rows[0], rows[1:]
-    if len(header) == 1 and ";" in header[0]:
-        raise BadData(f"{name}: columns are separated by semicolons; expected commas, and points in numbers")
     columns = _columns(name, header)
     if len(body) < 2:
         got = "one row" if body else "a header and no rows"
@@ -233,7 +232,7 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
         raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
     return ProfileTable(
         name, time, modes, demand, values, cells.surfaces(), settings["linear"], settings["cycles"],
-        hashlib.sha256(content).hexdigest(), settings["begins"],
+        hashlib.sha256(content).hexdigest(), settings["begins"], notes,
     )  # fmt: skip
 
 

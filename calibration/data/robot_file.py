@@ -16,6 +16,7 @@ from calibration.data import rig_file, stated
 from calibration.data.configuration_tables import loads, resolved_likes
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadConfiguration, choices, is_number, number, toml_content, toml_text
+from calibration.data.writing import write_text
 from mmrjax import effects, params, power, robots
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
@@ -46,7 +47,10 @@ RATINGS = {
     "battery.delay_cutoff": (0.0, 1e3, "s", "how long a cell may be below it, since a start draws more; assumed"),
     "battery.current_limit": (1e-3, 1e4, "A", "largest current that a cell may give; not stated: none"),
     "battery.current_charge": (0.0, 1e4, "A", "largest current that a cell may take; not stated: none"),
+    "battery.capacity_curve": (1.0, 1e6, "C", "capacity of the cell whose curvature and slope are stated"),
 }
+#: The parabola of a cell's no-load voltage; stated beside a capacity it is that of a cell of this capacity.
+CURVE = {"battery.curvature", "battery.slope"}
 #: What a robot has or has not, which no fit can free: meaning.
 SWITCHES = {
     "gearbox.mesh_theory": "load driving the motor loses 2 - 1/η of the mesh's theory, else η",
@@ -272,24 +276,13 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     stated = current_values(values, robot, where, notes)
     counts = {name: _count(where, name, stated.pop(name)) for name in COUNTS if name in stated}
     ratings = {name: _rating(where, name, stated.pop(name)) for name in RATINGS if name in stated}
+    if CURVE & stated.keys() and "battery.capacity" in stated:  # all of one cell, unless it is said otherwise
+        ratings.setdefault("battery.capacity_curve", stated["battery.capacity"])
     ratings |= {name: _switch(where, name, stated.pop(name)) for name in SWITCHES if name in stated}
     known = {p.name: p for p in params.walk(robot)}
-    for name, value in stated.items():
-        if name not in known:
-            raise BadConfiguration(f"{where}, {name}: no such parameter; {_parameters(name, known)}")
-        spec = known[name].spec
-        low, high = spec.bounds
-        allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
-        if not is_number(value):
-            form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
-            raise BadConfiguration(f"{where}, {name}: got {value!r}; expected a number, {allowed}{form}")
-        if name == "gearbox.ratio" and 0 < value < 1:
-            raise BadConfiguration(
-                f"{where}, {name}: got {number(value)}; expected turns of the motor for one of the output, at least "
-                f"1; is {number(1 / value)} meant?"
-            )
-        if not math.isfinite(value) or not low <= value <= high:
-            raise BadConfiguration(f"{where}, {name}: got {number(value)}; expected {allowed}")
+    refused = [f"{name}: {why}" for name, value in stated.items() if (why := _refused(name, value, known))]
+    if refused:
+        raise BadConfiguration(f"{where}, {'; also '.join(refused)}")
     robot = params.replace(robot, {name: jnp.asarray(value, float) for name, value in stated.items()})
     robot = rig_file.moved_priors(robot, stated)
     robot = dataclasses.replace(
@@ -303,7 +296,30 @@ def change(robot: Robot, values: Mapping[str, Any], where: str, notes: list[str]
     _check_pairs(robot, where)
     if notes is not None and "battery.voltage_cutoff" in values and (remark := power.cutoff_remark(robot.battery)):
         notes.append(f"{where}, battery.voltage_cutoff: {remark}")
+    shapes = CURVE | {"battery.capacity_curve"}
+    if notes is not None and shapes & values.keys() and (remark := power.curve_remark(robot.battery)):
+        notes.append(f"{where}, battery.curvature: {remark}")
     return _with_backlash(robot, where)
+
+
+def _refused(name: str, value: Any, known: Mapping[str, params.Parameter]) -> str:
+    """Why a parameter cannot be stated so; empty: it can."""
+    if name not in known:
+        return f"no such parameter; {_parameters(name, known)}"
+    spec = known[name].spec
+    low, high = spec.bounds
+    allowed = f"{number(low)} to {number(high)} {spec.unit} ({spec.meaning})"
+    if not is_number(value):
+        form = ', alone or with its standard deviation as "0.61 ± 0.03"' if isinstance(value, str) else ""
+        return f"got {value!r}; expected a number, {allowed}{form}"
+    if name == "gearbox.ratio" and 0 < value < 1:
+        return (
+            f"got {number(value)}; expected turns of the motor for one of the output, at least 1; is "
+            f"{number(1 / value)} meant?"
+        )
+    if not math.isfinite(value) or not low <= value <= high:
+        return f"got {number(value)}; expected {allowed}"
+    return ""
 
 
 def _with_backlash(robot: Robot, where: str) -> Robot:
@@ -421,7 +437,8 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
     for name, (_, _, unit, what) in RATINGS.items():
         part, _, key = name.partition(".")
         rating = getattr(getattr(robot, part), key)
-        if rating is not None and (whole or rating != getattr(getattr(nothing, part), key)):
+        beside = key == "capacity_curve" and bool(tables[part])  # else it would follow from the capacity
+        if rating is not None and (whole or beside or rating != getattr(getattr(nothing, part), key)):
             tables[part].append(f"{key} = {rating!r}  # [{unit}] {what if whole else what.partition(';')[0]}")
     for name, what in SWITCHES.items():
         part, _, key = name.partition(".")
@@ -436,7 +453,7 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         if not (whole or table or title in robot.configurations):
             continue
         lines += ["", f"[{title}]", *table]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _start(robot: Robot) -> Robot:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import difflib
 import hashlib
 import math
+import re
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data import contradictions, instruments, surfaces
+from calibration.data import contradictions, delimited, instruments, surfaces, units
 from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
@@ -79,13 +80,11 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
         text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise BadData(f"{name}: cannot be read as a UTF-8 text file ({error})") from error
-    rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    rows, notes = delimited.cells(name, [line for line in text.splitlines() if line.strip()])
     if not rows:
         expected = ", ".join((*layout.required(measured=True, battery=False), *layout.measured_columns))
         raise BadData(f"{name}: the file is empty; expected a header with {expected}")
-    header = [cell.strip() for cell in rows[0]]
-    if len(header) == 1 and ";" in header[0]:
-        raise BadData(f"{name}: columns are separated by semicolons; expected commas, and points in numbers")
+    header, capitals = _in_case(name, rows[0], layout, inferred)
     repeated = sorted({c for c in header if header.count(c) > 1})
     if repeated:
         raise BadData(f"{name}: column {repeated[0]} stands {header.count(repeated[0])} times; expected once")
@@ -99,19 +98,28 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
         if len(row) != len(header):
             raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
     columns: dict[str, np.ndarray] = {}
+    bad: list[tuple[int, int, str]] = []
     for j, meaning in enumerate(meanings):
         if meaning is not None:
-            cells = [row[j].strip() for row in rows[1:]]
+            cells = [row[j] for row in rows[1:]]
+            if meaning.column == "configuration":
+                cells, more = _configurations_in_case(name, cells, layout)
+                capitals = (*capitals, *more)
             if battery and meaning.column == SUPPLY and layout.imposed == "voltage":
                 _refuse_stated(name, cells)
                 continue
             if meaning.column in layout.idle:
                 _refuse_ground(name, meaning, cells)
                 continue
-            where = (f"{name} row {k}" for k in range(1, len(rows)))
-            columns[meaning.column] = np.array(
-                [_cell(at, meaning, cell, layout) for at, cell in zip(where, cells, strict=True)]
-            )
+            values = []
+            for k, cell in enumerate(cells, 1):
+                try:
+                    values.append(_cell(f"{name} row {k}", meaning, cell, layout))
+                except BadData as error:
+                    bad.append((k, j, str(error)))
+            columns[meaning.column] = np.array(values)
+    if bad:
+        raise BadData(_listed(name, [said for _, _, said in sorted(bad)]))
     layout = dataclasses.replace(layout, instruments=instruments.infer_instruments(layout.instruments, columns))
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
@@ -124,8 +132,78 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
     unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
-    extras = {c: _extra([row[header.index(c)].strip() for row in rows[1:]]) for c in unknown}
-    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout)
+    extras = {c: _extra([row[header.index(c)] for row in rows[1:]]) for c in unknown}
+    notes = (*notes, *capitals, *(_lacks(name, columns, layout) if measured else ()))
+    return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes)
+
+
+#: Bad cells that a message lists, at most.
+LISTED = 8
+
+
+def _listed(name: str, said: list[str]) -> str:
+    """What is wrong with a file's cells, the first row's first."""
+    first, *others = said
+    if not others:
+        return first
+    more = [sentence.removeprefix(f"{name} ") for sentence in others[: LISTED - 1]]
+    rest = f"; and {len(said) - LISTED} more" if len(said) > LISTED else ""
+    return f"{first}; also {'; '.join(more)}{rest}"
+
+
+def _in_case(name: str, header: list[str], layout: Layout, inferred: bool) -> tuple[list[str], tuple[str, ...]]:
+    """A header with the capitals of the columns' names, and sentences on what was read so."""
+    known = dataclasses.replace(layout, channels=channels.EVERY) if inferred else layout
+    spelled: dict[str, set[str]] = {}
+    for column in known.spellings():
+        spelled.setdefault(column.casefold(), set()).add(column)
+    found, said = [], []
+    for column in header:
+        meant = spelled.get(column.casefold(), set())
+        if column not in meant and len(meant) == 1 and not meant & set(header):
+            (right,) = meant
+            said.append(f"{name}: column {column} is read as {right}")
+            column = right
+        found.append(column)
+    return found, tuple(said)
+
+
+def _configurations_in_case(name: str, cells: list[str], layout: Layout) -> tuple[list[str], list[str]]:
+    """Names of configurations with the capitals of the robot's, and sentences on what was read so."""
+    meant = {c.casefold(): c for c in layout.configurations}
+    if len(meant) < len(layout.configurations):  # told apart by their capitals alone
+        return cells, []
+    odd = {c: meant[c.casefold()] for c in cells if c not in layout.configurations and c.casefold() in meant}
+    said = [f"{name}: configuration {c} is read as {right}" for c, right in odd.items()]
+    return [odd.get(c, c) for c in cells], said
+
+
+def _lacks(name: str, columns: dict[str, np.ndarray], layout: Layout) -> Iterator[str]:
+    """Sentences on channels and readings that a table lacks, and on names of runs that name several rows."""
+    for channel in layout.channels:
+        if channel.column not in columns:
+            if layout.complete:
+                yield f"{name}: no column {channel.column}; nothing is known of its channel"
+            continue
+        empty = np.flatnonzero(np.isnan(columns[channel.column]))
+        if empty.size:
+            count = f"{empty.size} of {len(columns[channel.column])}"
+            yield (
+                f"{name}: {count} cells of {channel.column} are empty, the first in row {empty[0] + 1}; they weigh "
+                "nothing"
+            )
+    if "run_id" in columns and not set(TIME) & set(columns):
+        runs, times = np.unique(columns["run_id"], return_counts=True)
+        several = times > 1
+        if several.any():
+            run = runs[np.argmax(several)]
+            rows = (np.flatnonzero(columns["run_id"] == run) + 1).tolist()
+            which = f"{', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''}"
+            others = f", and so {several.sum() - 1} more" if several.sum() > 1 else ""
+            yield (
+                f"{name}: run_id {run} stands in rows {which}{others}; without {', '.join(TIME)} every row is a run "
+                "of its own"
+            )
 
 
 def _with_channels(name: str, header: list[str], layout: Layout) -> Layout:
@@ -266,8 +344,8 @@ def _check_header(
 def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[InputError] = BadData) -> Any:
     column = meaning.column
 
-    def refuse(allowed: str) -> InputError:
-        return kind(f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; expected {allowed}")
+    def refuse(allowed: str, hint: str = "") -> InputError:
+        return kind(f"{where}, {meaning.shown}: got {cell or 'an empty cell'}; {hint}expected {allowed}")
 
     if column in WORDS:
         if column == "surface" and (message := surfaces.refused(cell, layout)):
@@ -282,14 +360,58 @@ def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[In
         return math.nan
     low, high = meaning.limits()
     positive = column in deviations
+    hint = _hint(meaning, cell, (*layout.measured_columns, *deviations))
     allowed = f"{'more than ' if positive else ''}{number(low)} to {number(high)}"
     try:
         value = float(cell)
     except ValueError:
-        raise refuse(f"a number, {allowed}") from None
+        raise refuse(f"a number, {allowed}", hint) from None
     if not math.isfinite(value) or not low <= value <= high or (positive and value == low):
-        raise refuse(allowed)
+        raise refuse(allowed, hint)
     return value if meaning.as_named else meaning.value(value)
+
+
+#: From how many times the largest value that is allowed another unit is supposed.
+FAR = 2.0
+#: What people write where there is no reading.
+NOTHING = ("nan", "na", "n/a", "n.a.", "none", "null", "-", "--", "?", "x", "inf", "-inf")
+_WITH_UNIT = re.compile(r"([+-]?\d*\.?\d+(?:[eE][+-]?\d+)?)\s*([^\d\s.,].*)")
+#: Units as people write them beside numbers, where a column's name has another spelling.
+_UNITS = {
+    "°": "deg", "v": "V", "volt": "V", "volts": "V", "a": "A", "amp": "A", "amps": "A", "ma": "mA", "mv": "mV",
+    "gram": "g", "grams": "g",
+}  # fmt: skip
+
+
+def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
+    """What a cell that is refused probably means, with a semicolon behind it; empty where nothing is known."""
+    if cell.lower() in NOTHING:
+        return "leave the cell empty where there is no reading; " if meaning.column in readings else ""
+    quantity, mine = meaning.quantity, meaning.unit
+    if quantity is None or meaning.factor != 1.0:
+        return ""
+    named = {unit: column for column, unit in quantity.columns().items()}
+    try:
+        value = float(cell)
+    except ValueError:
+        found = _WITH_UNIT.fullmatch(cell)
+        return "" if found is None else _unit_hint(found[1], found[2], mine, named)
+    far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
+    for unit, column in named.items():
+        low, high = quantity.limits(unit)
+        if far and unit != mine and low <= value <= high:
+            return f"is it in {unit or 'shares of 1'}? then name the column {column}; "
+    return ""
+
+
+def _unit_hint(value: str, written: str, mine: str, named: Mapping[str, str]) -> str:
+    """What to do with a unit beside a number; `mine`: the column's own, `named`: columns by their units."""
+    unit = units.spelled(_UNITS.get(written.lower(), written))
+    if unit == mine:
+        return f"write {value}, the unit stands in the column's name; "
+    if unit in named:
+        return f"write numbers alone, in {mine or 'shares of 1'}, or name the column {named[unit]}; "
+    return f"write the number alone{f', in {mine}' if mine else ''}; "
 
 
 def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:

@@ -33,6 +33,7 @@ class Runs:
         extras: cells of `unknown` columns, shape (rows,): numbers, NaN where empty, or words; not in `columns`, as
             they have no role, and looked at only for what residuals go with.
         layout: what its columns mean for the robot that it is of, and its channels.
+        notes: sentences on how the file was read, and what it lacks.
     """
 
     source: str
@@ -41,6 +42,7 @@ class Runs:
     digest: str = ""
     extras: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     layout: Layout = dataclasses.field(default_factory=Layout)
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.columns["configuration"])

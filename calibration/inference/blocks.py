@@ -114,8 +114,10 @@ def held_out(problem: Problem, start: np.ndarray, masks: dict[str, dict[str, np.
         masks: kind → label → mask, from `blocks`; kinds without blocks are left out of the answer.
     """
     answers = {}
+    fits: dict[tuple[bytes, ...], refits.HeldOutFits] = {}  # of kinds that divide the rows alike, the same
     for kind, by in masks.items():
         if by:
-            seen = refits.held_out(problem, start, list(by.values()))
+            parts = tuple(m.tobytes() for m in by.values())
+            seen = fits[parts] = fits.get(parts) or refits.held_out(problem, start, list(by.values()))
             answers[kind] = HeldOut(tuple(by), seen.block, seen.reading, seen.status, seen.z, seen.converged)
     return answers

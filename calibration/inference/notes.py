@@ -242,6 +242,14 @@ class NoPrediction(Note):
 
 
 @dataclasses.dataclass(frozen=True)
+class SamePredictions(Note):
+    """Kinds of blocks without which every row is predicted as without those of `kind`."""
+
+    kind: str
+    others: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class BlockNotConverged(Note):
     """A kind of block without which a search did not converge."""
 

@@ -20,6 +20,7 @@ from calibration.inference.notes import (
     Note,
     OfRows,
     ProductAlone,
+    SamePredictions,
 )
 from calibration.inference.population import EDGE
 from calibration.inference.problem import MARGIN
@@ -97,6 +98,9 @@ def _blocks(found: CalibrationResult) -> Iterator[Note]:
     for kind, held in found.held_out.items():
         if held.unreachable_rows:
             yield NoPrediction(kind, len(held.unreachable_rows), len(found))
+    for kind, others in found.held_out_alike.items():
+        if others:
+            yield SamePredictions(kind, others)
     for kind, held in found.held_out.items():
         if not all(block.converged for block in held.blocks.values()):
             yield BlockNotConverged(kind)

@@ -326,6 +326,22 @@ class CalibrationResult:
         return _counts(self.status)
 
     @property
+    def held_out_alike(self) -> dict[str, tuple[str, ...]]:
+        """The kinds of blocks that tell something of their own, and of each the later ones that predict every row
+        as it does, to 1 % of a reading's sd."""
+        found: dict[str, tuple[str, ...]] = {}
+        for kind, held in self.held_out.items():
+            like = next((k for k in found if self._same(self.held_out[k], held)), None)
+            found |= {kind: ()} if like is None else {like: (*found[like], kind)}
+        return found
+
+    def _same(self, one: HeldOut, other: HeldOut) -> bool:
+        return all(
+            np.allclose(one.reading[name] / r.sd, other.reading[name] / r.sd, rtol=0, atol=0.01, equal_nan=True)
+            for name, r in self.readings.items()
+        )
+
+    @property
     def main_blocks(self) -> HeldOut | None:
         """The most telling kind of blocks that was held out."""
         return next(iter(self.held_out.values()), None)

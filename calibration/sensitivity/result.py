@@ -252,9 +252,9 @@ class SensitivityResult:
         return tuple(n for n, x in zip(self.names, self.importance(), strict=True) if x < NEGLIGIBLE)
 
     @property
-    def studied(self) -> bool:
-        """Whether every output has a number at every point."""
-        return all(o.studied.all() for o in self.outputs.values())
+    def solved(self) -> bool:
+        """Whether the solver gave an answer at every point."""
+        return not any(counts.get("failed") for counts in self.statuses.values())
 
     def leaders(self) -> dict[str, list[tuple[str, float]]]:
         """Input → label and share [-] of each output that it decides more than any other does."""

@@ -54,13 +54,10 @@ def build(robot: Robot, base_mass: float, configuration: str, design: Design) ->
     """The robot that a design makes of a robot, with its ratings; traceable.
 
     Motors, gearboxes and cells take the place of the robot's own in its mass. The cell's voltage falls over the share
-    of its capacity that is taken as the robot's cell's does; cells in parallel stretch that and share the resistance.
+    of its capacity that is taken as the robot's cell's does; cells in parallel share the resistance.
     """
     ratio, radius, parallel = (jnp.exp(design.continuous[..., k]) for k in range(3))
     d, c = design.drive, design.cell
-    own = robot.battery
-    capacity = parallel * c["capacity"]
-    stretch = capacity / own.capacity
     more = d["mass"] + design.cells * parallel * c["mass"] - base_mass
     values: dict[str, Any] = {
         **{f"motor.{key}": d[key] for key in (
@@ -68,8 +65,7 @@ def build(robot: Robot, base_mass: float, configuration: str, design: Design) ->
             "resistance_thermal_winding", "resistance_thermal_housing",
         )},
         "gearbox.ratio": ratio, "gearbox.efficiency_load": d["efficiency"],
-        "battery.capacity": capacity, "battery.curvature": own.curvature / stretch**2,
-        "battery.slope": own.slope / stretch, "battery.voltage_full": c["voltage_full"],
+        "battery.capacity": parallel * c["capacity"], "battery.voltage_full": c["voltage_full"],
         "battery.resistance": c["resistance"] / parallel,
         **{f"{name}.mass": chassis.mass + more for name, chassis in robot.configurations.items()},
         f"{configuration}.radius": radius,

@@ -28,6 +28,7 @@ from calibration.inference.notes import (
     PriorOfProduct,
     ProductAlone,
     ReadFromMembers,
+    SamePredictions,
     Shown,
 )
 from mmrjax import channels
@@ -145,6 +146,14 @@ def no_prediction(note: NoPrediction) -> str:
     return (
         f"held out by {blocks.in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because the "
         "robot fitted without them slides there; the errors leave them out"
+    )
+
+
+def same_predictions(note: SamePredictions) -> str:
+    """Kinds of blocks that tell nothing beside another."""
+    return (
+        f"held out by {' or by '.join(blocks.in_words(k) for k in note.others)}: the same predictions as held out by "
+        f"{blocks.in_words(note.kind)}, which stand for them; these runs do not vary them apart"
     )
 
 

@@ -35,6 +35,7 @@ SAID: dict[type, Callable[[Any], str]] = {
     of_fit.ProductAlone: fits.product_alone,
     of_fit.PriorOfProduct: fits.prior_of_product,
     of_fit.NoPrediction: fits.no_prediction,
+    of_fit.SamePredictions: fits.same_predictions,
     of_fit.BlockNotConverged: fits.block_not_converged,
     of_fit.Agreement: fits.agreement,
     of_fit.Elsewhere: fits.elsewhere,

@@ -65,6 +65,7 @@ def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
         "battery_overcurrent": on_battery & (current > most),
         "current_limited": robot.driver.limits(signals.current),
         "gearbox_overload": torque > (robot.gearbox.torque_limit or jnp.inf),
+        "voltage_rising": on_battery & battery.rises(signals.discharge),
     }
 
 

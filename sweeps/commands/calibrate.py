@@ -24,7 +24,7 @@ def calibrate(
 ) -> int:
     """Calibrate a robot to a table and leave a run folder; returns the exit code.
 
-    0 done; 3 done, but the search did not converge, or a row or a fit without a block did not.
+    0 done; 3 done, but the search or a fit without a block did not converge, or the solver failed at a row.
     """
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
@@ -39,10 +39,9 @@ def calibrate(
         found.save(folder.partial, config.robot)
         print_calibration(found)
         settled = found.converged and all(b.converged for h in found.held_out.values() for b in h.blocks.values())
-        reached = words.settled(found.counts) == len(found)
         manifest = {"seed": found.seed, "statuses": found.counts}
         shown = page("calibration", found, robot_name=config.robot)
-        return leave(folder, config, manifest, complete=settled and reached, page=shown, runs=runs)
+        return leave(folder, config, manifest, solved=settled and words.solved(found.counts), page=shown, runs=runs)
 
 
 def print_calibration(found: CalibrationResult) -> None:
@@ -61,7 +60,7 @@ def print_calibration(found: CalibrationResult) -> None:
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
     lines = {"before": found.errors_before, "after": found.errors_after}
-    lines |= {f"after, held out by {blocks.in_words(k)}": h.errors for k, h in found.held_out.items()}
+    lines |= {f"after, held out by {blocks.in_words(k)}": found.held_out[k].errors for k in found.held_out_alike}
     for which, by in lines.items():
         cells = ("-" if e.rows == 0 else f"{e.rms_percent:.1f}" for e in by.values())
         errors.add_row(which, f"{max(e.rows for e in by.values())}/{len(found)}", *cells)

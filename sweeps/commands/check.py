@@ -22,7 +22,10 @@ SHOWN = 3
 
 
 def check(config: configuration.Check, out: Path | None, force: bool) -> int:
-    """Hold a robot against requirements and leave a run folder; returns the exit code: 3 where one is missed."""
+    """Hold a robot against requirements and leave a run folder; returns the exit code.
+
+    0 done, with what is missed said; 3 where the solver failed at a worst corner.
+    """
     asked = requirements.load(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
@@ -32,7 +35,7 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
         _write(folder, config, found)
         print_check(found, changes=config.changes)
         manifest = {"seed": None, **sheet.counts(found.outcomes)}
-        return leave(folder, config, manifest, complete=not found.missed, page=page("check", found, file))
+        return leave(folder, config, manifest, solved=found.solved, page=page("check", found, file))
 
 
 def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:

@@ -27,7 +27,7 @@ from sweeps.store import open_folder
 def loop(config: configuration.Loop, source: str, out: Path | None, force: bool, members: Path | None = None) -> int:
     """Run the closed loop on a table and leave a run folder; returns the exit code.
 
-    0 done; 3 done, but rows could not be simulated, or the fit that is proposed did not converge.
+    0 done, whatever the verdict; 3 done, but the fit that is proposed did not converge.
     """
     began = time.monotonic()
     robot = load_robot(config).robot
@@ -54,9 +54,9 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
             say("The track model was not asked: nothing remains in slip, track or ground that it has a say in.")
         if config.report:
             progress("writing the report")
-        manifest, complete = {"seed": config.seed, "verdict": found.verdict}, found.converged and not found.unusable
+        manifest = {"seed": config.seed, "verdict": found.verdict}
         shown = page("loop", found, robot_name=config.robot)
-        return leave(folder, config, manifest, complete=complete, page=shown, runs=found.runs)
+        return leave(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
 
 
 def print_discovery(found: DiscoveryResult) -> None:

@@ -65,6 +65,8 @@ def simulate(
     robot = file.robot
     _check_robot(robot)
     source = profiles.read(config.profile)
+    for note in source.notes:
+        tell(note)
     _check_acting(robot, source)
     source.check_source(config.battery)
     for column in source.stated:

@@ -17,7 +17,7 @@ from sweeps.console import progress, say, tell
 from sweeps.inputs import load_robot, one_run
 from sweeps.pages import words
 from sweeps.points import imposed, run, scale
-from sweeps.store import DONE, SOME_NOT_CONVERGED
+from sweeps.store import DONE, SOLVER_FAILED
 
 
 def render(
@@ -62,5 +62,4 @@ def render(
     status = STATUSES[int(trajectory.result.status)]
     say(f"{status}: {words.STATUSES[status].why}")
     say(str(file))
-    # A start is drawn from its beginning: that it still gains speed at the end of the run is no fault of the picture.
-    return DONE if status in (*words.SETTLED, "not_settled") else SOME_NOT_CONVERGED
+    return SOLVER_FAILED if status == "failed" else DONE

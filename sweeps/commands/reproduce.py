@@ -34,4 +34,6 @@ def reproduce(config: configuration.Reproduce, out: Path | None, force: bool) ->
             robot, folder.partial / "robot.toml", note=f"the robot of these figures, from {config.robot}"
         )
         folder.write_json("result.json", result)
-        return leave(folder, config, {"seed": None}, complete=True, runs=runs)
+        return leave(
+            folder, config, {"seed": None}, solved=rows is None or "failed" not in rows.plain["status"], runs=runs
+        )

@@ -35,6 +35,7 @@ from sweeps import config as configuration
 from sweeps.config import GridPart
 from sweeps.console import progress, say
 from sweeps.inputs import check_configurations, load_robot
+from sweeps.pages import words
 from sweeps.points import imposed, run, scale
 from sweeps.points.grid import grid
 from sweeps.results.resonance import SLOW, ResonanceResult, span
@@ -84,8 +85,8 @@ def resonance(config: configuration.Resonance, out: Path | None, force: bool) ->
         found = _found(config, robot, what, table)
         _write(folder, config, found)
         print_resonance(found)
-        manifest, complete = {"seed": None, "statuses": found.statuses}, found.statuses["converged"] == len(runs)
-        return leave(folder, config, manifest, complete=complete, page=page("resonance", found, file), runs=runs)
+        manifest, solved = {"seed": None, "statuses": found.statuses}, words.solved(found.statuses)
+        return leave(folder, config, manifest, solved=solved, page=page("resonance", found, file), runs=runs)
 
 
 def _grid(config: configuration.Resonance, voltages: tuple[float, ...], payloads: tuple[float, ...]) -> GridPart:

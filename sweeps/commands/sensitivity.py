@@ -57,7 +57,7 @@ AXES = {
 def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool) -> int:
     """Study a robot and leave a run folder; returns the exit code.
 
-    0 done; 3 done, but some operating points have no numbers.
+    0 done; 3 done, but the solver failed at some operating points.
     """
     file = load_robot(config)
     robot = file.robot
@@ -81,7 +81,7 @@ def sensitivity(config: configuration.Sensitivity, out: Path | None, force: bool
         print_sensitivity(found)
         manifest = {"seed": found.seed, "statuses": found.statuses}
         shown = page("sensitivity", found, file)
-        return leave(folder, config, manifest, complete=bool(found.studied), page=shown, runs=runs)
+        return leave(folder, config, manifest, solved=found.solved, page=shown, runs=runs)
 
 
 def _ranges(vary: tuple[str, ...]) -> dict[str, tuple[float, float]]:
@@ -176,6 +176,8 @@ def print_sensitivity(found: SensitivityResult) -> None:
     """What decides which output, what does not matter, what to measure next; for a person."""
     say(found.statement())
     title = f"{words.METHODS[found.method]}, {len(found.points)} operating points"
+    if found.evaluations:
+        title += f", {found.evaluations:,} model evaluations"
     shown = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for heading in ("", "first", "second", "third"):
         shown.add_column(heading)

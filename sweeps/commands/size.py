@@ -22,7 +22,10 @@ from sweeps.store import RunFolder, open_folder
 
 
 def size(config: configuration.Size, out: Path | None, force: bool) -> int:
-    """Search, and leave a run folder; returns the exit code: 3 where the best misses something or there is none."""
+    """Search, and leave a run folder; returns the exit code.
+
+    0 done, whether or not a design meets everything; 3 where the solver failed at a worst corner of the best.
+    """
     asked = requirements.load(Path(config.requirements))
     file = load_robot(config)
     robot = file.robot
@@ -45,8 +48,13 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
         _write(folder, config, found)
         print_size(found)
         manifest = {"seed": config.seed, "feasible": sizing.best is not None}
-        complete = bool(outcomes) and all(o.met for o in outcomes)
-        return leave(folder, config, manifest, complete=complete, page=page("size", found, file))
+        return leave(
+            folder,
+            config,
+            manifest,
+            solved=all(o.status != "failed" for o in outcomes),
+            page=page("size", found, file),
+        )
 
 
 def _write(folder: RunFolder, config: configuration.Size, found: SizeResult) -> None:

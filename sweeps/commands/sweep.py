@@ -31,7 +31,7 @@ from sweeps.points.identity import Identity, identity
 from sweeps.points.job import laid_out, prepare, usual
 from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
 from sweeps.skeleton import page
-from sweeps.store import DONE, SOME_NOT_CONVERGED, default_path, open_folder
+from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
 
 #: Most runs of which a grid leaves a table, runs.csv; of more it leaves a store, in a tenth of the time and bytes.
 TABLE = 100_000
@@ -270,7 +270,7 @@ def finish(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job,
     if not left:
         print_counts(counts, "points")
         say(str(store.path))
-    return DONE if words.settled(counts) == job.plan.design.points else SOME_NOT_CONVERGED
+    return DONE if words.solved(counts) else SOLVER_FAILED
 
 
 def leave(store: SweepStore, config: Campaign, file: RobotFile, job: scale.Job, same: Identity) -> None:

@@ -156,8 +156,8 @@ def _current(axes: Axes, start: Start, colour: str) -> None:
     if cut:
         note(axes, f"peak {peak:.3g} A cut off", x=0.02, y=0.8, color=colour)
     during = (start.time > start.starting) & (start.time < start.slipping)
-    if start.slipping - start.starting > 0.15 * last and start.gets_under_way:
-        middle = float(np.median(start.current[during]))
+    middle = float(np.median(start.current[during])) if during.any() else 0.0
+    if start.slipping - start.starting > 1.5 * _share(axes, f"{middle:.2f} A") * last and start.gets_under_way:
         at = (start.starting + start.slipping) / 2
         axes.annotate(f"{middle:.2f} A", (at, middle), xytext=(0, 5), textcoords="offset points", ha="center")
     crest = start.current[ending(start.time)].max()
@@ -178,11 +178,12 @@ def _speeds(axes: Axes, start: Start, colour: str) -> None:
         axes.axvline(start.settled, color=FAINT, lw=0.9, ls=":")
         text = f"t' = {start.settled:.2f} s\n(V within 1 %\nof its end)"
         axes.text(start.settled + 0.02 * last, 0.1 * start.speed[-1], text, fontsize=8.5)
+    # Right of the line at t', where that is beside the curve, else of the curve.
     half = int(np.argmax(start.speed >= 0.5 * start.speed[-1]))
-    axes.annotate(
-        "$V_x$ (robot)", (start.time[half], start.speed[half]), xytext=(6, -12), textcoords="offset points",
-        color=colour, fontsize=8.5,
-    )  # fmt: skip
+    beside = 0 < start.settled < 0.5 * last and start.gets_under_way
+    at = (start.settled if beside else start.time[half], start.speed[half])
+    place = (6, 6) if beside else (6, -12)
+    axes.annotate("$V_x$ (robot)", at, xytext=place, textcoords="offset points", color=colour, fontsize=8.5)
     if start.status not in words.SETTLED:
         note(axes, f"ends: {words.short(start.status)}", y=0.15, color=VERMILION)
 
@@ -262,11 +263,18 @@ def _stages(axes: Axes, start: Start, scale: float = 1.0) -> None:
         if right <= left:
             continue
         axes.axvspan(left, right, color=shade, zorder=0, lw=0)
-        if (right - left) / (right_edge - left_edge) > 0.15:
+        width = (right - left) / (right_edge - left_edge)
+        if width > _share(axes, stage):
+            text = f"{stage}\n{name}" if width > _share(axes, name) else stage
             axes.text(
-                (left + right) / 2, 0.985, f"{stage}\n{name}", transform=axes.get_xaxis_transform(), ha="center",
+                (left + right) / 2, 0.985, text, transform=axes.get_xaxis_transform(), ha="center",
                 va="top", fontsize=8.5, fontweight="bold", color=INK,
             )  # fmt: skip
+
+
+def _share(axes: Axes, text: str, size: float = 8.5) -> float:
+    """About the share of the axes' width that a text in bold takes [-]."""
+    return 0.72 * size * len(text) / 72 * axes.figure.dpi / axes.bbox.width
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from mmrjax.signals import FLAGS
 from sweeps import capabilities
 from sweeps.pages import mission_figures, words
 from sweeps.pages.page import ROWS, Album, named, render, statuses
-from sweeps.pages.runs import labels
+from sweeps.pages.runs import labels, warmed
 from sweeps.points.imposed import UNLIMITED
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         asked.append(("rms torque, one gearbox", run["rms_torque_Nm"], float(gearbox.torque_limit), "N·m", 2))
     answer = [
         {"words": words, "value": f"{value:.{digits}f} {unit}", "limit": f"{limit:.{digits}f} {unit}",
-         "percent": 100 * value / limit}
+         "percent": warmed(value, limit, float(motor.temperature_ambient)) if unit == "°C" else 100 * value / limit}
         for words, value, limit, unit, digits in asked
         if np.isfinite(value) and limit < UNLIMITED
         and (words != "hottest winding" or capabilities.thermal(robot))

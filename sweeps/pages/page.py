@@ -203,6 +203,7 @@ def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[C
         "version": __version__,
     }
     page = environment.get_template(template).render(pictures=album.pictures, **known)
+    page = page.replace("<table", '<div class="scroll"><table').replace("</table>", "</table></div>")
     path = Path(folder) / "report.html"
     path.write_text(page, encoding="utf-8")
     return path

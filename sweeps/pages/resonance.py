@@ -87,7 +87,7 @@ def _points(found: ResonanceResult) -> list[dict[str, Any]]:
             "speed": table["speed_mean_mm_s"][k],
             "ripple": [table[f"{name}_ripple_percent"][k] for name in SIGNALS],
             "status": words.short(str(table["status"][k])),
-            "shaken": found.shaken(k),
+            "to_avoid": found.to_avoid(k),
         }
         for k in np.flatnonzero(table["table8"])
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from calibration.data.robot_file import RobotFile
     from mmrjax.fidelities.base import Run
     from mmrjax.robot import Robot
+    from sweeps.pages.history_figures import Start
 
 #: What the table of runs shows beside conditions and channels: heading, factor, format.
 FURTHER = {
@@ -70,7 +72,7 @@ def write(
         total=len(names),
         rows=[{"label": name, **row} for name, row in zip(names, first_rows(runs), strict=False)],
         statuses=statuses(runs),
-        limits=limits(robot, {key: value[0] for key, value in runs.items()}) if single else [],
+        limits=limits(robot, {key: value[0] for key, value in runs.items()}, known["starts"]) if single else [],
         chained=len(chain),
         most=CHAINS,
         columns=columns(robot.channels),
@@ -126,8 +128,13 @@ def _histories(
     return known
 
 
-def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
-    """How much of each limit a run uses: words, its value, the limit, and the share of it [%]."""
+def limits(robot: Robot, run: dict[str, Any], starts: Sequence[Start] = ()) -> list[dict[str, Any]]:
+    """How much of each limit a run uses: words, its value, the limit, and the share of it [%]; of a winding the share
+    of what it may warm up by. An inrush of which the robot states no limit has neither.
+
+    Args:
+        starts: the same run from standstill, of a fidelity that has histories.
+    """
     idle = capabilities.idle_columns(robot)
     radius = float(robot.configurations[str(run["configuration"])].radius)
     rpm = RPM
@@ -149,9 +156,35 @@ def limits(robot: Robot, run: dict[str, Any]) -> list[dict[str, Any]]:
         (gear, torque, robot.gearbox.torque_limit or math.nan, "{:.2f}", " N·m"),
         ("voltage of a cell, charged", cell, robot.battery.voltage_charge, "{:.2f}", " V"),
     ]  # fmt: skip
-    return [
+    ambient = float(robot.motor.temperature_ambient)
+    found = [
         {"words": name, "value": words.NONE_SETTLES if math.isinf(value) else form.format(value) + unit,
-         "limit": form.format(limit) + unit, "percent": 100 * abs(value) / limit}
+         "limit": form.format(limit) + unit,
+         "percent": warmed(value, limit, ambient) if unit == " °C" else 100 * abs(value) / limit}
         for name, value, limit, form, unit in asked
         if not (math.isnan(value) or math.isnan(limit) or limit >= UNLIMITED)
     ]  # fmt: skip
+    for start in starts[:1]:
+        if start.time.size:
+            most = inrush_limit(robot, math.isnan(float(run.get("supply_voltage_V", math.nan))))
+            found.append({
+                "words": "largest current of the start, all motors", "value": f"{abs(start.peak):.1f} A",
+                "limit": "not stated" if most is None else f"{most:.1f} A",
+                "percent": None if most is None else 100 * abs(start.peak) / most,
+                "unstated": "driver.current_limit" + ", battery.current_limit" * bool(run.get("voltage_cell_V")),
+            })  # fmt: skip
+    return found
+
+
+def warmed(value: float, limit: float, ambient: float) -> float:
+    """Share of what a winding may warm up by above the surroundings [%]."""
+    return 100 * (value - ambient) / max(limit - ambient, 1.0)
+
+
+def inrush_limit(robot: Robot, on_battery: bool) -> float | None:
+    """What the driver, or the battery beside other consumers, gives to all motors at most [A]; None: not stated."""
+    most, battery = float(robot.driver.current_limit), robot.battery
+    stated = [float(robot.sides) * most] if most < float(type(robot.driver)().current_limit) else []
+    if on_battery and battery.current_limit is not None:
+        stated.append(battery.current_limit - float(battery.current_other))
+    return min(stated, default=None)

@@ -138,7 +138,7 @@ def _bars(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarra
         f"effect over the 95 % range{unit}" if "mean_absolute_effect" in shown else "share of the variance [-]"
     )
     ax.grid(axis="y", visible=False)
-    ax.legend(loc="lower right", fontsize=7.5)
+    ax.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, fontsize=7.5)  # beside no bar
 
 
 def _over_points(ax: Axes, study: OutputStudy, found: SensitivityResult, top: np.ndarray) -> None:

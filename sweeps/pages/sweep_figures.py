@@ -9,6 +9,7 @@ from matplotlib import colormaps, colors
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from mmrjax.channels import Channel
 from sweeps.pages import words
@@ -160,8 +161,14 @@ def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) ->
 
 
 def _ticks(setter: Any, levels: np.ndarray) -> None:
-    every = 1 if levels.size <= 8 else -(-levels.size // 5)
-    setter(range(0, levels.size, every), [f"{v:.3g}" for v in levels[::every]])
+    """Every level, or round numbers between the first and the last where there are many."""
+    if levels.size <= 8:
+        setter(range(levels.size), [f"{v:.3g}" for v in levels])
+        return
+    low, high = float(levels[0]), float(levels[-1])
+    values = np.asarray(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(low, high))
+    values = values[(values >= low - 1e-9 * (high - low)) & (values <= high + 1e-9 * (high - low))]
+    setter(np.interp(values, levels, np.arange(levels.size)), [f"{v:g}" for v in values])
 
 
 def _scatter(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Channel, norm: Any) -> None:

@@ -68,6 +68,7 @@ FLAGS = {
     "gearbox_overload": "more torque than the gearbox may carry for long",
     "too_hot": "winding hotter than permitted",
     "demand_missed": "a demanded speed was not reached",
+    "voltage_rising": "a cell's voltage that rises as it discharges: the parabola of its curve has turned up",
 }
 
 
@@ -82,9 +83,9 @@ SETTLED = ("converged", "reverses")
 UNDER_WAY = (*SETTLED, "rolls_back", "not_settled")
 
 
-def settled(counted: Mapping[str, int]) -> int:
-    """How many runs ended as their conditions ask, of counts by status."""
-    return sum(counted[status] for status in SETTLED)
+def solved(counted: Mapping[str, int]) -> bool:
+    """Whether the solver gave an answer to every run, of counts by status."""
+    return not counted.get("failed")
 
 
 #: What a requirement's quantity may come to beside a status of a run: in one line.

@@ -167,7 +167,7 @@ def energy(robot: Robot, ratio: dict[str, float]) -> tuple[Figure, list[dict[str
     for item in (*data.SPLIT, "other"):
         share = 100 * lifted[item] / total
         share = np.where(np.isfinite(share), share, 0.0)
-        if item == "other" and np.abs(share).max() < 0.05:
+        if np.abs(share).max() < 0.05:  # not to be seen, and in no legend
             continue
         axes.barh(height, share, left=left, height=0.82, color=_SPLIT_COLOURS[item], label=item, ec="white", lw=0.6)
         for y, x, width in zip(height, left, share, strict=True):

@@ -18,6 +18,7 @@ from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
 from mmrjax.variation import STATUS, Variation, check_outputs
 from sweeps.config_campaign import Campaign
+from sweeps.console import tell
 from sweeps.points import axes, scale
 from sweeps.points.design import Blocks
 from sweeps.points.zarr_store import ABSENT, Layout, Variable
@@ -68,6 +69,8 @@ def _profile(name: str, robot: Robot, plan: axes.Plan, where: str) -> Profile:
             surfaces.
     """
     source = profiles.read(name)
+    for note in source.notes:
+        tell(note)
     if source.surface is not None:
         raise BadConfiguration(
             f"{where}, profile: got {source.source} with the column surface; expected the surface in conditions"

@@ -196,6 +196,5 @@ def leave(
     folder.write_table("runs.csv", capabilities.of(result.robot, result.table))
     robot_file.write(result.robot, folder.partial / "robot.toml", note=f"the robot of this run, from {config.robot}")
     folder.write_json("result.json", result.to_json())
-    complete = words.settled(result.statuses) == len(result.table["status"])
     manifest = {"seed": None, "statuses": result.statuses}
-    return skeleton.leave(folder, config, manifest, complete=complete, page=page, runs=result.runs)
+    return skeleton.leave(folder, config, manifest, solved=words.solved(result.statuses), page=page, runs=result.runs)

@@ -119,7 +119,8 @@ class ResonanceResult:
         parts = []
         named, bare = ([r for r in self.avoid if bool(r[2][0].mode) is has] for has in (True, False))
         if named:
-            parts.append(f"Avoid {_listed(named, self.passing.name)}.")
+            loads = "" if len(self.modes) == 1 else "at one payload or another: "
+            parts.append(f"Avoid {loads}{_listed(named, self.passing.name)}.")
         elif not bare:
             largest = ", ".join(f"{s.label} {percent(self._largest(n))}" for n, s in SIGNALS.items())
             parts.append(
@@ -169,7 +170,11 @@ class ResonanceResult:
             if hit:
                 loads = ", ".join(f"{self.table['payload_kg'][k]:g}" for k in hit)
                 inside.append(f"{voltage:g} V with {'every payload' if len(hit) == len(of) else loads + ' kg'}")
-        return f"Of Table 8 at {self.slope_deg:g}°, in such a peak: {'; '.join(inside)}." if inside else ""
+        return (
+            f"Of Table 8 at {self.slope_deg:g}°, affected at their own payload: {'; '.join(inside)}."
+            if inside
+            else ""
+        )
 
     def shaken(self, row: int | np.integer[Any]) -> bool:
         """Whether a run is within one of the strongest peaks of its own payload."""
@@ -180,6 +185,12 @@ class ResonanceResult:
             for p in self.peaks
             if p.payload == payload and (p.mode, p.order, p.signal) in strong
         )
+
+    def to_avoid(self, row: int | np.integer[Any]) -> str:
+        """Whether the speed of a run is one to avoid: `yes`, `at other payloads` than its own, or `no`."""
+        speed = self.table["speed_mean_mm_s"][row] * MM
+        within = any(low <= speed <= high for low, high, _ in self.avoid)
+        return "yes" if self.shaken(row) else "at other payloads" if within else "no"
 
     def to_json(self) -> dict[str, Any]:
         """`result.json`."""
@@ -215,6 +226,7 @@ class ResonanceResult:
                     "speed_mean_mm_s": self.table["speed_mean_mm_s"][k].item(),
                     "status": str(self.table["status"][k]),
                     "in_a_peak": self.shaken(k),
+                    "to_avoid": self.to_avoid(k),
                 }
                 for k in np.flatnonzero(self.table["table8"])
             ],

@@ -1,0 +1,232 @@
+"""The command `explain`: what a name means, read from the code that it is a name of."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from calibration.data import effect_file
+from calibration.data.errors import BadConfiguration, number
+from calibration.words import effects as words_of
+from mmrjax import channels, derived, effects, missions, outputs, params, robots
+from mmrjax.effects import Effect
+from mmrjax.errors import near
+from mmrjax.params import Parameter, Spec
+from mmrjax.signals import Result
+from sweeps.console import say
+from sweeps.pages import words
+
+#: A line of an explanation: heading and text.
+Line = tuple[str, str]
+WIDTH, INDENT = 80, 16
+#: Of a run, solved for, and of a mission.
+EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *missions.OUTPUTS)
+
+
+def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
+    """Say what a name means: of an effect, status, flag, output, channel or parameter; without one, which there are.
+
+    Raises:
+        BadConfiguration: nothing has that name; what is near is said.
+    """
+    library = {**effect_file.library(files), **effects.UNNAMED}
+    known = names(library)
+    if name is None:
+        for kind, those in known.items():
+            say(_wrapped(kind, ", ".join(those)))
+        say("mmrjax explain NAME says what one means.")
+        return 0
+    found = [(kind, lines) for kind, about in EXPLAINED.items() if (lines := list(about(name, library)))]
+    if not found:
+        below = [p for p in known["parameters"] if p.endswith(f".{name}")]
+        if below:
+            raise BadConfiguration(f"explain: got {name}; is one of these meant? {', '.join(below)}")
+        close = near(name, [n for those in known.values() for n in those], 3)
+        hint = f"did you mean {', '.join(close)}? " if close else ""
+        raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists the names that there are")
+    for kind, lines in found:
+        say(f"{name}: {kind}")
+        for heading, text in lines:
+            say(_wrapped(heading, text))
+    return 0
+
+
+def _wrapped(heading: str, text: str) -> str:
+    head = f"  {heading}".ljust(INDENT)
+    return textwrap.fill(
+        text, WIDTH, initial_indent=head, subsequent_indent=" " * INDENT, break_long_words=False,
+        break_on_hyphens=False,
+    )  # fmt: skip
+
+
+def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
+    """Every name that can be explained, by kind."""
+    return {
+        "effects": [name for name in library if name not in effects.UNNAMED],
+        "statuses": list(words.STATUSES),
+        "flags": list(words.FLAGS),
+        "channels": [c.name for c in channels.EVERY],
+        "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
+        "parameters": [p.name for p in params.walk(robots.nominal())],
+    }
+
+
+def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    effect = library.get(name)
+    if effect is None:
+        return
+    equation, meaning, source = words_of.about(effect)
+    yield "equation", equation
+    yield "stands for", meaning
+    yield "enters", f"the balance {effect.balance}{f', channel {effect.channel}' if effect.channel else ''}"
+    made = effect()
+    for p in params.walk(made):
+        if p.spec.amplitude:
+            yield "typical size", f"{p.spec.prior_sd(0.0):g} {p.spec.unit} ({p.spec.meaning}; {p.spec.source})"
+            yield "bounds", _bounds(p.spec)
+        else:
+            yield f"  {p.name}", f"{float(p.value):g} {p.spec.unit}: {p.spec.meaning}"
+    if said := ", ".join(words_of.declared(effect)):
+        yield "declares", said
+    yield "in data", f"{effect.family()}{_histories(effect)}"
+    for line in _changes(made):
+        yield "", line
+    for k, test in enumerate(words_of.tests(effect)):
+        yield "" if k else "on a bench", test
+    if source:
+        yield "source", source
+    yield "in a file", f"[effects.{name}] amplitude = ..."
+
+
+def _histories(effect: type[Effect]) -> str:
+    if effect.transient:
+        return "; settled runs show nothing of it, histories do"
+    return f"; settled runs cannot tell it from {effect.settles_to}" if effect.settles_to else ""
+
+
+def _changes(effect: Effect) -> Iterator[str]:
+    """What one typical size of it changes in settled travel, in percent of the readings; nothing where that shows
+    nothing of it, or the runs have no operating point."""
+    if effect.transient or effect.needs_reverse:
+        return
+    import dataclasses
+
+    import mmrjax as mm
+
+    robot = robots.nominal()
+    spec = next(p.spec for p in params.walk(effect) if p.spec.amplitude)
+    within = dataclasses.replace(robot, effects=(effect,))
+    run = mm.Conditions(
+        list(robot.configurations), voltage=24.0, slope_deg=5.0, payload=3.0, battery=float(effect.needs_battery)
+    )
+    sized = params.replace(within, {f"effects.{effect.name}.amplitude": np.asarray(spec.prior_sd(0.0))})
+    without, there = (mm.simulate(r, run) for r in (within, sized))
+    for k, name in enumerate(robot.configurations):
+        shares = {}
+        for c in robot.channels:
+            before, after = float(without.reading[c.name][k]), float(there.reading[c.name][k])
+            if np.isfinite(after) and before:
+                shares[c.label] = 100 * (after / before - 1)
+        if any(abs(x) > 5e-3 for x in shares.values()):
+            said = ", ".join(f"{label} {x:+.2g} %" for label, x in shares.items())
+            yield f"one typical size at {name}, 24 V, 5°, 3 kg: {said}"
+
+
+def _status(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    if name in words.STATUSES:
+        about = words.STATUSES[name]
+        yield "means", about.meaning
+        if about.why != about.meaning:
+            yield "in short", about.why
+        yield "exit code", "3, since a solver failed" if name == "failed" else "0: it is an answer"
+        yield "in files", "column status of runs.csv, counts in result.json"
+
+
+def _flag(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    if name in words.FLAGS:
+        yield "means", words.FLAGS[name]
+        yield "in files", "column flags of runs.csv, counts in result.json; a run may have several"
+
+
+def _channel(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    c = next((c for c in channels.EVERY if name in (c.name, c.column, c.sd_column)), None)
+    if c is None:
+        return
+    low, high = c.range
+    yield "is", f"{c.label} [{c.unit_shown}], as its instrument shows it"
+    yield "column", f"{c.column}, its standard deviation {c.sd_column}, {number(low)} to {number(high)}"
+    if c.other_units:
+        yield "other units", ", ".join(unit for unit, _ in c.other_units)
+    yield "typical noise", f"{100 * c.sd_share:g} % of the reading, where nobody states it"
+    yield "shows in", " and ".join(["settled runs"] * c.settled + ["histories"] * c.over_time)
+    wrong = [e for e in library.values() if e.channel == c.name and e.name not in effects.UNNAMED]
+    if wrong:
+        yield "its errors", ", ".join(e.name for e in wrong)
+        for k, test in enumerate(words_of.tests(wrong[0])):
+            yield "" if k else "on a bench", test
+
+
+def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    for o in (o for o in EVERY_OUTPUT if name in (o.name, o.column)):
+        yield "is", f"{o.label} [{o.unit}]"
+        if (said := _attribute(Result, o.name)) and o in outputs.FURTHER:
+            yield "equation", said
+        where = "missions (--profile)" if o in missions.OUTPUTS else "every run"
+        yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else where}"
+
+
+def _attribute(kind: type, name: str) -> str:
+    """What a class's docstring says of one of its attributes."""
+    text = " ".join((inspect.getdoc(kind) or "").partition("Attributes:")[2].split())
+    found = re.search(rf"(?:^|[.\]] |, |; )(?:\w+, )*{name}(?:, \w+)*: (.*?)(?=\.? [a-z_]+(?:, [a-z_]+)*: |$)", text)
+    return "" if found is None else found[1].rstrip(".")
+
+
+def _parameter(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    robot = robots.nominal()
+    found = next((p for p in params.walk(robot) if p.name == name), None)
+    if found is None:
+        return
+    spec = found.spec
+    yield "means", f"{spec.meaning} [{spec.unit}]"
+    yield "nominal", f"{float(found.value):g} {spec.unit}; {spec.source}"
+    yield "prior", _prior(found)
+    yield "bounds", _bounds(spec)
+    first = name.partition(".")[0]
+    part: Any = dict(robot.configurations.items()).get(first, robot)
+    for step in name.split(".")[:-1]:
+        part = getattr(part, step, part)
+    equation = " ".join((inspect.getdoc(type(part)) or "").partition("\n\nAttributes:")[0].split())
+    if part is not robot and equation:
+        yield "equation", equation
+    rests = [e.name for e in library.values() if name in e.rests_on]
+    if rests:
+        yield "scales", ", ".join(rests)
+    yield (
+        "change it",
+        f"--set {name}=VALUE, or [{name.rpartition('.')[0]}] {name.rpartition('.')[2]} = VALUE in a file",
+    )
+
+
+def _prior(p: Parameter) -> str:
+    sd = p.spec.prior_sd(float(p.value))
+    return f"standard deviation {sd:.3g} {p.spec.unit}" + (
+        f" ({100 * p.spec.relative_sd:g} %)" if p.spec.relative_sd else ""
+    )
+
+
+def _bounds(spec: Spec) -> str:
+    low, high = spec.bounds
+    return f"{number(low)} to {number(high)} {spec.unit}"
+
+
+#: What explains a name, by kind.
+EXPLAINED: dict[str, Callable[[str, dict[str, type[Effect]]], Iterator[Line]]] = {
+    "effect": _effect, "status": _status, "flag": _flag, "channel": _channel, "output": _output,
+    "parameter": _parameter,
+}  # fmt: skip

@@ -1,0 +1,60 @@
+"""A sweep from Python: every combination of a grid, simulated in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mmrjax.results import Results
+from mmrjax.robot import Robot
+from mmrjax.simulation import simulate
+from sweeps.config import GridPart
+from sweeps.points.grid import grid
+
+#: One value of an axis, or several.
+Axis = Sequence[float] | np.ndarray | float | None
+
+
+def sweep(
+    robot: Robot,
+    *,
+    configurations: Sequence[str] | str | None = None,
+    voltages: Axis = None,
+    motor_speeds_rpm: Axis = None,
+    payloads: Axis = None,
+    slopes_deg: Axis = None,
+    surface: str | None = None,
+    battery: bool = False,
+    discharge: float = 0.0,
+    model: str = "steady",
+    **options: Any,
+) -> Results:
+    """Simulate every combination of a grid, slope varying fastest; Table 8 where nothing is stated.
+
+    Args:
+        configurations: names, all by default; voltages [V], or for a rig that imposes it motor_speeds_rpm [rpm].
+        payloads: [kg]; slopes_deg: [deg]; surface: of Table 5.
+        battery: whether the on-board battery feeds the motors; discharge: charge already taken from it [C].
+        model, options: as for `simulate`.
+
+    Returns:
+        Results of shape (runs,).
+
+    Raises:
+        BadConfiguration: a configuration, axis or surface that the robot does not have.
+        UsageError: as `simulate`.
+    """
+    names = (configurations,) if isinstance(configurations, str) else configurations
+    config = GridPart.model_construct(
+        configurations=None if names is None else tuple(names),
+        voltages_V=_axis(voltages), motor_speeds_rpm=_axis(motor_speeds_rpm), payloads_kg=_axis(payloads),
+        slopes_deg=_axis(slopes_deg), surface=surface,
+    )  # fmt: skip
+    runs = grid(config, robot, battery)
+    return simulate(robot, runs.conditions(robot, battery=float(battery), discharge=discharge), model, **options)
+
+
+def _axis(values: Axis) -> tuple[float, ...] | None:
+    return None if values is None else tuple(float(v) for v in np.atleast_1d(np.asarray(values, float)))

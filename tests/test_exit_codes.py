@@ -1,0 +1,40 @@
+"""One rule for exit codes: whatever the answer 0, and 3 where a solver failed; documented for each command."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.main import get_command
+
+from sweeps import cli
+from sweeps.pages import words
+from sweeps.points import run
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+@pytest.mark.parametrize(("status", "code"), [(status, 3 if status == "failed" else 0) for status in words.STATUSES])
+def test_only_a_solver_that_failed_ends_with_3(status, code, mmrjax, monkeypatch):
+    honest = run.evaluate
+
+    def evaluate(*given, **options):
+        found = honest(*given, **options)
+        return {**found, "status": np.array([status, *found["status"][1:]])}
+
+    monkeypatch.setattr(run, "evaluate", evaluate)
+    assert mmrjax("compare", "measured", "--no-report", "--out", "s")[0] == code
+
+
+def test_every_command_says_what_3_means_and_the_docs_have_its_words():
+    text = (DOCS / "exit-codes.md").read_text(encoding="utf-8")
+    documented = {}
+    for line in text.splitlines():
+        if line.startswith("| `"):
+            names, _, meaning = line.strip("| ").partition(" | ")
+            documented |= {name.strip("` "): meaning for name in names.split(",")}
+    said = {
+        name: command.epilog.partition("Exit code 3: ")[2].removesuffix(".")
+        for name, command in get_command(cli.app).commands.items()
+        if "Exit code 3" in (command.epilog or "")
+    }
+    assert said == documented and all(said.values()) and {"simulate", "sweep", "loop", "check"} <= set(said)

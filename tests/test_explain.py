@@ -1,0 +1,90 @@
+"""What `mmrjax explain` says of every name, and what is near an unknown one."""
+
+import pytest
+
+from calibration.words import effects as words_of
+from mmrjax import channels, effects, params, robots
+from mmrjax.errors import choices, near
+from sweeps.commands import explain
+from sweeps.pages import words
+
+
+def said(kind, name):
+    return list(explain.EXPLAINED[kind](name, effects.BY_NAME))
+
+
+@pytest.fixture
+def unsimulated(monkeypatch):
+    """Without the runs that say what an effect changes: a program of its own each."""
+    monkeypatch.setattr(explain, "_changes", lambda effect: iter(["as simulated"]))
+
+
+def test_every_name_has_an_explanation_of_its_kind(unsimulated):
+    kinds = {"effects": "effect", "statuses": "status", "flags": "flag", "channels": "channel", "outputs": "output",
+             "parameters": "parameter"}  # fmt: skip
+    for kind, those in explain.names(effects.BY_NAME).items():
+        for name in those:
+            lines = said(kinds[kind], name)
+            assert lines and all(text and "None" not in text for _, text in lines), (name, lines)
+
+
+def test_an_effect_is_explained_by_what_its_class_states(unsimulated):
+    for name, effect in effects.BY_NAME.items():
+        lines = dict(said("effect", name))
+        spec = next(p.spec for p in params.walk(effect()) if p.spec.amplitude)
+        equation, meaning, source = words_of.about(effect)
+        assert (lines["equation"], lines["stands for"], lines["source"]) == (equation, meaning, source)
+        assert lines["typical size"].startswith(f"{spec.sd:g} {spec.unit}") and spec.source in lines["typical size"]
+        assert effect.balance in lines["enters"] and lines["in data"].startswith(effect.family())
+        assert "on a bench" in lines and list(words_of.tests(effect))
+
+
+def test_a_typical_size_is_simulated(robot):
+    """0.5 ohm in series take 0.5 V/A · I of 24 V less what drives: the motors slow down by that."""
+    changes = list(explain._changes(effects.BY_NAME["series_resistance"]()))
+    assert len(changes) == 2 and changes[0].startswith("one typical size at 6T2A, 24 V, 5°, 3 kg: total current -")
+    assert "motor speed -3.3 %" in changes[0]
+    assert list(explain._changes(effects.BY_NAME["armature_inductance"]())) == []
+
+
+def test_parameters_and_channels_are_explained_by_their_rows():
+    known = {p.name: p for p in params.walk(robots.nominal())}
+    lines = dict(said("parameter", "motor.resistance"))
+    spec = known["motor.resistance"].spec
+    assert lines["means"] == f"{spec.meaning} [{spec.unit}]" and lines["nominal"] == f"0.611 ohm; {spec.source}"
+    assert lines["equation"].startswith("U_e = C_E ω + I R") and "5 %" in lines["prior"]
+    assert dict(said("parameter", "6T2A.ground.friction.static"))["equation"]
+    lines = dict(said("channel", "speed_mm_s"))
+    assert "speed_sd_mm_s" in lines["column"] and lines["other units"].startswith("m/s, km/h")
+    assert lines["typical noise"].startswith(f"{100 * channels.of('speed').sd_share:g} %")
+    assert dict(said("output", "slip"))["equation"].startswith("1 - V / V_theoretical, eq. (33)")
+
+
+def test_the_command_prints_80_columns_and_every_meaning_of_a_name(mmrjax):
+    code, out, _ = mmrjax("explain", "cut_off")
+    assert code == 0 and "cut_off: status" in out and "cut_off: flag" in out
+    assert words.FLAGS["cut_off"] in " ".join(out.split())
+    assert max(map(len, out.splitlines())) <= 80
+    code, out, _ = mmrjax("explain")
+    assert code == 0 and "series_resistance" in out and "motor.resistance" in out and "converged" in out
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("resistance", "is one of these meant? battery.resistance, motor.resistance"),
+        ("slidez", "did you mean slides"),
+        ("xyzzy", "explain: got xyzzy; mmrjax explain lists the names"),
+    ],
+)
+def test_an_unknown_name_is_answered_by_what_is_near(name, says, mmrjax):
+    code, _, err = mmrjax("explain", name)
+    assert code == 2 and says in err
+
+
+def test_near_words_have_the_word_as_a_part_whatever_its_capitals():
+    outputs = ["total_current", "motor_speed", "peak_current", "slip"]
+    assert near("current", outputs) == ["total_current"]
+    assert near("current", outputs, 3) == ["total_current", "peak_current"]
+    assert near("SLIP", outputs) == ["slip"] and near("slop", outputs) == ["slip"] and near("xyzzy", outputs) == []
+    assert choices("Motor_Speed", outputs).startswith("did you mean motor_speed? allowed: total_current")

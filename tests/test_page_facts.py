@@ -1,0 +1,106 @@
+"""What pages say of limits, scales and tables: what is judged, by which measure, and that nothing overruns."""
+
+import dataclasses
+import re
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import mmrjax as mm
+from mmrjax import params, robots
+from mmrjax.tables import TRACKED, WHEELED
+from sweeps.pages import runs as page
+from sweeps.pages import sweep_figures
+from sweeps.pages.history_figures import Start
+from sweeps.paper import runs as paper_runs
+from sweeps.results.resonance import ResonanceResult
+
+
+def run_of(robot, **conditions):
+    found = mm.simulate(robot, mm.Conditions("6T2A", 33.0, 5.0, **conditions))
+    return {name: np.atleast_1d(values)[0] for name, values in found.to_dict().items()}
+
+
+def judged(robot, run, peak=-95.3):
+    zeros = np.zeros(2)
+    start = Start("a", "6T2A", "converged", np.arange(2.0), np.array([0.0, peak]), zeros, zeros, None)
+    return {line["words"]: line for line in page.limits(robot, run, [start])}
+
+
+def test_a_winding_is_judged_by_what_it_may_warm_up_by():
+    """28 of 125 °C in a room of 25 °C were once 23 % used."""
+    assert page.warmed(28.0, 125.0, 25.0) == pytest.approx(3.0) and page.warmed(125.0, 125.0, 25.0) == 100.0
+    robot, run = robots.nominal(), run_of(robots.nominal())
+    found = judged(robot, run)["winding, long running"]["percent"]
+    assert found == pytest.approx(float(run["winding_settled_C"]) - 25.0)  # of 100 K
+    warm = params.replace(robot, {"motor.temperature_ambient": np.asarray(75.0)})
+    other = run_of(warm)
+    assert judged(warm, other)["winding, long running"]["percent"] == pytest.approx(
+        2 * (float(other["winding_settled_C"]) - 75.0)
+    )
+
+
+def test_an_inrush_is_judged_or_it_is_said_that_nobody_stated_its_limit():
+    robot, run = robots.nominal(), run_of(robots.nominal())
+    line = judged(robot, run)["largest current of the start, all motors"]
+    assert (line["value"], line["limit"], line["percent"]) == ("95.3 A", "not stated", None)
+    assert line["unstated"] == "driver.current_limit"
+    driven = params.replace(robot, {"driver.current_limit": np.asarray(30.0)})
+    line = judged(driven, run)["largest current of the start, all motors"]
+    assert line["limit"] == "60.0 A" and line["percent"] == pytest.approx(100 * 95.3 / 60)
+    rated = dataclasses.replace(robot, battery=dataclasses.replace(robot.battery, current_limit=50.0))
+    line = judged(rated, run_of(robot, battery=1.0))["largest current of the start, all motors"]
+    assert line["limit"] == "48.5 A"  # beside 1.5 A of the other consumers
+    assert judged(rated, run)["largest current of the start, all motors"]["percent"] is None  # fed by a bench supply
+
+
+@pytest.mark.parametrize(
+    ("levels", "ticks"),
+    [
+        (np.arange(0, 20.5, 0.5), ["0", "5", "10", "15", "20"]),
+        (np.round(np.arange(0, 8.05, 0.1), 1), ["0", "2", "4", "6", "8"]),
+        (np.array([0.0, 1.5, 3.0, 5.0, 6.5, 8.0]), ["0", "1.5", "3", "5", "6.5", "8"]),
+        (np.arange(4.1, 25, 0.41), ["5", "10", "15", "20"]),
+    ],
+)
+def test_ticks_of_a_map_are_round_numbers_at_their_places(levels, ticks):
+    """They were once 4.1, 8.2 and 12.3."""
+    seen = {}
+    sweep_figures._ticks(lambda places, names: seen.update(zip(names, places, strict=True)), levels)
+    assert list(seen) == ticks
+    np.testing.assert_allclose(
+        np.interp(list(seen.values()), np.arange(levels.size), levels), [float(t) for t in ticks]
+    )
+
+
+def test_every_table_of_a_page_scrolls_in_itself(mmrjax, tmp_path):
+    assert mmrjax("simulate", "--out", "a")[0] == 0
+    text = (tmp_path / "a" / "report.html").read_text()
+    tables = re.findall(r"(.{0,20})<table", text)
+    assert len(tables) > 1 and all(before.endswith('<div class="scroll">') for before in tables)
+    assert text.count("</table></div>") == len(tables) and ".scroll { overflow-x: auto; }" in text
+
+
+def test_legend_of_the_energy_split_has_what_is_drawn():
+    fig, _ = paper_runs.energy(robots.nominal(), dict.fromkeys((TRACKED, WHEELED), 1.5))
+    shown = {text.get_text() for text in fig.legends[0].get_texts()}
+    drawn = {
+        bars.get_label() for bars in fig.axes[0].containers if max(bar.get_width() for bar in bars.patches) > 0.05
+    }
+    plt.close(fig)
+    assert shown == drawn and {"gearbox", "lift"} <= shown
+
+
+def test_a_point_within_a_range_to_avoid_is_never_a_plain_no():
+    """«Avoid 815-1004» was once above a table that had 979 mm/s as «no»."""
+
+    class Found(ResonanceResult):
+        avoid = ((0.815, 1.004, ()),)
+
+        def shaken(self, row):
+            return row == 0
+
+    table = {"speed_mean_mm_s": np.array([979.0, 979.0, 1100.0])}
+    found = Found("6T2A", 0.0, "", None, None, table, {}, [], [])
+    assert [found.to_avoid(k) for k in range(3)] == ["yes", "at other payloads", "no"]

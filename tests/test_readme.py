@@ -1,0 +1,63 @@
+"""What README and docs say of commands, files and Python holds."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from sweeps import cli
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "docs" / "rigs" / "README.md"]
+
+
+def commands(text):
+    """Lines of shell blocks that call the program, without remarks."""
+    for block in re.findall(r"```sh\n(.*?)```", text, re.S):
+        for line in block.splitlines():
+            if line.startswith("mmrjax "):
+                yield shlex.split(line, comments=True)[1:]
+
+
+def unknown(words):
+    """What of a command line the program does not know."""
+    command = get_command(cli.app)
+    while hasattr(command, "commands"):
+        if words[0] not in command.commands:
+            return words[0]
+        command, words = command.commands[words[0]], words[1:]
+    known = {name for p in command.params for name in (*p.opts, *p.secondary_opts)}
+    return next((w for w in words if w.startswith("--") and w.partition("=")[0] not in known), None)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_of_a_page_and_its_options_exist(page):
+    for words in commands(page.read_text(encoding="utf-8")):
+        assert unknown(words) is None, words
+
+
+def test_a_command_that_does_not_exist_is_found():
+    assert unknown(["simulat"]) == "simulat" and unknown(["simulate", "--slop", "3"]) == "--slop"
+    assert unknown(["rig", "check", "a.toml"]) is None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_of_a_page_resolves(page):
+    text = page.read_text(encoding="utf-8")
+    for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+        assert "://" in link or (page.parent / link).exists(), link
+
+
+def test_the_readme_can_be_read_in_a_minute():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 80 and len(list(commands(text))) == 3
+
+
+@pytest.mark.slow
+def test_python_of_the_readme_runs():
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    names = {}
+    exec(code, names)
+    assert names["found"].converged
