@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from mmrjax.contact import Friction
 from mmrjax.params import Scalar, parameter
 from mmrjax.signals import quotient
 from mmrjax.trigonometry import sine
+
+#: Least load by which a demand is divided, beyond what it can hold [N].
+NO_LOAD = 1e-9
 
 
 class Ground(eqx.Module):
@@ -40,7 +44,8 @@ class Ground(eqx.Module):
 
     def speed_creep(self, demand: Scalar, normal: Scalar, adhesion: Scalar) -> Scalar:
         """Sliding speed [m/s] at which the contact carries `demand` [N]."""
-        return self.friction.speed_creep(demand / (adhesion * normal))
+        # Nothing presses on a vertical ground: a quotient of nothing would make NaN of a whole batch's derivatives.
+        return self.friction.speed_creep(demand / jnp.maximum(adhesion * normal, NO_LOAD))
 
 
 def force_gravity(mass: Scalar, slope: Scalar, gravity: float) -> Scalar:

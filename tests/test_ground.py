@@ -75,3 +75,10 @@ def test_traction_rise_is_the_derivative_of_traction():
     for speed in (-0.05, 0.003, 0.1):
         difference = (surface.traction(speed + 1e-7, 60.0, 1.3) - surface.traction(speed - 1e-7, 60.0, 1.3)) / 2e-7
         np.testing.assert_allclose(surface.traction_rise(speed, 60.0, 1.3), difference, rtol=1e-5)
+
+
+def test_a_robot_on_a_wall_creeps_at_v_s_with_derivatives_of_zero():
+    surface = robots.nominal().configurations["6T2A"].ground
+    for normal, demand in ((0.0, 60.0), (0.0, -60.0), (1e-300, 60.0), (-1.0, 60.0)):
+        value, slopes = jax.value_and_grad(surface.speed_creep, argnums=(0, 1))(demand, normal, 1.0)
+        assert float(value) == np.sign(demand) * surface.friction.speed_static and slopes == (0.0, 0.0)

@@ -194,7 +194,7 @@ def slip_over_start(shown: list[Start]) -> Figure:
     fig, grid = figure(len(shown), 2, 3.1 * len(shown), width_ratios=[1.2, 1.0])
     look = looks(start.configuration for start in shown)
     for (speeds, slip), start in zip(grid, shown, strict=True):
-        speeds.set_title(f"{start.name}\nspeeds, Fig. 24{', backward positive' if start.sense < 0 else ''}")
+        speeds.set_title(f"{start.name}\nspeeds{', backward positive' if start.sense < 0 else ''}")
         slip.set_title("slip")
         if start.stages is None:
             note(speeds, f"no numbers: {words.short(start.status)}", color=VERMILION)
