@@ -1,8 +1,6 @@
 """What the loop and `calibrate` write, simulated under the conditions of their table, is what they fitted."""
 
-import csv
 import dataclasses
-import tomllib
 
 import equinox as eqx
 import jax
@@ -10,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import SETTLED, STATED
-from test_loop_command import mmrjax
 
 from calibration.data import own_mass, robot_file
 from calibration.data import runs as records
@@ -24,7 +21,6 @@ from calibration.inference.optimizers import read
 from mmrjax import channels, params, robots
 from mmrjax.effects import ALL, BY_NAME, UNNAMED
 from mmrjax.fidelities.steady import steady_batch
-from sweeps.commands import loop as room
 
 #: Mass without payload that the tables here state [kg]; the nominal robot has 13.1 and 11.5 kg.
 MASSES = {"6T2A": 14.2, "4W2T": 13.1}
@@ -234,41 +230,7 @@ def test_a_prior_of_a_mass_that_the_table_states_is_refused(robot):
     own_mass.check_priors(["4W2T.mass"], robot, unweighed(table()))
 
 
-# --- the commands ---------------------------------------------------------------------------------------
-
-
-def rows(path):
-    with path.open(encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
-@pytest.fixture(scope="module")
-def looped(tmp_path_factory):
-    """`loop` on the measured runs, with a library of a few effects."""
-    folder = tmp_path_factory.mktemp("looped")
-    some = {n: BY_NAME[n] for n in ("series_resistance", "brush_drop", "mass_offset", "nonlinear_slip")}
-    options = ("--noise", "current=2%,motor_speed=0.5%,speed=1%", "--replicates", 250, "--no-report")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(room.effect_file, "library", lambda paths: some)
-        done = mmrjax(folder, "loop", "measured", *options, "--out", "found")
-    assert done.code == 0, done.err
-    return folder, done
-
-
-@pytest.mark.slow
-def test_sweep_of_the_loops_robot_is_its_fit(looped):
-    folder, done = looped
-    assert "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg" in done.out
-    written = tomllib.loads((folder / "found" / "robot.toml").read_text(encoding="utf-8"))
-    assert written["4W2T"]["mass"] == 13.1 and written["effects"]
-    axes = ("--voltages", "15,33", "--payloads", "0,8")
-    mmrjax(folder, "sweep", "--robot", "found/robot.toml", *axes, "--no-report", "--out", "swept")
-    keys = ("configuration", "supply_voltage_V", "payload_kg", "slope_deg")
-    swept = {tuple(r[k] for k in keys): r for r in rows(folder / "swept" / "runs.csv")}
-    for row in rows(folder / "found" / "rows.csv"):
-        same = swept[tuple(row[k] for k in keys)]
-        for c in channels.usual():
-            assert float(same[c.column]) == pytest.approx(float(row[f"after_{c.column}"]), rel=1e-7), (row["row"], c)
+# --- what calibration writes (what the loop writes: tests/test_prediction.py) ---------------------------
 
 
 @pytest.mark.slow

@@ -235,12 +235,12 @@ def test_posterior_of_the_loop_has_what_it_found(names, verdict):
     import generator as g
     from synthetic import SETTLED, table
 
-    from calibration.discovery.discover import finished
+    from calibration.discovery.discover import assemble_result
     from mmrjax.effects import BY_NAME
 
     runs = table(g.case(names, 10.0, seed=4) if names else g.case(seed=2))
     traced = SETTLED.trace(runs)
-    found = finished(traced, runs, None, SETTLED.settings, BY_NAME, lambda text: None)
+    found = assemble_result(traced, runs, None, SETTLED.settings, BY_NAME, lambda text: None)
     assert (found.verdict == "none") == (verdict == "none")
     found.posterior.check(found.robot, "the loop's")
     sd = dict(zip(found.posterior.names, found.posterior.sd, strict=True))

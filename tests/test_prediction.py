@@ -1,16 +1,19 @@
 """Scores of data held out: against SciPy's densities, and the set of effects that is chosen by them."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from calibration.data import robot_file
 from calibration.data.runs import Runs
 from calibration.discovery import prediction
 from calibration.discovery.discover import discover
 from calibration.discovery.prediction import Gain, HeldOutScore, scored, smallest
-from mmrjax import robots
+from mmrjax import channels, robots
+from mmrjax.fidelities.steady import steady_batch
 from sweeps.inputs import read_runs
 
 RNG = np.random.default_rng(2)
@@ -85,10 +88,12 @@ def test_nothing_is_chosen_where_nothing_can_be_held_out(runs):
 
 
 @pytest.mark.slow
-def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row():
-    """What is written predicts, on the rows that both reach, no worse than this, by kind of block [%]."""
+def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row(tmp_path):
+    """What is written predicts, on the rows that both reach, no worse than this, by kind of block [%]; and swept with
+    the mass of its own file it is what was fitted."""
     robot = robots.nominal()
-    found = discover(read_runs("measured", robot, measured=True), robot)
+    runs = read_runs("measured", robot, measured=True)
+    found = discover(runs, robot)
     assert found.verdict == "class" and found.written and found.gain.mean > found.gain.se
     standing = {e.name: found.support.rests_on(e.name) for e in found.effects}
     assert standing == {"series_resistance": None, "vibration_slip": 10}
@@ -105,3 +110,10 @@ def test_measured_runs_show_a_voltage_drop_and_a_slip_that_rests_on_a_row():
         error = np.where(both, 100 * (after - measured) / after, np.nan)
         rms = np.sqrt(np.nanmean(error**2, 0))
         assert (rms < np.array(wanted[kind]) + 0.05).all(), (kind, rms)
+    found.save(tmp_path)
+    again = robot_file.read(tmp_path / "robot.toml")
+    assert float(again.configurations["4W2T"].mass) == 13.1
+    unweighed = {k: v for k, v in runs.columns.items() if k != "total_mass_kg"}
+    shown = steady_batch(again, dataclasses.replace(runs, columns=unweighed).conditions(again)).reading
+    swept = np.stack([np.asarray(shown[c.name]) for c in channels.usual()], -1)
+    np.testing.assert_allclose(swept, found.readings_of_rows.after, rtol=1e-7)

@@ -44,6 +44,8 @@ seed = 7
 voltage = {distribution = "uniform", low = 15, high = 33}
 """
 POINTS, CHUNKS = 300, 12
+#: Four devices, compiled as these tests are.
+FOUR = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4".strip()
 
 
 @pytest.fixture
@@ -693,7 +695,7 @@ def test_replacement_killed_between_any_two_steps_is_taken_up(opened, monkeypatc
 @pytest.mark.slow
 def test_four_devices_give_the_same_samples_and_results_to_1e_12(whole, tmp_path):
     (tmp_path / "plan.toml").write_text(CONFIG)
-    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, "XLA_FLAGS": FOUR, "JAX_PLATFORMS": "cpu"}
     command = [*MMRJAX, "sweep", "plan.toml", "--chunk", "27", "--out", "s"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -719,7 +721,7 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
         "table = compiled(compiled.points(0))['speed']\n"
         "print(len(table.sharding.device_set), bool((table == found).all()))"
     )
-    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, "XLA_FLAGS": FOUR, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, "-c", probe], env=environment, capture_output=True, text=True)
     said = ["4 [(2,), (2,), (2,), (2,)] ('points',)", "4 True"]  # a plan; the rows of a table
     assert done.stdout.splitlines() == said, done.stderr
