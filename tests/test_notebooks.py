@@ -20,11 +20,8 @@ def test_there_are_notebooks():
     assert len(SCRIPTS) >= 3
 
 
-@pytest.mark.parametrize(
-    "script",
-    [pytest.param(p, marks=() if p.stem.startswith("01") else pytest.mark.slow) for p in SCRIPTS],
-    ids=[p.stem for p in SCRIPTS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("script", SCRIPTS, ids=[p.stem for p in SCRIPTS])
 def test_notebook_runs(script, tmp_path):
     env = {
         **os.environ,

@@ -85,7 +85,7 @@ def test_draws_have_mean_and_covariance_of_the_posterior(posterior):
 
 def test_draws_reproduce_the_linear_standard_error_of_readings(posterior, fitted):
     runs = read("measured").where(np.array([0, 1, 5, 6]))
-    found = uncertainty.intervals(fitted, posterior, runs, config.Compare(), 2000)
+    found = uncertainty.intervals(fitted, posterior, runs, config.Compare(), 500)
     conditions = runs.conditions(fitted)
 
     def readings(z):

@@ -90,10 +90,10 @@ def by_wheel(size):
 @pytest.mark.parametrize("channel", [*(pytest.param(c, marks=pytest.mark.slow) for c in (CURRENT, MOTOR)), SPEED])
 def test_a_hidden_column_is_found_in_its_channel(channel):
     name = ("total_current", "motor_speed", "speed")[channel]
-    hits = [residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(40)]
-    assert sum(bool(f) and (f[0].column, f[0].channel, f[0].within) == ("idle_wheel", name, "") for f in hits) >= 38
+    hits = [residual_clusters(left(s, shift=by_wheel(1.5), channel=channel)) for s in range(20)]
+    assert sum(bool(f) and (f[0].column, f[0].channel, f[0].within) == ("idle_wheel", name, "") for f in hits) >= 19
     others = [c.column for f in hits for c in f if c.column != "idle_wheel"]
-    assert len(others) <= 2  # what goes with it by chance is said beside it, not as a finding of its own
+    assert len(others) <= 1  # what goes with it by chance is said beside it, not as a finding of its own
 
 
 def test_levels_are_said_in_the_unit_of_the_channel():
@@ -112,7 +112,7 @@ def test_levels_that_differ_in_one_configuration_alone_are_found_within_it():
         side = np.where(runs["configuration"] == "6T2A", 1.0, -1.0)
         return 2.0 * side * np.where(columns["who"] == "Ann", 1.0, -1.0)
 
-    hits = [residual_clusters(left(s, shift=shift)) for s in range(20)]
+    hits = [residual_clusters(left(s, shift=shift)) for s in range(10)]
     assert all((f[0].column, f[0].within) == ("who", "configuration") for f in hits)
     assert {m.within for m in hits[0][0].levels} == {"6T2A", "4W2T"}
 
@@ -125,14 +125,14 @@ def test_levels_whose_sign_follows_the_travel_are_found():
         made = dataclasses.replace(made, simulated=made.simulated * travel[:, None])
         return leaving(made, made.whitened + added[:, None] * [0, 0, 1])
 
-    hits = [residual_clusters(both_ways(s, 1.5)) for s in range(20)]
+    hits = [residual_clusters(both_ways(s, 1.5)) for s in range(10)]
     assert all(f[0].column == "who" and f[0].reversing and f[0].channel == "speed" for f in hits)
-    assert sum(bool(residual_clusters(both_ways(s, 0.0))) for s in range(60)) <= 2
+    assert sum(bool(residual_clusters(both_ways(s, 0.0))) for s in range(30)) <= 1
 
 
 def test_a_column_of_many_numbers_is_found_by_ranks():
     shift = lambda runs, columns: 2.0 * np.tanh(columns["yaw_rate_deg_s"])  # noqa: E731
-    hits = [residual_clusters(left(s, shift=shift)) for s in range(20)]
+    hits = [residual_clusters(left(s, shift=shift)) for s in range(10)]
     assert all(f[0].column == "yaw_rate_deg_s" and not f[0].levels and f[0].correlation < -0.4 for f in hits)
 
 

@@ -113,6 +113,7 @@ def test_worker_killed_in_the_middle_changes_nothing(tmp_path, two_workers):
     assert arrays(tmp_path / "there") == arrays(tmp_path / "here")
 
 
+@pytest.mark.slow
 def test_scheduler_that_does_not_answer_is_refused_in_ten_seconds(tmp_path):
     (tmp_path / "plan.toml").write_text(CONFIG)
     with socket.socket() as silent:  # takes the connection and says nothing
