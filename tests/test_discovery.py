@@ -291,7 +291,9 @@ def toy():
     linear = SettledLinearization(
         *map(jnp.asarray, (e, jacobian, signatures, defects, scale)), None, channels=channels.USUAL
     )
-    return SimpleNamespace(linear=linear, bases=(basis, shown), scores=eqx.filter_jit(score_tests)(linear, (basis, shown)))
+    return SimpleNamespace(
+        linear=linear, bases=(basis, shown), scores=eqx.filter_jit(score_tests)(linear, (basis, shown))
+    )
 
 
 def left(linear: SettledLinearization, columns: np.ndarray) -> np.ndarray:

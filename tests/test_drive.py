@@ -232,10 +232,10 @@ def test_drive_start_has_three_stages(drive_table8, grid):
 
 @pytest.fixture(scope="module")
 def small(robot):
-    """Nine runs at once to a given time, so that every small case shares one compilation."""
+    """Nine runs at once to a given time, so that every small case shares one compilation, that of `ROWS` too."""
 
     def go(runs, end, other=None):
-        return drive_batch(other or robot, runs, jnp.linspace(0.0, end, 21))
+        return drive_batch(other or robot, runs, jnp.linspace(0.0, end, len(INSTANTS)), 1e-6)
 
     return robot, go
 
@@ -327,9 +327,12 @@ def test_drive_compiles_once_for_other_numbers(robot, small, compilations):
     runs = Conditions(voltage=np.linspace(10, 30, 9))
     jax.block_until_ready(go(runs, 1.0))
     other = params.replace(robot, {"motor.resistance": 0.9, "6T2A.mass": 14})
-    runs, later = Conditions(voltage=np.linspace(12, 33, 9), slope_deg=np.degrees(0.02)), jnp.linspace(0.0, 1.5, 21)
+    runs, later = (
+        Conditions(voltage=np.linspace(12, 33, 9), slope_deg=np.degrees(0.02)),
+        jnp.linspace(0.0, 1.5, len(INSTANTS)),
+    )
     compilations.clear()
-    jax.block_until_ready(drive_batch(other, runs, later))
+    jax.block_until_ready(drive_batch(other, runs, later, 1e-6))
     assert not compilations
 
 

@@ -727,16 +727,6 @@ def test_chunk_is_split_along_the_points_among_all_devices(tmp_path):
     assert done.stdout.splitlines() == said, done.stderr
 
 
-def test_chunks_share_one_compilation(sweep, compilations):
-    jax.clear_caches()
-    assert sweep("t", "--chunk", "40")[0] == 0
-    once = len(compilations)
-    compilations.clear()
-    jax.clear_caches()
-    assert sweep("u", "--chunk", "40", config=CONFIG.replace("number = 50", "number = 500"))[0] == 0
-    assert len(compilations) <= once
-
-
 # --- before it starts ---------------------------------------------------------------------------------------------
 
 
@@ -819,3 +809,16 @@ def test_plan_of_the_page_is_accepted(mmrjax, tmp_path):
     code, out, err = mmrjax("sweep", "plan.toml", "--dry-run", "--chunk", "1000")
     assert code == 0, err
     assert "60,680,000 (2 configuration x 41 slope_deg x 37 voltage x 20 motor.friction_coulomb x 1000 sample)" in out
+
+
+# --- last, since it forgets what was compiled ----------------------------------------------------------------------
+
+
+def test_chunks_share_one_compilation(sweep, compilations):
+    jax.clear_caches()
+    assert sweep("t", "--chunk", "40")[0] == 0
+    once = len(compilations)
+    compilations.clear()
+    jax.clear_caches()
+    assert sweep("u", "--chunk", "40", config=CONFIG.replace("number = 50", "number = 500"))[0] == 0
+    assert len(compilations) <= once

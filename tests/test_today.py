@@ -116,7 +116,7 @@ DOWNHILL = (
     ],
 )
 def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell(mmrjax, tmp_path, model):
-    code, out, _ = mmrjax(*DOWNHILL, *model, "--out", "a")
+    code, out, _ = mmrjax(*DOWNHILL, *model, "--no-report", "--out", "a")
     assert code == 0
     (row,) = table(tmp_path / "a" / "runs.csv")
     assert "overvoltage" in row["flags"].split(";") and float(row["total_current_A"]) < -0.5
@@ -124,7 +124,7 @@ def test_charging_above_the_charge_voltage_is_flagged_with_the_voltage_of_a_cell
     assert float(row["voltage_cell_V"]) > 4.2 and row["supply_voltage_V"] == ""
     (note,) = json.loads((tmp_path / "a" / "result.json").read_text())["notes"]
     assert note in " ".join(out.split()) and "A flow into the battery, a cell at 4." in note
-    code, out, _ = mmrjax(*DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--out", "b")
+    code, out, _ = mmrjax(*DOWNHILL, *model, "--set", "battery.voltage_charge=4.9", "--no-report", "--out", "b")
     assert code == 0 and "overvoltage" not in out
 
 
@@ -197,7 +197,7 @@ def test_a_sweep_on_the_battery_has_no_axis_of_voltages(mmrjax, tmp_path):
 
 
 def test_the_command_line_reverses(mmrjax, tmp_path):
-    code, out, _ = mmrjax("simulate", "--voltage", "-15", "--out", "a")
+    code, out, _ = mmrjax("simulate", "--voltage", "-15", "--no-report", "--out", "a")
     assert code == 0 and "reverses: steady travel backward" in out
     code, _, _ = mmrjax("simulate", "--voltage", "15", "--out", "b", "--no-report")
     (back,), (forth,) = table(tmp_path / "a" / "runs.csv"), table(tmp_path / "b" / "runs.csv")
@@ -218,7 +218,7 @@ def test_the_command_line_reverses(mmrjax, tmp_path):
     assert code == 0
     assert json.loads((tmp_path / "c" / "result.json").read_text())["statuses"]["reverses"] == 4
     assert "-33 V" in (tmp_path / "c" / "report.html").read_text()
-    code, out, _ = mmrjax("simulate", "--voltage", 0, "--slope", 20, "--model", "drive", "--out", "d")
+    code, out, _ = mmrjax("simulate", "--voltage", 0, "--slope", 20, "--model", "drive", "--no-report", "--out", "d")
     assert code == 0 and "rolls_back: gravity drives the robot" in out
     code, _, err = mmrjax("simulate", "--voltage", "-101")
     assert code == 2 and "supply_voltage_V: got -101; expected -100 to 100" in err
@@ -243,7 +243,7 @@ def test_readings_without_a_sign_are_refused_backward(tmp_path, row, sentence):
 
 def test_compare_takes_readings_with_their_signs(mmrjax, tmp_path):
     (tmp_path / "mine.csv").write_text(f"{COLUMNS}\n6T2A,15,13.1,0,0,2.1,5292\n6T2A,-15,13.1,0,0,-2.1,-5292\n")
-    code, out, _ = mmrjax("compare", "mine.csv", "--out", "a")
+    code, out, _ = mmrjax("compare", "mine.csv", "--no-report", "--out", "a")
     assert code == 0 and "did not converge" not in out
     rows = table(tmp_path / "a" / "comparison.csv")
     assert rows[0]["error_total_current_percent"] == pytest.approx(rows[1]["error_total_current_percent"])
