@@ -182,19 +182,23 @@ def outputs_start(robot):
 
 @functools.cache
 def compiled(outputs, those: tuple[type[Effect], ...]):
-    """Outputs, and their derivatives, as functions of the amplitudes of effects."""
+    """Outputs, and their derivatives with them, as functions of the amplitudes of effects."""
 
     def numbers(amplitudes):
         there = tuple(fitted(e, a) for e, a in zip(those, amplitudes, strict=True))
         return outputs(with_effects(*there))
 
-    return jax.jit(numbers), jax.jit(jax.jacfwd(numbers))
+    def twice(amplitudes):
+        return (numbers(amplitudes),) * 2
+
+    return jax.jit(numbers), jax.jit(jax.jacfwd(twice, has_aux=True))
 
 
 @functools.cache
 def at_zero(outputs, those: tuple[type[Effect], ...]) -> tuple[np.ndarray, np.ndarray]:
     """Outputs and their slopes where all amplitudes are zero."""
-    return tuple(np.asarray(f(jnp.zeros(len(those)))) for f in compiled(outputs, those))
+    slopes, values = compiled(outputs, those)[1](jnp.zeros(len(those)))
+    return np.asarray(values), np.asarray(slopes)
 
 
 def company(effect: type[Effect]) -> tuple[type[Effect], ...]:

@@ -14,7 +14,7 @@ G = 9.80665
 
 
 def test_ground_forces_match_reference():
-    for _ in range(100):
+    for _ in range(30):
         f, mu, m, alpha, v, ratio = RNG.uniform((0, 0.1, 2, -0.5, -0.5, 0.3), (0.2, 1, 20, 0.5, 0.5, 2))
         surface = Ground(Friction(static=mu, dynamic=0.8 * mu), rolling_resistance=f)
         normal = chassis.normal_load(2 * m, alpha, G, 2)
