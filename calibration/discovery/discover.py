@@ -125,8 +125,8 @@ def discover(
     for note in ready.foreign:
         tell(note)
     space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
-    with ahead(space, functools.partial(bases_at, distinct), ready.settings):
-        traced, notes = ready.trace(progress=tell), ready.notes
+    with ahead(space, functools.partial(bases_at, distinct), ready.settings) as later:
+        traced, notes = ready.trace(progress=tell, later=later), ready.notes
     silent = channels.names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
@@ -166,11 +166,15 @@ class LoopInput:
     foreign: Notes
 
     def trace(
-        self, noise: Noise | None = None, progress: Tell = lambda note: None, of: LoopStages | None = None
+        self,
+        noise: Noise | None = None,
+        progress: Tell = lambda note: None,
+        of: LoopStages | None = None,
+        later: Callable[[BaseFit], None] = lambda base: None,
     ) -> LoopStages:
-        """The stages up to a verdict, with this noise or another; `of` are those with the first one."""
+        """The stages up to a verdict, with this noise or another; `of` and `later` as of the function `trace`."""
         sds = self.noise if noise is None else noise
-        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, of)
+        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, of, later)
 
 
 def prepared(
@@ -333,8 +337,10 @@ def trace(
     library: Library = effects.BY_NAME,
     progress: Tell = lambda note: None,
     of: LoopStages | None = None,
+    later: Callable[[BaseFit], None] = lambda base: None,
 ) -> LoopStages:
-    """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`.
+    """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`. `later` is told the base
+    fit as soon as something is missing.
 
     What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages `of` the
     same table with other sds are known, and the same rows count, their replicates serve.
@@ -366,6 +372,7 @@ def trace(
         if not left.test.rejected and screened.cluster is None:
             return LoopStages("none", screened, left, sds)
         progress(Step("effects"))
+        later(screened.base)
         searched = search(space, base, left, bases, settings, progress)
         best, after = searched.best, searched.diagnosis
         if after is None or not after.test.rejected_with_margin:

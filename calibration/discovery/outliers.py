@@ -6,6 +6,7 @@ import concurrent.futures
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from calibration.data.runs import Runs
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import BaseFit, Candidate, empty, fit_base
 from calibration.discovery.clusters import LEVELS, Cluster, cluster
+from calibration.discovery.experiments import predict
 from calibration.discovery.score_tests import Diagnosed, ScoreTable, bootstrap, diagnosed
 from calibration.discovery.settings import Settings
 from calibration.inference import bases as bases_room
@@ -42,9 +44,12 @@ class Screening:
 
 
 @contextlib.contextmanager
-def ahead(space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings) -> Iterator[None]:
+def ahead(
+    space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings: Settings
+) -> Iterator[Callable[[BaseFit], None]]:
     """Beside what is done meanwhile, a first look at the prior's mean, a replicate of a bootstrap there and a fit
-    with room for effects, on other cores: what every later one needs is then compiled. What they find is not read."""
+    with room for effects, on other cores: what every later one needs is then compiled. So are experiments foreseen,
+    by a call of what this gives, with the base fit. What they find is not read."""
     nothing, none = np.zeros(len(space.coordinates)), empty(settings)
     mean = Candidate(none, nothing, nothing, np.inf, nothing, nothing, False, False, False)
     start = BaseFit(mean, np.full(np.shape(space.bare.data.measured), np.nan), space, ())
@@ -57,9 +62,13 @@ def ahead(space: CandidateSpace, bases_at: Callable[[BaseFit], Bases], settings:
         if not space.bare.observe.long:
             search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
+    def foresee(base: BaseFit) -> None:
+        if not space.bare.observe.long:
+            jobs.append(others.submit(predict, base.space, {"": base.candidate}, settings))
+
     with concurrent.futures.ThreadPoolExecutor(2) as others:
-        jobs = [others.submit(look), others.submit(fit)]
-        yield
+        jobs: list[concurrent.futures.Future[Any]] = [others.submit(look), others.submit(fit)]
+        yield foresee
     for job in jobs:
         job.result()
 
