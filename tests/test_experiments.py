@@ -17,7 +17,7 @@ from calibration.data.errors import BadConfiguration
 from calibration.discovery import experiments, menu, predicted
 from calibration.discovery.candidates import Candidate, filled, fit_candidates
 from calibration.discovery.classes import Classes
-from calibration.discovery.discrepancy import Location
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import Heat, NothingPossible, Overspeed, Overvoltage
 from calibration.discovery.reach import reach
 from calibration.discovery.stated_values import Shift
@@ -285,7 +285,7 @@ def test_nothing_is_proposed_where_one_name_is_left(seen):
 def test_unnamed_asks_for_finer_steps_in_its_variable(seen):
     space = seen["mass_error", "tension_friction"][1]
     runs = int(space.included.sum())
-    where = Location("track", "speed", ("track",), (), 60.0, 60.0)
+    where = DiscrepancyLocation("track", "speed", ("track",), (), 60.0, 60.0)
     proposal = experiments.denser(space, where, SETTINGS)
     assert "speed" in proposal.name and proposal.instruction.place == "track"
     assert proposal.expected_sigma == pytest.approx(np.sqrt(60 * 45 / runs)) and runs == 90

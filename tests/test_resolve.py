@@ -9,8 +9,8 @@ import pytest
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration
 from calibration.discovery import resolve as room
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import Asked
-from calibration.discovery.result import Whereabouts
 from mmrjax import robots
 from mmrjax.effects import ALL, BY_NAME
 
@@ -26,7 +26,7 @@ def found(unnamed=None, remains=None, effects=(), alternatives=(), scores=("vibr
 
 
 def where(balance, alike=()):
-    return Whereabouts(balance, "", alike, "slope", ())
+    return DiscrepancyLocation(balance, "slope", alike, (), 9.0, 9.0)
 
 
 @pytest.mark.parametrize(

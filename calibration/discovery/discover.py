@@ -23,9 +23,10 @@ from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
-from calibration.discovery.discrepancy import Location, diagnosis_beside, fit_discrepancy, locate
+from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.hidden import hidden
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import (
     AssumedNoise,
     Copies,
@@ -265,7 +266,7 @@ class LoopStages:
     sds: Sds
     searched: Search | None = None
     alike: Classes | None = None
-    where: Location | None = None
+    where: DiscrepancyLocation | None = None
     standing: NameSupport | None = None
     held_out: tuple[HeldOutAlternative, ...] = ()
 
@@ -661,7 +662,7 @@ def assemble_result(
     remains = None
     if traced.alike is not None:
         found = findings.found_effects(space, base, best, traced.alike, left.test, settings)
-        remains = None if where is None or traced.verdict == "unnamed" else findings.whereabouts(where)
+        remains = None if where is None or traced.verdict == "unnamed" else where
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None and traced.verdict != "unnamed":
         ask = not observe.long

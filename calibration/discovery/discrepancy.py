@@ -19,6 +19,7 @@ from calibration.discovery.active_set import ActiveSet, CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.formula import Proposal, propose
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.projection import Defect, Projection, defect
 from calibration.discovery.score_tests import diagnosed
 from calibration.discovery.smooth import Smooth, smooth
@@ -31,7 +32,6 @@ from calibration.inference.problem import Problem
 from mmrjax import params
 from mmrjax.compiling import compiled
 from mmrjax.effects import UNNAMED
-from mmrjax.effects.base import EQUATION
 from mmrjax.effects.curve import PLACES
 from mmrjax.robot import Robot
 
@@ -51,54 +51,7 @@ ALIKE = 1.0
 # --- where it is ----------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class Location:
-    """Where something is missing.
-
-    Attributes:
-        place: balance in which a curve explains most, or channel whose readings it shifts; variable: over which it
-            does.
-        alike: places in which one explains as much, or would if it had curves of its own.
-        variables_alike: over which a curve there is as improbable, beside `variable`: the most improbable first, of
-            what happens for a while one along each axis.
-        explained: what the curves of that balance and variable explain [σ²]; strongest: what the most improbable
-            family does.
-    """
-
-    place: str
-    variable: str
-    alike: tuple[str, ...]
-    variables_alike: tuple[str, ...]
-    explained: float
-    strongest: float
-
-    @property
-    def balance(self) -> str:
-        """The balance, `sensor` where it is in what an instrument shows."""
-        return bases_room.balance_of(self.place)
-
-    @property
-    def channel(self) -> str:
-        """The channel whose readings are off, empty for none."""
-        return self.place if bases_room.in_readings(self.place) else ""
-
-    @property
-    def balances_alike(self) -> tuple[str, ...]:
-        """Balances of the places that act alike."""
-        return tuple(dict.fromkeys(map(bases_room.balance_of, self.alike)))
-
-    @property
-    def family(self) -> str:
-        """Its equation and what drives it, in the words of `Effect.family`."""
-        happens = bases_room.window(self.variable)
-        variable = self.variable if happens is None else happens.axis
-        what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
-        drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
-        drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
-        return f"{what} that changes with {drivers.get(variable, variable)}"
-
-
-def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
+def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> DiscrepancyLocation:
     """Place of the curve whose score is the most improbable, the variable over which a curve there has the greatest
     evidence, and the places in which one is as improbable.
 
@@ -131,8 +84,8 @@ def locate(left: Diagnosis, bases: Bases, included: np.ndarray) -> Location:
         happening, strength = refined(left.linear, place, happening.axis, included)
         variable = str(happening)
     strongest = max(strength, float(explained[k]))
-    return Location(place, variable, tuple(itertools.chain(*alike)), alike_variables(names, deviate, place, variable),
-                    strength, strongest)  # fmt: skip
+    also = alike_variables(names, deviate, place, variable)
+    return DiscrepancyLocation(place, variable, tuple(itertools.chain(*alike)), also, strength, strongest)
 
 
 def alike_variables(

@@ -27,7 +27,7 @@ from calibration.discovery import menu, predicted
 from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
-from calibration.discovery.discrepancy import Location
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import CarryOut, Instruction, MoreRuns, NothingPossible, NothingTells, TooWeak
 from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
@@ -314,7 +314,7 @@ def more_runs(place: str, variable: str, within: Reach) -> MoreRuns:
     return MoreRuns(place, variable, SERIES, low, high, volts[-1], slope, payload, (step, angle, mass), within)
 
 
-def denser(space: CandidateSpace, where: Location, settings: Settings) -> Proposal:
+def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings) -> Proposal:
     """More runs along the variable of a discrepancy without a name.
 
     Its expected separation from nothing is that of the table [σ], whose curve explains so much a run, over the

@@ -15,9 +15,10 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.adequacy import AdequacyTest
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
-from calibration.discovery.discrepancy import Discrepancy, Location
+from calibration.discovery.discrepancy import Discrepancy
 from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import Hidden
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import RuledOut
 from calibration.discovery.result import (
     Alternative,
@@ -36,7 +37,6 @@ from calibration.discovery.result import (
     ReadingsOfRows,
     StatedValue,
     UnnamedDiscrepancy,
-    Whereabouts,
 )
 from calibration.discovery.score_tests import ScoreTable
 from calibration.discovery.search import own_p, without_each
@@ -149,16 +149,11 @@ def _without_each(
     return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
-def whereabouts(where: Location) -> Whereabouts:
-    """A location in the words of the result."""
-    return Whereabouts(where.balance, where.channel, where.balances_alike, where.variable, where.variables_alike)
-
-
-def unnamed(found: Discrepancy, where: Location, p_value: float, rows: int) -> UnnamedDiscrepancy:
+def unnamed(found: Discrepancy, where: DiscrepancyLocation, p_value: float, rows: int) -> UnnamedDiscrepancy:
     """The discrepancy of an `unnamed` verdict, over the rows of the table."""
     f, lacks, happens = found.proposal, found.defect, bases_room.window(where.variable)
     return UnnamedDiscrepancy(
-        **dataclasses.asdict(whereabouts(where)),
+        **dataclasses.asdict(where),
         unit=found.unit,
         families=(where.family,),
         window=None if happens is None else dataclasses.asdict(happens),

@@ -13,7 +13,7 @@ from calibration.inference.series_noise import SeriesNoise
 
 if TYPE_CHECKING:
     from calibration.discovery.clusters import Cluster
-    from calibration.discovery.discrepancy import Location
+    from calibration.discovery.location import DiscrepancyLocation
     from calibration.discovery.menu import Experiment
     from calibration.discovery.reach import Reach
 
@@ -171,7 +171,7 @@ class Summary:
 
     verdict: str
     p: float
-    where: Location | None
+    where: DiscrepancyLocation | None
     missing: tuple[Missing, ...] = ()
     nearest: tuple[str, ...] = ()
     support: NameSupport | None = None

@@ -14,6 +14,7 @@ from calibration.data.posterior import Posterior
 from calibration.data.runs import WHEN, Runs
 from calibration.data.writing import write_json, write_table
 from calibration.discovery.clusters import Cluster
+from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import Asked, Instruction, NameSupport, RuledOut, Summary
 from calibration.discovery.prediction import Gain
 from calibration.discovery.settings import Settings
@@ -123,29 +124,7 @@ class Formula:
 
 
 @dataclasses.dataclass(frozen=True)
-class Whereabouts:
-    """Where something is missing beyond doubt that has no name.
-
-    Attributes:
-        balance, variable: in which, over what; balances_alike: balances in which it acts alike.
-        channel: whose readings are off, where the balance is `sensor`; else "".
-        variables_alike: over which it shows there as well, the plainest first; levels of conditions too.
-    """
-
-    balance: str
-    channel: str
-    balances_alike: tuple[str, ...]
-    variable: str
-    variables_alike: tuple[str, ...]
-
-    @property
-    def place(self) -> str:
-        """The balance, or the channel whose readings are off."""
-        return self.channel or self.balance
-
-
-@dataclasses.dataclass(frozen=True)
-class UnnamedDiscrepancy(Whereabouts):
+class UnnamedDiscrepancy(DiscrepancyLocation):
     """A discrepancy that no effect of the library explains.
 
     Attributes:
@@ -484,7 +463,7 @@ class DiscoveryResult:
     unusable: tuple[int, ...]
     effects: tuple[FoundEffect, ...]
     unnamed: UnnamedDiscrepancy | None
-    remains: Whereabouts | None
+    remains: DiscrepancyLocation | None
     next_experiment: NextExperiment | None
     cannot_see: tuple[str, ...]
     needs_histories: tuple[str, ...]
@@ -564,7 +543,7 @@ class DiscoveryResult:
             "effects": [_effect(e, self.support) for e in self.effects]
             + ([] if self.unnamed is None else [_unnamed(self.unnamed)]),
             "next_experiment": None if proposal is None else proposal.to_json(),
-            "remains": None if self.remains is None else dataclasses.asdict(self.remains),
+            "remains": None if self.remains is None else self.remains.to_json(),
             "cannot_see": list(self.cannot_see),
             "needs_series": list(self.needs_histories),
             "needs_reverse": list(self.needs_reverse),

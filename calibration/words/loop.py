@@ -38,7 +38,7 @@ from mmrjax import channels
 
 if TYPE_CHECKING:
     from calibration.discovery.clusters import Cluster
-    from calibration.discovery.discrepancy import Location
+    from calibration.discovery.location import DiscrepancyLocation
     from calibration.discovery.result import (
         DiscoveryResult,
         Errors,
@@ -121,7 +121,7 @@ def _tentative(those: Sequence[Missing], support: NameSupport | None) -> str:
     return f" Tentative, in the model since it predicts better: {'; '.join(each)}."
 
 
-def _without_name(where: Location, p: float, no_effect: str) -> str:
+def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
     others = [bases.in_words(p).removeprefix("balance ") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""

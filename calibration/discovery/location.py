@@ -1,0 +1,66 @@
+"""Where something is missing: the balance or the channel, and over what it shows."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from calibration.inference import bases as bases_room
+from mmrjax.effects.base import EQUATION
+
+
+@dataclasses.dataclass(frozen=True)
+class DiscrepancyLocation:
+    """Where something is missing.
+
+    Attributes:
+        place: balance in which a curve explains most, or channel whose readings it shifts; variable: over which it
+            does.
+        alike: places in which one explains as much, or would if it had curves of its own.
+        variables_alike: over which a curve there is as improbable, beside `variable`: the most improbable first, of
+            what happens for a while one along each axis.
+        explained: what the curves of that balance and variable explain [σ²]; strongest: what the most improbable
+            family does.
+    """
+
+    place: str
+    variable: str
+    alike: tuple[str, ...]
+    variables_alike: tuple[str, ...]
+    explained: float
+    strongest: float
+
+    @property
+    def balance(self) -> str:
+        """The balance, `sensor` where it is in what an instrument shows."""
+        return bases_room.balance_of(self.place)
+
+    @property
+    def channel(self) -> str:
+        """The channel whose readings are off, empty for none."""
+        return self.place if bases_room.in_readings(self.place) else ""
+
+    @property
+    def balances_alike(self) -> tuple[str, ...]:
+        """Balances of the places that act alike."""
+        return tuple(dict.fromkeys(map(bases_room.balance_of, self.alike)))
+
+    @property
+    def family(self) -> str:
+        """Its equation and what drives it, in the words of `Effect.family`."""
+        happens = bases_room.window(self.variable)
+        variable = self.variable if happens is None else happens.axis
+        what = bases_room.in_words(self.place) if self.channel else EQUATION[self.balance]
+        drivers = {"speed_motor": "speed", "current": "current" if self.balance == "electrical" else "load"}
+        drivers |= {"payload": "load", "slope": "demand" if self.balance == "slip" else "slope"}
+        return f"{what} that changes with {drivers.get(variable, variable)}"
+
+    def to_json(self) -> dict[str, Any]:
+        """As in result.json."""
+        return {
+            "balance": self.balance,
+            "channel": self.channel,
+            "balances_alike": self.balances_alike,
+            "variable": self.variable,
+            "variables_alike": self.variables_alike,
+        }
