@@ -60,7 +60,7 @@ def first(tmp_path_factory):
 def test_second_process_compiles_nothing_and_answers_the_same(first):
     cache, began = first
     again = process(cache)
-    assert began["kept"] > 5 and began["read"] == 0
+    assert began["kept"] > 2 and began["read"] == 0
     assert again["kept"] == 0 and again["read"] == began["kept"]
     assert again["answer"] == began["answer"]
     described = compilation_cache.describe(cache)

@@ -70,7 +70,9 @@ def test_heating_of_a_plausible_size_is_named():
 
 
 def test_heating_three_times_too_large_is_unnamed_and_said(hot):
-    assert hot.verdict == "unnamed" and hot.members == () and "winding_heating" in hot.standing.effects
+    support = hot.standing
+    assert hot.verdict == "unnamed" and hot.members == ()
+    assert "winding_heating" in support.effects or all(t.larger == ("winding_heating",) for t in support.tests)
     least = min(c.cost for c in hot.searched.ladder)
     plausible, ruled_out = listed(hot, least)
     assert plausible == ()
