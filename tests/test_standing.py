@@ -281,6 +281,13 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         assert {e for e in found[0].effects if stood.established(e)} == set(established)
 
 
+def test_a_class_stands_whoever_leads_it():
+    support = NameSupport(True, "beside", tests=(NameTest("a", 9.0, 3.0, (), 0.0), NameTest("b", 1.0, 3.0, (), 0.0)))
+    other = support.renamed({"a": "c", "b": "b", "": ""})
+    assert other.established("c") and not other.established("a") and not other.established("b")
+    assert support.renamed({}) == support
+
+
 # --- settled runs ---------------------------------------------------------------------------------------
 
 #: V_s of both configurations grows with speed, twofold at 0.4 m/s: creep (Fig. 7) times the speed.

@@ -401,6 +401,7 @@ def trace(
         progress(Step("held out"))
         searched, alike, compared = preference.prefer_by_held_out(space, runs, searched, alike, bases, settings)
         after = searched.diagnosis or after
+        stood = stood.renamed(dict(zip(best.active, (searched.best or best).active, strict=True)))
     alone = [len(m) + len(v) == 1 for m, v in zip(alike.members, alike.stated, strict=True)]
     verdict = "named" if all(one for one, name in zip(alone, named, strict=True) if name) else "class"
     remains = locate(after, bases, space.included) if after.test.rejected_with_margin else None

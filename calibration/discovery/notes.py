@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -122,6 +123,11 @@ class NameSupport:
         """Number of the row that an effect rests on; None where it needs none, or was not tested."""
         test = self.test_of(effect)
         return None if test is None else test.rests_on
+
+    def renamed(self, names: Mapping[str, str]) -> NameSupport:
+        """With others of their classes in the place of effects: what stands is a class, whoever leads it."""
+        tests = tuple(dataclasses.replace(t, effect=names.get(t.effect, t.effect)) for t in self.tests)
+        return dataclasses.replace(self, tests=tests)
 
     def numbered(self, numbers: np.ndarray) -> NameSupport:
         """With rows called as messages call them.
