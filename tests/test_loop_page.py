@@ -244,6 +244,17 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     assert words.answer(dataclasses.replace(found, verdict="none", effects=())).startswith("Yes")
 
 
+def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
+    got = shown("churning", capsys)
+    d, found = got.found.to_json()["chi2"], got.found
+    seen, rows = found.readings_of_rows, found.included
+    for when, simulated in (("before", seen.before), ("after", seen.after)):
+        left = ((simulated - seen.measured) / seen.sd)[rows]
+        assert d["of_readings"][when] == pytest.approx(float(np.nansum(left**2)), rel=1e-9)
+        assert d["of_readings"][when] < d[when]  # the rest is what parameters moved from their priors
+    assert f"{d['of_readings']['before']:.0f} → {d['of_readings']['after']:.0f} σ², with priors" in got.page.text
+
+
 def test_reading_that_weighs_most_is_named(shown, capsys):
     found = shown("churning", capsys).found
     seen, row = found.readings_of_rows, int(np.flatnonzero(found.included)[3])

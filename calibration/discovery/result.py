@@ -517,6 +517,17 @@ class DiscoveryResult:
         return self.runs.channels
 
     @property
+    def chi2_of_readings(self) -> tuple[float, float]:
+        """Sum of the squares that the fits leave of the readings that count, before and after [σ²]; `chi2` has what
+        parameters moved from their priors, and penalties, too."""
+        seen = self.readings_of_rows
+        before, after = (
+            float(np.nansum(np.where(self.included[:, None], (simulated - seen.measured) / seen.sd, np.nan) ** 2))
+            for simulated in (seen.before, seen.after)
+        )
+        return before, after
+
+    @property
     def held_by_prior(self) -> tuple[str, ...]:
         """Names of the parameters of the proposed robot that were fitted and are held by their priors."""
         base = [name for name, p in self.base_shift.items() if p.held_by_prior]
@@ -571,7 +582,12 @@ class DiscoveryResult:
             },
             "adequate": {"before": self.before.adequate, "after": self.after.adequate},
             "evidence": {"before": _evidence(self.before), "after": _evidence(self.after)},
-            "chi2": {"before": self.chi2[0], "after": self.chi2[1], "readings": self.readings},
+            "chi2": {
+                "before": self.chi2[0],
+                "after": self.chi2[1],
+                "readings": self.readings,
+                "of_readings": dict(zip(("before", "after"), self.chi2_of_readings, strict=True)),
+            },
             "base_shift": {name: dataclasses.asdict(p) for name, p in self.base_shift.items()},
             "scores": [dataclasses.asdict(s) for s in self.scores],
             "bootstrap": {
