@@ -249,12 +249,11 @@ SAMPLES = [
         "only 400 of 500 bootstrap tables could be fitted again; the thresholds are theirs",
     ),
     (
-        of_loop.RestsOn("slip", NameTest("slip", 10.57, 3.3, (), 0.0, 2, 4.3, what="run")),
+        of_loop.RestsOn(NameTest("slip", 10.57, 3.3, (), 0.0, 2, 4.3, what="run")),
         "slip rests on run 2 (10.6 σ with it, 4.3 σ without): repeat run 2, and runs at conditions on either side of it",
     ),
     (
         of_loop.RestsOn(
-            "slip",
             NameTest("slip", 10.57, 3.3, (), 0.0, 10, 4.3),
             {"configuration": "6T2A", "supply_voltage_V": 33.0, "slope_deg": 20.0},
             "slope_deg",

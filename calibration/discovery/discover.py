@@ -821,7 +821,7 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
     along a series that it is in."""
     runs = found.runs
     if test.what == "run":
-        return RestsOn(test.effect, test)
+        return RestsOn(test)
     row = int(np.flatnonzero(found.numbers == test.row)[0])
     columns = [c for c in ("configuration", *runs.axes) if runs.has(c)]
     at = {c: str(runs[c][row]) if runs[c].dtype.kind == "U" else float(runs[c][row]) for c in columns}
@@ -830,5 +830,5 @@ def _rests_on(found: DiscoveryResult, test: NameTest) -> RestsOn:
         x, here = np.unique(runs[axis][row if series is None else series]), float(runs[axis][row])
         if len(x) > 1:
             step = np.diff(x)[max(int(np.searchsorted(x, here)) - 1, 0)]
-            return RestsOn(test.effect, test, at, axis, (here - step / 2, here + step / 2))
-    return RestsOn(test.effect, test, at)
+            return RestsOn(test, at, axis, (here - step / 2, here + step / 2))
+    return RestsOn(test, at)

@@ -402,12 +402,11 @@ class RestsOn(Note):
     """An effect that stands by one run alone, which would have to be made again, and others beside it.
 
     Attributes:
-        effect: its name; test: of it.
+        test: of it.
         conditions: column → what the run was at; axis: column along which others were made at the same conditions
             otherwise, "" for none; beside: where along that others would tell most.
     """
 
-    effect: str
     test: NameTest
     conditions: dict[str, str | float] = dataclasses.field(default_factory=dict)
     axis: str = ""

@@ -221,9 +221,13 @@ def largest_share(found: DiscoveryResult) -> str:
         return ""
     row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
     columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
-    at = ", ".join(str(x) if isinstance(x, str) else f"{x:g} {c.rpartition('_')[2]}" for c, x in columns.items())
-    label = found.channels[k].label
+    at, label = _conditions(columns), found.channels[k].label
     return f"{label} of row {found.numbers[row]} ({at}) makes {share:.0f} % of the squares that are left: is it right"
+
+
+def _conditions(columns: Mapping[str, str | float]) -> str:
+    """Conditions of a run by column: `6T2A, 33 V, 20 deg`."""
+    return ", ".join(str(x) if isinstance(x, str) else f"{x:g} {c.rpartition('_')[2]}" for c, x in columns.items())
 
 
 #: Share of what is left from which one reading is worth a look [%].
@@ -323,7 +327,7 @@ def called(found: DiscoveryResult, effect: FoundEffect) -> str:
 
 def tentative(found: DiscoveryResult, effect: FoundEffect) -> str:
     """In a few words, what speaks against the name of an effect; empty where it is established."""
-    if found.support is None or found.support.established(effect.name):
+    if found.support is None or is_established(found, effect):
         return ""
     test = found.support.test_of(effect.name)
     return ": ".join(["tentative", *([", ".join(DOUBTS[d][0].format(test) for d in test.fails)] if test else [])])
@@ -532,12 +536,12 @@ def led(note: Led) -> str:
 def rests_on(note: RestsOn) -> str:
     """An effect that stands by one run alone."""
     test = note.test
-    at = ", ".join(v if isinstance(v, str) else f"{v:g} {c.rpartition('_')[2]}" for c, v in note.conditions.items())
+    at = _conditions(note.conditions)
     run = f"{test.what} {test.rests_on}{f' ({at})' * bool(at)}"
     beside = " and ".join(f"{x:g}" for x in note.beside)
     others = f"run it at {note.axis} {beside} too" if beside else "runs at conditions on either side of it"
     return (
-        f"{note.effect} rests on {test.what} {test.rests_on} ({test.root:.1f} σ with it, {test.root_without:.1f} σ "
+        f"{test.effect} rests on {test.what} {test.rests_on} ({test.root:.1f} σ with it, {test.root_without:.1f} σ "
         f"without): repeat {run}, and {others}"
     )
 
