@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from calibration.sizing import sheet
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
+from sweeps.pages import words
 from sweeps.results.check import CheckResult, changed, corner, label, limit, reached, wanted
 from sweeps.skeleton import leave, page
 from sweeps.store import RunFolder, open_folder
@@ -35,7 +37,13 @@ def check(config: configuration.Check, out: Path | None, force: bool) -> int:
         _write(folder, config, found)
         print_check(found, changes=config.changes)
         manifest = {"seed": None, **sheet.counts(found.outcomes)}
-        return leave(folder, config, manifest, solved=found.solved, page=page("check", found, file))
+        return leave(
+            folder,
+            config,
+            manifest,
+            solved=words.solved(Counter(o.status for o in found.outcomes)),
+            page=page("check", found, file),
+        )
 
 
 def _write(folder: RunFolder, config: configuration.Check, found: CheckResult) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 from rich.table import Table
@@ -15,6 +16,7 @@ from calibration.sizing.search import size as search
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot
+from sweeps.pages import words
 from sweeps.results import check as check_result
 from sweeps.results.size import SizeResult, described, missed, objective
 from sweeps.skeleton import leave, page
@@ -52,7 +54,7 @@ def size(config: configuration.Size, out: Path | None, force: bool) -> int:
             folder,
             config,
             manifest,
-            solved=all(o.status != "failed" for o in outcomes),
+            solved=words.solved(Counter(o.status for o in outcomes)),
             page=page("size", found, file),
         )
 

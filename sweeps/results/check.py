@@ -33,11 +33,6 @@ class CheckResult:
         """What does not hold."""
         return [o for o in self.outcomes if not o.met]
 
-    @property
-    def solved(self) -> bool:
-        """Whether the solver gave an answer at every worst corner."""
-        return all(o.status != "failed" for o in self.outcomes)
-
     def statement(self) -> str:
         """The sheet in a sentence."""
         if not self.missed:
