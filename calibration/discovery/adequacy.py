@@ -41,8 +41,14 @@ class AdequacyTest:
     @property
     def rejected_with_margin(self) -> bool:
         """Whether what is left is beyond doubt, so that a fit which leaves it is not the whole story."""
-        margins = self.settings.margins
-        return any(float(getattr(self.found, k)) > self.threshold(k) + margins[k] for k in self.settings.shares)
+        return any(self._beyond(kind, float(getattr(self.found, kind))) for kind in self.settings.shares)
+
+    def beyond_doubt(self, chi2: float) -> bool:
+        """Whether a fit that leaves such a χ² [σ²] leaves something, whatever that is."""
+        return "chi2" in self.settings.shares and self._beyond("chi2", chi2)
+
+    def _beyond(self, kind: str, found: float) -> bool:
+        return found > self.threshold(kind) + self.settings.margins[kind]
 
     @property
     def p_value(self) -> float:

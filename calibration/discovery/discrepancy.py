@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -143,8 +144,10 @@ class Shaped(eqx.Module):
 
     Attributes:
         base: of the base; root: L, shape (ordinates, ordinates); names: dotted, of the ordinates.
+        fitted_once: whether few fits are made with such coordinates.
     """
 
+    fitted_once: ClassVar[bool] = True
     base: Coordinates | ActiveSet
     root: Float[Array, "ordinates ordinates"]
     names: tuple[str, ...] = eqx.field(static=True)

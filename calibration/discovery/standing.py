@@ -59,8 +59,8 @@ def standing(
 ) -> NameSupport:
     """Which effects of the best candidate of a search may be named, or of another that is proposed.
 
-    A single effect that leaves nothing is weighed against curves alone; several, or one that leaves something, each
-    by itself (`name_tests`).
+    A set that leaves nothing is weighed against curves, one that leaves something against one curve alone; then each
+    effect by itself (`name_tests`).
 
     Args:
         left: what the base leaves; blocks: masks of rows that are left out in turn, each of shape (rows,).
@@ -72,12 +72,12 @@ def standing(
     adequate = not after.test.rejected_with_margin
     if len(best.effects) == 1 and adequate and better:
         return NameSupport(False, "larger", better[0].effects)
-    found = _against_curves(space, base, best, left.linear, bases, settings) if adequate else NameSupport(True)
-    if len(best.effects) == 1 and adequate:
-        return found
-    if not adequate:
+    if adequate:
+        found = _against_curves(space, base, best, left.linear, bases, settings)
+    else:
         found = _one_curve(space, base, best, left, bases, settings)
-    tests = name_tests(space, best, searched, bases, after, settings, blocks, better)
+    fits = dataclasses.replace(searched, ladder=(base, *searched.ladder))
+    tests = name_tests(space, best, fits, bases, after, settings, blocks, better)
     if found.stands:
         found = NameSupport(any(t.established for t in tests))
         found = dataclasses.replace(found, why="beside" if found.stands else "none by itself")
@@ -207,7 +207,8 @@ def _one_curve(
     if equation(where.place) in {_equation(space, e) for e in best.effects}:
         # Names mend what a strong curve in their equation leaves at a base fit that it has pulled far away.
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
-        if not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
+        adequate = not left.test.beyond_doubt(curve.chi2[1])  # or there is no need to compile a closer look
+        if adequate and not diagnosis_beside(space, curve, bases, left).test.rejected_with_margin:
             return NameSupport(False, "curve alone", curves=(_over(where.place, where.variable),))
     return NameSupport(True)
 

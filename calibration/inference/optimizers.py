@@ -374,7 +374,6 @@ def _vacant(problem: Problem, members: Member) -> Progress:
     return jax.vmap(one)(members)
 
 
-@functools.partial(compiled, options=SMALL)
 def _go_on(
     problem: Problem, members: Member, fresh: Numbers, at: Progress, enough: Numbers, max_steps: Numbers
 ) -> tuple[Progress, Optimum]:
@@ -393,6 +392,10 @@ def _go_on(
     at = jax.vmap(begin)(members, fresh, at)
     at = jax.lax.while_loop(lambda at: jnp.sum(at.over) < enough, lambda at: jax.vmap(advance)(members, at), at)
     return at, jax.vmap(lambda member, at: _ended(at, member.problem(problem).data, pin))(members, at)
+
+
+_go_on_often = compiled(_go_on, options=SMALL)
+_go_on_seldom = compiled(_go_on, options=SELDOM)
 
 
 def searches_refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
@@ -416,6 +419,7 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
     cores = min(CORES, -(-count // places))
     first = jax.tree.map(lambda x: np.repeat(x[:1], places, 0), members)
     idle = _vacant(problem, first)
+    go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
 
     def some(core: int) -> list[tuple[int, Any]]:
         waiting, ended = list(range(core, count, cores))[::-1], []
@@ -428,7 +432,7 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
             own = jax.tree.map(lambda x: x[np.maximum(holds, 0)], members)
             running = int((holds >= 0).sum())
             enough = places - running + (max(1, places // 4) if waiting else running)
-            at, found = _go_on(problem, own, fresh, at, np.asarray(enough), most)
+            at, found = go_on(problem, own, fresh, at, np.asarray(enough), most)
             over, found = jax.device_get((at.over, (found, at.found)))
             for place in np.flatnonzero(over & (holds >= 0)):
                 ended.append((holds[place], jax.tree.map(lambda x: x[place], found)))  # noqa: B023
@@ -436,7 +440,7 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
         return ended
 
     if cores > 1:  # the program is made once, by a call that takes no step
-        _go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
+        go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
     with concurrent.futures.ThreadPoolExecutor(cores) as pool:
         ended = dict(itertools.chain(*pool.map(some, range(cores))))
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
