@@ -44,6 +44,7 @@ class Task:
     robot: str = "nominal"
     narrow: bool = False
     stratum: str = ""
+    brief: bool = False
 
 
 @functools.cache
@@ -223,6 +224,9 @@ def campaign(
     parser.add_argument("--robot", default="nominal", help="of the paper's robot's cases")
     parser.add_argument("--stratum", default="", help="one stratum of the wide kinds alone, e.g. plain")
     parser.add_argument("--narrow", action="store_true", help="one surface, its adhesion stated, as before")
+    parser.add_argument(
+        "--brief", action="store_true", help="verdicts and findings alone, no experiments carried out"
+    )
     parser.add_argument("--out", type=Path, default=Path(out))
     parser.add_argument("--cache", type=Path, help="folder of compiled programs that the workers share")
     parser.add_argument("--limit", type=float, default=np.inf, help="seconds after which the campaign stops")
@@ -236,7 +240,7 @@ def campaign(
     done = {(x["kind"], x["seed"]) for x in lines}
     wanted = {kind: getattr(given, kind) for kind in kinds}
     tasks = [
-        Task(kind, seed, given.replicates, given.robot, given.narrow, given.stratum)
+        Task(kind, seed, given.replicates, given.robot, given.narrow, given.stratum, given.brief)
         for kind, count in wanted.items()
         for seed in range(given.first, given.first + count)
         if (kind, seed) not in done

@@ -1,16 +1,20 @@
 """The closed loop on synthetic tables: false findings, right classes, unnamed discrepancies, next experiments.
 
     python benchmarks/loop.py --clean-wide 1000 --library 500 --variants 300 --outside 300 --pairs 200 --jobs 2
+    python benchmarks/loop.py --clean-unstated 300 --clean-heavy 100 --clean-uneven 100 --clean-rounded 100 --jobs 2
 
 Tables come from `tests/generator.py` and `tests/generator_wide.py`, which share nothing with the simulator; labels
 are read by the scorer alone. Every table is one line of `--out`, and a run that is started again goes on where it
 ended.
 Surfaces are wide (adhesion 0.2 to 1, V_s 2 to 60 mm/s, known by the fields' priors alone), and some tables come from
 other robots or poor instruments; with `--narrow` all come from the paper's robot on one surface that is stated.
+Kinds with a noise of their own (`NOISES`) are the same without sds in the table, or with heavy-tailed, uneven or
+coarsely rounded readings, of which every other table states sds.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import tempfile
 import time
@@ -23,13 +27,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import generator as g
 import generator_wide as gw
+import loop_findings
 import loop_scores as scores
 from campaign import Task, campaign, plain, robot_of
 
 KINDS = (
     "clean", "clean_wide", "noise", "library", "variants", "outside", "blind", "pairs", "compensating", "triples",
-    "drift", "cluster", "coverage",
+    "drift", "cluster", "coverage", "clean_unstated", "clean_heavy", "clean_uneven", "clean_rounded",
+    "library_unstated", "outside_unstated", "pairs_unstated",
 )  # fmt: skip
+#: Kinds whose noise is their own: of what effects they are, its law, whether sds are stated (None: every other time).
+NOISES: dict[str, tuple[str, str, bool | None]] = {
+    "clean_unstated": ("clean_wide", "normal", False), "clean_heavy": ("clean_wide", "heavy", None),
+    "clean_uneven": ("clean_wide", "uneven", None), "clean_rounded": ("clean_wide", "normal", None),
+    "library_unstated": ("library", "normal", False), "outside_unstated": ("outside", "normal", False),
+    "pairs_unstated": ("pairs", "normal", False),
+}  # fmt: skip
 #: Kinds that keep to the paper's robot on one stated surface.
 NARROW = ("clean", "compensating")
 #: Sigmas of each effect, least and most.
@@ -43,6 +56,8 @@ SHARES = {
     "plain": 0.52, "quantised": 0.08, "outliers": 0.08, "missing": 0.08, "long": 0.08, "short": 0.04, "tracks": 0.04,
     "wheels": 0.04, "both": 0.04,
 }  # fmt: skip
+#: The same of kinds whose noise is their own: tables with series, and such as Tables A1 and A2.
+SERIES = {"plain": 0.5, "few": 0.3, "missing": 0.1, "both": 0.1}
 #: Amplitudes of more than so many ordinary sizes are left out: no library should believe them.
 SIZES = 3.0
 #: Draws of names until effects of the wanted strength are not too large together.
@@ -64,9 +79,11 @@ def make(kind: str, seed: int, narrow: bool = True) -> g.Case | None:
     return None if isinstance(made, str) else made
 
 
-def attempt(kind: str, seed: int, narrow: bool = False) -> g.Case | str:
-    """The case of a kind and a seed, or why there is none."""
+def attempt(kind: str, seed: int, narrow: bool = False, only: str = "") -> g.Case | str:
+    """The case of a kind and a seed, or why there is none; `only` of a stratum."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
+    own, rounded = kind in NOISES, kind == "clean_rounded"
+    kind, law, stated = NOISES.get(kind, (kind, "normal", True))
     low, high = SIGMAS.get(kind, (0.0, 0.0))
     if narrow or kind in NARROW:
         names = _names(kind, seed, rng, tuple(g.LIBRARY))
@@ -74,14 +91,16 @@ def attempt(kind: str, seed: int, narrow: bool = False) -> g.Case | str:
             sigmas = float(rng.uniform(low, high)) if names else 0.0
             case = g.case(names, sigmas, seed=seed, compensating=kind == "compensating")
         return _refused(case, kind, low) or case
-    stratum = gw.STRATA[seed % len(gw.STRATA)]
-    if kind != "clean_wide":
-        usual = [s for s in SHARES if kind not in ("noise", "coverage") or s in ("plain", "both", "tracks", "wheels")]
-        share = np.array([SHARES[s] for s in usual])
+    stratum, shares = gw.STRATA[seed % len(gw.STRATA)], SERIES if own else SHARES
+    if own or kind != "clean_wide":
+        usual = [s for s in shares if kind not in ("noise", "coverage") or s in ("plain", "both", "tracks", "wheels")]
+        share = np.array([shares[s] for s in usual])
         stratum = str(rng.choice(usual, p=share / share.sum()))
+    stratum = only or ("quantised" if rounded else stratum)
     world = gw.world(
         rng, stratum, noise=(0.5, 2.0)[seed % 2] if kind == "noise" else 1.0,
         shuffled=True if kind in ("drift", "cluster") else None, from_priors=kind == "coverage",
+        law=law, stated=seed % 2 == 0 if stated is None else stated,
     )  # fmt: skip
     refused: Counter[str] = Counter()
     for _ in range(TRIES.get(kind, 1)):
@@ -199,7 +218,7 @@ def one(task: Task) -> dict:
     from calibration.data import runs as records
     from calibration.discovery.discover import prepared
 
-    case = attempt(task.kind, task.seed, task.narrow)
+    case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
     with tempfile.TemporaryDirectory() as folder:
@@ -212,11 +231,23 @@ def one(task: Task) -> dict:
 
             robot = robot_file.read(table.with_suffix(".toml"))
     stated = {} if isinstance(case, gw.WideCase) else STATED
-    began = time.perf_counter()
+    began, spent = time.perf_counter(), time.process_time()
     given = prepared(runs, robot, stated=stated, replicates=task.replicates, seed=task.seed)
     found = given.trace()
-    seconds = time.perf_counter() - began
-    return {"seconds": seconds, **verdict(found), **judged(task.kind, case, given.runs, found, given.settings)}
+    seconds, processor = time.perf_counter() - began, time.process_time() - spent
+    line = {
+        "seconds": seconds,
+        "processor_seconds": processor,
+        **verdict(found),
+        **loop_findings.findings(given, found),
+        **judged(task, case, given.runs, found, given.settings),
+    }
+    if isinstance(case, gw.WideCase) and task.kind not in ("drift", "cluster"):
+        further = dataclasses.replace(case, table=case.elsewhere(task.seed))
+        with tempfile.TemporaryDirectory() as folder:
+            further.write(Path(folder) / "further.csv", Path(folder) / "label.json")
+            line["elsewhere"] = loop_findings.elsewhere(given, found, records.read(Path(folder) / "further.csv"))
+    return line
 
 
 def verdict(found) -> dict:
@@ -242,16 +273,16 @@ def located(found) -> tuple | None:
 
 
 #: Of a label, what the scorer keeps of a case.
-KEPT = ("surface", "robot", "rows", "shuffled", "noise", "outliers", "missing", "refused")
+KEPT = ("surface", "robot", "rows", "shuffled", "noise", "law", "stated", "outliers", "missing", "refused")
 
 
-def judged(kind: str, case: g.Case, runs, found, settings) -> dict:
+def judged(task: Task, case: g.Case, runs, found, settings) -> dict:
     """The truth of a case, and what only the truth can judge.
 
     Args:
         found: what the stages of the loop found, a `LoopStages`.
     """
-    label = case.label
+    label, kind = case.label, task.kind
     facts = ("name", "class", "balance", "channel", "sigmas", "sizes", "amplitude", "where")
     told = [{k: e[k] for k in facts if k in e} for e in label["effects"]]
     if kind not in ("drift", "cluster"):
@@ -262,9 +293,9 @@ def judged(kind: str, case: g.Case, runs, found, settings) -> dict:
         "truth": told,
     }
     paper = not isinstance(case, gw.WideCase) or case.toml is None
-    if kind == "library" and found.verdict in ("named", "class"):
+    if kind == "library" and found.verdict in ("named", "class") and not task.brief:
         line |= after(case, runs, found)
-    if kind == "library" and found.verdict == "class" and paper:
+    if kind == "library" and found.verdict == "class" and paper and not task.brief:
         try:
             line["experiments"] = carried_out(case, found, settings)
         except Exception as error:  # a menu that the generator does not know costs a figure, not the table
@@ -372,7 +403,7 @@ def program(task: Task) -> tuple | dict:
     from calibration.discovery.discover import padded
     from calibration.inference.observers.settled import SettledRuns
 
-    case = attempt(task.kind, task.seed, task.narrow)
+    case = attempt(task.kind, task.seed, task.narrow, task.stratum)
     if isinstance(case, str):
         return {"skipped": case}
     names = case.world.machine.names.values() if isinstance(case, gw.WideCase) else ()
@@ -382,6 +413,7 @@ def program(task: Task) -> tuple | dict:
 def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
     f = scores.Figures(lines)
+    scores.findings(f)
     scores.clean(f, ("clean", "clean_wide"))
     scores.noise(f)
     scores.library(f)

@@ -184,6 +184,83 @@ class Figures:
         self.out.append(text)
 
 
+def findings(f: Figures) -> None:
+    """Each effect by itself: established, tentative, right or wrong, and whether what is written predicts.
+
+    By kind, and where a kind has tables whose sds are stated and such whose are not, by that.
+    """
+    known = [x for x in f.lines if "verdict" in x and "effects" in x]
+    for kind in dict.fromkeys(x["kind"] for x in known):
+        every = [x for x in known if x["kind"] == kind]
+        ways = dict.fromkeys(x.get("made", {}).get("stated", True) for x in every)
+        for stated in ways:
+            those = [x for x in every if x.get("made", {}).get("stated", True) == stated]
+            what = kind + (f", sds {'' if stated else 'not '}stated" if len(ways) > 1 else "")
+            _found(f, what, those)
+            _written(f, those)
+
+
+def _found(f: Figures, what: str, those: Sequence[dict]) -> None:
+    """What was found of these cases, of one kind."""
+    count = max((len(x.get("truth", ())) for x in those), default=0)
+    if count == 0:
+        f.say(f"{what}: rejected (goal <= 5 %)", those, false_finding)
+        f.say("  something established (goal <= 1 %)", those, lambda x: wrong(x, "established"))
+        f.say("  something tentative", those, lambda x: wrong(x, "tentative"))
+        return
+    if all(t["class"] for x in those for t in x["truth"]):
+        strong = [x for x in those if all(sigmas(t) >= 5 for t in x["truth"])]
+        f.say(
+            f"{what}, >= 5 sigma left: every truth established (goal >= 93 %)",
+            strong,
+            lambda x: all_in(x, "established"),
+        )
+        f.say("  established or tentative", strong, lambda x: all_in(x, "established", "tentative"))
+    else:
+        f.say(f"{what}: nothing found", those, lambda x: x["verdict"] == "none")
+    f.say("  something wrong established (goal <= 3 %)", those, lambda x: wrong(x, "established"))
+    f.say("  something wrong tentative", those, lambda x: wrong(x, "tentative"))
+    free = [x for x in those if x["truth"][0].get("best_other", np.inf) >= MIMIC]
+    if len(free) < len(those):
+        f.say("  the same where no effect mimics: wrong established", free, lambda x: wrong(x, "established"))
+        f.say("  wrong tentative", free, lambda x: wrong(x, "tentative"))
+
+
+def _written(f: Figures, those: Sequence[dict]) -> None:
+    """Whether what is written predicts, by data held out and by runs at other conditions."""
+    from calibration.discovery.prediction import WORSE
+
+    def kept(x: dict) -> bool:
+        return bool(x.get("written", True)) and "gain" in x
+
+    further = [x for x in those if "elsewhere" in x]
+    f.say(
+        f"  elsewhere not below the refit by more than {WORSE:g} nat a reading (goal >= 98 %)",
+        further,
+        lambda x: not kept(x) or not x["elsewhere"] or x["elsewhere"]["gain"][0] >= -WORSE,
+    )
+    added = [x for x in further if kept(x) and x["elsewhere"]]
+    f.say("    of those with effects written", added, lambda x: x["elsewhere"]["gain"][0] >= -WORSE)
+    f.say(
+        "    a channel's error rises there by more than a tenth",
+        added,
+        lambda x: any(after > 1.1 * before for before, after, *_ in x["elsewhere"]["rms_sigma"].values()),
+    )
+    f.say("  effects found and not written", [x for x in those if x["effects"]], lambda x: not kept(x))
+
+
+def wrong(x: dict, standing: str) -> bool:
+    """Whether an effect of this standing holds no truth in its class."""
+    truths = {t["class"] for t in x["truth"]}
+    return any(e["standing"] == standing and not truths & set(e["class"]) for e in x["effects"])
+
+
+def all_in(x: dict, *standings: str) -> bool:
+    """Whether each truth is in the class of an effect of one of these standings."""
+    classes = [e["class"] for e in x["effects"] if e["standing"] in standings]
+    return all(any(t["class"] in c for c in classes) for t in x["truth"])
+
+
 def clean(f: Figures, kinds: Sequence[str]) -> None:
     """False findings, per stratum and per property; a stratum that is too high is marked."""
     for kind in kinds:

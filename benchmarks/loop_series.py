@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import generator as g
 import generator_series as gs
 import generator_series_wide as sw
+import loop_findings
 import loop_scores as scores
 from campaign import Task, campaign, robot_of
 from loop import SIZES, verdict
@@ -167,6 +168,7 @@ def judged(robot, runs, label: dict, stated: dict, task: Task) -> dict:
     return {
         "seconds": seconds,
         **verdict(found),
+        **loop_findings.findings(given, found),
         "stratum": label.get("stratum", "narrow"),
         "made": {k: label[k] for k in KEPT if k in label},
         "truth": [{**{k: e[k] for k in facts if k in e}, **_left(found, e, settings)} for e in label["effects"]],
@@ -207,6 +209,7 @@ def _amplitudes(found, settings) -> dict:
 def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
     f = scores.Figures(lines)
+    scores.findings(f)
     scores.clean(f, ("clean", "clean_wide"))
     scores.noise(f)
     scores.library(f)

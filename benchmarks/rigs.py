@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import generator_rigs as gr
 import generator_rigs_laws as laws
+import loop_findings
 import loop_scores as scores
 from campaign import Task, campaign
 from loop import verdict
@@ -125,8 +126,9 @@ def work(task: Task) -> dict:
         case.write(Path(folder))
         robot = robot_file.read(Path(folder) / "rig.toml")
         runs = records.read(Path(folder) / "table.csv", robot=robot)
-        found = prepared(runs, robot, replicates=task.replicates, seed=task.seed).trace()
-        said = verdict(found)
+        given = prepared(runs, robot, replicates=task.replicates, seed=task.seed)
+        found = given.trace()
+        said = {**verdict(found), **loop_findings.findings(given, found)}
         parameters = identified(found, case)
     line = {
         "seconds": time.perf_counter() - began,
@@ -175,6 +177,7 @@ def program(task: Task) -> tuple[str, int]:
 def summary(lines: list[dict]) -> list[str]:
     """The figures of a campaign."""
     f = scores.Figures(lines)
+    scores.findings(f)
     _clean(f)
     _library(f)
     _outside(f)

@@ -23,6 +23,10 @@ STRATA = ("plain", "quantised", "outliers", "missing", "short", "long", "tracks"
 ADHESION, CREEP = (0.2, 1.0), (0.002, 0.06)  # μ_s [-]; V_s [m/s]
 OUTLIERS, GROSS, MISSING = 0.02, (6.0, 30.0), 0.1  # share of readings, their size [sd], share of cells
 COARSE = (3.0, 6.0)  # steps of a coarse display [sd]
+#: Degrees of freedom of heavy-tailed noise; what uneven noise is about zero, and at the largest reading [sd of all].
+TAIL, UNEVEN = 3.0, (0.3, 1.7)
+#: What noise may be like: as stated, heavy-tailed (Student's t of the same sd), uneven (of larger readings larger).
+NOISES = ("normal", "heavy", "uneven")
 #: Rows of short and of long tables. Few lengths once padded to 16: each is a program to compile for who reads them.
 SHORT, LONG = ((15, 16), (17, 32), (33, 48)), ((113, 128), (193, 200))
 
@@ -98,6 +102,7 @@ class World:
     Attributes:
         stratum: of STRATA; constants: true ones; conditions: in the order of measuring; shuffled: that order.
         outliers, missing: shares of readings; noise: true sd over the stated one.
+        law: of NOISES; stated: whether the table states sds.
         z: where the truth is in the analyst's priors, where it was drawn from them.
     """
 
@@ -111,6 +116,8 @@ class World:
     missing: float = 0.0
     noise: float = 1.0
     z: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    law: str = "normal"
+    stated: bool = True
 
     def slopes(self) -> np.ndarray:
         """Whitened change of the readings for one sd of the analyst's prior of each constant."""
@@ -132,9 +139,10 @@ def gripping(c: g.Conditions, p: dict[str, float], y: np.ndarray) -> bool:
 
 def world(
     rng: np.random.Generator, stratum: str = "plain", *, shuffled: bool | None = None, noise: float = 1.0,
-    from_priors: bool = False,
+    from_priors: bool = False, law: str = "normal", stated: bool = True,
 ) -> World:  # fmt: skip
-    """A world of a stratum; `from_priors`: the truth is drawn from the analyst's priors.
+    """A world of a stratum, or of `few` rows (see `World` for `law` and `stated`); `from_priors`: the truth is drawn
+    from the analyst's priors.
 
     Rows are in the order of the grid, or shuffled, as it comes, where `shuffled` does not say.
     """
@@ -157,7 +165,7 @@ def world(
     show = _coarse(rng, m.instruments) if everything or stratum == "quantised" else m.instruments
     has = {f: everything or stratum == f for f in fault}
     return World(
-        stratum, m, p, c, show, order, OUTLIERS * has["outliers"], MISSING * has["missing"], noise, z
+        stratum, m, p, c, show, order, OUTLIERS * has["outliers"], MISSING * has["missing"], noise, z, law, stated
     )  # fmt: skip
 
 
@@ -174,6 +182,8 @@ def _conditions(
         again = rng.integers(0, len(c.U), max(count - len(c.U), 0))  # repeats
         return c.at(rng.permutation(np.concatenate([rng.permutation(len(c.U))[:count], again]))), True
     c = robots.grid(m, p)
+    if length == "few":  # as in Tables A1 and A2
+        c = c.at(np.flatnonzero((c.payload == 0) & (np.isin(c.U, np.unique(c.U)[[0, -1]]))))
     return (c.at(rng.permutation(len(c.U))), True) if shuffled else (c, False)
 
 
@@ -326,6 +336,25 @@ class WideCase(g.Case):
         """The robot's file; None for the paper's."""
         return self.world.machine.toml
 
+    def elsewhere(self, seed: int) -> dict[str, np.ndarray]:
+        """As many runs again of the same robot, without faults, at conditions within those of the table."""
+        rng = np.random.default_rng([78, seed])
+        w, c = self.world, self.conditions
+        n = len(c.U)
+        k = rng.integers(0, n, 3 * n)
+        slope, payload, U = c.slope[k].copy(), c.payload[k].copy(), rng.uniform(c.U.min(), c.U.max(), 3 * n)
+        for role in np.unique(c.wheeled):  # no steeper and no heavier than that configuration went
+            mine = c.wheeled[k] == role
+            slope[mine] *= rng.random(mine.sum())
+            payload[mine] = rng.uniform(0, c.payload[c.wheeled == role].max(), mine.sum())
+        new = g.conditions(c.wheeled[k], U, np.degrees(slope), payload, self.constants)
+        _, sound = g.readings(new, self.constants, self.terms)
+        new = new.at(np.flatnonzero(sound)[:n])
+        y, sound = g.readings(new, self.constants, self.terms)
+        plain = dataclasses.replace(w, conditions=new, noise=1.0, law="normal", stated=True)
+        faultless = np.zeros(y.shape, bool)
+        return _table(plain, y, sound, faultless, faultless, rng)
+
     def write(self, table: Path, label: Path) -> None:
         """As `Case.write`; the robot's file is beside the table, with the ending of its own."""
         with table.open("w", newline="", encoding="utf-8") as file:
@@ -411,6 +440,8 @@ def case(
         "rows": len(c.U),
         "shuffled": w.shuffled,
         "noise": w.noise,
+        "law": w.law,
+        "stated": w.stated,
         "outliers": [[int(r) + 1, g.CHANNELS[k]] for k, r in zip(*np.nonzero(odd & sound), strict=True)],
         "missing": int((missing & sound).sum()),
         "rows_lost": int((~sound).sum()),
@@ -428,7 +459,7 @@ def _table(
     w: World, y: np.ndarray, sound: np.ndarray, missing: np.ndarray, odd: np.ndarray, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     show = w.instruments
-    noise = w.noise * rng.standard_normal(y.shape) * np.array(show.sd)[:, None]
+    noise = w.noise * _deviates(w.law, y, rng) * np.array(show.sd)[:, None]
     gross = rng.choice((-1.0, 1.0), y.shape) * rng.uniform(*GROSS, y.shape) * show.stated[:, None]
     step = np.array(show.step)[:, None]
     shown = np.round((y * g._SHOWN + noise + np.where(odd, gross, 0.0)) / step) * step
@@ -441,4 +472,17 @@ def _table(
     for k, (reading, sd) in enumerate(zip(readings, deviations, strict=True)):
         clean[reading] = np.where(missing[k], np.nan, np.round(shown[k], 6))
         clean[sd] = np.where(missing[k], np.nan, clean[sd])
+        if not w.stated:
+            del clean[sd]
     return {name: column[sound] for name, column in clean.items()}
+
+
+def _deviates(law: str, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Noise of unit variance over all rows [sd]; y are the readings, shape (3, rows)."""
+    if law == "heavy":
+        return rng.standard_t(TAIL, y.shape) * np.sqrt(1 - 2 / TAIL)
+    if law == "uneven":
+        size = np.abs(y) / np.nanmax(np.abs(y), 1, keepdims=True)
+        sd = UNEVEN[0] + (UNEVEN[1] - UNEVEN[0]) * size
+        return rng.standard_normal(y.shape) * sd / np.sqrt(np.nanmean(sd**2, 1, keepdims=True))
+    return rng.standard_normal(y.shape)

@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
 
 import campaign
 import loop
+import loop_findings
 import loop_scores as scores
 
 
@@ -101,6 +102,7 @@ def test_what_a_result_holds_is_written_as_json():
 @pytest.mark.parametrize("kind", [k for k in loop.KINDS if k != "blind"])
 def test_cases_of_every_kind(kind):
     made = next(m for m in (loop.attempt(kind, s) for s in range(8)) if not isinstance(m, str))
+    kind = loop.NOISES.get(kind, (kind,))[0]
     count = {"pairs": 2, "compensating": 2, "triples": 3, "clean": 0, "clean_wide": 0, "noise": 0}.get(kind, 1)
     effects = made.label["effects"]
     assert len(effects) == count or kind == "coverage"
@@ -144,3 +146,73 @@ def test_a_worker_that_dies_costs_its_case_alone():
     assert [x["seed"] for x in lines if "error" in x] == [3] and "7" in next(
         x["error"] for x in lines if "error" in x
     )
+
+
+# --- findings, each by itself ---------------------------------------------------------------------------
+
+
+def found(*effects, truth=(), gain=0.0, written=True, stated=True, kind="x", **more):
+    """A line with effects of (standing, class)."""
+    listed = [{"standing": s, "class": list(c), "name": c[0]} for s, c in effects]
+    further = {"gain": [gain, 0.01], "rms_sigma": {"speed": [1.0, 1.0, 9, 9]}} if listed else {}
+    return line(
+        "named" if listed else "none", truth=[{"class": c, "sigmas": 9.0} for c in truth], effects=listed,
+        elsewhere=further, made={"stated": stated}, written=written, **({"gain": [0.0, 0.0]} if listed else {}), **more,
+    ) | {"kind": kind}  # fmt: skip
+
+
+def figure(lines, start):
+    f = scores.Figures(lines)
+    scores.findings(f)
+    return next(x for x in f.out if x.strip().startswith(start))
+
+
+def test_an_effect_is_right_or_wrong_by_its_class_and_counts_by_its_standing():
+    lines = [found(("established", "ab"), truth="a")] * 2 + [found(("tentative", "a"), truth="a"), found(truth="a")]
+    lines += [found(("established", "c"), ("tentative", "d"), truth="a")]
+    assert " 40.0 %" in figure(lines, "x, >= 5 sigma left: every truth established")
+    assert " 60.0 %" in figure(lines, "established or tentative")
+    assert " 20.0 %" in figure(lines, "something wrong established")
+    assert " 20.0 %" in figure(lines, "something wrong tentative")
+
+
+def test_both_of_a_pair_have_to_be_found():
+    lines = [found(("established", "a"), ("tentative", "b"), truth="ab"), found(("established", "a"), truth="ab")]
+    assert "  0.0 %" in figure(lines, "x, >= 5 sigma left: every truth established")
+    assert " 50.0 %" in figure(lines, "established or tentative")
+
+
+def test_clean_tables_without_stated_sds_are_counted_apart():
+    lines = [found(), found(), found(("established", "a"), stated=False), found(stated=False)]
+    assert "  0.0 %" in figure(lines, "x, sds stated: rejected")
+    assert " 50.0 %" in figure(lines, "x, sds not stated: rejected")
+
+
+def test_what_is_written_counts_by_what_it_predicts_elsewhere():
+    worse = found(("established", "a"), truth="a", gain=-0.2)
+    lines = [worse, worse | {"written": False}, found(("established", "a"), truth="a", gain=0.3), found(truth="a")]
+    assert " 75.0 %" in figure(lines, "elsewhere not below the refit")
+    assert " 50.0 %" in figure(lines, "of those with effects written")
+
+
+@pytest.mark.parametrize("kind", [k for k in loop.NOISES if k.startswith("clean")])
+def test_kinds_with_a_noise_of_their_own_say_whether_sds_are_stated(kind):
+    for seed in (2, 3):
+        case = loop.attempt(kind, seed)
+        stated = "speed_sd_mm_s" in case.table
+        assert stated == case.label["stated"] == (kind != "clean_unstated" and seed % 2 == 0)
+        assert case.label["law"] == {"clean_heavy": "heavy", "clean_uneven": "uneven"}.get(kind, "normal")
+
+
+def test_errors_are_of_the_rows_that_both_fits_predict():
+    before, after = np.array([[3.0], [1.0], [np.nan]]), np.array([[1.0], [np.nan], [2.0]])
+    assert loop_findings._rms(before, after, ["speed"]) == {"speed": [3.0, 1.0, 2, 2]}
+
+
+@pytest.mark.slow
+def test_a_line_holds_what_the_findings_rest_on():
+    """A resistance of five sigmas, told nothing of the noise."""
+    x = loop.one(campaign.Task("library_unstated", 3, replicates=100, brief=True, stratum="plain"))
+    assert x["noise"]["speed"]["source"] == "series" and x["noise"]["speed"]["freedom"] > 20
+    assert {e["name"] for e in x["effects"]} <= {t["effect"] for t in x["tests"]}
+    assert np.isfinite(x["gain"]).all() and np.isfinite(x["elsewhere"]["gain"]).all()

@@ -300,3 +300,42 @@ def test_label_of_a_coverage_table_holds_every_truth():
     label = gw.case(w, ["churning"], 8.0, seed=1).label
     assert set(label["constants"]) == set(label["z"]) == {w.machine.public(n) for n in w.machine.free}
     assert any(n.startswith("crawler.") for n in label["z"]) and label["effects"][0]["amplitude"] != 0
+
+
+# --- noise of its own -----------------------------------------------------------------------------------
+
+
+def noise_of(law):
+    """Noise of many tables [sd], shape (rows, channels, tables), and their readings without any [shown]."""
+    w = gw.world(np.random.default_rng(3), "plain", law=law)
+    truth = g.readings(w.conditions, w.constants)[0] * g._SHOWN
+    off = []
+    for seed in range(200):
+        table = gw.case(w, seed=seed).table
+        off.append((np.stack([table[c] for c in READINGS]) - truth) / w.instruments.stated[:, None])
+    return np.array(off), truth
+
+
+@pytest.mark.parametrize("law", gw.NOISES)
+def test_noise_is_as_large_as_stated_by_any_law(law):
+    off, truth = noise_of(law)
+    np.testing.assert_allclose(off.std((0, 2)), 1.0, rtol=0.12 if law == "heavy" else 0.03)
+    large = np.abs(truth) > np.median(np.abs(truth), 1, keepdims=True)
+    ratio = [off[:, k, large[k]].std() / off[:, k, ~large[k]].std() for k in range(3)]
+    assert min(ratio) > 1.2 if law == "uneven" else law == "heavy" or np.allclose(ratio, 1.0, atol=0.06)
+    assert (np.mean(np.abs(off) > 4) > 0.002) == (law == "heavy")
+
+
+def test_few_rows_are_a_grid_of_slopes_at_two_voltages():
+    c = gw.world(np.random.default_rng(4), "few").conditions
+    assert len(c.U) == 20 and not c.payload.any() and len(np.unique(c.U)) == 2
+
+
+def test_runs_elsewhere_are_as_many_and_between_those_of_the_table():
+    w = gw.world(np.random.default_rng(5), "plain", law="heavy", stated=False)
+    case = gw.case(w, ("series_resistance",), 8.0, seed=1)
+    table = case.elsewhere(1)
+    assert len(table["speed_mm_s"]) == len(w.conditions.U) and "speed_sd_mm_s" in table
+    assert "speed_sd_mm_s" not in case.table
+    assert table["slope_deg"].min() >= 0 and table["slope_deg"].max() <= case.table["slope_deg"].max()
+    assert not set(table["supply_voltage_V"]) & set(case.table["supply_voltage_V"])

@@ -1,0 +1,174 @@
+"""What a campaign keeps of the findings of a table: each effect, its tests in numbers, and what predicts.
+
+Numbers are raw, so that the constants of the tests can be chosen again from the lines of a campaign alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+
+def findings(given: Any, found: Any) -> dict[str, Any]:
+    """Effects of the model, tests of each, the noise, and what is written.
+
+    Args:
+        given: what `discover.prepared` gave; found: the `LoopStages` of it.
+    """
+    alike, best, base = found.alike, found.best, found.screened.base.candidate
+    members = () if alike is None else alike.members
+    stated = () if alike is None else alike.stated
+    stood = found.standing
+    named = [m[0] for m in found.members]
+    line: dict[str, Any] = {
+        "effects": [
+            {
+                "name": m[0],
+                "class": list(m),
+                "stated": [s.name for s in v],
+                "standing": "established" if m[0] in named else "tentative",
+                "size": float(best.size[best.active.index(m[0])]),
+            }
+            for m, v in zip(members, stated, strict=True)
+        ],
+        "standing": None if stood is None else [stood.stands, stood.why, list(stood.effects)],
+        "tests": _tests(found, given),
+        "noise": _noise(found.sds.noise),
+        "missing": [found.left.test.p_value, found.left.test.rejected, found.left.test.rejected_with_margin],
+        "ends": found.ends.test.rejected_with_margin,
+    }
+    if best is not base and not found.screened.base.space.bare.observe.long:
+        line |= _held_out(given.runs, found)
+    return line
+
+
+def _tests(found: Any, given: Any) -> list[dict[str, Any]]:
+    """Of each effect that was tested by itself; where a single one was weighed against curves alone, of that one too,
+    which decides nothing (`alone`)."""
+    from calibration.discovery.standing import name_tests
+    from calibration.inference import blocks as blocks_room
+
+    tests = () if found.standing is None else found.standing.tests
+    alone = not tests and found.searched is not None and found.searched.best is not None
+    if alone and found.searched.diagnosis is not None and not found.screened.base.space.bare.observe.long:
+        space, best = found.screened.base.space, found.searched.best
+        kinds = blocks_room.distinct(given.runs, space.bare.observe.blocks)
+        masks = [mask for by in kinds.values() for mask in by.values()]
+        tests = name_tests(
+            space, best, found.searched, found.screened.bases, found.searched.diagnosis, given.settings, masks
+        )
+    return [
+        {f.name: getattr(t, f.name) for f in dataclasses.fields(t)}
+        | {"fails": t.fails, "alone": alone}
+        | {"root_without": t.root_without if np.isfinite(t.root_without) else None}
+        for t in tests
+    ]
+
+
+def _noise(noise: Any) -> dict[str, dict[str, Any]]:
+    """Channel → where its sd comes from, its median [SI], and what an estimate is like."""
+    series = {s.channel.name: s for s in noise.along_series}
+    known = {}
+    for k, channel in enumerate(noise.channels):
+        found = series.get(channel.name)
+        known[channel.name] = {"source": noise.source[k], "sd": float(np.median(noise.sd[:, k]))}
+        if found is not None:
+            known[channel.name] |= {"share": found.share, "freedom": found.freedom, "series": found.count}
+    return known
+
+
+# --- what predicts --------------------------------------------------------------------------------------
+
+
+def _held_out(runs: Any, found: Any) -> dict[str, Any]:
+    """Scores of the model and of smaller sets over the refit, by data held out, and errors by channel."""
+    from calibration.discovery import prediction
+    from calibration.discovery.search import path
+    from calibration.inference import blocks as blocks_room
+    from calibration.inference.held_out import held_out
+
+    space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
+    kinds = blocks_room.distinct(runs, space.bare.observe.blocks)
+    if not kinds:
+        return {}
+    data, rows = space.equipped.data, len(runs)
+    measured, sd, counts = (np.asarray(x)[:rows] for x in (data.measured, data.sd, space.weight > 0))
+
+    def reading(candidate: Any) -> dict[str, np.ndarray]:
+        active = space.library.indices(candidate.active)
+        return {
+            kind: held_out(space.equipped, candidate.z, list(by.values()), active).reading
+            for kind, by in kinds.items()
+        }
+
+    def score(seen: dict[str, np.ndarray]) -> Any:
+        return prediction.scored(seen, measured, sd, counts, runs, space.bare.observe.blocks)
+
+    before, after = reading(base), reading(best)
+    gain, refit = score(after).gain(score(before)), score(before)
+    smaller = [c for c in path(found.searched) if c.key != best.key]
+    gains = [(c.effects, score(reading(c)).gain(refit)) for c in smaller]
+    names = [channel.name for channel in runs.channels]
+    return {
+        "gain": [gain.mean, gain.se],
+        "written": bool(gain.mean >= -prediction.WORSE),
+        "gains_of_smaller": [[list(effects), g.mean, g.se] for effects, g in gains],
+        "rms_sigma": {
+            kind: _rms(*((x[kind] - measured) / np.where(counts, sd, np.nan) for x in (before, after)), names)
+            for kind in kinds
+        },
+    }
+
+
+def elsewhere(given: Any, found: Any, runs: Any) -> dict[str, Any]:
+    """By how much the model predicts runs at other conditions better than the refit does, and errors by channel.
+
+    The blocks that `prediction` scores by choose what is written too; nothing was chosen by these runs. By the same
+    density, of errors over the sds that the runs state; empty where the model is the refit.
+
+    Args:
+        runs: further ones of the same robot, as many, so that programs are shared.
+    """
+    from calibration.discovery import findings as results
+    from calibration.discovery import prediction
+    from calibration.discovery.discover import pose
+
+    space, base, best = found.screened.base.space, found.screened.base.candidate, found.best
+    if best is base:
+        return {}
+    measured, sd, rows = runs.measured(), runs.deviations(), len(runs)
+    there = pose(runs, given.robot, sd, given.settings, given.stated, given.library)
+    if there.library.names != space.library.names or there.coordinates.base.names != space.coordinates.base.names:
+        return {}
+    off, score = [], []
+    for candidate in (base, best):
+        fitted = results.Fitted(there.equipped, candidate.z, there.library.indices(candidate.active))
+        seen = fitted.observation()
+        lost = there.equipped.observe.unreachable(np.asarray(seen.status))[:rows, None]
+        off.append(np.where(lost, np.nan, (np.asarray(seen.reading)[:rows] - measured) / sd))
+        counted = np.where(np.isfinite(off[-1]), off[-1], prediction.UNREACHED)
+        score.append(-(prediction.FREEDOM + 1) / 2 * np.log1p(counted**2 / prediction.FREEDOM))
+    gain = (score[1] - score[0]).mean(1)
+    return {
+        "gain": [float(gain.mean()), float(gain.std(ddof=1) / np.sqrt(rows))],
+        "rms_sigma": _rms(*off, [channel.name for channel in runs.channels]),
+    }
+
+
+def _rms(before: np.ndarray, after: np.ndarray, names: Sequence[str]) -> dict[str, list[float]]:
+    """Channel → rms errors of the refit and of the model [σ], over the rows that both predict, and how many each
+    does."""
+    both = np.isfinite(before) & np.isfinite(after)
+    return {
+        name: [
+            *(
+                float(np.sqrt(np.mean(x[both[:, k], k] ** 2))) if both[:, k].any() else float("nan")
+                for x in (before, after)
+            ),
+            *(int(np.isfinite(x[:, k]).sum()) for x in (before, after)),
+        ]
+        for k, name in enumerate(names)
+    }
