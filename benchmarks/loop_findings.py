@@ -35,7 +35,7 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
             for m, v in zip(members, stated, strict=True)
         ],
         "standing": None if stood is None else [stood.stands, stood.why, list(stood.effects)],
-        "tests": _tests(found, given),
+        "tests": _tests(found),
         "noise": _noise(found.sds.noise),
         "missing": [found.left.test.p_value, found.left.test.rejected, found.left.test.rejected_with_margin],
         "ends": found.ends.test.rejected_with_margin,
@@ -45,25 +45,12 @@ def findings(given: Any, found: Any) -> dict[str, Any]:
     return line
 
 
-def _tests(found: Any, given: Any) -> list[dict[str, Any]]:
-    """Of each effect that was tested by itself; where a single one was weighed against curves alone, of that one too,
-    which decides nothing (`alone`)."""
-    from calibration.discovery.standing import name_tests
-    from calibration.inference import blocks as blocks_room
-
+def _tests(found: Any) -> list[dict[str, Any]]:
+    """Of each effect that was tested by itself; a root without any one row that is infinite is None."""
     tests = () if found.standing is None else found.standing.tests
-    alone = not tests and found.searched is not None and found.searched.best is not None
-    if alone and found.searched.diagnosis is not None and not found.screened.base.space.bare.observe.long:
-        space, best = found.screened.base.space, found.searched.best
-        kinds = blocks_room.distinct(given.runs, space.bare.observe.blocks)
-        masks = [mask for by in kinds.values() for mask in by.values()]
-        tests = name_tests(
-            space, best, found.searched, found.screened.bases, found.searched.diagnosis, given.settings, masks
-        )
     return [
         {f.name: getattr(t, f.name) for f in dataclasses.fields(t)}
-        | {"fails": t.fails, "alone": alone}
-        | {"root_without": t.root_without if np.isfinite(t.root_without) else None}
+        | {"fails": t.fails, "root_without": t.root_without if np.isfinite(t.root_without) else None}
         for t in tests
     ]
 

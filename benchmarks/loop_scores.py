@@ -207,6 +207,8 @@ def _found(f: Figures, what: str, those: Sequence[dict]) -> None:
         f.say(f"{what}: rejected (goal <= 5 %)", those, false_finding)
         f.say("  something established (goal <= 1 %)", those, lambda x: wrong(x, "established"))
         f.say("  something tentative", those, lambda x: wrong(x, "tentative"))
+        for name in sorted({x.get("stratum", "") for x in those}):
+            stratum(f, f"rejected, stratum {name}", [x for x in those if x.get("stratum", "") == name])
         return
     if all(t["class"] for x in those for t in x["truth"]):
         strong = [x for x in those if all(sigmas(t) >= 5 for t in x["truth"])]
