@@ -159,6 +159,8 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     ratios = np.stack([r(linear.signals, rows) for r in RATIOS], 1)
     known = dictionary(ratios[counts])
     terms = list(known)
+    if not terms:  # all runs alike
+        return Proposal("", (), (), (), (), 0.0, 0.0, 0)
     shapes = np.zeros((rows, len(terms)))
     for k, value in enumerate(known.values()):
         shapes[counts, k] = value
