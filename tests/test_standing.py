@@ -222,10 +222,17 @@ def test_effect_has_to_be_the_strongest_again_without_blocks_that_leave_half_of_
     space = SimpleNamespace(included=np.ones(toy.rows, bool), library=library)
     both = np.concatenate([a, b], 1)
     few, most, others = rows < 4, rows < 11, rows >= 16
-    again = lambda *blocks: _chosen_again(space, "a", (jacobian, residual, a), both, blocks)  # noqa: E731
+    settings = SETTLED.settings
+    again = lambda *blocks: _chosen_again(space, "a", (jacobian, residual, a), both, blocks, settings)  # noqa: E731
     assert again(few, others) == 1.0 and again(most) == 1.0 and again() == 1.0
     b3 = np.append(2.0 * a[:, 0] * (at < 4) + 2.5 * b[:, 0], np.zeros(2))  # only the first rows show it
-    assert _chosen_again(space, "a", (jacobian, b3, a), both, (few, others)) == 0.5
+    assert _chosen_again(space, "a", (jacobian, b3, a), both, (few, others), settings) == 0.5
+    # What data cannot tell from it, of whatever family, does not take its place.
+    near = a * (1 + 0.05 * random.standard_normal(a.shape))
+    of_near = np.append(2.0 * near[:, 0], np.zeros(2))  # which is the stronger of the two
+    assert _chosen_again(space, "a", (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), settings) == 1.0
+    none = dataclasses.replace(settings, same=0.0, form=0.0)
+    assert _chosen_again(space, "a", (jacobian, of_near, a), np.concatenate([a, near], 1), (few,), none) == 0.0
 
 
 def candidate_of(*effects):
@@ -244,6 +251,8 @@ def candidate_of(*effects):
         (True, (), None, None),
         (False, ("a",), ("a", "c"), ("a", "c")),
         (False, (), ("a",), ("a",)),
+        (False, (), ("a", "x"), ("a",)),  # what only stands in for a curve is left to it
+        (False, (), ("x",), None),
         (False, (), None, None),
     ],
 )
@@ -255,7 +264,10 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
     def judged(space, base, searched, left, bases, settings, proposed=None, blocks=()):
         those = best if proposed is None else proposed[0]
         asked.append(those.effects)
-        tests = [NameTest(e, 9.0 if e in established else 1.0, 3.0, (), 0.0) for e in those.effects]
+        evidence = {"x": -20.0}
+        tests = [
+            NameTest(e, 9.0 if e in established else 1.0, 3.0, (), evidence.get(e, 0.0)) for e in those.effects
+        ]
         return NameSupport(bool(established), "beside", tests=tuple(tests))
 
     monkeypatch.setattr(discover, "standing", judged)

@@ -412,7 +412,8 @@ def choose(
     runs: Runs, screened: Screening, left: Diagnosis, searched: Search, settings: Settings, progress: Tell
 ) -> tuple[tuple[Candidate, Diagnosis] | None, Search, NameSupport]:
     """The effects that belong in the model: those whose names stand by themselves, and those of the smallest set that
-    predicts as well as any; None for none. With what was searched, and which names stand.
+    predicts as well as any, but what only stands in for a curve; None for none. With what was searched, and which
+    names stand.
 
     Where the largest set leaves nothing its effects are judged, else those of the set that predicts.
 
@@ -440,7 +441,8 @@ def choose(
     else:
         proposed = best, after
     names = [e for e in proposed[0].effects if stood.established(e)]
-    names += [e for e in (() if few is None else few.effects) if e not in names][: settings.slots - len(names)]
+    further = [e for e in (() if few is None else few.effects) if e not in names and not stood.stands_in(e)]
+    names += further[: settings.slots - len(names)]
     if not names:
         return None, searched, stood
     known = [c for c in (proposed[0], best, *searched.ladder) if c.key == frozenset(names)]

@@ -114,6 +114,12 @@ class NameSupport:
         """That of an effect; None where it was not tested."""
         return next((t for t in self.tests if t.effect == effect), None)
 
+    def stands_in(self, effect: str) -> bool:
+        """Whether it stands in for a curve, which claims no cause: beside curves of other equations it explains
+        nothing, and one of its own explains more."""
+        test = self.test_of(effect)
+        return test is not None and {"chance", "curve"} <= set(test.fails)
+
     def established(self, effect: str) -> bool:
         """Whether the name of an effect stands, by itself where it was tested so."""
         test = self.test_of(effect)

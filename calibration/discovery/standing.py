@@ -235,13 +235,11 @@ def _curves_beside(
     barred = np.isin([equation(p) for p in places], list(without))
     chosen, columns = list[int](), np.zeros((linear.readings, 0))
     deviate, test = np.array(seen.scores.curve), seen.test
-    for _ in range(most):
+    while test.rejected_with_margin and len(chosen) < most:
         chosen.append(int(np.argmax(np.where(barred, -np.inf, deviate))))
         columns = np.concatenate([columns, family_columns(linear, bases, chosen[-1])], 1)
         found, deviate = beside_columns(linear, bases, columns, [places[k] for k in chosen])
         test = AdequacyTest(found, seen.test.null, settings)
-        if not test.rejected_with_margin:
-            break
     return chosen, test
 
 
@@ -280,7 +278,8 @@ def name_tests(
         own = _equation(space, effect)
         linear = seen[without.active]
         chosen, _ = _curves_beside(after.linear, after, bases, {own}, CURVES, settings)
-        columns = np.concatenate([family_columns(linear, bases, k) for k in chosen], 1)
+        none = np.zeros((linear.readings, 0))
+        columns = np.concatenate([none, *(family_columns(linear, bases, k) for k in chosen)], 1)
         mine = space.library.of == space.library.names.index(effect)
         beside = *augment_with_columns(linear, columns), np.asarray(linear.signatures)[:, mine]
         run, root_without = _weakest_run(space, linear.runs(), *beside)
@@ -294,7 +293,7 @@ def name_tests(
                 _evidence_over_curves(space, whole, others, effect, seen[others.active], bases, settings),
                 run,
                 root_without,
-                _chosen_again(space, effect, beside, np.asarray(linear.signatures), blocks),
+                _chosen_again(space, effect, beside, np.asarray(linear.signatures), blocks, settings),
                 next((c.effects for c in better if effect not in c.effects), ()),
                 own in lacks,
                 "run" if space.bare.observe.long else "row",
@@ -342,16 +341,16 @@ def _chosen_again(
     beside: tuple[np.ndarray, ...],
     signatures: np.ndarray,
     blocks: Sequence[np.ndarray],
+    settings: Settings,
 ) -> float:
-    """Share of the blocks without which an effect of its family is still the strongest of the library, of those that
-    leave half of what is known of it; 1 where there are none.
+    """Share of the blocks without which an effect of its family still explains as much as any of the library, as
+    `classes` has it, of those that leave half of what is known of it; 1 where there are none.
 
     Args:
         beside: Jacobian, residual and its own signatures, as `_root` takes them; signatures: of the library.
     """
-    names, library = space.library.names, space.library
-    families = [library[name].family() for name in names]
-    mine, again = families[names.index(effect)], []
+    library, family, again = space.library, space.library[effect].family(), []
+    akin = np.array([library[name].family() == family for name in library.names])[library.of]
     whole = _left_of(*beside)[0].max()
     for out in blocks:
         kept = _kept(space, out, len(signatures))
@@ -362,7 +361,8 @@ def _chosen_again(
         left, told = _left_of(j, e, every)
         root = np.abs(told) / np.sqrt(np.maximum(left, 1e-12))
         root = np.where(left > ABSORBED**2 * np.sum(every**2, 0), root, 0.0)
-        again.append(families[library.of[int(np.argmax(root))]] == mine)
+        most = np.max(root) ** 2
+        again.append(np.max(root[akin]) ** 2 >= most - max(settings.same, settings.form**2 * most))
     return float(np.mean(again)) if again else 1.0
 
 
