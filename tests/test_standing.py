@@ -265,9 +265,7 @@ def test_model_holds_what_is_established_and_what_predicts(monkeypatch, adequate
         those = best if proposed is None else proposed[0]
         asked.append(those.effects)
         evidence = {"x": -20.0}
-        tests = [
-            NameTest(e, 9.0 if e in established else 1.0, 3.0, (), evidence.get(e, 0.0)) for e in those.effects
-        ]
+        tests = [NameTest(e, 9.0 if e in established else 1.0, 3.0, (), evidence.get(e, 0.0)) for e in those.effects]
         return NameSupport(bool(established), "beside", tests=tuple(tests))
 
     monkeypatch.setattr(discover, "standing", judged)
