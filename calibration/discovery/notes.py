@@ -28,8 +28,8 @@ class CurveOver(NamedTuple):
     variables: tuple[str, ...]
 
 
-#: Evidence by which a smooth curve of an effect's own equation has to be the better explanation [σ²]. Of 369 right names
-#: of two campaigns 7 have less than -6, of 6 wrong ones of laws outside the library (148 tables) 3 (docs/benchmarks.md).
+#: Evidence by which a smooth curve of an effect's own equation has to be the better explanation [σ²]: of 369 right
+#: names of two campaigns 7 have less than -6, of 6 wrong ones of laws outside the library 3 (docs/lab/findings.md).
 BETTER = 6.0
 #: Share of its root that an effect has to keep without any one row.
 KEPT = 1 / math.sqrt(3)
