@@ -368,7 +368,9 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
 class Loop(RobotPart, InferencePart, OutputPart):
     """The closed loop beside its data."""
 
-    replicates: Annotated[int, Field(ge=250, le=100_000)] = about(500, "Tables of the bootstrap", solver=True)
+    replicates: Annotated[int, Field(ge=250, le=100_000)] = about(
+        500, "Tables of the bootstrap; of time histories at least 333 are made", solver=True
+    )
     prefer: Literal["fit", "held-out"] = about(
         "fit",
         "By what one of several effects that these data cannot tell apart comes first, held-out being errors of "

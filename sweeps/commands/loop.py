@@ -13,7 +13,8 @@ from calibration.data.columns import Layout
 from calibration.discovery.discover import discover
 from calibration.discovery.resolve import resolve
 from calibration.discovery.result import DiscoveryResult
-from calibration.inference import blocks, priors
+from calibration.discovery.settings import fewest_replicates
+from calibration.inference import blocks, observers, priors
 from calibration.words import loop as said_of
 from sweeps import config as configuration
 from sweeps.console import say, tell
@@ -33,6 +34,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
+    replicates = max(config.replicates, fewest_replicates(observers.kind(runs)))
 
     def progress(text: str) -> None:
         tell(f"{time.monotonic() - began:4.0f} s  {text}")
@@ -40,7 +42,7 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
     with open_folder("loop", config, robot, out, force, runs) as folder:
         found = discover(
             runs, robot, noise=config.noise or None, stated=stated, library=effect_file.library(config.effects),
-            replicates=config.replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
+            replicates=replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
             progress=progress,
         )  # fmt: skip
         if config.resolve:

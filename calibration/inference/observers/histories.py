@@ -263,7 +263,7 @@ class Histories(Observer):
     @classmethod
     def check_settled(cls, runs: Runs) -> None:
         raise BadData(
-            f"{runs.source}: column time_s: time histories are for calibrate and loop; expected one row a run"
+            f"{runs.source}: column time_s: time histories are for calibrate, compare and loop; expected a row a run"
         )
 
     @classmethod
@@ -672,7 +672,13 @@ def _in_time(
     step = np.diff(times, axis=1)
     slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
     slope = np.concatenate([slope, np.zeros((len(slope), 1))], 1)
-    return dataclasses.replace(conditions, motor_speed=jnp.asarray(speed), motor_acceleration=jnp.asarray(slope))
+    # Not by `dataclasses.replace`: its constructor broadcasts, and what does not change has no instants.
+    return eqx.tree_at(
+        lambda c: (c.motor_speed, c.motor_acceleration),
+        conditions,
+        (jnp.asarray(speed), jnp.asarray(slope)),
+        is_leaf=lambda x: x is None,
+    )
 
 
 def begin_name(run: str) -> str:
