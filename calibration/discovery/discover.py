@@ -794,9 +794,10 @@ def remarks(found: DiscoveryResult) -> Notes:
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
             said.append(KeptOut(rows, why))
-    shifts = {name: abs(p.shift_after) for name, p in found.base_shift.items()}
-    said += [FarFromPrior(name, x, "loop") for name, x in shifts.items() if x > 3]
-    said += [HeldByPrior(found.held_by_prior)] * bool(found.held_by_prior)
+    far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > 3}
+    said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
+    held = tuple(name for name in found.held_by_prior if name not in far)
+    said += [HeldByPrior(held)] * bool(held)
     said += found.residual_clusters
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
