@@ -281,6 +281,29 @@ def calibrate(
 
 
 @_command(
+    config.Settle,
+    example="mmrjax settle log.csv --robot rig.toml --out settled, then "
+    "mmrjax loop settled/settled.csv --robot rig.toml",
+    failure="does not occur: nothing is solved",
+)
+def settle(
+    told: Told,
+    log: Annotated[
+        str, typer.Argument(metavar="LOG.csv", help="A log over time: time_s, what is imposed, channels.")
+    ],
+    out: _Out = None,
+    force: _Force = False,
+) -> int:
+    """Take the settled runs out of a log over time: the table for loop and calibrate, what was left out and why.
+
+    Writes settled.csv (means with their sds), stretches.csv (every stretch, with what still changes), report.html.
+    """
+    from sweeps.commands import settle as room
+
+    return room.settle(told.config, log, out, force)
+
+
+@_command(
     config.Loop,
     beside=config.MembersPart,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",

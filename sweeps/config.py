@@ -365,6 +365,17 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
     hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
 
 
+class Settle(RobotPart, OutputPart):
+    """A log over time, from which settled runs are taken."""
+
+    shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = about(
+        None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
+    )
+    drift: Annotated[float, Field(gt=0, le=0.5)] = about(
+        0.02, "Largest change of a channel's mean within a stretch, as a share of it"
+    )
+
+
 class Loop(RobotPart, InferencePart, OutputPart):
     """The closed loop beside its data."""
 
