@@ -20,6 +20,8 @@ _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "paylo
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
 _SPEED = channels.of("motor_speed").range
+_CURRENT = channels.of("motor_current").range
+MotorCurrent = Annotated[float, Field(ge=_CURRENT[0], le=_CURRENT[1], allow_inf_nan=False)]
 MotorSpeed = Annotated[float, Field(ge=_SPEED[0], le=_SPEED[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
 #: The fidelity that follows profiles.
@@ -182,6 +184,11 @@ class OneRun(Part):
     motor_speed_rpm: float | None = about(
         None, "Motor speed (rpm), negative backward, of a rig on whose motors it is imposed"
     )
+    motor_current_A: float | None = about(
+        None,
+        "Current of each motor (A), negative backward, of a rig on whose motors it is imposed",
+        flag="--motor-current",
+    )
     payload_kg: float | None = about(None, "Additional load mass", usual="0")
     slope_deg: float | None = about(None, "Slope, positive uphill", usual="0")
     surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
@@ -204,6 +211,9 @@ class GridPart(Part):
     )
     motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = about(
         None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
+    )
+    motor_currents_A: Annotated[tuple[MotorCurrent, ...], Field(min_length=1)] | None = about(
+        None, "Currents of each motor (A) of a rig on whose motors they are imposed", flag="--motor-currents"
     )
     payloads_kg: Payloads | None = about(None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG))
     slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = about(
@@ -577,6 +587,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         "payloads_kg": _PAYLOAD,
         "voltages_V": _VOLTAGE,
         "motor_speeds_rpm": _SPEED,
+        "motor_currents_A": _CURRENT,
     }
     allowed = ranges.get(key)
     if allowed is not None and limits:

@@ -48,6 +48,7 @@ MORE = {
     "discharge_mAh": "charge already taken from the battery",
     "voltages_V": "axis of supply_voltage_V", "payloads_kg": "axis of payload_kg",
     "slopes_deg": "axis of slope_deg", "motor_speeds_rpm": "axis of motor_speed_rpm",
+    "motor_currents_A": "axis of motor_current_A",
     "step_s": "integration step", "shortest_s": "shortest stretch of a log that is taken for settled",
     # runs over time
     "time_end_s": "when a run ends", "permissible_time_s": "how long a current may flow from ambient temperature",

@@ -67,7 +67,8 @@ class Inertia:
     """What acceleration takes of the current of a configuration's motors.
 
     Attributes:
-        speed, current: names of channels; per_rate: current [A] of one unit of the speed's column a second.
+        speed, current: names of channels, `current` empty where it is what is imposed.
+        per_rate: current [A] of one unit of the speed's column a second.
         least: current below which shares are of this [A].
     """
 
@@ -405,9 +406,9 @@ def _settled(
     if moving and all(abs(means[s.channel.name]) < STILL * s.largest for s in moving):
         return out("rest")
     acting = inertia.get(str(runs["configuration"][rows[0]]))
-    if acting is not None and acting.speed in drifts and acting.current in means:
+    if acting is not None and acting.speed in drifts and (not acting.current or acting.current in means):
         a_second = acting.per_rate / float(time[taken[-1]] - time[taken[0]])
-        whole = max(abs(means[acting.current]), acting.least)
+        whole = max(abs(means[acting.current] if acting.current else imposed), acting.least)
         share, noise = (
             abs(a_second * drifts[acting.speed]) / whole,
             OF_CHANGE * abs(a_second * sds[acting.speed]) / whole,

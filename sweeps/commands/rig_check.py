@@ -60,7 +60,10 @@ class RigCheck:
         motors = "One motor drives" if count == 1 else f"{count} motors alike drive"
         gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
         loads = "; ".join(f"{name}: {_load(load)}" for name, load in robot.configurations.items())
-        imposed = "the voltage (times the duty in histories)" if rig.imposed == "voltage" else "the motors' speed"
+        imposed = "the voltage (times the duty in histories)"
+        imposed = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}.get(
+            rig.imposed, imposed
+        )
         starts = {
             "rest": "start at rest",
             "measured": "start as their first samples show",

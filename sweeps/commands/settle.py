@@ -53,7 +53,9 @@ def inertia(robot: Robot) -> dict[str, Inertia]:
         currents, speeds = ({c.name: _shown(robot, k, c, state) for c in settling.shown(robot)} for state in states)
         current = next((n for n, x in currents.items() if x and not speeds[n]), "")
         speed = next((n for n, x in speeds.items() if x), "")
-        if current and speed and at_motor > 0 and constant > 0:
+        known = current or robot.rig.imposed == "motor_current"
+        currents[""] = 1.0  # of the imposed one
+        if known and speed and at_motor > 0 and constant > 0:
             per_rate = at_motor / constant * currents[current] / speeds[speed]
             found[name] = Inertia(speed, current, per_rate, least=1e-3)
     return found
