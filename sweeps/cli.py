@@ -7,6 +7,7 @@ import inspect
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -305,7 +306,7 @@ def settle(
 
 @_command(
     config.Loop,
-    beside=config.MembersPart,
+    beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
     failure="the fit that is proposed did not converge. Every verdict is an answer: 0",
 )
@@ -325,7 +326,7 @@ def loop(
     """
     from sweeps.commands import loop as room
 
-    return room.loop(told.config, data, out, force, told.beside.members)
+    return room.loop(told.config, data, out, force, told.beside.members, told.beside.seconds)
 
 
 @_command(
@@ -498,6 +499,8 @@ def main() -> None:
         advice = "no run folder was left"
         if "sweep" in sys.argv[1:2]:
             advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
+        if "loop" in sys.argv[1:2]:
+            advice = "the loop goes on after its last whole stage, with the same --out"
         code = _fail(f"interrupted; {advice}", INTERRUPTED)
     except OSError as error:
         place = error.filename or "a file"
@@ -510,7 +513,10 @@ def main() -> None:
 
             traceback.print_exc()
             code = _fail(f"internal error: {error}", 1)
-    if code == INTERRUPTED:  # XLA may still be at work, and has crashed when Python was taken down around it
+    kept = sys.modules.get("calibration.discovery.kept")  # whose threads nobody waits for
+    beside = kept is not None and any(t.name.startswith(kept.BESIDE) for t in threading.enumerate())
+    # XLA may still be at work, and has crashed when Python was taken down around it
+    if code == INTERRUPTED or (beside and isinstance(code, int)):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -244,6 +244,22 @@ class MembersPart(Part):
     )
 
 
+class LoopBeside(MembersPart):
+    """What changes no number of the loop."""
+
+    within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] | None = about(
+        None, "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
+    )
+
+    @property
+    def seconds(self) -> float | None:
+        """The time [s]; None: as long as it takes."""
+        if self.within is None:
+            return None
+        number = self.within.rstrip("sminh")
+        return float(number) * {"min": 60.0, "h": 3600.0}.get(self.within.removeprefix(number), 1.0)
+
+
 class PosteriorPart(Part):
     """Whether results come with the uncertainty of a calibrated robot."""
 
