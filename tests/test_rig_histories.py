@@ -12,6 +12,7 @@ from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from mmrjax import channels, params
+from mmrjax.fidelities import histories as integrator
 from mmrjax.rig import Begin, Begins, Rig
 
 DRIVE = """
@@ -184,3 +185,25 @@ def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
     assert code == 2 and "--own-mass: table.csv holds time histories" in err
     code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--model", "track", "--out", "other")
     assert code == 2 and "they need --model drive" in err
+
+
+def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, monkeypatch):
+    """A second of a voltage at 50 Hz, against steps that stay short after each change."""
+    path = tmp_path / "rig.toml"
+    text = DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed"', start="rest") + BENCH
+    path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0").replace("inertia = 0.02", "inertia = 0.002"))
+    robot = robot_file.load(str(path))
+    t = np.arange(0, 1, 0.02)
+    volts = 12 * np.sin(5 * t) + 6 * np.sign(np.sin(11 * t)) + 0.5 * np.random.default_rng(1).standard_normal(50)
+    rows = [f"{a:.2f},{b:.4f},0,0" for a, b in zip(t, volts, strict=True)]
+    table = tmp_path / "log.csv"
+    table.write_text("time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows))
+    runs = records.read(table, robot=robot)
+    made = observers.kind(runs).of(runs, robot)
+    shown = np.asarray(made(robot).reading)
+    monkeypatch.setattr(integrator, "growth", lambda duration, changes: integrator.GROWTH)
+    fine = observers.kind(runs).of(runs, robot)
+    exact = np.asarray(fine(robot).reading)
+    assert made.times.size < 45 * len(runs) and 3 * made.times.size < fine.times.size
+    error = np.sqrt(np.mean((shown - exact) ** 2, 0) / np.mean(exact**2, 0))
+    assert (error < 2e-3).all() and (error > 1e-6).all()

@@ -58,6 +58,8 @@ LAGS = 12
 DELAYS, SCANNED = (256, 2048), 32
 #: Of a chassis' friction law what only sliding shows.
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
+#: Growth of steps after changes, over the usual one, from which on that is said.
+COARSE = 15
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 #: Fields of `Conditions` that may change within a run; and of those what makes for an inrush, with how much of the
@@ -256,7 +258,7 @@ class Histories(Observer):
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         each = [np.flatnonzero(names == name) for name in np.unique(names)]
         changes = max(len(c) for c in _changes(runs, each)) + 1
-        if growth(float(runs["time_s"].max()), changes) > 10 * GROWTH:
+        if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
         return said
 
