@@ -402,7 +402,9 @@ app.add_typer(rig, name="rig")
 @rig.command(epilog="Example: mmrjax rig new my-rig.toml --kind wheeled")
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
-    kind: Annotated[str, typer.Option(help="tracked, wheeled, bench, pendulum or linear.")] = "bench",
+    kind: Annotated[
+        str, typer.Option(help="tracked, wheeled, bench, pendulum, servo, linear or carriage.")
+    ] = "bench",
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
     """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.

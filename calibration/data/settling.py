@@ -137,7 +137,7 @@ class Settled:
         found: dict[str, np.ndarray] = {}
         means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
         read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
-        read |= {c.sd_column for c in channels.EVERY} | {"output_angle_deg"}
+        read |= {c.sd_column for c in channels.EVERY} | {angle for angle, _, _ in RATES}
         for name, column in means.items():
             if name in read or (name == "mode"):
                 continue
@@ -265,7 +265,7 @@ def _signals(runs: Runs, each: list[np.ndarray], half: int) -> tuple[Signal, ...
 
 
 #: Columns of angles, the channel of their rate, and its unit's value of one of the angle's a second.
-RATES = (("output_angle_deg", "output_speed", 1 / 6),)
+RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1.0))
 
 
 def _step(runs: Runs, channel: Channel) -> float:

@@ -711,7 +711,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
         key = begin_name(str(name))
         at: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
-            field = "angle" if channel.unit_si == "rad" else "motor_speed"
+            field = "motor_speed" if channel.settled else "angle"
             there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
             if channel.zero_at_rest and field not in at and len(there):
                 factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)
