@@ -39,7 +39,7 @@ BALANCES = {
 
 def absent(robot: Robot) -> frozenset[str]:
     """Balances that a robot has not, or that nothing of it shows: the ground's of a load on a shaft, those of the
-    voltage where the motors' speed is imposed."""
+    voltage where the motors' speed or current is imposed."""
     supply = set() if robot.rig.imposed == "voltage" else {"supply"}
     winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
     return robot.lacks | supply | winding
@@ -102,7 +102,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
 
 def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     """Voltage at the motors [V]: the driver's share of what the supply gives, less the drops on the way to it."""
-    if conditions.motor_speed is not None:  # whatever the imposed speed takes
+    if conditions.voltage_follows:
         return signals
     source = power.voltage_source(
         robot.battery, conditions.voltage, conditions.battery, signals.total_current, signals.discharge
@@ -113,12 +113,15 @@ def supply(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
     return _fill(signals, voltage_source=source, voltage=jnp.where(blocked, back, voltage))
 
 
-def electrical(robot: Robot, signals: Signals, imposed: bool = False) -> Signals:
-    """What of the supply voltage is left to change the current [V]; or the voltage that an imposed speed takes."""
+def electrical(robot: Robot, conditions: Conditions, signals: Signals) -> Signals:
+    """What of the supply voltage is left to change the current [V]; or the voltage that an imposed speed takes, or an
+    amplifier gives that brings the current to what is imposed within the winding's time constant."""
     back = robot.motor.voltage_back(signals.speed_motor)
     drop = robot.motor.voltage_winding(signals.current, signals.temperature) + added(robot, signals, "electrical")
-    if imposed:
-        signals = _fill(signals, voltage=back + drop, voltage_source=back + drop)
+    if conditions.voltage_follows:
+        asked = signals.current if conditions.motor_current is None else conditions.motor_current
+        taken = back + drop + robot.motor.resistance * (asked - signals.current)
+        signals = _fill(signals, voltage=taken, voltage_source=taken)
     return _fill(
         signals,
         voltage_back=back,
@@ -218,7 +221,7 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
 
 def _to_slip(robot: Robot, conditions: Conditions, chassis: Load, signals: Signals) -> Signals:
     """The balances between kinematics and traction, in their order."""
-    signals = electrical(robot, supply(robot, conditions, signals), conditions.motor_speed is not None)
+    signals = electrical(robot, conditions, supply(robot, conditions, signals))
     return slip(robot, travel(robot, chassis, motor(robot, signals)))
 
 

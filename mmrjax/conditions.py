@@ -36,6 +36,7 @@ class Conditions(eqx.Module):
         open: 1 where the motors' circuit is open, so that they coast.
         motor_speed: imposed on the motors' shafts [rad/s], whatever voltage that takes; None: the voltage is imposed.
         motor_acceleration: of an imposed speed [rad/s²]; None: none.
+        motor_current: imposed on each motor [A], whatever voltage that takes; None: it follows.
         begin: which of the beginnings of `Rig.begins` is a history's, its index; None: it starts from rest.
     """
 
@@ -52,6 +53,7 @@ class Conditions(eqx.Module):
     open: Float[Array, "..."]
     motor_speed: Float[Array, "..."] | None
     motor_acceleration: Float[Array, "..."] | None
+    motor_current: Float[Array, "..."] | None
     begin: Int[Array, "..."] | None
 
     def __init__(
@@ -70,6 +72,7 @@ class Conditions(eqx.Module):
         motor_speed: Number | None = None,
         motor_acceleration: Number | None = None,
         begin: Number | None = None,
+        motor_current: Number | None = None,
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
@@ -77,6 +80,7 @@ class Conditions(eqx.Module):
         given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
         numbers = [_number(v) for v in given]
         others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
+        others["motor_current"] = motor_current
         optional = {name: _number(value) for name, value in others.items() if value is not None}
         shapes = [x.shape for x in (which, *numbers, *optional.values())]
         try:
@@ -100,13 +104,18 @@ class Conditions(eqx.Module):
         self.order, self.duty, self.open = numbers[6:]
         held = {name: _broadcast(x, shape) for name, x in optional.items()}
         self.total_mass, self.motor_speed = held.get("total_mass"), held.get("motor_speed")
-        self.motor_acceleration = held.get("motor_acceleration")
+        self.motor_acceleration, self.motor_current = held.get("motor_acceleration"), held.get("motor_current")
         self.begin = None if begin is None else _broadcast(_number(begin, int), shape)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the batch; () for one run."""
         return self.voltage.shape
+
+    @property
+    def voltage_follows(self) -> bool:
+        """Whether the motors' voltage is what an imposed speed or current takes."""
+        return self.motor_speed is not None or self.motor_current is not None
 
     @property
     def slope(self) -> Float[Array, "..."]:

@@ -15,8 +15,9 @@ from mmrjax.params import Index, Scalar, parameter
 
 #: How histories may begin.
 STARTS = ("rest", "measured", "free")
-#: What may be imposed: the voltage of supply or battery (times the duty), or the speed of the motors' shafts.
-IMPOSED = ("voltage", "motor_speed")
+#: What may be imposed: the voltage of supply or battery (times the duty), the speed of the motors' shafts, or the
+#: current of each motor by an amplifier, whatever voltage these take.
+IMPOSED = ("voltage", "motor_speed", "motor_current")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,6 +35,7 @@ CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
     "total_mass": (0.1, 500.0, "kg"),
     "motor_speed": (-1e4, 1e4, "rad/s"),
     "motor_acceleration": (-1e7, 1e7, "rad/s^2"),
+    "motor_current": (-2000.0, 2000.0, "A"),
 }
 
 

@@ -38,6 +38,7 @@ CONDITIONS: dict[str, str] = {
     "total_mass": "total mass of robot and payload",
     "motor_speed": "motor speed imposed on the shafts",
     "motor_acceleration": "acceleration of an imposed motor speed",
+    "motor_current": "current imposed on each motor",
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
 STATUS, FLAGS = CODES

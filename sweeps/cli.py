@@ -7,6 +7,7 @@ import inspect
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -281,8 +282,31 @@ def calibrate(
 
 
 @_command(
+    config.Settle,
+    example="mmrjax settle log.csv --robot rig.toml --out settled, then "
+    "mmrjax loop settled/settled.csv --robot rig.toml",
+    failure="does not occur: nothing is solved",
+)
+def settle(
+    told: Told,
+    log: Annotated[
+        str, typer.Argument(metavar="LOG.csv", help="A log over time: time_s, what is imposed, channels.")
+    ],
+    out: _Out = None,
+    force: _Force = False,
+) -> int:
+    """Take the settled runs out of a log over time: the table for loop and calibrate, what was left out and why.
+
+    Writes settled.csv (means with their sds), stretches.csv (every stretch, with what still changes), report.html.
+    """
+    from sweeps.commands import settle as room
+
+    return room.settle(told.config, log, out, force)
+
+
+@_command(
     config.Loop,
-    beside=config.MembersPart,
+    beside=config.LoopBeside,
     example="mmrjax loop measured --out found, then mmrjax sweep --robot found/robot.toml",
     failure="the fit that is proposed did not converge. Every verdict is an answer: 0",
 )
@@ -302,7 +326,7 @@ def loop(
     """
     from sweeps.commands import loop as room
 
-    return room.loop(told.config, data, out, force, told.beside.members)
+    return room.loop(told.config, data, out, force, told.beside.members, told.beside.seconds)
 
 
 @_command(
@@ -378,7 +402,9 @@ app.add_typer(rig, name="rig")
 @rig.command(epilog="Example: mmrjax rig new my-rig.toml --kind wheeled")
 def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
-    kind: Annotated[str, typer.Option(help="tracked, wheeled, bench, pendulum or linear.")] = "bench",
+    kind: Annotated[
+        str, typer.Option(help="tracked, wheeled, bench, pendulum, servo, linear or carriage.")
+    ] = "bench",
     force: Annotated[bool, typer.Option("--force", help="Replace the file where there is one.")] = False,
 ) -> int:
     """Write a rig's file to fill in, with units and where each number comes from; it asks nothing.
@@ -475,6 +501,8 @@ def main() -> None:
         advice = "no run folder was left"
         if "sweep" in sys.argv[1:2]:
             advice = "a sweep goes on where it stopped, after its last whole chunk, with the same --out"
+        if "loop" in sys.argv[1:2]:
+            advice = "the loop goes on after its last whole stage, with the same --out"
         code = _fail(f"interrupted; {advice}", INTERRUPTED)
     except OSError as error:
         place = error.filename or "a file"
@@ -487,7 +515,10 @@ def main() -> None:
 
             traceback.print_exc()
             code = _fail(f"internal error: {error}", 1)
-    if code == INTERRUPTED:  # XLA may still be at work, and has crashed when Python was taken down around it
+    kept = sys.modules.get("calibration.discovery.kept")  # whose threads nobody waits for
+    beside = kept is not None and any(t.name.startswith(kept.BESIDE) for t in threading.enumerate())
+    # XLA may still be at work, and has crashed when Python was taken down around it
+    if code == INTERRUPTED or (beside and isinstance(code, int)):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -20,6 +20,8 @@ _VOLTAGE, _PAYLOAD, _SLOPE = (CONDITIONS[c] for c in ("supply_voltage_V", "paylo
 Slope = Annotated[float, Field(ge=_SLOPE[0], le=_SLOPE[1], allow_inf_nan=False)]
 Payload = Annotated[float, Field(ge=_PAYLOAD[0], le=_PAYLOAD[1], allow_inf_nan=False)]
 _SPEED = channels.of("motor_speed").range
+_CURRENT = channels.of("motor_current").range
+MotorCurrent = Annotated[float, Field(ge=_CURRENT[0], le=_CURRENT[1], allow_inf_nan=False)]
 MotorSpeed = Annotated[float, Field(ge=_SPEED[0], le=_SPEED[1], allow_inf_nan=False)]
 Voltage = Annotated[float, Field(ge=_VOLTAGE[0], le=_VOLTAGE[1], allow_inf_nan=False)]
 #: The fidelity that follows profiles.
@@ -182,6 +184,11 @@ class OneRun(Part):
     motor_speed_rpm: float | None = about(
         None, "Motor speed (rpm), negative backward, of a rig on whose motors it is imposed"
     )
+    motor_current_A: float | None = about(
+        None,
+        "Current of each motor (A), negative backward, of a rig on whose motors it is imposed",
+        flag="--motor-current",
+    )
     payload_kg: float | None = about(None, "Additional load mass", usual="0")
     slope_deg: float | None = about(None, "Slope, positive uphill", usual="0")
     surface: str | None = about(None, SURFACE, usual=f"{BENCH}; of a rig none")
@@ -204,6 +211,9 @@ class GridPart(Part):
     )
     motor_speeds_rpm: Annotated[tuple[MotorSpeed, ...], Field(min_length=1)] | None = about(
         None, "Motor speeds (rpm) of a rig on whose motors they are imposed", usual="thirds of speed_limit"
+    )
+    motor_currents_A: Annotated[tuple[MotorCurrent, ...], Field(min_length=1)] | None = about(
+        None, "Currents of each motor (A) of a rig on whose motors they are imposed", flag="--motor-currents"
     )
     payloads_kg: Payloads | None = about(None, "Additional load masses (kg), of a rig 0", usual=_shown(PAYLOADS_KG))
     slopes_deg: Annotated[tuple[Slope, ...], Field(min_length=1)] | None = about(
@@ -232,6 +242,22 @@ class MembersPart(Part):
     members: Path | None = about(
         None, "File that keeps the population's runs; the same command with it goes on from there", solver=True
     )
+
+
+class LoopBeside(MembersPart):
+    """What changes no number of the loop."""
+
+    within: Annotated[str, Field(pattern=r"^\d+(\.\d+)?(s|min|h)?$")] | None = about(
+        None, "Wall-clock time after which it ends with the best that there is, as 90s, 5min or 1h"
+    )
+
+    @property
+    def seconds(self) -> float | None:
+        """The time [s]; None: as long as it takes."""
+        if self.within is None:
+            return None
+        number = self.within.rstrip("sminh")
+        return float(number) * {"min": 60.0, "h": 3600.0}.get(self.within.removeprefix(number), 1.0)
 
 
 class PosteriorPart(Part):
@@ -365,10 +391,23 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
     hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
 
 
+class Settle(RobotPart, OutputPart):
+    """A log over time, from which settled runs are taken."""
+
+    shortest_s: Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)] | None = about(
+        None, "Shortest stretch that is taken for settled", usual="0.3, and at least 20 samples"
+    )
+    drift: Annotated[float, Field(gt=0, le=0.5)] = about(
+        0.02, "Largest change of a channel's mean within a stretch, as a share of it"
+    )
+
+
 class Loop(RobotPart, InferencePart, OutputPart):
     """The closed loop beside its data."""
 
-    replicates: Annotated[int, Field(ge=250, le=100_000)] = about(500, "Tables of the bootstrap", solver=True)
+    replicates: Annotated[int, Field(ge=250, le=100_000)] = about(
+        500, "Tables of the bootstrap; of time histories at least 333 are made", solver=True
+    )
     prefer: Literal["fit", "held-out"] = about(
         "fit",
         "By what one of several effects that these data cannot tell apart comes first, held-out being errors of "
@@ -564,6 +603,7 @@ def _sentence(kind: type[Part], error: ValidationError, file: Path | None, given
         "payloads_kg": _PAYLOAD,
         "voltages_V": _VOLTAGE,
         "motor_speeds_rpm": _SPEED,
+        "motor_currents_A": _CURRENT,
     }
     allowed = ranges.get(key)
     if allowed is not None and limits:

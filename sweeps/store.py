@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 import importlib.metadata
 import json
 import os
+import pickle
 import platform
+import re
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
     from mmrjax.robot import Robot
     from sweeps.config import RobotPart
 
+T = TypeVar("T")
 #: Exit codes of a command that is done: every solver gave an answer, or one failed. A run that stalls or slides, a
 #: requirement that is missed and any verdict are answers.
 DONE, SOLVER_FAILED = 0, 3
@@ -140,7 +145,8 @@ class RunFolder(Folder):
             return
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(self.partial)
-        vain = issubclass(kind, KeyboardInterrupt) and not any((self.partial / "chunks").glob("*.npz"))
+        chunks = self.partial / "chunks"
+        vain = issubclass(kind, KeyboardInterrupt) and not any((*chunks.glob("*.npz"), *chunks.glob("*.stage")))
         if vain or issubclass(kind, InputError):
             shutil.rmtree(self.partial, ignore_errors=True)
 
@@ -159,6 +165,19 @@ class RunFolder(Folder):
         with writing.naming(file), aside.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **columns)
         aside.replace(file)
+
+    def stage(self, name: str, make: Callable[[], T]) -> T:
+        """The result of a stage: that which an interrupted run of the same identity kept, or made now and kept. What
+        cannot be written is not kept."""
+        file = self.partial / "chunks" / f"{re.sub(r'[^a-z0-9.]', '-', name)}.stage"
+        if file.is_file():
+            return pickle.loads(file.read_bytes())
+        made = make()
+        aside = file.with_suffix(".writing")
+        with contextlib.suppress(OSError, pickle.PicklingError, AttributeError, TypeError):
+            aside.write_bytes(pickle.dumps(made))
+            aside.replace(file)
+        return made
 
     def move_into_place(self) -> Path:
         """Drop the chunks, and move the folder to where it is to appear."""

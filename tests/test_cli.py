@@ -213,8 +213,8 @@ def test_somebody_elses_partial_folder_is_left_alone(mmrjax, tmp_path):
 
 def test_time_histories_are_not_taken_for_steady_runs(mmrjax, tmp_path):
     (tmp_path / "runs.csv").write_text(f"{HEADER},run_id,time_s\n6T2A,15,13.1,0,5,2.75,4800,400,a,0.1\n")
-    code, _, err = mmrjax("compare", "runs.csv", "--out", "x")
-    assert code == 4 and "column time_s: time histories are for calibrate and loop" in err
+    code, _, err = mmrjax("simulate", "--runs", "runs.csv", "--out", "x")
+    assert code == 4 and "column time_s: time histories are for calibrate, compare and loop" in err
 
 
 def test_data_are_hashed_in_the_manifest(mmrjax, tmp_path):

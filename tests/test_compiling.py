@@ -22,6 +22,7 @@ from calibration.inference import noise, observers
 from mmrjax import effects, params, robots
 from mmrjax.compiling import compiled, for_equations
 from mmrjax.conditions import Conditions
+from mmrjax.effects.scaled import scaled
 from mmrjax.fidelities.steady import steady
 from mmrjax.rig import Instrument, Rig
 
@@ -81,7 +82,7 @@ def test_what_equations_read_keeps_programs_apart():
 
 def test_an_effect_of_another_size_is_the_same_to_equations():
     kind = effects.BY_NAME["churning"]
-    wide = scales._scaled(kind, 3.0, 1.0)
+    wide = scaled(kind, (3.0, 1.0, 3.0))
     one = wide(amplitude=jnp.asarray(2e-4))
     assert effects_sd(one) == pytest.approx(3 * effects_sd(kind()))
     plain = for_equations(one)

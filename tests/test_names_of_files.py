@@ -48,7 +48,8 @@ MORE = {
     "discharge_mAh": "charge already taken from the battery",
     "voltages_V": "axis of supply_voltage_V", "payloads_kg": "axis of payload_kg",
     "slopes_deg": "axis of slope_deg", "motor_speeds_rpm": "axis of motor_speed_rpm",
-    "step_s": "integration step",
+    "motor_currents_A": "axis of motor_current_A",
+    "step_s": "integration step", "shortest_s": "shortest stretch of a log that is taken for settled",
     # runs over time
     "time_end_s": "when a run ends", "permissible_time_s": "how long a current may flow from ambient temperature",
     "source_voltage_V": "terminals of battery or supply", "demanded_speed_mm_s": "speed that a profile demands",

@@ -404,7 +404,8 @@ def test_rig_new_lists_the_kinds(mmrjax, tmp_path):
     code, _, err = mmrjax("rig", "new", "my-rig.toml", "--kind", "bensh")
     assert (
         code == 2
-        and "--kind: got bensh; did you mean bench? allowed: bench, pendulum, linear, wheeled, tracked" in err
+        and "--kind: got bensh; did you mean bench? allowed: bench, pendulum, servo, linear, carriage, wheeled, tracked"
+        in err
     )
     code, _, err = mmrjax("rig", "new", "nowhere/my-rig.toml")
     assert code == 2 and "no such folder as nowhere" in err
@@ -545,3 +546,30 @@ def test_example_of_the_page_reads(tmp_path, text):
     robot = read(tmp_path, text)
     assert not robot.rig.inherits and not [f for f in rig_facts.facts(robot) if f.odd]
     assert same(again(tmp_path, robot), robot)
+
+
+def test_a_linear_unit_of_exact_numbers_makes_an_exact_shaft(tmp_path):
+    unit = """
+base = "none"
+imposed = "current"
+channels = ["speed"]
+[motor]
+torque_constant = "1 ± 0"
+[gearbox]
+ratio = 1
+efficiency_load = 1.0
+[carriage]
+load = "linear"
+mass_kg = "2.5 ± 2 %"
+drum_radius_mm = "1000 ± 0"
+force_coulomb_N = "12 ± 50 %"
+force_viscous_N_s_m = 40.0
+"""
+    robot = read(tmp_path, unit)
+    sds = {name: sd for name, _, sd in robot.rig.priors}
+    assert sds["carriage.radius"] == 0.0 == sds["motor.torque_constant"]
+    assert sds["carriage.inertia"] == pytest.approx(0.05) and sds["carriage.loss_coulomb"] == pytest.approx(6.0)
+    assert "carriage.loss_viscous" not in sds  # which stands without ±
+    assert "carriage.radius" not in priors.free_names(robot, ["carriage"])
+    freed = read(tmp_path, unit.replace('"1000 ± 0"', "1000.0"))
+    assert "carriage.radius" not in freed.rig.stated

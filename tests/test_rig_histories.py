@@ -1,5 +1,6 @@
 """Histories of rigs: an imposed speed with a delay, and beginnings that are measured or free, given back."""
 
+import csv
 import dataclasses
 
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from calibration.data import runs as records
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from mmrjax import channels, params
+from mmrjax.fidelities import histories as integrator
 from mmrjax.rig import Begin, Begins, Rig
 
 DRIVE = """
@@ -145,3 +147,63 @@ def test_what_is_imposed_acts_later_by_the_delay():
     shown = [float(rig.late(times, values, at)) for at in (-1.0, 0.1, 0.7, 1.2, 1.7, 9.0)]
     assert shown == pytest.approx([3.0, 3.0, 4.0, 5.0, 4.5, 4.0])
     assert rig.clock(jnp.asarray([-0.5, 0.0, 0.3])).tolist() == pytest.approx([-0.5, 0.0, 0.5])
+
+
+def imposed_speed(tmp_path, runs):
+    """A rig whose motor's speed is imposed over time, and the table of so many runs of it."""
+    path = tmp_path / "rig.toml"
+    text = DRIVE.format(imposed="motor_speed", channels='"total_current"', start="measured") + BENCH
+    path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0"))
+    robot = robot_file.load(str(path))
+    t = np.tile(np.arange(0, 1, 0.05), runs)
+    run = np.repeat(np.arange(runs), 20)
+    speed = (200 * np.sin(6 * t + run) + 50 * np.sin(14 * t)) / channels.RPM
+    columns = {"time_s": t, "run_id": run, "motor_speed_rpm": speed}
+    return robot, history(tmp_path, robot, robot, columns, [0.01], 3)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_an_imposed_speed_changes_within_each_run_and_nothing_else_does(tmp_path, count):
+    robot, runs = imposed_speed(tmp_path, count)
+    made = observers.kind(runs).of(runs, observers.kind(runs).with_initial_states(robot, runs, noise.of(runs, 1.0)))
+    conditions = made.conditions
+    assert conditions.motor_speed.shape == conditions.motor_acceleration.shape == made.times.shape
+    assert conditions.configuration.shape == conditions.voltage.shape == (count,)
+    assert made.angle(made.whole(robot)).shape == (len(runs),)
+
+
+def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
+    imposed_speed(tmp_path, 2)
+    code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found")
+    assert code == 0, err
+    with (tmp_path / "found" / "comparison.csv").open(encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    error = [float(r["simulated_total_current_A"]) - float(r["total_current_A"]) for r in table]
+    assert len(table) == 40 and np.std(error) == pytest.approx(0.01, rel=0.4) and table[20]["run_id"] == "1"
+    assert table[21]["time_s"] == "0.05"
+    code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--own-mass", "--out", "other")
+    assert code == 2 and "--own-mass: table.csv holds time histories" in err
+    code, _, err = mmrjax("compare", "table.csv", "--robot", "rig.toml", "--model", "track", "--out", "other")
+    assert code == 2 and "they need --model drive" in err
+
+
+def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, monkeypatch):
+    """A second of a voltage at 50 Hz, against steps that stay short after each change."""
+    path = tmp_path / "rig.toml"
+    text = DRIVE.format(imposed="voltage", channels='"total_current", "motor_speed"', start="rest") + BENCH
+    path.write_text(text.replace('delay = "0 ± 0.05"', "delay = 0.0").replace("inertia = 0.02", "inertia = 0.002"))
+    robot = robot_file.load(str(path))
+    t = np.arange(0, 1, 0.02)
+    volts = 12 * np.sin(5 * t) + 6 * np.sign(np.sin(11 * t)) + 0.5 * np.random.default_rng(1).standard_normal(50)
+    rows = [f"{a:.2f},{b:.4f},0,0" for a, b in zip(t, volts, strict=True)]
+    table = tmp_path / "log.csv"
+    table.write_text("time_s,supply_voltage_V,total_current_A,motor_speed_rpm\n" + "\n".join(rows))
+    runs = records.read(table, robot=robot)
+    made = observers.kind(runs).of(runs, robot)
+    shown = np.asarray(made(robot).reading)
+    monkeypatch.setattr(integrator, "growth", lambda duration, changes: integrator.GROWTH)
+    fine = observers.kind(runs).of(runs, robot)
+    exact = np.asarray(fine(robot).reading)
+    assert made.times.size < 45 * len(runs) and 3 * made.times.size < fine.times.size
+    error = np.sqrt(np.mean((shown - exact) ** 2, 0) / np.mean(exact**2, 0))
+    assert (error < 2e-3).all() and (error > 1e-6).all()

@@ -282,6 +282,7 @@ def front_door_fits_nothing(path: PurePosixPath, tree: ast.Module) -> Iterator[B
 KEPT = {
     ("mmrjax/__init__.py", "globals"): "a public name, once it is imported",
     ("mmrjax/mjcf.py", "_template"): "pure: the topology of the track model",
+    ("mmrjax/effects/scaled.py", "scaled"): "pure: a class of a class and its factors",
     ("mmrjax/params.py", "own_spec"): "pure, of hashable arguments",
     ("calibration/data/effect_file.py", "_instants"): "pure: signals of the nominal robot",
     ("calibration/data/effect_file.py", "sys.modules"): "a user's module, by a name that follows from its path",

@@ -245,6 +245,11 @@ SAMPLES = [
         "a comes first in its class by errors held out; errors held out: a 3.00 σ, b 2.00 σ; b is not as adequate",
     ),
     (
+        of_loop.Outstanding((0.5, 2.0), "assumed"),
+        "out of time: whether the verdict stands with 0.5 and 2 times the assumed noise is not known; run the same "
+        "command without --within",
+    ),
+    (
         of_loop.LostReplicates(400, 500),
         "only 400 of 500 bootstrap tables could be fitted again; the thresholds are theirs",
     ),

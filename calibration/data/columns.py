@@ -38,8 +38,8 @@ WORDS = ("configuration", "surface", "run_id", "mode")
 #: Columns that every table of the packaged robot has to have, and those that one without measurements may lack.
 REQUIRED, OWN = ("configuration", *CONDITIONS), ("total_mass_kg",)
 #: Column of what is imposed (`rig.IMPOSED`), and the SI value of its unit.
-SUPPLY, SPEED = "supply_voltage_V", "motor_speed_rpm"
-IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM)}
+SUPPLY, SPEED, CURRENT = "supply_voltage_V", "motor_speed_rpm", "motor_current_A"
+IMPOSED = {"voltage": (SUPPLY, 1.0), "motor_speed": (SPEED, RPM), "motor_current": (CURRENT, 1.0)}
 #: What a column that a table may lack is then.
 DEFAULTS = {"slope_deg": 0.0, "payload_kg": 0.0, SUPPLY: 0.0}
 #: Conditions that act on a vehicle alone.

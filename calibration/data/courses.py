@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data.columns import SPEED
+from calibration.data.columns import SUPPLY
 from calibration.data.runs import Runs
 
 #: Columns of which every sample of a run may have a value of its own. A stated mass may change as the payload does.
@@ -42,9 +42,8 @@ class Stretch:
 
 
 def changing(runs: Runs) -> tuple[str, ...]:
-    """Those of `CHANGING`, and an imposed speed, that a table has."""
-    imposed = (SPEED,) if runs.layout.imposed_column == SPEED else ()
-    return tuple(c for c in (*imposed, *CHANGING) if runs.has(c))
+    """Those of `CHANGING`, and what is imposed, that a table has."""
+    return tuple(c for c in dict.fromkeys((runs.layout.imposed_column, *CHANGING)) if runs.has(c))
 
 
 def names(runs: Runs) -> np.ndarray:
@@ -53,10 +52,10 @@ def names(runs: Runs) -> np.ndarray:
 
 
 def applied(runs: Runs) -> np.ndarray:
-    """Voltage that the driver gives the motors in every row, 0 where they brake or coast [V], or the speed imposed on
-    them [rpm]; shape (rows,)."""
-    if runs.layout.imposed_column == SPEED:
-        return runs[SPEED]
+    """Voltage that the driver gives the motors in every row, 0 where they brake or coast [V], or the speed [rpm] or
+    current [A] imposed on them; shape (rows,)."""
+    if runs.layout.imposed_column != SUPPLY:
+        return runs[runs.layout.imposed_column]
     voltage = runs["supply_voltage_V"] * (runs["duty"] if runs.has("duty") else 1.0)
     return np.where(runs["mode"] == "voltage", voltage, 0.0) if runs.has("mode") else voltage
 

@@ -22,6 +22,8 @@ from mmrjax.signals import GRAVITY
 NONE = "none"
 #: Keys and tables of a robot file that state the rig.
 KEYS = ("imposed", "channels", "start", "columns", "instruments", "surfaces")
+#: What may be imposed, in short: `current` for `motor_current`.
+SHORT = {word.removeprefix("motor_"): word for word in IMPOSED}
 #: What a configuration may be.
 LOADS = ("shaft", "linear", "vehicle")
 
@@ -68,7 +70,8 @@ def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], 
     """Turn the table of a linear unit into that of the shaft of one of its drives, and its sds with it.
 
     Travel r a radian is lead / 2π or the drum's radius; of n drives each has J = J_0 + m r² / n, M_0 = F_0 r / n,
-    K = b r² / n, M_c = (F_c + m g sin α) r / n. Their sds are those of first order, of independent inputs.
+    K = b r² / n, M_c = (F_c + m g sin α) r / n. Their sds are those of first order, of independent inputs; of exact
+    ones they are exact.
 
     Args:
         table: of the configuration `name`, without `load`; where: opens the message of an error.
@@ -89,7 +92,12 @@ def linear(table: dict[str, Any], name: str, where: str, sds: dict[str, float], 
     table.clear()
     table.update(_shaft(at, sides))
     inputs = {key: sds.pop(f"{name}.{key}") for key in at if f"{name}.{key}" in sds}
+    exact = {key for key, sd in inputs.items() if sd == 0}
     for result in table:
+        moved = {key for key in at if _shaft({**at, key: 1.01 * at[key] + 1e-6}, sides)[result] != table[result]}
+        if moved and moved <= exact:
+            sds[f"{name}.{result}"] = 0.0
+            continue
         steps = [_shaft({**at, key: at[key] + sd}, sides)[result] - table[result] for key, sd in inputs.items()]
         sd = math.hypot(*steps)
         if sd > 0:
@@ -143,7 +151,8 @@ def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: b
         BadConfiguration: an unknown word, channel or column, a channel that is imposed, or an instrument of a channel
             that the rig does not have.
     """
-    imposed = _one_of(content.pop("imposed", IMPOSED[0]), IMPOSED, f"{where}, imposed")
+    stated = content.pop("imposed", IMPOSED[0])
+    imposed = _one_of(SHORT.get(stated, stated) if isinstance(stated, str) else stated, IMPOSED, f"{where}, imposed")
     start = _one_of(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
     usual = [name for name in channels.USUAL if travels or name != "speed"]
     names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
@@ -255,7 +264,7 @@ def _columns(stated: Any, where: str) -> tuple[tuple[str, str, float], ...]:
 
 def needed(rig: Rig) -> tuple[str, ...]:
     """Parameters of the drive that a robot which starts from nothing has to state."""
-    current = {"total_current", "motor_current", "winding_temperature"} & set(rig.channels)
+    current = {"total_current", "motor_current", "winding_temperature"} & {*rig.channels, rig.imposed}
     voltage = rig.imposed == "voltage" or "motor_voltage" in rig.channels
     hot = "winding_temperature" in rig.channels
     conditions: tuple[tuple[str, Any], ...] = (
@@ -321,7 +330,7 @@ def moved_priors(robot: Robot, values: Mapping[str, float]) -> Robot:
 def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
     """Lines of a robot file that state a rig: of its head, and by table."""
     head = [
-        f'imposed = "{rig.imposed}"  # on the drives: voltage or motor_speed',
+        f'imposed = "{rig.imposed}"  # on the drives: voltage, motor_speed or motor_current',
         f"channels = {json.dumps(list(rig.channels))}  # what its instruments show",
         f'start = "{rig.start}"  # of histories: rest, measured or free',
     ]

@@ -18,6 +18,7 @@ from calibration.data.effect_file import Library
 from calibration.data.errors import BadConfiguration, choices, is_number, number, toml_content, toml_text
 from calibration.data.writing import write_text
 from mmrjax import effects, params, power, robots
+from mmrjax.effects.scaled import scaled
 from mmrjax.robot import Configurations, Robot
 from mmrjax.shaft import Shaft
 from mmrjax.tables import TRACKED, WHEELED
@@ -34,6 +35,9 @@ COUNTS = {
     "sides": (1, 12, "(motors driven alike)"),
     "battery.cells": (1, 100, "(cells of the battery in series)"),
 }
+
+#: Key of an effect's table by which a file brings the library's priors and limits to the rig's size.
+FACTORS = "scaled"
 
 #: What makers allow, which no fit can free: least, greatest, unit and meaning. Experiments stay within it.
 RATINGS = {
@@ -124,7 +128,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
         parameters: in tables by dotted name in SI units, e.g. `[motor] resistance = 0.9`, or with the sd of their
             prior as `"0.9 ± 5 %"`; RATINGS; and SWITCHES, true or false.
         effects: one is present when its table `[effects.NAME]` is, which may name the `configurations` that it acts
-            on.
+            on, and by `scaled` how its priors and limits compare to the library's (see `effects.scaled`).
 
     Args:
         notes: as for `find`.
@@ -154,7 +158,9 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
             raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
-    robot = with_effects(robot, tuple(present), library, acting, where=path.name)
+    factors = {name: table.pop(FACTORS) for name, table in tables.items() if FACTORS in table}
+    of_size = {name: _of_size(library, name, value, path.name) for name, value in factors.items()}
+    robot = with_effects(robot, tuple(present), {**library, **of_size}, acting, where=path.name)
     parameters = dict(_flatten(content))
     robot = rig_file.with_priors(change(robot, parameters, where=path.name, notes=notes), sds, path.name)
     return RobotFile(robot, str(path), frozenset(parameters), linear, text)
@@ -191,6 +197,24 @@ def _without_parameters(
         missing += [f"{name}.radius" for name in found.by_name if f"{name}.radius" not in given]
     rig_file.refuse_missing([*missing, *found.missing], known, where, given)
     return robot, sds, found.linear
+
+
+def _of_size(library: Library, name: str, factors: Any, where: str) -> type[effects.Effect]:
+    """The effect of a name with its priors and limits brought to the rig's size, as its file states.
+
+    Raises:
+        BadConfiguration: no three positive numbers, or an effect that has no size of its own.
+    """
+    here = f"{where}, effects.{name}.{FACTORS}"
+    if name not in library:
+        raise BadConfiguration(f"{here}: a curve or wave has no prior size; remove the key")
+    three = isinstance(factors, list) and len(factors) == 3
+    if not three or not all(is_number(x) and 0 < x < math.inf for x in factors):
+        raise BadConfiguration(
+            f"{here}: got {factors!r}; expected three numbers more than 0, each times the library's: [sd of the "
+            "amplitude, shape, limits of the amplitude]"
+        )
+    return scaled(library[name], (float(factors[0]), float(factors[1]), float(factors[2])))
 
 
 def with_effects(
@@ -418,6 +442,9 @@ def write(robot: Robot, path: Path, *, note: str = "") -> None:
         named = effect.configurations or type(effect)().configurations
         acting = f"configurations = {json.dumps(effect.configurations)}  # on which it acts"
         tables[f"effects.{effect.name}"] = [acting] if named else []
+        if type(effect).plain is not None:
+            line = f"{FACTORS} = {list(type(effect).factors)}  # sd, shape, limits: times the library's"
+            tables[f"effects.{effect.name}"].append(line)
     start = {p.name: float(p.value) for p in params.walk(nothing)}
     needed, always = rig_file.needed(robot.rig), (*(f"{name}." for name in robot.configurations), "effects.")
     for parameter in params.walk(robot):

@@ -178,8 +178,8 @@ class Runs:
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
             ]
-        column, factor = IMPOSED["motor_speed"]
-        imposed = robot.rig.imposed == "motor_speed"
+        column, factor = IMPOSED[robot.rig.imposed]
+        imposed = robot.rig.imposed != "voltage"
         if imposed and not self.has(column):
             raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
         return Conditions(
@@ -194,5 +194,6 @@ class Runs:
             order=self["order"] if self.has("order") else 0.0,
             duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),
             open=self["mode"] == "coast" if self.has("mode") else 0.0,
-            motor_speed=self[column] * factor if imposed else None,
+            motor_speed=self[column] * factor if robot.rig.imposed == "motor_speed" else None,
+            motor_current=self[column] * factor if robot.rig.imposed == "motor_current" else None,
         )

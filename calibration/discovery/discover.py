@@ -18,7 +18,7 @@ from calibration.data import own_mass
 from calibration.data.effect_file import Library
 from calibration.data.errors import BadData
 from calibration.data.runs import Runs
-from calibration.discovery import findings, menu, prediction, preference, scales
+from calibration.discovery import findings, kept, menu, prediction, preference, scales
 from calibration.discovery.active_set import CandidateSpace, candidate_space
 from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, filled, fit_base, fit_candidates, start
@@ -26,6 +26,7 @@ from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
 from calibration.discovery.experiments import Proposal, denser, separating
 from calibration.discovery.hidden import hidden
+from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import (
     AssumedNoise,
@@ -37,6 +38,7 @@ from calibration.discovery.notes import (
     NameSupport,
     NameTest,
     NoiseFromSeries,
+    Outstanding,
     PhasesDiffer,
     RestsOn,
     StillLacks,
@@ -99,6 +101,8 @@ def discover(
     prefer: str = FIT,
     forbidden: Sequence[str] = (),
     progress: Callable[[str], None] = lambda text: None,
+    keep: Keep = kept.nothing,
+    left: Callable[[], float | None] = lambda: None,
 ) -> DiscoveryResult:
     """Find what a robot's model lacks against measured runs.
 
@@ -111,7 +115,8 @@ def discover(
         replicates: of the bootstrap; seed: random seed.
         prefer: by what the leader of a class is chosen, `fit` or `held-out`.
         forbidden: kinds of experiments (`menu.KINDS`) and configurations that are not to be proposed.
-        progress: called with a sentence as the work goes on.
+        progress: called with a sentence as the work goes on; keep: by which stages are kept as they end.
+        left: time that is left once there is a verdict [s], for which verdicts at other noises are waited; None: all.
 
     Raises:
         BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
@@ -127,16 +132,34 @@ def discover(
         tell(note)
     space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
     with ahead(space, functools.partial(bases_at, distinct), ready.settings) as later:
-        traced, notes = ready.trace(progress=tell, later=later), ready.notes
+        traced, notes = keep("verdict", lambda: ready.trace(progress=tell, later=later, keep=keep)), ready.notes
     silent = channels.names(known.silent)
     factors = FACTORS.get(known.word, ())
     # Verdicts at other noises run the programs of the first one: beside what follows it, on other cores.
-    with concurrent.futures.ThreadPoolExecutor(2) as others:
+    others = concurrent.futures.ThreadPoolExecutor(2, kept.BESIDE)
+    sensitivity, outstanding = list[Sensitivity](), list[float]()
+    try:
         if factors:
             tell(Step("factors", (tuple(f"{f:g}" for f in factors), known.word)))
-        verdicts = {f: others.submit(ready.trace, known.scaled(dict.fromkeys(silent, f)), of=traced) for f in factors}
-        found = assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell)
-        sensitivity = [in_short(f, verdict.result(), ready.numbers) for f, verdict in verdicts.items()]
+
+        def other(factor: float) -> LoopStages:
+            noise = known.scaled(dict.fromkeys(silent, factor))
+            return keep(f"noise {factor:g}", lambda: ready.trace(noise, of=traced))
+
+        verdicts = {f: others.submit(other, f) for f in factors}
+        found = keep(
+            "result",
+            lambda: assemble_result(traced, distinct, ready.numbers, ready.settings, ready.library, tell),
+        )
+        for f, verdict in verdicts.items():
+            try:
+                sensitivity.append(in_short(f, verdict.result(left()), ready.numbers))
+            except concurrent.futures.TimeoutError:
+                outstanding.append(f)
+    finally:  # one that is interrupted, or out of time, waits for none
+        others.shutdown(wait=False, cancel_futures=True)
+    if outstanding:
+        notes = (Outstanding(tuple(outstanding), known.word), *notes)
     assumed = [c for c in known.silent if c not in {s.channel for s in known.along_series}]
     if assumed:
         notes = (*notes, AssumedNoise(channels.names(assumed), noise_room.default(assumed)))
@@ -172,10 +195,11 @@ class LoopInput:
         progress: Tell = lambda note: None,
         of: LoopStages | None = None,
         later: Callable[[BaseFit], None] = lambda base: None,
+        keep: Keep = kept.nothing,
     ) -> LoopStages:
-        """The stages up to a verdict, with this noise or another; `of` and `later` as of the function `trace`."""
+        """The stages up to a verdict, with this noise or another; the others as of the function `trace`."""
         sds = self.noise if noise is None else noise
-        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, of, later)
+        return trace(self.runs, self.robot, sds, self.settings, self.stated, self.library, progress, of, later, keep)
 
 
 def prepared(
@@ -339,9 +363,10 @@ def trace(
     progress: Tell = lambda note: None,
     of: LoopStages | None = None,
     later: Callable[[BaseFit], None] = lambda base: None,
+    keep: Keep = kept.nothing,
 ) -> LoopStages:
     """The stages of the loop up to a verdict, in order; the arguments as of `discover_at`. `later` is told the base
-    fit as soon as something is missing.
+    fit as soon as something is missing. What is kept of a stage holds what those before it found, which is one whole.
 
     What replicates of a bootstrap show in units of their own sds hardly depends on these: where the stages `of` the
     same table with other sds are known, and the same rows count, their replicates serve.
@@ -356,26 +381,36 @@ def trace(
         at = functools.partial(bases_at, runs)
         return screen(fit_base(space, settings, runs.source), at, runs, settings)
 
-    screened = look(noise)
-    residuals = residuals_of(screened, runs)
-    factors = {} if screened.cluster is not None else common_factors(residuals)
-    sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
-    if factors:
-        progress(Step("sds"))
-        sds = dataclasses.replace(sds, noise=noise.scaled(factors))
-        screened = look(sds.noise)
+    def begun() -> tuple[Screening, Sds]:
+        screened = look(noise)
+        residuals = residuals_of(screened, runs)
+        factors = {} if screened.cluster is not None else common_factors(residuals)
+        sds = Sds(noise, factors, tuple(noise_remarks(residuals, noise.word)))
+        if factors:
+            progress(Step("sds"))
+            sds = dataclasses.replace(sds, noise=noise.scaled(factors))
+            screened = look(sds.noise)
+        return screened, sds
 
-    for _ in range(SCREENINGS):
-        base, space, bases = screened.base.candidate, screened.base.space, screened.bases
+    def tested(screened: Screening) -> tuple[Screening, Diagnosis]:
+        weight = screened.base.space.weight
+        null = None if of is None or np.any(of.screened.base.space.weight != weight) else of.left.test.null
+        return screened, diagnosis_of_base(screened, settings, sds.noise.freedom, null)
+
+    def tried(screened: Screening, left: Diagnosis) -> tuple[Screening, Diagnosis, Search]:
+        base = screened.base
+        return screened, left, search(base.space, base.candidate, left, screened.bases, settings, progress)
+
+    screened, sds = keep("base", begun)
+    for k in range(SCREENINGS):
         progress(Step("bootstrap", (settings.replicates,)))
-        null = None if of is None or np.any(of.screened.base.space.weight != space.weight) else of.left.test.null
-        left = diagnosis_of_base(screened, settings, sds.noise.freedom, null)
+        screened, left = keep(f"bootstrap {k}", functools.partial(tested, screened))
         if not left.test.rejected and screened.cluster is None:
             return LoopStages("none", screened, left, sds)
         progress(Step("effects"))
         later(screened.base)
-        searched = search(space, base, left, bases, settings, progress)
-        best, after = searched.best, searched.diagnosis
+        screened, left, searched = keep(f"search {k}", functools.partial(tried, screened, left))
+        after = searched.diagnosis
         if after is None or not after.test.rejected_with_margin:
             break
         more = screen_beside(screened, after.scores, lambda base: bases_at(runs, base), runs, settings)
@@ -384,6 +419,7 @@ def trace(
         progress(Step("alone"))
         screened = more
 
+    base, space, bases = screened.base.candidate, screened.base.space, screened.bases
     where = locate(left, bases, space.included)
     model, searched, stood = choose(runs, screened, left, searched, settings, progress)
     if model is None:
@@ -794,9 +830,10 @@ def remarks(found: DiscoveryResult) -> Notes:
     for rows, why in ((found.unusable, "unusable"), (found.outliers, "outliers")):
         if rows:
             said.append(KeptOut(rows, why))
-    shifts = {name: abs(p.shift_after) for name, p in found.base_shift.items()}
-    said += [FarFromPrior(name, x, "loop") for name, x in shifts.items() if x > 3]
-    said += [HeldByPrior(found.held_by_prior)] * bool(found.held_by_prior)
+    far = {name: abs(p.shift_after) for name, p in found.base_shift.items() if abs(p.shift_after) > 3}
+    said += [FarFromPrior(name, x, "loop") for name, x in far.items()]
+    held = tuple(name for name in found.held_by_prior if name not in far)
+    said += [HeldByPrior(held)] * bool(held)
     said += found.residual_clusters
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:

@@ -75,7 +75,7 @@ class Run:
         steepest: whether only the steepest slope that the robot climbs is worth while.
         repeats: readings that are averaged.
         watch: what can be damaged, and what shows that it will be.
-        imposed: what is in the place of the voltage, see `Rig`; `motor_speed`: [rad/s].
+        imposed: what is in the place of the voltage, see `Rig`; `motor_speed`: [rad/s]; `motor_current`: [A].
     """
 
     name: str
@@ -274,7 +274,7 @@ def menu(reach: Reach) -> tuple[Experiment, ...]:
 
     What the robot cannot do (climb that slope, move at that voltage) only its readings show: see `possible`.
     """
-    if reach.imposed == "motor_speed" or not reach.has_ground:
+    if reach.imposed != "voltage" or not reach.has_ground:
         runs: tuple[Run, ...] = tuple(r for used in reach.used for r in _turns(reach, used))
     else:
         runs = (*_alone(reach), *(r for used in reach.used for r in _travels(reach, used)))
@@ -282,9 +282,10 @@ def menu(reach: Reach) -> tuple[Experiment, ...]:
 
 
 def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
-    """Runs of a load on a shaft, or of motors whose speed is imposed: at other levels, and the other way round."""
-    speeds = reach.imposed == "motor_speed"
-    levels = reach.speeds if speeds else used.voltages
+    """Runs of a load on a shaft, or of motors whose speed or current is imposed: at other levels, and the other way
+    round."""
+    others_of = {"voltage": "other voltages", "motor_speed": "other speeds", "motor_current": "other currents"}
+    levels = used.voltages if reach.imposed == "voltage" else reach.levels
     sizes = tuple(sorted({round_significant(abs(x)) for x in levels if x})) or (1.0,)
     others = tuple(
         sorted(
@@ -297,7 +298,7 @@ def _turns(reach: Reach, used: Used) -> tuple[Run, ...]:
     )
     both = any(x < 0 for x in levels) and any(x > 0 for x in levels)
     found = [
-        _runs(reach, "other speeds" if speeds else "other voltages", "run", kinds=("other voltages",), at=used,
+        _runs(reach, others_of[reach.imposed], "run", kinds=("other voltages",), at=used,
               voltages=others),
         *([] if both else [
             _runs(reach, "reverse", "other way", at=used,

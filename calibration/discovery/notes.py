@@ -305,6 +305,14 @@ class LostReplicates(Note):
 
 
 @dataclasses.dataclass(frozen=True)
+class Outstanding(Note):
+    """Verdicts at other noises that the time did not do for: factors of the sds, and `assumed` or `estimated`."""
+
+    factors: tuple[float, ...]
+    word: str
+
+
+@dataclasses.dataclass(frozen=True)
 class TooFewReplicates(Note):
     """Bootstrap tables that do not do for every kind of evidence."""
 

@@ -87,8 +87,9 @@ def batch(experiments: Sequence[Experiment], shown: tuple[str, ...]) -> Batch:
 def _conditions(run: Run) -> Conditions:
     # None would take the robot's own mass, which a batch with the others cannot.
     mass = UNLOADED if run.setup in setups.WEIGHTLESS else math.nan
-    if run.imposed == "motor_speed":
-        return Conditions(run.configuration, 0.0, run.slope, run.payload, total_mass=mass, motor_speed=run.voltage)
+    if run.imposed != "voltage":
+        level = {run.imposed: run.voltage}
+        return Conditions(run.configuration, 0.0, run.slope, run.payload, total_mass=mass, **level)
     return Conditions(run.configuration, run.voltage, run.slope, run.payload, total_mass=mass)
 
 

@@ -64,7 +64,8 @@ class Reach:
         motors: how many are driven alike.
         resistance [ohm], torque_constant [N·m/A]: of one.
         hot: temperature of a winding that is too hot [°C].
-        imposed: on the motors, see `Rig`; speeds: of the motors that the table used [rad/s], where they are imposed.
+        imposed: on the motors, see `Rig`; levels: of speed [rad/s] or current [A] that the table
+            used, where these are imposed.
         has_ground: whether a ground carries it.
     """
 
@@ -83,7 +84,7 @@ class Reach:
     torque_constant: float
     hot: float
     imposed: str = "voltage"
-    speeds: tuple[float, ...] = ()
+    levels: tuple[float, ...] = ()
     has_ground: bool = True
 
     @property
@@ -131,7 +132,8 @@ def reach(robot: Robot, conditions: Conditions, measured: tuple[str, ...]) -> Re
     return Reach(
         used, measured, voltage, min(voltage, constant * geared), min(voltage, constant * alone), current,
         motor_speed, speed, geared, alone, motors, resistance, constant, motor.temperature_limit, robot.rig.imposed,
-        () if conditions.motor_speed is None else _levels(np.asarray(conditions.motor_speed)), robot.has_ground,
+        _levels(np.asarray(getattr(conditions, robot.rig.imposed))) if conditions.voltage_follows else (),
+        robot.has_ground,
     )  # fmt: skip
 
 

@@ -11,20 +11,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.effect_file import Library
-from calibration.inference.linearization import amplitude_of, shape_of
 from mmrjax import channels, params, robots
 from mmrjax.balances import BALANCES, absent, added
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
+from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
 from mmrjax.fidelities.steady import operating
-from mmrjax.params import Parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -57,6 +56,9 @@ SLIPPERY = 16.0
 #: so many times as large a share of its balance. With 1, 5 of 26 random rigs with an effect of at most three ordinary
 #: sizes got no name for its size (benchmarks/rigs.py).
 UNKNOWN = 4.0
+#: Most that an instrument is taken to be off by, as a share of what its channel shows (rms): beyond it whoever reads
+#: it would know; 47 A on readings of 114 A are no ammeter's offset.
+MOST_OFF = 0.25
 
 
 def library_for(robot: Robot, conditions: Conditions, library: Library) -> Library:
@@ -134,7 +136,11 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
     elif amplitude.spec.unit != "-":
         factor = _ratio(_unit_share(effect, *theirs), _unit_share(grown, *mine))
     factor *= SLIPPERY if kind.balance == "slip" and amplitude.spec.unit == "-" else UNKNOWN
-    return _scaled(kind, factor, stretch)
+    limits = factor
+    if kind.balance == "sensor":
+        low, high = amplitude_of(grown).spec.bounds
+        limits = min(factor, MOST_OFF / (max(-low, high) * _unit_share(grown, *mine)))
+    return scaled(kind, (float(factor), float(stretch), float(limits)))
 
 
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
@@ -149,32 +155,3 @@ def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:
 
     term, total = jax.vmap(share)(signals)
     return _size(term) / _size(total)
-
-
-def _scaled(kind: type[Effect], factor: float, stretch: float) -> type[Effect]:
-    """A class of the same effect whose amplitude's prior is `factor` times as wide, and its shape `stretch` times."""
-    effect = kind()
-    fields: dict[str, object] = {amplitude_of(effect).name: _field(amplitude_of(effect), factor)}
-    if (shape := shape_of(effect)) is not None and stretch != 1.0:
-        fields[shape.name] = _field(shape, stretch)
-    body: Mapping[str, object] = {
-        "__annotations__": dict.fromkeys(fields, "Scalar"),
-        "__module__": kind.__module__,
-        "__doc__": kind.__doc__,
-        "name": kind.name,
-        "plain": kind,
-        **fields,
-    }
-    return type(kind.__name__, (kind,), dict(body))
-
-
-def _field(parameter: Parameter, factor: float) -> object:
-    spec = parameter.spec
-    low, high = spec.bounds
-    sd = None if spec.sd is None else spec.sd * factor
-    scaled = dataclasses.replace(spec, bounds=(low * factor, high * factor), sd=sd)
-    value = factor * float(parameter.value)
-    return params.parameter(
-        value, unit=scaled.unit, meaning=scaled.meaning, bounds=scaled.bounds, source=scaled.source,
-        relative_sd=scaled.relative_sd, sd=scaled.sd, amplitude=scaled.amplitude,
-    )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from calibration.data.errors import BadConfiguration, choices
 from calibration.inference.observers import Observer
@@ -93,6 +94,12 @@ class Settings:
     def family_wise_error(self) -> float:
         """Of the test whether anything is missing."""
         return sum(self.shares.values())
+
+
+def fewest_replicates(kind: type[Observer]) -> int:
+    """Tables of the bootstrap from which on every kind of evidence that data of a kind give can count: below, a
+    statistic beyond all of them is no more improbable than 1 / (1 + tables)."""
+    return math.ceil(1 / min(SHARES[kind.evidence])) - 1
 
 
 def settings_for(kind: type[Observer], replicates: int = 500, seed: int = 0, prefer: str = FIT) -> Settings:

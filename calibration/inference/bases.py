@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
-from calibration.data.columns import SPEED, Layout
+from calibration.data.columns import CURRENT, SPEED, Layout
 from calibration.inference.linearization import PROBED, Linearization
 from mmrjax import channels
 from mmrjax.balances import absent
@@ -159,7 +159,7 @@ def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
 def axes_of(robot: Robot | None) -> tuple[str, ...]:
     """Columns of the conditions over which curves are, of a robot; None: of the packaged one."""
     axes = Layout.of(robot).axes
-    return tuple(c for c in (SPEED, *EVERY_AXIS) if c in axes)
+    return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
 
 def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> Bases:

@@ -114,6 +114,9 @@ def calibrate(
             tell(sentence)
         present = {robot.configurations.names[k] for k in runs.configurations(robot)}
         default = priors.default_names(present, robot, computed=facts.computes)
+        owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
+        held = {*default, *fidelities.unread(model, owned)}
+        default = (*default, *(n for n in owned if n not in held and not n.endswith(facts.computes)))
         default = (*default, *priors.delays(robot, observe.free()[0]))
         names = priors.choose(robot, default, *words)
         if unread := fidelities.unread(model, names):

@@ -83,7 +83,7 @@ def _constant_conditions(runs: Runs) -> list[Constant]:
     imposed = runs.layout.imposed_column
     alike = {
         "slope_deg": "guides" if runs.layout.complete else "slope",
-        imposed: "voltage" if imposed == SUPPLY else "speed",
+        imposed: "voltage" if imposed == SUPPLY else "speed",  # and friction by speed is told by levels of current
     }
     return [
         Constant(column, runs[column][0], losses)

@@ -82,7 +82,7 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
     about = identifiability.analyse(posed, z, data)
     held = identifiability.held_by_prior(about.sd)
     fields = priors.known(robot)
-    width = np.abs(np.asarray(coordinates.slope(z)))
+    width = coordinates.prior_sd
     found = tuple(
         Determined(n, fields[n].spec.unit, float(fields[n].value), float(width[k]), float(about.sd[k]), bool(held[k]))
         for k, n in enumerate(names)

@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 from mmrjax import params
 from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
+from mmrjax.effects.scaled import amplitude_of as amplitude_of
+from mmrjax.effects.scaled import shape_of as shape_of
 from mmrjax.params import Parameter, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -43,19 +45,6 @@ def probe(of: str) -> Effect:
 
 
 # --- effects as they are scored -------------------------------------------------------------------------
-
-
-def amplitude_of(effect: Effect) -> Parameter:
-    """The amplitude of an effect."""
-    return next(p for p in params.walk(effect) if p.spec.amplitude)
-
-
-def shape_of(effect: Effect) -> Parameter | None:
-    """The shape parameter that a fit frees: the first phase or scale beside the amplitude, if the effect has one."""
-    for p in params.walk(effect):
-        if not p.spec.amplitude and (_phase(p) or (p.spec.relative_sd and float(p.value) > 0)):
-            return p
-    return None
 
 
 def _phase(p: Parameter) -> bool:

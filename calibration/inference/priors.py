@@ -31,6 +31,8 @@ FRICTION = (
 )
 #: Freed by default of a load on a shaft.
 SHAFT = ("loss_coulomb", "loss_viscous", "torque_constant", "torque_gravity", "angle_zero")
+#: Ends of names of parameters that settled travel does not show.
+OVER_TIME = (".inertia", ".inductance", ".backlash")
 #: And of configurations on tracks, after the losses; guide friction μ_t stays at Table 4 because only its product
 #: with the share of the guides acts.
 GUIDE_SHARE, GUIDE_FRICTION = "track.guide_share", "track.guide_friction"
@@ -116,6 +118,14 @@ class Coordinates(eqx.Module):
         u = held_within(own.location + own.spread * z, own.low, own.high, SOFTNESS * own.spread)
         return xp.where(xp.asarray(self.scale), xp.exp(u), u)
 
+    @property
+    def prior_sd(self) -> np.ndarray:
+        """Of each parameter [SI], as it is stated: of a log-normal prior the sd that its median and spread stand
+        for, m √(e^s² - 1) with m the median, by which a file's "m ± sd" is read."""
+        own = jax.tree.map(np.asarray, self)
+        size = np.exp(np.where(own.scale, own.location, 0.0))
+        return np.where(own.scale, size * np.sqrt(np.expm1(own.spread**2)), own.spread)
+
     def slope(self, z: Float[Array, " parameters"]) -> Float[Array, " parameters"]:
         """dθ/dz [SI]."""
         return jax.jvp(self.value, (jnp.asarray(z),), (jnp.ones_like(z),))[1]
@@ -162,6 +172,18 @@ def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     fields, stated, exact = known(robot), robot.rig.stated, robot.rig.exact
     mine = (n for n in names if n in fields and n not in exact)
     return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
+
+
+def stated_names(robot: Robot, configurations: Iterable[str], idle: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """What a robot's file states with a ±, but as exact: who says how sure he is of a number asks for its fit. Of
+    these, parameters of configurations that the data have, that something shows, and that follow no other.
+
+    Args:
+        idle: ends of the names of parameters that the data do not show.
+    """
+    others = set(robot.configurations) - set(configurations)
+    mine = [n for n, _, sd in robot.rig.priors if sd > 0 and n.partition(".")[0] not in {"rig", *others}]
+    return _drive(robot, (n for n in mine if _leader(robot, n) is None and not n.endswith(idle)))
 
 
 def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
@@ -292,6 +314,11 @@ def choose(
     if both:
         raise BadConfiguration(f"--free and --fix both name {both[0]}; name it once")
     names = [n for n in dict.fromkeys(chosen if free else default) if n not in fixed]
+    if not names and not fix:
+        raise BadConfiguration(
+            "no parameter to fit: every loss of the robot's file is zero or exact, so it is held, and nothing "
+            "is stated with a ±; state what is not known with one, or name a parameter with --free"
+        )
     if not names:
         raise BadConfiguration("--fix leaves no parameter to fit; name at least one with --free")
     return tuple(names)

@@ -70,10 +70,11 @@ def _statuses(found: CalibrationResult) -> Iterator[Note]:
 
 
 def _parameters(found: CalibrationResult) -> Iterator[Note]:
-    if found.held_by_prior:
-        yield HeldByPrior(found.held_by_prior)
+    far = {name for name, p in found.parameters.items() if abs(p.shift) > FAR}  # which is said of them instead
+    if held := tuple(name for name in found.held_by_prior if name not in far):
+        yield HeldByPrior(held)
     for name, p in found.parameters.items():
-        if abs(p.shift) > FAR:
+        if name in far:
             yield FarFromPrior(name, abs(p.shift), "calibration")
     for name, p in found.parameters.items():
         if p.at_bound:

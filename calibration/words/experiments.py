@@ -99,7 +99,8 @@ def _run(run: menu.Run) -> str:
     where = "" if run.setup in setups.WEIGHTLESS or level else f" {slopes(run.slope)}"
     read = both([channels.of(c).label for c in run.channels])
     turning = [menu.round_significant(v / RPM) for v in run.voltage]
-    at = amounts(run.voltage, "V") if run.imposed == "voltage" else amounts(turning, "rpm of the motor")
+    unit = {"voltage": "V", "motor_current": "A of each motor"}.get(run.imposed)
+    at = amounts(turning, "rpm of the motor") if unit is None else amounts(run.voltage, unit)
     text = f"{_doing(run)}{where} at {at}; read {read}"
     return f"{text}. Watch {'; '.join(map(watch, run.watch))}" if run.watch else text
 
@@ -160,7 +161,7 @@ def more_runs(what: MoreRuns) -> str:
     if happens is not None:
         return _again(happens)
     by_kind = {} if what.within.has_ground else _of_shaft(what)
-    by_kind = _of_speed(what) if what.within.imposed == "motor_speed" else by_kind
+    by_kind = _of_level(what) if what.within.imposed != "voltage" else by_kind
     last = f"Repeat with {what.variable.replace('_', ' ')} in even small steps from its least to its largest"
     return (_usual(what) | by_kind).get(what.variable, last)
 
@@ -217,21 +218,23 @@ def _usual(what: MoreRuns) -> dict[str, str]:
     }
 
 
-def _of_speed(what: MoreRuns) -> dict[str, str]:
-    """By variable, where the motors' speed is imposed."""
+def _of_level(what: MoreRuns) -> dict[str, str]:
+    """By variable, where the motors' speed or current is imposed."""
     within = what.within
     level = "Repeat on the level, unladen," if within.has_ground else "Repeat"
-    fastest = max(within.speeds, default=within.motor_speed) / RPM
-    turning = f"with the motor speed in {what.runs} even steps up to {fastest:.0f} rpm"
+    of_speed = within.imposed == "motor_speed"
+    most = max(within.levels, default=within.motor_speed if of_speed else within.current)
+    one, top = ("motor speed", f"{most / RPM:.0f} rpm") if of_speed else ("motor current", f"{most:.3g} A")
+    turning = f"with the {one} in {what.runs} even steps up to {top}"
     words = {
         "speed_motor": f"{level} {turning}",
         "speed": f"{level} {turning}, and so the travelling speed",
-        "slope": f"Repeat at one motor speed and payload with the slope from 0 to {what.slope:g} deg, and downhill",
-        "payload": f"Repeat at one motor speed and slope with the payload from 0 to {what.payload:g} kg",
-        "time": "Record one motor speed from a cold start for ten minutes, and again at once while all is warm",
+        "slope": f"Repeat at one {one} and payload with the slope from 0 to {what.slope:g} deg, and downhill",
+        "payload": f"Repeat at one {one} and slope with the payload from 0 to {what.payload:g} kg",
+        "time": f"Record one {one} from a cold start for ten minutes, and again at once while all is warm",
     }
     if not within.has_ground:
-        words["current"] = f"{level} at one motor speed with a brake that is raised in {what.runs} even steps"
+        words["current"] = f"{level} at one {one} with a brake that is raised in {what.runs} even steps"
     return words
 
 

@@ -22,6 +22,7 @@ from calibration.discovery.notes import (
     NameSupport,
     NameTest,
     NoiseFromSeries,
+    Outstanding,
     PhasesDiffer,
     RestsOn,
     RuledOut,
@@ -559,6 +560,15 @@ def unwritten(note: Unwritten) -> str:
 def lost_replicates(note: LostReplicates) -> str:
     """Bootstrap tables that could not be fitted again."""
     return f"only {note.settled} of {note.asked} bootstrap tables could be fitted again; the thresholds are theirs"
+
+
+def outstanding(note: Outstanding) -> str:
+    """Verdicts that are not there yet."""
+    at = " and ".join(f"{f:g}" for f in note.factors)
+    return (
+        f"out of time: whether the verdict stands with {at} times the {note.word} noise is not known; run the same "
+        "command without --within"
+    )
 
 
 def too_few_replicates(note: TooFewReplicates) -> str:

@@ -53,6 +53,7 @@ SAID: dict[type, Callable[[Any], str]] = {
     of_loop.StillLacks: loop.still_lacks,
     of_loop.Led: loop.led,
     of_loop.LostReplicates: loop.lost_replicates,
+    of_loop.Outstanding: loop.outstanding,
     of_loop.TooFewReplicates: loop.too_few_replicates,
     of_loop.RestsOn: loop.rests_on,
     of_loop.Unwritten: loop.unwritten,

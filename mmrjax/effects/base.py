@@ -69,7 +69,8 @@ class Effect(eqx.Module):
         memory_size: size of its memory, for an effect whose term depends on the past of the run (a
             temperature, a phase); None has none. A run starts with memory 0.
         memory_unit: unit of its memory.
-        plain: of a class with priors of its own, the class that it differs from by these alone.
+        plain: of a class with priors of its own, the class that it differs from by these alone; factors: by what it
+            does, see `effects.scaled`.
         configurations: names of the configurations that it acts on; none: all, or those with its `movers`. A
             field: what a class states is the default, and a robot file may say `configurations = ["4W2T"]`.
 
@@ -93,6 +94,7 @@ class Effect(eqx.Module):
     memory_size: ClassVar[float | None] = None
     memory_unit: ClassVar[str] = "-"
     plain: ClassVar[type[Effect] | None] = None
+    factors: ClassVar[tuple[float, float, float]] = (1.0, 1.0, 1.0)
 
     if TYPE_CHECKING:
         # Made without arguments an effect is absent.

@@ -144,7 +144,9 @@ def _begun(robot: Robot, conditions: Conditions) -> Array:
     radius = robot.chassis(conditions.configuration).radius
     turning = begin.motor_speed if conditions.motor_speed is None else conditions.motor_speed
     rolling = radius * turning / robot.gearbox.ratio
-    left = voltage_at_rest(robot, conditions) - robot.motor.voltage_back(turning)
+    left = voltage_at_rest(robot, conditions)
+    if conditions.motor_current is None:  # whose amplifier makes up for it
+        left = left - robot.motor.voltage_back(turning)
     open_circuit = (conditions.open > 0.5) | (conditions.motor_speed is not None)
     current = jnp.where(open_circuit, 0.0, left / robot.motor.resistance)
     return jnp.stack([jnp.asarray(x, float) for x in (current, turning, rolling, radius * begin.angle)])

@@ -143,7 +143,9 @@ def current_after(run: System, signals: Signals) -> Scalar:
 
     def left(current: Scalar) -> Scalar:
         shifted = dataclasses.replace(signals, current=current, total_current=run.robot.sides * current)
-        return balances.electrical(run.robot, balances.supply(run.robot, run.conditions, shifted)).voltage_left
+        return balances.electrical(
+            run.robot, run.conditions, balances.supply(run.robot, run.conditions, shifted)
+        ).voltage_left
 
     voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
     z = run.step * slope / signals.inductance

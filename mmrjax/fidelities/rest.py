@@ -42,6 +42,8 @@ def voltage_at_rest(robot: Robot, conditions: Conditions) -> Array:
     """Voltage that the driver gives motors at rest [V], no current flowing."""
     if conditions.motor_speed is not None:  # that which makes for the imposed speed
         return jnp.asarray(robot.motor.voltage_back(conditions.motor_speed))
+    if conditions.motor_current is not None:  # an amplifier's, see `balances.electrical`
+        return jnp.asarray(robot.motor.resistance * conditions.motor_current)
     battery = robot.battery.voltage(0.0, conditions.discharge)
     source = jnp.where(conditions.battery > 0.5, battery, conditions.voltage)
     return conditions.duty * jnp.where(conditions.open > 0.5, 0.0, source)

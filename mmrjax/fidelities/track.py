@@ -221,9 +221,10 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
     """
     if not robot.has_ground:
         raise ValueError("the robot's load is a shaft, which has no running gear; steady and drive take it")
-    if robot.rig.imposed == "motor_speed":
+    if robot.rig.imposed != "voltage":
+        what = robot.rig.imposed.removeprefix("motor_")
         raise ValueError(
-            "the motors' speed is imposed, and this model drives them by their voltage; use steady or drive"
+            f"the motors' {what} is imposed, and this model drives them by their voltage; use steady or drive"
         )
     if sample < step or abs(sample / step - round(sample / step)) > 1e-6:
         raise ValueError(f"step: got {step:g} s; expected {sample:g} s, a sample, divided by a whole number")

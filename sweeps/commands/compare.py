@@ -12,9 +12,13 @@ from rich.table import Table
 
 from calibration.data import instruments
 from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from calibration.data.robot_file import RobotFile
 from calibration.inference import errors as residual
+from calibration.inference import preparation
 from calibration.inference.ranges import check_ranges
 from calibration.words.notes import sentences
+from mmrjax import fidelities
 from mmrjax.channels import Channel
 from mmrjax.robot import Robot
 from sweeps import config as configuration
@@ -25,6 +29,8 @@ from sweeps.points import run, uncertainty
 from sweeps.skeleton import page
 from sweeps.store import open_folder
 
+#: Fidelity that follows time histories, and over what their errors are shown besides.
+HISTORIES, OVER = "drive", {"time_s": "time [s]"}
 #: Conditions that are printed, and their headings.
 HEADINGS = {
     "supply_voltage_V": "U [V]", "motor_speed_rpm": "n [rpm]", "total_mass_kg": "M [kg]", "slope_deg": "slope [deg]",
@@ -36,7 +42,9 @@ Summary = dict[str, dict[str, dict[str, Any]]]
 def compare(config: configuration.Compare, source: str, own_mass: bool, out: Path | None, force: bool) -> int:
     """Simulate the runs of a table, set them beside its readings, leave a run folder; returns the exit code."""
     file = load_robot(config)
-    stated = runs = read_runs(source, file.robot, measured=True)
+    stated = runs = read_runs(source, file.robot, measured=True, series=True)
+    if runs.sampled:
+        return _over_time(config, file, runs, own_mass, out, force)
     robot = instruments.with_inferred_instruments(file.robot, runs)
     if own_mass:
         runs = dataclasses.replace(runs, columns={k: v for k, v in runs.columns.items() if k != "total_mass_kg"})
@@ -66,14 +74,47 @@ def compare(config: configuration.Compare, source: str, own_mass: bool, out: Pat
         return run.leave(folder, config, result, shown)
 
 
+def _over_time(
+    config: configuration.Compare, file: RobotFile, runs: records.Runs, own_mass: bool, out: Path | None, force: bool
+) -> int:
+    """The same for time histories, which the robot follows as its fits do, from each run's own beginning."""
+    options = {"--own-mass": own_mass, "--posterior": config.posterior, "--duration": config.duration_s}
+    for option in (name for name, stated in options.items() if stated):
+        raise BadConfiguration(
+            f"{option}: {Path(runs.source).name} holds time histories, which are followed sample by sample, with the "
+            "masses and times that they state; leave it out"
+        )
+    model = None if config.model == fidelities.NAMES[0] else config.model
+    ready = preparation.prepare(runs, file.robot)
+    with open_folder("compare", config, ready.robot, out, force, runs) as folder:
+        table = run.followed(ready.robot, runs, model)
+        comparison, summary = compared(runs, table, ready.robot, sized=True)
+        comparison |= {column: runs[column] for column in (*OVER, "run_id") if runs.has(column)}
+        folder.write_table("comparison.csv", comparison)
+        notes = [*missing(comparison, runs.channels), *sentences((*ready.checked, *ready.begins, *ready.weighed))]
+        print_comparison(comparison, summary, runs.channels, notes, sized=True)
+        result = run.SimulationResult(
+            "compare", HISTORIES, ready.robot, runs, table, {"errors": summary, "notes": notes}
+        )
+        shown = page(
+            "comparison", dataclasses.replace(file, robot=ready.robot), model=HISTORIES, data_name=runs.source,
+            table=comparison, summary=summary, notes=notes, over=OVER,
+        )  # fmt: skip
+        return run.leave(folder, config, result, shown)
+
+
 def compared(
-    measured: records.Runs, simulated: dict[str, np.ndarray], robot: Robot | None = None
+    measured: records.Runs, simulated: dict[str, np.ndarray], robot: Robot | None = None, sized: bool | None = None
 ) -> tuple[dict[str, np.ndarray], Summary]:
     """Rows side by side with their errors (35), and the errors' summary for all rows and by configuration, of `robot`
     those of its surfaces.
 
     A reading that is missing is NaN in its row; it weighs nothing and is counted as `missing`.
+
+    Args:
+        sized: whether percent are of a channel's size; None: where readings of the table's layout cross zero.
     """
+    crosses_zero = measured.layout.crosses_zero if sized is None else sized
     table = {key: simulated[key] for key in ("configuration", *measured.layout.axes)}
     if not measured.layout.complete and measured.has("surface"):
         table["surface"] = measured["surface"]
@@ -82,7 +123,7 @@ def compared(
         table[channel.column] = measured.columns.get(channel.column, nothing)
         table[f"simulated_{channel.column}"] = simulated[channel.column]
         table[f"error_{channel.name}_percent"] = residual.percent_error(
-            simulated[channel.column], table[channel.column], crosses_zero=measured.layout.crosses_zero
+            simulated[channel.column], table[channel.column], crosses_zero=crosses_zero
         )
     table["status"] = simulated["status"]
     groups = {"all": np.ones(len(measured), bool)}

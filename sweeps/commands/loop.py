@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 from rich.table import Table
 
-from calibration.data import effect_file
+from calibration.data import effect_file, robot_file
 from calibration.data.columns import Layout
+from calibration.discovery import findings
 from calibration.discovery.discover import discover
+from calibration.discovery.kept import OutOfTime
 from calibration.discovery.resolve import resolve
-from calibration.discovery.result import DiscoveryResult
-from calibration.inference import blocks, priors
+from calibration.discovery.result import REFIT_FILE, DiscoveryResult
+from calibration.discovery.settings import fewest_replicates
+from calibration.inference import blocks, observers, priors
 from calibration.words import loop as said_of
 from sweeps import config as configuration
 from sweeps.console import say, tell
@@ -21,28 +26,58 @@ from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.pages.page import rms
 from sweeps.skeleton import leave, page
-from sweeps.store import open_folder
+from sweeps.store import RunFolder, open_folder
+
+T = TypeVar("T")
 
 
-def loop(config: configuration.Loop, source: str, out: Path | None, force: bool, members: Path | None = None) -> int:
+def loop(
+    config: configuration.Loop,
+    source: str,
+    out: Path | None,
+    force: bool,
+    members: Path | None = None,
+    within: float | None = None,
+) -> int:
     """Run the closed loop on a table and leave a run folder; returns the exit code.
 
-    0 done, whatever the verdict; 3 done, but the fit that is proposed did not converge.
+    0 done, whatever the verdict; 3 done, but the fit that is proposed did not converge. Stages are kept as they end,
+    so that the same command goes on after an interrupt, or once its time is out before there is a verdict.
+
+    Args:
+        within: wall-clock time after which it ends with the best that there is [s].
     """
     began = time.monotonic()
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
+    replicates = max(config.replicates, fewest_replicates(observers.kind(runs)))
+
+    stages: dict[str, Any] = {}
+
+    def left() -> float | None:
+        return None if within is None else max(within - (time.monotonic() - began), 0.0)
 
     def progress(text: str) -> None:
         tell(f"{time.monotonic() - began:4.0f} s  {text}")
+        if left() == 0.0 and "verdict" not in stages:
+            raise OutOfTime
 
     with open_folder("loop", config, robot, out, force, runs) as folder:
-        found = discover(
-            runs, robot, noise=config.noise or None, stated=stated, library=effect_file.library(config.effects),
-            replicates=config.replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
-            progress=progress,
-        )  # fmt: skip
+
+        def keep(name: str, make: Callable[[], T]) -> T:
+            found = stages[name] = folder.stage(name, make)
+            return found
+
+        try:
+            found = discover(
+                runs, robot, noise=config.noise or None, stated=stated, library=effect_file.library(config.effects),
+                replicates=replicates, seed=config.seed, prefer=config.prefer, forbidden=config.forbid,
+                progress=progress, keep=keep, left=left,
+            )  # fmt: skip
+        except (KeyboardInterrupt, OutOfTime):
+            _say_kept(stages, folder, config.robot)
+            raise KeyboardInterrupt from None
         if config.resolve:
             found = dataclasses.replace(found, resolved=resolve(
                 found, noise=config.noise or None, population=config.population, generations=config.generations,
@@ -57,6 +92,21 @@ def loop(config: configuration.Loop, source: str, out: Path | None, force: bool,
         manifest = {"seed": config.seed, "verdict": found.verdict}
         shown = page("loop", found, robot_name=config.robot)
         return leave(folder, config, manifest, solved=found.converged, page=shown, runs=found.runs)
+
+
+def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> None:
+    """Say which stages are kept, and leave the robot of the base fit where there is one but no verdict."""
+    if not stages:
+        return
+    tell(f"kept: {', '.join(stages)}; the same command with --out {folder.path} goes on")
+    if "verdict" in stages:
+        traced = stages["verdict"]
+        tell(f"verdict so far: {traced.verdict}; errors held out and other noises are outstanding")
+        return
+    base = stages["base"][0].base
+    robot = findings.proposed_robot(base.space, base.candidate)
+    robot_file.write(robot, folder.partial / REFIT_FILE, note=f"{robot_name}, fitted; the loop has no verdict yet")
+    tell(f"no verdict yet; the best that there is so far is the refit, {folder.partial / REFIT_FILE}")
 
 
 def print_discovery(found: DiscoveryResult) -> None:

@@ -95,9 +95,10 @@ def simulate(
 
 
 def _check_robot(robot: Robot) -> None:
-    if robot.rig.imposed == "motor_speed":
+    if robot.rig.imposed != "voltage":
+        what = imposed.SAID[robot.rig.imposed].words
         raise BadConfiguration(
-            "--profile: the motors' speed is imposed on this robot, and a profile drives motors by their voltage; "
+            f"--profile: the {what} is imposed on this robot, and a profile drives motors by their voltage; "
             'simulate a table of runs, or state imposed = "voltage" in the robot\'s file'
         )
     if robot.loose:

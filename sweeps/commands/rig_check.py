@@ -19,7 +19,7 @@ from calibration.data.rig_facts import Fact, Origin
 from calibration.data.rig_file import FREE
 from calibration.data.runs import Runs
 from calibration.data.writing import finite
-from calibration.inference import foresight, identifiability
+from calibration.inference import foresight, identifiability, priors
 from calibration.inference.foresight import Foresight
 from mmrjax import channels
 from mmrjax.robot import Robot
@@ -60,7 +60,10 @@ class RigCheck:
         motors = "One motor drives" if count == 1 else f"{count} motors alike drive"
         gear = f"{'its' if count == 1 else 'their'} gearbox {float(robot.gearbox.ratio):g} : 1"
         loads = "; ".join(f"{name}: {_load(load)}" for name, load in robot.configurations.items())
-        imposed = "the voltage (times the duty in histories)" if rig.imposed == "voltage" else "the motors' speed"
+        imposed = "the voltage (times the duty in histories)"
+        imposed = {"motor_speed": "the motors' speed", "motor_current": "the current of each motor"}.get(
+            rig.imposed, imposed
+        )
         starts = {
             "rest": "start at rest",
             "measured": "start as their first samples show",
@@ -83,7 +86,9 @@ class RigCheck:
             lines = ", ".join(map(str, self.examples))
             said.append(f"{len(self.examples)} lines still hold the number of an example ({EXAMPLE}): {lines}")
         said += [f"{fact.what} {fact.value}: {fact.odd}" for fact in self.facts if fact.odd]
-        loose = [o.name for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value != 0]
+        loose = [
+            _program(self.robot, o) for o in self.origins if o.why.startswith("the file") and o.sd is None and o.value
+        ]
         if loose and not self.robot.rig.inherits:
             said.append(f"without ±, so with the program's: {', '.join(loose)}")
         if self.robot.motor.voltage_limit is None and self.robot.rig.imposed == "voltage":
@@ -198,6 +203,12 @@ class RigCheck:
             "data": runs,
             "statement": self.statement(),
         }
+
+
+def _program(robot: Robot, origin: Origin) -> str:
+    """A number stated without ±, with the width that the program gives it where a fit frees it."""
+    sd = float(priors.coordinates(robot, (origin.name,)).prior_sd[0])
+    return f"{origin.name} (±{100 * sd / abs(origin.value):.2g} %)"
 
 
 def _load(load: Any) -> str:

@@ -12,7 +12,9 @@ from sweeps.console import say
 KINDS = {
     "bench": "a motor with its gearbox that turns a shaft: brake, disk, worm, winch",
     "pendulum": "a servo with an arm that gravity pulls",
+    "servo": "a servo driven by PWM, whose angle is logged",
     "linear": "a carriage on a screw, a belt or a rope",
+    "carriage": "the same on an amplifier that controls the current, with its position logged",
     "wheeled": "a robot on wheels",
     "tracked": "a robot on tracks",
 }

@@ -106,6 +106,10 @@ def _operating_points(
 ) -> Runs:
     """The grid of operating points; an axis that varies has one value, the middle of its range."""
     layout = Layout.of(robot)
+    if layout.imposed == "motor_current":
+        raise BadConfiguration(
+            "sensitivity: the motors' current is imposed on this robot; simulate and sweep take it"
+        )
     table8: dict[str, tuple[float, ...]] = {}
     if layout.table8:
         table8 = CORNERS if config.method in ("sobol", "morris", "shapley") else WHOLE

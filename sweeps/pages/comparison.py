@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ def write(
     table: dict[str, np.ndarray],
     summary: dict[str, dict[str, dict[str, Any]]],
     notes: list[str],
+    over: Mapping[str, str] | None = None,
 ) -> Path:
     """Write `report.html` and `figures/` for a simulation set against a table of measured runs.
 
@@ -34,14 +36,15 @@ def write(
         table: conditions, `<column>` measured, `simulated_<column>`, `error_<channel>_percent`, `status`.
         summary: group (`all`, each configuration) → channel → rows, rms_percent, max_percent, r2.
         notes: what to say of readings that are missing.
+        over: of time histories, further columns over which errors are shown, with their words.
 
     Returns:
         The path of the page.
     """
     album, robot = Album(folder), file.robot
-    sized = Layout.of(robot).crosses_zero
+    sized = Layout.of(robot).crosses_zero or over is not None
     album.add("parity", lambda: comparison_figures.parity(table, robot.channels, band=not sized))
-    album.add("errors", lambda: comparison_figures.errors_over(table, robot.channels, in_units=sized))
+    album.add("errors", lambda: comparison_figures.errors_over(table, robot.channels, in_units=sized, beside=over))
     known = named(file)
     return render(
         folder,

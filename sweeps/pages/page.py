@@ -85,6 +85,7 @@ def changed_parameters(robot: Robot, nominal: Robot) -> list[dict[str, str]]:
 CONDITIONS = {
     "supply_voltage_V": ("U [V]", "{:g}"),
     "motor_speed_rpm": ("n [rpm]", "{:g}"),
+    "motor_current_A": ("I [A]", "{:.4g}"),
     "total_mass_kg": ("M [kg]", "{:.1f}"),
     "payload_kg": ("payload [kg]", "{:g}"),
     "slope_deg": ("slope [°]", "{:g}"),
@@ -109,6 +110,8 @@ def label(table: dict[str, np.ndarray], row: int) -> str:
         parts.append(supply(table["supply_voltage_V"][row]))
     elif "motor_speed_rpm" in table:
         parts.append(f"{table['motor_speed_rpm'][row]:g} rpm")
+    elif "motor_current_A" in table and "simulated_motor_current_A" not in table:
+        parts.append(f"{table['motor_current_A'][row]:g} A")
     if "payload_kg" in table:
         parts += [f"{table['payload_kg'][row]:g} kg", f"{table['slope_deg'][row]:g}°"]
     return ", ".join(parts)

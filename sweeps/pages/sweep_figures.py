@@ -21,8 +21,8 @@ _CELLS = 12  # along an axis up to which cells are labelled
 
 
 #: Axis of what is imposed: its unit, and words of several.
-UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm"}
-PLURAL = {"supply_voltage_V": "voltages", "motor_speed_rpm": "motor speeds"}
+UNITS = {"supply_voltage_V": "V", "motor_speed_rpm": "rpm", "motor_current_A": "A"}
+PLURAL = {"supply_voltage_V": "voltages", "motor_speed_rpm": "motor speeds", "motor_current_A": "motor currents"}
 
 
 def imposed(runs: dict[str, np.ndarray]) -> str:

@@ -205,7 +205,7 @@ def idle_current(robot: Robot, configuration: str, speed_wheel: np.ndarray) -> n
         state = State(zero + current, wheel * robot.gearbox.ratio, chassis.radius * wheel, zero)
         signals = balances.begin(robot, asked, state, direction=zero + 1.0)
         signals = dataclasses.replace(signals, normal=zero, traction=zero)
-        signals = balances.motor(robot, balances.electrical(robot, balances.supply(robot, asked, signals)))
+        signals = balances.motor(robot, balances.electrical(robot, asked, balances.supply(robot, asked, signals)))
         return np.asarray(balances.gearbox(robot, chassis, balances.track(robot, chassis, signals)).torque_net)
 
     low, high = 5.0, 10.0

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from calibration.data.columns import IMPOSED as OF_IMPOSED
 from calibration.data.errors import BadConfiguration, choices, stated_number
 from mmrjax import variation
-from mmrjax.channels import RPM
 from mmrjax.rig import IMPOSED
 from mmrjax.robot import Robot
 from mmrjax.tables import SURFACES, adhesion_ratio
@@ -98,7 +98,7 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
     own = AXIS[robot.rig.imposed]
     if not robot.rig.inherits and own not in {*fixed, *design.names} and fixed.get("battery", 0.0) <= 0.5:
         level = imposed.default(robot, f"{where}, conditions.{own}")
-        fixed[own] = level if own == "voltage" else level * RPM
+        fixed[own] = level * OF_IMPOSED[own][1]
     if surface is not None and "adhesion" in {*fixed, *design.names}:
         raise BadConfiguration(f"{where}, conditions.surface: got {surface} beside adhesion; expected one of the two")
     if design.points > MOST:
@@ -109,8 +109,12 @@ def plan(config: Campaign, robot: Robot, where: str) -> Plan:
 
 def _acting(names: set[str], robot: Robot, where: str, surface: str | None) -> None:
     """Refuse conditions that do not act on a robot."""
-    idle = ("motor_speed", "motor_acceleration") if robot.rig.imposed == "voltage" else ("voltage", "duty", "open")
-    for name in sorted(names & set(idle)):
+    kinds = {
+        "voltage": ("voltage", "duty", "open"), "motor_speed": ("motor_speed", "motor_acceleration"),
+        "motor_current": ("motor_current",),
+    }  # fmt: skip
+    idle = {name for kind, mine in kinds.items() if kind != robot.rig.imposed for name in mine}
+    for name in sorted(names & idle):
         raise BadConfiguration(
             f"{where}, {name}: the robot's file imposes the {robot.rig.imposed.replace('_', ' ')}; vary "
             f"{AXIS[robot.rig.imposed]} instead"

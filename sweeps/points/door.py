@@ -23,6 +23,7 @@ def sweep(
     configurations: Sequence[str] | str | None = None,
     voltages: Axis = None,
     motor_speeds_rpm: Axis = None,
+    motor_currents_A: Axis = None,
     payloads: Axis = None,
     slopes_deg: Axis = None,
     surface: str | None = None,
@@ -34,7 +35,8 @@ def sweep(
     """Simulate every combination of a grid, slope varying fastest; Table 8 where nothing is stated.
 
     Args:
-        configurations: names, all by default; voltages [V], or for a rig that imposes it motor_speeds_rpm [rpm].
+        configurations: names, all by default; voltages [V], or for a rig that imposes it motor_speeds_rpm [rpm]
+            or motor_currents_A [A].
         payloads: [kg]; slopes_deg: [deg]; surface: of Table 5.
         battery: whether the on-board battery feeds the motors; discharge: charge already taken from it [C].
         model, options: as for `simulate`.
@@ -49,7 +51,8 @@ def sweep(
     names = (configurations,) if isinstance(configurations, str) else configurations
     config = GridPart.model_construct(
         configurations=None if names is None else tuple(names),
-        voltages_V=_axis(voltages), motor_speeds_rpm=_axis(motor_speeds_rpm), payloads_kg=_axis(payloads),
+        voltages_V=_axis(voltages), motor_speeds_rpm=_axis(motor_speeds_rpm),
+        motor_currents_A=_axis(motor_currents_A), payloads_kg=_axis(payloads),
         slopes_deg=_axis(slopes_deg), surface=surface,
     )  # fmt: skip
     runs = grid(config, robot, battery)

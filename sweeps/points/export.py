@@ -23,6 +23,7 @@ COLUMNS = {
     "payload": ("payload_kg", 1.0),
     "total_mass": ("total_mass_kg", 1.0),
     "motor_speed": ("motor_speed_rpm", channels.RPM),
+    "motor_current": ("motor_current_A", 1.0),
     "discharge": ("discharge_mAh", COULOMB_PER_MAH),
 }
 

@@ -21,13 +21,14 @@ G = TypeVar("G", bound=GridPart)
 
 #: Option that states an axis.
 OPTIONS = {
-    "voltages_V": "--voltages", "motor_speeds_rpm": "--motor-speeds", "payloads_kg": "--payloads",
+    "voltages_V": "--voltages", "motor_speeds_rpm": "--motor-speeds",
+    "motor_currents_A": "--motor-currents", "payloads_kg": "--payloads",
     "slopes_deg": "--slopes", "surface": "--surface",
 }  # fmt: skip
 #: Those that act on a vehicle alone.
 ON_GROUND = ("payloads_kg", "slopes_deg", "surface")
 #: Axis of what is imposed (`rig.IMPOSED`).
-AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm"}
+AXIS = {"voltage": "voltages_V", "motor_speed": "motor_speeds_rpm", "motor_current": "motor_currents_A"}
 
 
 def resolved(config: G, robot: Robot, battery: bool = False, notes: list[str] | None = None) -> G:

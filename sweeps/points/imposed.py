@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable
 
@@ -22,8 +23,30 @@ VOLTAGE = 33.0
 SHARES = (1 / 3, 2 / 3, 1.0)
 
 
+@dataclasses.dataclass(frozen=True)
+class Said:
+    """What is said of what is imposed: in words, its unit, the parameter that limits it, and examples of options for
+    one run and for a grid."""
+
+    words: str
+    unit: str
+    limit: str
+    one: str
+    several: str
+
+
+SAID = {
+    "voltage": Said("voltage", "V", "voltage_limit", "12", "6,12,24"),
+    "motor_speed": Said("motors' speed", "rpm", "speed_limit", "3000", "1000,2000"),
+    "motor_current": Said("motors' current", "A", "current_limit", "2", "0.5,1,2"),
+}
+
+
 def limit(robot: Robot) -> float | None:
-    """What may be imposed at most: supply voltage [V] or motor speed [rpm]; None where the file says nothing."""
+    """What may be imposed at most: supply voltage [V] or motor speed [rpm]; None where the file says nothing, as it
+    does of a current."""
+    if robot.rig.imposed == "motor_current":
+        return None
     if robot.rig.imposed == "voltage":
         return robot.motor.voltage_limit
     most = min(float(robot.motor.speed_limit), float(robot.gearbox.speed_limit))
@@ -46,7 +69,7 @@ def default(robot: Robot, option: str) -> float:
         return VOLTAGE
     most = limit(robot)
     if most is None:
-        raise BadConfiguration(_missing(robot, option, "12" if robot.rig.imposed == "voltage" else "3000"))
+        raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].one))
     return most if robot.rig.imposed == "voltage" else _digits(most)
 
 
@@ -63,7 +86,7 @@ def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[f
         return VOLTAGES_V
     most = limit(robot)
     if most is None:
-        raise BadConfiguration(_missing(robot, option, "6,12,24" if robot.rig.imposed == "voltage" else "1000,2000"))
+        raise BadConfiguration(_missing(robot, option, SAID[robot.rig.imposed].several))
     found = tuple(_digits(share * most) for share in SHARES)
     if notes is not None:
         shown = ",".join(f"{v:g}" for v in found)
@@ -72,11 +95,13 @@ def levels(robot: Robot, option: str, notes: list[str] | None = None) -> tuple[f
 
 
 def _of(robot: Robot) -> str:
-    return "voltage_limit" if robot.rig.imposed == "voltage" else "speed_limit"
+    return SAID[robot.rig.imposed].limit
 
 
 def _missing(robot: Robot, option: str, example: str) -> str:
-    unit = "V" if robot.rig.imposed == "voltage" else "rpm"
+    unit = SAID[robot.rig.imposed].unit
+    if robot.rig.imposed == "motor_current":  # which no file limits
+        return f"{option}: not stated; state it [{unit}], as {option} {example}"
     return (
         f"{option}: not stated, and the robot's file has no motor.{_of(robot)} to take it from; state it "
         f"[{unit}], as {option} {example}"
@@ -85,8 +110,9 @@ def _missing(robot: Robot, option: str, example: str) -> str:
 
 def refused(robot: Robot, option: str, instead: str) -> str:
     """Why an option of what is not imposed is refused."""
-    if robot.rig.imposed == "motor_speed":
-        return f"{option}: the motors' speed is imposed on this robot; state {instead} [rpm]"
+    said = SAID[robot.rig.imposed]
+    if robot.rig.imposed != "voltage":
+        return f"{option}: the {said.words} is imposed on this robot; state {instead} [{said.unit}]"
     return f"{option}: the voltage is imposed on this robot, and its motors' speed follows; state {instead} [V]"
 
 
@@ -111,10 +137,9 @@ def check_battery(robot: Robot) -> None:
     Raises:
         BadConfiguration: its speed is imposed, or its battery is none of its own.
     """
-    if robot.rig.imposed == "motor_speed":
-        raise BadConfiguration(
-            "--battery: the motors' speed is imposed on this robot, whatever feeds them; leave it out"
-        )
+    if robot.rig.imposed != "voltage":
+        what = SAID[robot.rig.imposed].words
+        raise BadConfiguration(f"--battery: the {what} is imposed on this robot, whatever feeds them; leave it out")
     if not capabilities.battery(robot):
         raise BadConfiguration("--battery: the robot's file states no battery; add [battery], or state --voltage")
 

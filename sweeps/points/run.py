@@ -12,7 +12,10 @@ import numpy as np
 from calibration.data import robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
-from mmrjax import fidelities, outputs
+from calibration.inference import observers
+from calibration.inference.problem import Observation
+from mmrjax import fidelities, outputs, params
+from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Run
 from mmrjax.power import COULOMB_PER_MAH
@@ -166,6 +169,25 @@ def evaluate(
     columns = {row.column: found[row.name] for row in outputs.table(robot.channels)}
     further = {name: found[name] for name in fidelities.get(config.model).columns}
     return {**conditions(robot, runs), **columns, **outputs.codes(found[STATUS], found[FLAGS_CODE]), **further}
+
+
+def followed(robot: Robot, runs: Runs, model: str | None) -> Table:
+    """Conditions and what the robot shows in every row of a table of time histories.
+
+    Args:
+        robot: prepared for the table; model: fidelity that is asked for, None: the one that follows histories.
+
+    Raises:
+        BadConfiguration: a fidelity that cannot follow them.
+    """
+    seen = jax.device_get(_observed(observers.kind(runs).of(runs, robot, model), params.strong(robot)))
+    columns = {c.column: seen.reading[:, k] / c.factor for k, c in enumerate(robot.channels)}
+    return {**conditions(robot, runs), **columns, **outputs.codes(seen.status, seen.flags)}
+
+
+@compiled
+def _observed(observe: observers.Observer, robot: Robot) -> Observation:
+    return observe(robot)
 
 
 def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:

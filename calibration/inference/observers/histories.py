@@ -58,11 +58,13 @@ LAGS = 12
 DELAYS, SCANNED = (256, 2048), 32
 #: Of a chassis' friction law what only sliding shows.
 SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
+#: Growth of steps after changes, over the usual one, from which on that is said.
+COARSE = 15
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 #: Fields of `Conditions` that may change within a run; and of those what makes for an inrush, with how much of the
 #: largest applied voltage a change has to be for steps to be short after it.
-CHANGING = ("voltage", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open")
+CHANGING = ("voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open")
 INRUSH = 2e-3
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
@@ -223,7 +225,7 @@ class Histories(Observer):
         """Histories begin when the supply is switched on, the robot at rest, and show one sample at a time."""
         names, measured = _names(runs), runs.measured()
         # Current rises within a millisecond; what moves does not.
-        resting = robot.rig.start == "rest" and robot.rig.imposed == "voltage"
+        resting = robot.rig.start == "rest" and robot.rig.imposed != "motor_speed"
         moving = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and resting]
         for channel in (c for c in runs.channels if not c.over_time and runs.has(c.column)):
             raise BadData(
@@ -256,14 +258,14 @@ class Histories(Observer):
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         each = [np.flatnonzero(names == name) for name in np.unique(names)]
         changes = max(len(c) for c in _changes(runs, each)) + 1
-        if growth(float(runs["time_s"].max()), changes) > 10 * GROWTH:
+        if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
         return said
 
     @classmethod
     def check_settled(cls, runs: Runs) -> None:
         raise BadData(
-            f"{runs.source}: column time_s: time histories are for calibrate and loop; expected one row a run"
+            f"{runs.source}: column time_s: time histories are for calibrate, compare and loop; expected a row a run"
         )
 
     @classmethod
@@ -369,6 +371,7 @@ class Histories(Observer):
         rows_of, time = np.asarray(self.rows_of), np.asarray(self.time)
         of_rows = jax.tree.map(np.asarray, self.of_rows)
         volts = np.where(of_rows.open > 0.5, 0.0, of_rows.voltage * of_rows.duty)
+        volts = volts if of_rows.motor_current is None else of_rows.motor_current
         values = [x for name in CHANGING if (x := getattr(of_rows, name)) is not None]
         return [divided(rows[rows >= 0], time, values, volts) for rows in rows_of]
 
@@ -379,12 +382,14 @@ class Histories(Observer):
         if not self.varying:
             return self.conditions
         rows = jax.tree.map(np.asarray, self.of_rows)
-        if rows.motor_speed is not None:
-            speeds = _few(rows.motor_speed)
-            which = np.stack([rows.configuration, speeds, rows.slope_deg, rows.payload], 1)
-            cases = np.unique(which[speeds != 0], axis=0, return_index=True)[1]
-            cases = np.flatnonzero(speeds != 0)[cases] if len(cases) else np.arange(1)
-            steady = dataclasses.replace(rows, motor_speed=speeds, motor_acceleration=np.zeros_like(speeds))
+        if rows.voltage_follows:
+            own = "motor_current" if rows.motor_speed is None else "motor_speed"
+            levels = _few(getattr(rows, own))
+            which = np.stack([rows.configuration, levels, rows.slope_deg, rows.payload], 1)
+            cases = np.unique(which[levels != 0], axis=0, return_index=True)[1]
+            cases = np.flatnonzero(levels != 0)[cases] if len(cases) else np.arange(1)
+            held = {} if rows.motor_speed is None else {"motor_acceleration": np.zeros_like(levels)}
+            steady = dataclasses.replace(rows, **{own: levels}, **held)
             return jax.tree.map(lambda x: jnp.asarray(x[cases]), steady)
         applied = np.where(rows.open > 0.5, 0.0, rows.voltage * rows.duty)
         some = np.flatnonzero(applied != 0) if (applied != 0).any() else np.arange(1)
@@ -633,6 +638,8 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
 def _changes(runs: Runs, each: list[np.ndarray]) -> list[np.ndarray]:
     """Instants at which the supply of the motors of each run changes [s]."""
     volts, time = applied(runs), runs["time_s"]
+    if runs.layout.imposed != "voltage":  # which no inrush follows
+        return [np.zeros(0)] * len(each)
     if not np.isfinite(volts).all() or not volts.any():
         return [np.zeros(0)] * len(each)
     coasts = runs["mode"] == "coast" if runs.has("mode") else np.zeros(len(runs), bool)
@@ -672,7 +679,13 @@ def _in_time(
     step = np.diff(times, axis=1)
     slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
     slope = np.concatenate([slope, np.zeros((len(slope), 1))], 1)
-    return dataclasses.replace(conditions, motor_speed=jnp.asarray(speed), motor_acceleration=jnp.asarray(slope))
+    # Not by `dataclasses.replace`: its constructor broadcasts, and what does not change has no instants.
+    return eqx.tree_at(
+        lambda c: (c.motor_speed, c.motor_acceleration),
+        conditions,
+        (jnp.asarray(speed), jnp.asarray(slope)),
+        is_leaf=lambda x: x is None,
+    )
 
 
 def begin_name(run: str) -> str:
@@ -698,7 +711,7 @@ def with_begins(robot: Robot, runs: Runs, noise: Noise) -> Robot:
         key = begin_name(str(name))
         at: dict[str, tuple[float, float]] = {}
         for k, channel in enumerate(runs.channels):
-            field = "angle" if channel.unit_si == "rad" else "motor_speed"
+            field = "motor_speed" if channel.settled else "angle"
             there = mine[np.isfinite(measured[mine, k])][:FIRST_SAMPLES]
             if channel.zero_at_rest and field not in at and len(there):
                 factor = 1 / _shown_of_unit(robot, int(rows[mine[0]]), channel)

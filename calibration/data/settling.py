@@ -1,0 +1,594 @@
+"""From a log over time to settled runs: stretches in which what is imposed holds and every channel has settled."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.data.courses import applied, names
+from calibration.data.errors import BadData, number
+from calibration.data.instruments import step_of
+from calibration.data.runs import Runs
+from mmrjax import channels
+from mmrjax.channels import Channel
+
+if TYPE_CHECKING:
+    from mmrjax.robot import Robot
+
+#: Share of a signal's largest size below which it counts as none: the motors are not driven, the output stands.
+STILL = 0.02
+#: Share of a signal's largest size to which it is known at least, beside the share of its own mean.
+FINE = 0.005
+#: A sample that comes so many times the usual step after the one before it: samples between are missing.
+GAP = 5.0
+#: Fewest samples of a stretch, and of its parts between which means are compared.
+FEWEST, PART = 8, 3
+#: Sds within which means of parts agree.
+SDS = 3.0
+#: Sd of the change along a stretch by a straight line, over that of its mean: √12.
+OF_CHANGE = 12**0.5
+#: Beginnings of a stretch that are tried, and share of the largest change from which on a change is slight.
+TRIES, SLIGHT = 5, 0.05
+#: Equal readings one after the other that an instrument with noise does not show, and up to what share of all steps
+#: readings that are equal to the one before are noise's chance.
+STUCK, CHANCE = 20, 0.2
+#: Conditions whose every change ends a stretch.
+EXACT = ("configuration", "surface", "mode", "slope_deg", "payload_kg", "total_mass_kg")
+#: Why samples are left out.
+REASONS = (
+    "changes", "short", "settling", "accelerates", "idle", "rest", "stuck", "undriven",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Signal:
+    """What a channel shows of settled travel, sample by sample.
+
+    Attributes:
+        channel: that the table of settled runs has; shown: its readings [unit of the column], NaN where missing.
+        angle: the angle that it is the rate of [unit of its column], empty where it is read itself.
+        step: of its instrument [unit], 0 without; largest: size of its readings but for the last two in a hundred.
+    """
+
+    channel: Channel
+    shown: np.ndarray
+    angle: np.ndarray
+    step: float
+    largest: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Inertia:
+    """What acceleration takes of the current of a configuration's motors.
+
+    Attributes:
+        speed, current: names of channels, `current` empty where it is what is imposed.
+        per_rate: current [A] of one unit of the speed's column a second.
+        least: current below which shares are of this [A].
+    """
+
+    speed: str
+    current: str
+    per_rate: float
+    least: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Stretch:
+    """Samples of a log that go together.
+
+    Attributes:
+        run: name of; rows: indices in the table, in the order of time; begin, end: of time [s].
+        why: empty where it is a settled run, else one of `REASONS`; channel: whose, where one is to blame; size: how
+            much, as a share.
+        mean, sd: of each channel, by name [unit of the column]; of a settled run alone.
+        drift: change of each channel over it, by name [unit]; imposed: mean of what drives the motors.
+    """
+
+    run: str
+    rows: np.ndarray
+    begin: float
+    end: float
+    imposed: float
+    why: str = ""
+    channel: str = ""
+    size: float = 0.0
+    mean: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    sd: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    drift: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def lasts(self) -> float:
+        """[s]."""
+        return self.end - self.begin
+
+
+@dataclasses.dataclass(frozen=True)
+class Settled:
+    """What a log holds of settled travel.
+
+    Attributes:
+        runs: of the log; stretches: all of them, in the order of the log; signals: of its channels.
+        shortest, drift: that were asked for; gaps: rows after which samples are missing.
+        scatter: of each channel by which stretches alike differ beyond their own sds, by name [unit].
+    """
+
+    runs: Runs
+    stretches: tuple[Stretch, ...]
+    signals: tuple[Signal, ...]
+    shortest: float
+    drift: float
+    gaps: tuple[int, ...]
+    scatter: Mapping[str, float]
+
+    @property
+    def kept(self) -> tuple[Stretch, ...]:
+        """Those that are settled runs."""
+        return tuple(s for s in self.stretches if not s.why)
+
+    def table(self) -> dict[str, np.ndarray]:
+        """The settled runs, a column each as tables of runs have them."""
+        kept = self.kept
+        found: dict[str, np.ndarray] = {}
+        means = dict(self.runs.columns) | {k: v for k, v in self.runs.extras.items() if v.dtype.kind == "f"}
+        read = {c.column for s in self.signals for c in (s.channel,)} | {"time_s", "order", "run_id"}
+        read |= {c.sd_column for c in channels.EVERY} | {angle for angle, _, _ in RATES}
+        for name, column in means.items():
+            if name in read or (name == "mode"):
+                continue
+            if column.dtype.kind == "f":
+                found[name] = np.array([_digits(np.nanmean(column[s.rows])) for s in kept])
+            else:
+                found[name] = np.array([str(column[s.rows[0]]) for s in kept])
+        for signal in self.signals:
+            name = signal.channel.name
+            found[signal.channel.column] = np.array([_digits(s.mean[name]) for s in kept])
+            found[signal.channel.sd_column] = np.array([_digits(s.sd[name], 3) for s in kept])
+        found["run_id"] = np.array([f"{s.run or 'log'} {s.begin:.6g}-{s.end:.6g} s" for s in kept])
+        found["order"] = np.arange(1.0, len(kept) + 1)
+        return found
+
+
+def _digits(x: float, digits: int = 7) -> float:
+    return float(f"{x:.{digits}g}") if math.isfinite(x) else math.nan
+
+
+def settle(
+    runs: Runs,
+    *,
+    shortest: float | None = None,
+    drift: float = 0.02,
+    inertia: Mapping[str, Inertia] | None = None,
+) -> Settled:
+    """The settled runs of a log.
+
+    What is imposed is divided where it changes; of each level the end is taken, and what stands before it as long as
+    every channel's mean stays there. Their means are the settled run. Its sds are those of means of readings with
+    their own autocorrelation (Geyer's initial positive sequence, 1992), with what steps of the instrument leave of
+    their mean (Widrow and Kollár, Quantization noise, 2008, of normal noise: the first term), the drift that is left,
+    and what stretches alike differ by.
+
+    Args:
+        shortest: stretch [s]; None: 0.3 s, and at least 20 samples.
+        drift: largest change of a mean within a stretch, as a share of it.
+        inertia: by configuration; a stretch whose acceleration takes more than `drift` of its current is left out.
+
+    Raises:
+        BadData: time that does not increase, a channel that shows one number only, or no stretch at all.
+    """
+    if not runs.sampled:
+        raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
+    each = _in_order(runs)
+    step = float(np.median(np.concatenate([np.diff(runs["time_s"][rows]) for rows in each])))
+    shortest = max(0.3, 20 * step) if shortest is None else shortest
+    half = max(1, round(shortest / 6 / step))
+    signals = _signals(runs, each, half)
+    for signal in signals:
+        _check_alive(runs, signal)
+    drives = applied(runs)
+    stuck = {s.channel.name: _stuck(s, each) for s in signals}
+    gaps: list[int] = []
+    found: list[Stretch] = []
+    for rows in each:
+        far = np.flatnonzero(np.diff(runs["time_s"][rows]) > GAP * step)
+        gaps += [int(rows[k]) for k in far]
+        for part in np.split(rows, far + 1):
+            for level in _levels(runs, drives, part, shortest, drift, step):
+                found.append(_settled(runs, signals, drives, level, shortest, drift, step, stuck, inertia or {}))
+    scatter = _scatter(runs, found, signals, float(np.max(np.abs(drives))))
+    found = [_wider(s, scatter) for s in found]
+    result = Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
+    if not result.kept:
+        raise BadData(_nothing(result))
+    return result
+
+
+# --- time and channels ----------------------------------------------------------------------------------
+
+
+def shown(robot: Robot) -> tuple[Channel, ...]:
+    """Channels that the settled runs of a robot's logs can have: its own, and rates of its angles."""
+    rates = {rate for angle, rate, _ in RATES if angle in {c.column for c in robot.channels}}
+    return tuple(c for c in channels.EVERY if (c in robot.channels and c.settled) or c.name in rates)
+
+
+def _in_order(runs: Runs) -> list[np.ndarray]:
+    """Rows of each run, whose time increases from row to row."""
+    of, time = names(runs), runs["time_s"]
+    each = [np.flatnonzero(of == name) for name in dict.fromkeys(of.tolist())]
+    for rows in each:
+        steps = np.diff(time[rows])
+        if (steps <= 0).any():
+            k = int(np.argmax(steps <= 0))
+            row, was, now = int(rows[k + 1]) + 1, time[rows[k]], time[rows[k + 1]]
+            if now == was:
+                raise BadData(
+                    f"{runs.source} row {row}, time_s: {number(now)} s stands twice; give each sample its own time, "
+                    "with more digits if the clock has them, or remove one"
+                )
+            raise BadData(
+                f"{runs.source} row {row}, time_s: goes back from {number(was)} to {number(now)} s; give each "
+                "recording its own run_id, or sort the rows"
+            )
+    if max(map(len, each)) < FEWEST:
+        raise BadData(
+            f"{runs.source}: {max(map(len, each))} samples in its longest run; at least {FEWEST} are needed"
+        )
+    return each
+
+
+def _signals(runs: Runs, each: list[np.ndarray], half: int) -> tuple[Signal, ...]:
+    """What settled travel shows of each channel of a log; of an angle its rate, where no channel reads that."""
+    none = np.zeros(0)
+    found = [
+        Signal(c, runs[c.column], none, _step(runs, c), _size(runs[c.column]))
+        for c in runs.channels
+        if c.settled and runs.has(c.column) and np.isfinite(runs[c.column]).any()
+    ]
+    have = {s.channel.name for s in found}
+    for angle, rate, factor in RATES:
+        if angle in runs.layout.measured_columns and runs.has(angle) and rate not in have:
+            whole = np.full(len(runs), np.nan)
+            shown = np.full(len(runs), np.nan)
+            for rows in each:
+                whole[rows] = runs[angle][rows] * factor
+                shown[rows] = _rate(runs["time_s"][rows], whole[rows], half)
+            found.append(Signal(channels.of(rate), shown, whole, 0.0, _size(shown)))
+    if not found:
+        raise BadData(f"{runs.source}: no channel with readings that settled travel shows")
+    return tuple(found)
+
+
+#: Columns of angles, the channel of their rate, and its unit's value of one of the angle's a second.
+RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1.0))
+
+
+def _step(runs: Runs, channel: Channel) -> float:
+    """Step of a channel's instrument [unit of the column]: that which its readings show, else the file's."""
+    stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
+    return step_of(runs[channel.column]) or next(stated, 0.0) / channel.factor
+
+
+def _rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
+    """Difference from twice so many samples before, by time: what comes after a level does not show at its end."""
+    k = np.arange(len(x))
+    before, now = np.maximum(k - 2 * half, 0), np.maximum(k, 1)
+    return (x[now] - x[before]) / (time[now] - time[before])
+
+
+def _check_alive(runs: Runs, signal: Signal) -> None:
+    shown = signal.shown[np.isfinite(signal.shown)]
+    if len(shown) > STUCK and np.ptp(shown) == 0:
+        raise BadData(
+            f"{runs.source} rows 1 to {len(runs)}, {signal.channel.column}: {number(shown[0])} {signal.channel.unit} "
+            "in every row; the channel is frozen or not connected; remove the column, or the channel from the rig's "
+            "file"
+        )
+
+
+def _stuck(signal: Signal, each: list[np.ndarray]) -> np.ndarray:
+    """Rows in which a channel shows one number for longer than its noise lets it: saturated, or frozen."""
+    held = np.zeros(len(signal.shown), bool)
+    if len(signal.angle):
+        return held
+    for rows in each:
+        shown = signal.shown[rows]
+        same = np.diff(shown) == 0
+        if not len(same) or same.mean() > CHANCE:
+            limits = (np.nanmin(shown), np.nanmax(shown))  # an instrument of coarse steps, or one at its limit
+            inside = same & ~np.isin(shown[1:], limits)
+            if not len(same) or inside.mean() > CHANCE:
+                continue
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+        for low, high in edges.reshape(-1, 2):
+            if high - low >= STUCK and shown[low] != 0:
+                held[rows[low : high + 1]] = True
+    return held
+
+
+# --- levels and stretches -------------------------------------------------------------------------------
+
+
+def _noise(x: np.ndarray) -> float:
+    """Sd of what changes from sample to sample, robust to steps; 0 where most samples are as the one before."""
+    steps = np.diff(x[np.isfinite(x)])
+    return 1.4826 * float(np.median(np.abs(steps - np.median(steps)))) / math.sqrt(2) if len(steps) else 0.0
+
+
+def _levels(
+    runs: Runs, drives: np.ndarray, rows: np.ndarray, shortest: float, drift: float, step: float
+) -> Iterator[np.ndarray]:
+    """Rows of a part without gaps, divided where a condition changes, or what is imposed by more than its noise."""
+    if not len(rows):
+        return
+    cuts = np.zeros(len(rows), bool)
+    cuts[0] = True
+    for name in EXACT:
+        if runs.has(name):
+            cuts[1:] |= runs[name][rows][1:] != runs[name][rows][:-1]
+    x = drives[rows]
+    largest, noise = float(np.max(np.abs(drives))), _noise(x)
+    size = 1 if noise <= 1e-9 * largest else max(1, min(round(shortest / step / 6), 64))
+    sd = noise / math.sqrt(size)
+    begin, mean, count = 0, float(x[0]), 0
+    for k in range(0, len(rows), size):
+        block = x[k : k + size]
+        value = float(np.mean(block))
+        tolerance = max(0.5 * drift * abs(mean), 0.2 * FINE * largest, 4 * sd)
+        if count and (abs(value - mean) > tolerance or cuts[k : k + size].any()):
+            # the last of averaged samples may be the next level's already
+            yield rows[begin : k - size if size > 1 and k - begin > 3 * size else k]
+            begin, mean, count = k, value, len(block)
+            continue
+        mean = (mean * count + value * len(block)) / (count + len(block))
+        count += len(block)
+    yield rows[begin:]
+
+
+def _settled(
+    runs: Runs,
+    signals: tuple[Signal, ...],
+    drives: np.ndarray,
+    rows: np.ndarray,
+    shortest: float,
+    drift: float,
+    step: float,
+    stuck: Mapping[str, np.ndarray],
+    inertia: Mapping[str, Inertia],
+) -> Stretch:
+    """The settled end of a level, or why it has none."""
+    time = runs["time_s"]
+    begin, end, imposed = float(time[rows[0]]), float(time[rows[-1]]), float(np.mean(drives[rows]))
+    run = str(names(runs)[rows[0]])
+    left = Stretch(run, rows, begin, end, imposed)
+
+    def out(why: str, channel: str = "", size: float = 0.0) -> Stretch:
+        return dataclasses.replace(left, why=why, channel=channel, size=size)
+
+    if runs.has("mode") and str(runs["mode"][rows[0]]) != "voltage":
+        return out("undriven")
+    if end - begin + step < shortest or len(rows) < FEWEST:
+        return out("changes" if len(rows) < FEWEST else "short")
+    if abs(imposed) < STILL * float(np.max(np.abs(drives))):
+        return out("idle")
+    for signal in signals:
+        if stuck[signal.channel.name][rows].mean() > 0.5:
+            return out("stuck", signal.channel.name)
+    parts = _parts(time[rows], shortest)
+    first = _first_steady(signals, rows, parts, drift)
+    last = max(len(parts) - 3, first)
+    # From where on nothing changes for certain, if there is such a place; else the end.
+    for k in sorted({first, *np.linspace(first, last, TRIES).astype(int).tolist()}):
+        taken = rows[parts[k][0] :]
+        seen = {s.channel.name: _mean(s, time[taken], taken) for s in signals}
+        left_over = max(_certain(s, *seen[s.channel.name]) for s in signals)
+        if left_over <= SLIGHT * drift:
+            break
+    means, sds, drifts = {}, {}, {}
+    for signal in signals:
+        name = signal.channel.name
+        mean, sd, change = seen[name]
+        if not math.isfinite(mean):
+            continue
+        tolerance = max(drift * abs(mean), FINE * signal.largest)
+        if abs(change) > tolerance + SDS * OF_CHANGE * sd:
+            return out("settling", name, abs(change) / max(abs(mean), FINE * signal.largest))
+        if (to_come := _to_come(signal, rows, mean)) > drift:
+            return out("settling", name, to_come)
+        left_over = max(left_over, to_come)
+        means[name], sds[name], drifts[name] = mean, sd, change
+    moving = [s for s in signals if s.channel.zero_at_rest and s.channel.name in means]
+    if moving and all(abs(means[s.channel.name]) < STILL * s.largest for s in moving):
+        return out("rest")
+    acting = inertia.get(str(runs["configuration"][rows[0]]))
+    if acting is not None and acting.speed in drifts and (not acting.current or acting.current in means):
+        a_second = acting.per_rate / float(time[taken[-1]] - time[taken[0]])
+        whole = max(abs(means[acting.current] if acting.current else imposed), acting.least)
+        share, noise = (
+            abs(a_second * drifts[acting.speed]) / whole,
+            OF_CHANGE * abs(a_second * sds[acting.speed]) / whole,
+        )
+        if share > drift + SDS * noise:
+            return out("accelerates", acting.speed, share)
+    # What changes for certain goes on after the end, of a lag's tail about as much again, and all channels with it.
+    sds = {name: math.hypot(sd, left_over * abs(means[name])) for name, sd in sds.items()}
+    for signal in signals:
+        means.setdefault(signal.channel.name, math.nan)
+        sds.setdefault(signal.channel.name, math.nan)
+        drifts.setdefault(signal.channel.name, math.nan)
+    return dataclasses.replace(left, rows=taken, begin=float(time[taken[0]]), mean=means, sd=sds, drift=drifts)
+
+
+def _certain(signal: Signal, mean: float, sd: float, change: float) -> float:
+    """What of the change along a stretch is no noise, as a share of the mean."""
+    if not math.isfinite(mean):
+        return 0.0
+    return max(abs(change) - OF_CHANGE * sd, 0.0) / max(abs(mean), 0.1 * signal.largest)
+
+
+def _to_come(signal: Signal, rows: np.ndarray, mean: float) -> float:
+    """What of the change along a level is still to come at its end, as a share of the mean: of a lag's tail, of which
+    quarters of the level show how fast it fades; 0 where noise hides it."""
+    quarters = [signal.shown[q] for q in np.array_split(rows, 4)]
+    quarters = [q[np.isfinite(q)] for q in quarters]
+    if min(map(len, quarters)) < PART:
+        return 0.0
+    at = [float(np.mean(q)) for q in quarters]
+    sd = [float(np.std(q)) * math.sqrt(_correlation_time(q - np.mean(q)) / len(q)) for q in quarters[2:]]
+    before, last = at[2] - at[1], at[3] - at[2]
+    if abs(last) < SDS * math.hypot(*sd) or before * last <= 0:
+        return 0.0
+    fades = min(last / before, 0.9)
+    return abs(last) * fades / (1 - fades) / max(abs(mean), 0.1 * signal.largest)
+
+
+def _size(shown: np.ndarray) -> float:
+    """Of the largest readings of a channel, but for the last two in a hundred."""
+    sizes = np.abs(shown[np.isfinite(shown)])
+    return float(np.quantile(sizes, 0.98)) if len(sizes) else 0.0
+
+
+def _parts(time: np.ndarray, shortest: float) -> list[tuple[int, int]]:
+    """A level in parts of a third of the shortest stretch, `PART` samples at least, the last three a stretch."""
+    size = max(shortest / 3, float(time[-1] - time[0]) / 300)
+    at = ((time[-1] - time) / size).astype(int)  # counted from the end, so that the last parts are whole
+    edges = [0, *(np.flatnonzero(np.diff(at)) + 1).tolist(), len(time)]
+    whole: list[tuple[int, int]] = []
+    for low, high in reversed(list(pairwise(edges))):
+        if whole and whole[-1][1] - whole[-1][0] < PART:
+            whole[-1] = (low, whole[-1][1])
+        else:
+            whole.append((low, high))
+    return whole[::-1]
+
+
+def _first_steady(signals: tuple[Signal, ...], rows: np.ndarray, parts: list[tuple[int, int]], drift: float) -> int:
+    """The first part from which on every channel's mean stays where it ends."""
+    ends = parts[-3:]
+    first = len(parts) - len(ends)
+    means = np.array([[_plain(s.shown[rows[low:high]]) for low, high in parts] for s in signals])
+    tail = np.array([_plain(s.shown[rows[ends[0][0] :]]) for s in signals])
+    noise = np.array([_noise_of_mean(s, rows, ends) for s in signals])
+    large = np.array([s.largest for s in signals])
+    tolerance = np.maximum(0.5 * drift * np.abs(tail), FINE * large)
+    for k in range(first - 1, -1, -1):
+        apart = np.abs(means[:, k] - tail)
+        count = parts[k][1] - parts[k][0]
+        if np.any(apart > tolerance + SDS * noise / math.sqrt(max(count, 1))):
+            break
+        first = k
+    return first
+
+
+def _plain(x: np.ndarray) -> float:
+    there = x[np.isfinite(x)]
+    return float(np.mean(there)) if len(there) else math.nan
+
+
+def _noise_of_mean(signal: Signal, rows: np.ndarray, ends: list[tuple[int, int]]) -> float:
+    """Sd of a reading about the end of a level, times the root of its autocorrelation time."""
+    shown = signal.shown[rows[ends[0][0] :]]
+    shown = shown[np.isfinite(shown)]
+    return float(np.std(shown) * math.sqrt(_correlation_time(shown - np.mean(shown)))) if len(shown) > 2 else 0.0
+
+
+def _correlation_time(x: np.ndarray) -> float:
+    """1 + 2 Σ ρ_k up to where sums of two autocorrelations turn negative (Geyer 1992); at least 1."""
+    power = float(np.mean(x**2))
+    if len(x) < 4 or power <= 0:
+        return 1.0
+    most = min(len(x) // 3, 500)
+    wide = np.fft.rfft(x, 2 * len(x))
+    rho = np.fft.irfft(np.abs(wide) ** 2)[:most] / (len(x) * power)
+    total = 1.0
+    for k in range(1, most - 1, 2):
+        pair = rho[k] + rho[k + 1]
+        if pair <= 0:
+            break
+        total += 2 * float(pair)
+    return max(total, 1.0)
+
+
+def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, float, float]:
+    """Mean of a channel over a stretch, sd of that mean, and its change from end to end by a straight line."""
+    shown = signal.shown[rows]
+    there = np.isfinite(shown)
+    if there.sum() < max(FEWEST, 0.5 * len(rows)):
+        return math.nan, math.nan, math.nan
+    t, x = time[there] - time[there].mean(), shown[there]
+    if len(signal.angle):
+        angle = signal.angle[rows][there]
+        slope = float(t @ (angle - angle.mean()) / (t @ t))
+        rest = angle - angle.mean() - slope * t
+        sd = math.sqrt(float(np.mean(rest**2)) * _correlation_time(rest) / float(t @ t))
+        bend = float(t @ (x - x.mean()) / (t @ t))
+        return slope, max(sd, 1e-9 * abs(slope)), bend * float(np.ptp(t))
+    mean = float(x.mean())
+    slope = float(t @ (x - mean) / (t @ t))
+    rest = x - mean - slope * t
+    spread = float(np.std(rest))
+    sd = spread * math.sqrt(_correlation_time(rest) / len(x))
+    if signal.step > 0:  # without noise readings round alike; with it their mean is off by less
+        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0)
+        rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
+        sd = math.hypot(sd, rounding * signal.step)
+    return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))
+
+
+def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], largest: float) -> dict[str, float]:
+    """What stretches under the same conditions differ by beyond their own sds, of each channel [unit]; 0 with too few
+    repeats."""
+    alike = [c for c in EXACT if runs.has(c)]
+    groups: list[list[Stretch]] = []
+    where: tuple[object, ...] = ()
+    for s in sorted((s for s in found if not s.why), key=lambda s: s.imposed):
+        here = tuple(runs[c][s.rows[0]] for c in alike)
+        if groups and here == where and abs(s.imposed - groups[-1][0].imposed) <= 0.2 * FINE * largest:
+            groups[-1].append(s)
+        else:
+            groups.append([s])
+        where = here
+    scatter = {}
+    for signal in signals:
+        name = signal.channel.name
+        excess, freedom = 0.0, 0
+        for group in groups:
+            values = np.array([s.mean[name] for s in group])
+            own = np.array([s.sd[name] for s in group])
+            good = np.isfinite(values)
+            if good.sum() > 1:
+                excess += float(np.sum((values[good] - values[good].mean()) ** 2))
+                excess -= float((1 - 1 / good.sum()) * np.sum(own[good] ** 2))
+                freedom += int(good.sum()) - 1
+        scatter[name] = math.sqrt(max(excess, 0.0) / freedom) if freedom >= 3 else 0.0
+    return scatter
+
+
+def _wider(stretch: Stretch, scatter: Mapping[str, float]) -> Stretch:
+    return dataclasses.replace(stretch, sd={name: math.hypot(sd, scatter[name]) for name, sd in stretch.sd.items()})
+
+
+def _nothing(found: Settled) -> str:
+    """That a log has no settled stretch, why mostly, and what to do."""
+    source, longest = found.runs.source, max(found.stretches, key=lambda s: s.lasts)
+    whys = [s.why for s in found.stretches]
+    why = max(dict.fromkeys(whys), key=lambda w: sum(s.lasts for s in found.stretches if s.why == w))
+    rows = f"rows {longest.rows[0] + 1} to {longest.rows[-1] + 1}"
+    if why in ("changes", "short"):
+        return (
+            f"{source}: no settled stretch: what is imposed holds for {longest.lasts:.3g} s at most ({rows}), and "
+            f"{found.shortest:.3g} s are asked for; hold each level longer, state --shortest, or give the log to "
+            "loop as it is (time histories)"
+        )
+    if why in ("settling", "accelerates"):
+        return (
+            f"{source}: never settles: at the end of its longest level ({rows}) {longest.channel or 'a channel'} "
+            f"still changes by {100 * longest.size:.2g} % ({100 * found.drift:g} % are allowed); hold each level "
+            "longer, state --drift, or give the log to loop as it is (time histories)"
+        )
+    return f"{source}: no settled stretch: {', '.join(dict.fromkeys(whys))}; see {rows}, the longest"

@@ -1,0 +1,75 @@
+"""What `settle` has to say: why samples of a log are no settled run, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from calibration.data.settling import Settled, Stretch
+
+#: Of each of `settling.REASONS`: what is so, and what to do where it is much.
+WHY = {
+    "changes": ("what is imposed changes all the time", "hold it, or give these samples to loop as time histories"),
+    "short": ("what is imposed holds too short", "hold it longer, or state --shortest"),
+    "settling": ("still changes at the end of its level", "hold the level longer, or state --drift"),
+    "accelerates": ("still accelerates at the end of its level", "hold the level longer, or state --drift"),
+    "idle": ("nothing drives the motors", "no need: a table of settled runs has driven ones"),
+    "rest": ("does not move", "no need: friction holds it there; histories tell of it"),
+    "stuck": ("shows one number for long: saturated or frozen", "mend the instrument or its range"),
+    "undriven": ("the driver brakes or coasts", "no need: histories tell of it"),
+}
+
+
+def reason(stretch: Stretch) -> str:
+    """Why a stretch is left out: `total_current still changes at the end of its level (6.1 %)`."""
+    what = f"{stretch.channel} {WHY[stretch.why][0]}" if stretch.channel else WHY[stretch.why][0]
+    return what + (f" ({100 * stretch.size:.2g} %)" if stretch.size else "")
+
+
+def left_out(stretches: Iterable[Stretch]) -> list[tuple[str, int, int, str, str]]:
+    """Of each reason: it, stretches, samples, rows of the longest one, what to do."""
+    found = []
+    every = [s for s in stretches if s.why]
+    for why in dict.fromkeys(s.why for s in every):
+        mine = [s for s in every if s.why == why]
+        longest = max(mine, key=lambda s: len(s.rows))
+        rows = f"{longest.rows[0] + 1}-{longest.rows[-1] + 1}"
+        found.append((reason(longest), len(mine), sum(len(s.rows) for s in mine), rows, WHY[why][1]))
+    return found
+
+
+def statement(found: Settled) -> str:
+    """What a log holds, in a sentence."""
+    kept, rows = found.kept, sum(len(s.rows) for s in found.kept)
+    back = sum(s.imposed < 0 for s in kept)
+    ways = f", {len(kept) - back} forward and {back} backward" if back else ""
+    return (
+        f"{len(kept)} settled run{'s' * (len(kept) != 1)}{ways}, of {rows} of {len(found.runs)} samples "
+        f"(shortest {found.shortest:.3g} s, means change by {100 * found.drift:g} % at most)."
+    )
+
+
+def remarks(found: Settled, fewest: int) -> list[str]:
+    """What should be looked at, a sentence each.
+
+    Args:
+        fewest: rows that the loop asks for.
+    """
+    said = []
+    if found.gaps:
+        rows = ", ".join(str(k + 1) for k in found.gaps[:5]) + (", ..." if len(found.gaps) > 5 else "")
+        said.append(f"samples are missing after {len(found.gaps)} rows ({rows}); no stretch goes across")
+    for signal in found.signals:
+        if len(signal.angle):
+            said.append(
+                f"{signal.channel.column} is the rate of the angle; add {signal.channel.name} to channels in "
+                "the rig's file"
+            )
+    wide = {name: x for name, x in found.scatter.items() if x > 0}
+    for signal in (s for s in found.signals if s.channel.name in wide):
+        said.append(
+            f"{signal.channel.column}: levels that were held several times differ by "
+            f"{wide[signal.channel.name]:.2g} {signal.channel.unit} beyond their noise; sds have it"
+        )
+    if len(found.kept) < fewest:
+        said.append(f"the loop asks for {fewest} settled runs; hold more levels, or give the log to loop as it is")
+    return said

@@ -1,0 +1,71 @@
+"""Effects of the size of a rig: classes that differ from the library's by priors and limits alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from mmrjax import params
+from mmrjax.effects.base import Effect
+from mmrjax.params import Parameter
+
+#: Factors of a class: of the sd of its amplitude, of its shape parameter, and of the limits of its amplitude.
+Factors = tuple[float, float, float]
+
+
+def amplitude_of(effect: Effect) -> Parameter:
+    """The amplitude of an effect."""
+    return next(p for p in params.walk(effect) if p.spec.amplitude)
+
+
+def shape_of(effect: Effect) -> Parameter | None:
+    """The shape parameter that a fit frees: the first phase or scale beside the amplitude, if the effect has one."""
+    for p in params.walk(effect):
+        if not p.spec.amplitude and (p.name == "phase" or (p.spec.relative_sd and float(p.value) > 0)):
+            return p
+    return None
+
+
+@functools.lru_cache(maxsize=4096)
+def scaled(kind: type[Effect], factors: Factors) -> type[Effect]:
+    """A class of the same effect whose amplitude's sd and limits and whose shape are so many times the library's; of
+    the same factors the same class."""
+    sd, stretch, limits = factors
+    effect = kind()
+    fields = {amplitude_of(effect).name: _field(amplitude_of(effect), sd, limits)}
+    if (shape := shape_of(effect)) is not None and stretch != 1.0:
+        fields[shape.name] = _field(shape, stretch, stretch)
+    body: Mapping[str, object] = {
+        "__annotations__": {**dict.fromkeys(fields, "Scalar"), "factors": ClassVar[Factors]},
+        "__module__": kind.__module__,
+        "__doc__": kind.__doc__,
+        "__reduce__": _reduced,
+        "name": kind.name,
+        "plain": kind,
+        "factors": factors,
+        **fields,
+    }
+    return type(kind.__name__, (kind,), dict(body))
+
+
+def _field(parameter: Parameter, factor: float, limits: float) -> Any:
+    spec = parameter.spec
+    low, high = spec.bounds
+    return params.parameter(
+        factor * float(parameter.value), unit=spec.unit, meaning=spec.meaning, bounds=(low * limits, high * limits),
+        source=spec.source, relative_sd=spec.relative_sd, sd=None if spec.sd is None else spec.sd * factor,
+        amplitude=spec.amplitude,
+    )  # fmt: skip
+
+
+def _reduced(effect: Effect) -> tuple[Any, ...]:
+    values = {f.name: getattr(effect, f.name) for f in dataclasses.fields(effect) if f.init}
+    kind = type(effect)
+    return _made, (kind.plain, kind.factors, values)
+
+
+def _made(kind: type[Effect], factors: Factors, values: Mapping[str, Any]) -> Effect:
+    """An effect from what it is pickled as: its class cannot be found by name."""
+    return scaled(kind, factors)(**values)

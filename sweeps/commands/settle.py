@@ -1,0 +1,122 @@
+"""The command `settle`: from a log over time to a table of settled runs, and a page that shows them over the log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from calibration.data import robot_file, settling
+from calibration.data.settling import Inertia, Settled
+from calibration.inference.observers import SettledRuns
+from calibration.words import settle as words
+from mmrjax import balances
+from mmrjax.channels import Channel
+from mmrjax.conditions import Conditions
+from mmrjax.robot import Robot
+from mmrjax.signals import State
+from sweeps import config as configuration
+from sweeps.console import say
+from sweeps.inputs import load_robot, read_runs
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
+
+
+def settle(config: configuration.Settle, source: str, out: Path | None, force: bool) -> int:
+    """Find what of a log has settled, and leave a run folder with the table; returns the exit code, 0."""
+    robot = load_robot(config).robot
+    runs = read_runs(source, robot, measured=True, series=True)
+    found = settling.settle(runs, shortest=config.shortest_s, drift=config.drift, inertia=inertia(robot))
+    with open_folder("settle", config, robot, out, force, runs) as folder:
+        robot_file.write(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
+        folder.write_table("settled.csv", found.table())
+        folder.write_table("stretches.csv", stretches(found))
+        folder.write_json("result.json", to_json(found))
+        print_settled(found)
+        shown = page("settle", found)
+        return leave(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
+
+
+def inertia(robot: Robot) -> dict[str, Inertia]:
+    """What acceleration takes of the motors' current in each configuration, where that is known."""
+    constant, ratio = float(robot.motor.torque_constant), float(robot.gearbox.ratio)
+    found = {}
+    for k, (name, load) in enumerate(robot.configurations.items()):
+        moved = float(load.mass) * float(load.radius) ** 2 / float(robot.sides)
+        at_motor = float(robot.motor.inertia) + (float(load.inertia) + moved) / ratio**2
+        none, one = jnp.zeros(()), jnp.ones(())
+        rolling = float(load.radius) / ratio
+        states = State(one, none, none, none), State(none, one, jnp.asarray(rolling), none)  # of 1 A, and of 1 rad/s
+        currents, speeds = ({c.name: _shown(robot, k, c, state) for c in settling.shown(robot)} for state in states)
+        current = next((n for n, x in currents.items() if x and not speeds[n]), "")
+        speed = next((n for n, x in speeds.items() if x), "")
+        known = current or robot.rig.imposed == "motor_current"
+        currents[""] = 1.0  # of the imposed one
+        if known and speed and at_motor > 0 and constant > 0:
+            per_rate = at_motor / constant * currents[current] / speeds[speed]
+            found[name] = Inertia(speed, current, per_rate, least=1e-3)
+    return found
+
+
+def _shown(robot: Robot, configuration: int, channel: Channel, state: State) -> float:
+    """What a channel shows of a state [unit of its column] that follows from it alone, 0 of others."""
+    signals = balances.begin(robot, Conditions(configuration), state)
+    try:
+        return float(channel.read(robot, signals)) / channel.factor
+    except (AttributeError, TypeError):  # a signal that the balances fill in
+        return 0.0
+
+
+def stretches(found: Settled) -> dict[str, np.ndarray]:
+    """Every stretch of a log, a row each: where it is, why it is left out, means, their sds, changes."""
+    every = found.stretches
+    table: dict[str, np.ndarray] = {
+        "run_id": np.array([s.run for s in every]),
+        "from_s": np.array([s.begin for s in every]),
+        "to_s": np.array([s.end for s in every]),
+        "first_row": np.array([s.rows[0] + 1 for s in every]),
+        "last_row": np.array([s.rows[-1] + 1 for s in every]),
+        "imposed": np.array([s.imposed for s in every]),
+        "left_out": np.array([words.reason(s) if s.why else "" for s in every]),
+    }
+    for signal in found.signals:
+        channel = signal.channel
+        of = {channel.column: "mean", channel.sd_column: "sd", f"{channel.name}_change_{channel.unit}": "drift"}
+        for column, field in of.items():
+            table[column] = np.array([getattr(s, field).get(channel.name, np.nan) for s in every])
+    return table
+
+
+def to_json(found: Settled) -> dict[str, Any]:
+    """`result.json`."""
+    left = words.left_out(found.stretches)
+    return {
+        "schema": "mmrjax.settle/1",
+        "statement": words.statement(found),
+        "samples": len(found.runs),
+        "settled": len(found.kept),
+        "shortest_s": found.shortest,
+        "drift": found.drift,
+        "gaps": len(found.gaps),
+        "scatter": dict(found.scatter),
+        "left_out": [dict(zip(("why", "stretches", "samples", "rows", "do"), row, strict=True)) for row in left],
+        "notes": words.remarks(found, SettledRuns.fewest),
+    }
+
+
+def print_settled(found: Settled) -> None:
+    """What was found and what was left out, for a person."""
+    say(words.statement(found))
+    left = words.left_out(found.stretches)
+    if left:
+        shown = Table(title="left out", title_justify="left", box=None, pad_edge=False)
+        for heading in ("why", "stretches", "samples", "rows, as", "what to do"):
+            shown.add_column(heading, justify="right" if heading in ("stretches", "samples") else "left")
+        for row in left:
+            shown.add_row(*map(str, row))
+        say(shown)
+    for sentence in words.remarks(found, SettledRuns.fewest):
+        say(f"- {sentence}")

@@ -1,0 +1,172 @@
+"""Motors whose current is imposed: steady travel, histories, tables and fits against plain physics, without a winding."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.inference import observers
+from calibration.inference.calibrate import calibrate
+from mmrjax import params
+from mmrjax.balances import absent
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.drive import drive
+from mmrjax.fidelities.steady import steady
+
+K, RATIO, ETA = 0.05, 10.0, 0.9
+DRY, VISCOUS, INERTIA, ROTOR = 0.3, 0.02, 0.01, 2e-6
+RIG = f"""
+base = "none"
+imposed = "current"
+channels = ["motor_speed"]
+[motor]
+torque_constant = {K}
+inertia = {ROTOR}
+[gearbox]
+ratio = {RATIO}
+efficiency_load = {ETA}
+[bench]
+load = "shaft"
+inertia = {INERTIA}
+loss_coulomb = "{DRY} ± 30 %"
+loss_viscous = "{VISCOUS} ± 50 %"
+"""
+
+
+@pytest.fixture
+def robot(tmp_path):
+    (tmp_path / "rig.toml").write_text(RIG, encoding="utf-8")
+    return robot_file.read(tmp_path / "rig.toml")
+
+
+def settles(current):
+    """Speed of the motor [rad/s] at which i η k I is what the load takes."""
+    torque = RATIO * ETA * K * np.abs(current) - DRY
+    return np.sign(current) * RATIO * np.maximum(torque, 0.0) / VISCOUS
+
+
+def followed(current, times, dry=DRY):
+    """Speed of the motor from rest [rad/s] at a current that is held, by its first-order law."""
+    inertia = INERTIA + ETA * ROTOR * RATIO**2
+    end = RATIO * (RATIO * ETA * K * current - dry) / VISCOUS
+    return end * (1 - np.exp(-VISCOUS / inertia * times))
+
+
+def test_the_file_says_what_is_imposed_and_needs_no_winding(robot, tmp_path):
+    assert robot.rig.imposed == "motor_current"
+    assert {"electrical", "inductance", "supply"} <= absent(robot)
+    robot_file.write(robot, tmp_path / "again.toml")
+    assert robot_file.read(tmp_path / "again.toml").rig == robot.rig
+    (tmp_path / "bad.toml").write_text(RIG.replace('["motor_speed"]', '["motor_current"]'), encoding="utf-8")
+    with pytest.raises(BadConfiguration, match="motor_current is imposed, so it is no reading"):
+        robot_file.read(tmp_path / "bad.toml")
+    (tmp_path / "bad.toml").write_text(RIG.replace(f"torque_constant = {K}", ""), encoding="utf-8")
+    with pytest.raises(BadConfiguration, match=r"motor\.torque_constant \[N·m/A\] is missing"):
+        robot_file.read(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize("resistance", [0.1, 5.0])
+def test_steady_speeds_follow_from_torque_whatever_the_winding(robot, resistance):
+    robot = params.replace(robot, {"motor.resistance": jnp.asarray(resistance)})
+    for current in (-2.0, 1.0, 3.0):
+        found = steady(robot, Conditions(motor_current=current))
+        assert float(found.reading["motor_speed"]) == pytest.approx(settles(current), rel=1e-6)
+        assert float(found.reading["motor_current"]) == pytest.approx(current, rel=1e-9)
+    assert float(steady(robot, Conditions(motor_current=0.5)).reading["motor_speed"]) == 0.0  # friction holds it
+
+
+def test_a_run_follows_its_first_order_law(robot):
+    times = jnp.linspace(0.0, 1.0, 21)
+    found = drive(robot, Conditions(motor_current=2.0), times)
+    assert np.asarray(found.signals.speed_motor) == pytest.approx(followed(2.0, np.asarray(times)), abs=0.15)
+    at_rest = drive(robot, Conditions(motor_current=0.5), times)
+    assert np.abs(np.asarray(at_rest.signals.speed_motor)).max() < 1e-6
+
+
+def log(tmp_path, robot, noise, dry=DRY):
+    """A table over time of two runs at currents that step, with readings of the law itself."""
+    rng = np.random.default_rng(2)
+    times = np.arange(0, 1.2, 0.02)
+    rows = []
+    for run, levels in enumerate(((2.0, 3.0), (3.0, 1.5))):
+        first = followed(levels[0], times[times < 0.6], dry)
+        rate = VISCOUS / (INERTIA + ETA * ROTOR * RATIO**2)
+        end = RATIO * (RATIO * ETA * K * levels[1] - dry) / VISCOUS
+        begin = RATIO * (RATIO * ETA * K * levels[0] - dry) / VISCOUS * (1 - np.exp(-rate * 0.6))
+        then = end + (begin - end) * np.exp(-rate * (times[times >= 0.6] - 0.6))
+        shown = np.concatenate([first, then]) + noise * rng.standard_normal(len(times))
+        rows += [
+            f"{run},{t:.3f},{levels[int(t >= 0.6)]},{x * 30 / np.pi:.4f}" for t, x in zip(times, shown, strict=True)
+        ]
+    (tmp_path / "log.csv").write_text("run_id,time_s,motor_current_A,motor_speed_rpm\n" + "\n".join(rows) + "\n")
+    return records.read(tmp_path / "log.csv", robot=robot)
+
+
+def test_histories_follow_a_current_that_changes(robot, tmp_path):
+    runs = log(tmp_path, robot, 0.0)
+    made = observers.kind(runs).of(runs, robot)
+    assert made.conditions.motor_current.shape == made.times.shape
+    shown = np.asarray(made(robot).reading)[:, 0]
+    assert shown == pytest.approx(runs["motor_speed_rpm"] * np.pi / 30, abs=0.3)
+    assert made.times.shape[1] < 800  # no inrush to be followed after a change
+
+
+def settled_table(tmp_path, robot, dry):
+    rng = np.random.default_rng(5)
+    current = np.repeat([-3.0, -2.0, -1.2, 1.2, 1.6, 2.0, 2.5, 3.0], 3)
+    torque = RATIO * ETA * K * np.abs(current) - dry
+    speed = np.sign(current) * RATIO * torque / VISCOUS + 0.5 * rng.standard_normal(len(current))
+    rows = [f"{i},{w * 30 / np.pi:.4f},{0.5 * 30 / np.pi:.4f}" for i, w in zip(current, speed, strict=True)]
+    (tmp_path / "runs.csv").write_text(
+        "motor_current_A,motor_speed_rpm,motor_speed_sd_rpm\n" + "\n".join(rows) + "\n", encoding="utf-8"
+    )
+    return records.read(tmp_path / "runs.csv", robot=robot)
+
+
+@pytest.mark.slow
+def test_a_calibration_of_settled_runs_gives_the_friction_back(robot, tmp_path):
+    runs = settled_table(tmp_path, robot, 0.25)
+    found = calibrate(runs, robot, starts=2, profiles=False, blocks=())
+    dry = found.parameters["bench.loss_coulomb"]
+    assert abs(dry.value - 0.25) < 4 * dry.sd < 0.02
+    assert "motor.resistance" not in found.parameters
+
+
+@pytest.mark.slow
+def test_a_calibration_of_histories_gives_the_friction_back(robot, tmp_path):
+    runs = log(tmp_path, robot, 0.5, dry=0.25)
+    found = calibrate(runs, robot, model="drive", starts=2, profiles=False, blocks=())
+    dry = found.parameters["bench.loss_coulomb"]
+    assert abs(dry.value - 0.25) < 4 * dry.sd < 0.05
+
+
+def test_commands_take_a_current_or_say_what_to_state(robot, tmp_path, mmrjax):
+    code, _, err = mmrjax("simulate", "--robot", "rig.toml", "--motor-current", "2", "--no-report", "--out", "one")
+    assert code == 0, err
+    row = (tmp_path / "one" / "runs.csv").read_text().splitlines()
+    cells = dict(zip(row[0].split(","), row[1].split(","), strict=True))
+    assert float(cells["motor_speed_rpm"]) == pytest.approx(settles(2.0) * 30 / np.pi, rel=1e-6)
+    assert cells["motor_current_A"] == "2"
+    code, _, err = mmrjax(
+        "sweep", "--robot", "rig.toml", "--motor-currents", "1,2,-2", "--no-report", "--out", "many"
+    )
+    assert code == 0, err
+    for options, said in (
+        (["simulate", "--voltage", "12"], "--voltage: the motors' current is imposed on this robot; state --motor-current [A]"),
+        (["simulate"], "--motor-current: not stated; state it [A], as --motor-current 2"),
+        (["simulate", "--battery"], "--battery: the motors' current is imposed on this robot"),
+        (["sensitivity"], "sensitivity: the motors' current is imposed on this robot"),
+        (["simulate", "--model", "track", "--motor-current", "1"], "which has no running gear"),
+    ):  # fmt: skip
+        code, _, err = mmrjax(*options, "--robot", "rig.toml", "--out", "none")
+        assert code == 2 and said in " ".join(err.split()), err
+
+
+def test_a_table_without_its_current_is_refused(robot, tmp_path):
+    (tmp_path / "runs.csv").write_text("motor_speed_rpm\n100\n", encoding="utf-8")
+    with pytest.raises(BadData, match="column motor_current_A is missing"):
+        records.read(tmp_path / "runs.csv", robot=robot)

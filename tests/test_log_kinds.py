@@ -1,0 +1,109 @@
+"""Logs of a servo on PWM and of a carriage on an amplifier, from plain NumPy laws, through the files of `rig new`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibration.data import robot_file, settling
+from calibration.data import runs as records
+from calibration.inference.preparation import prepare
+from sweeps.commands import rig_new
+from sweeps.points import run as points
+
+STEP = 1e-4  # of the simulation [s]
+
+
+def written(tmp_path, kind, columns):
+    """A file of `rig new` and a log of these columns beside it."""
+    (tmp_path / "rig.toml").write_text(rig_new.template(kind), encoding="utf-8")
+    lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return robot_file.read(tmp_path / "rig.toml")
+
+
+def sampled(rng, speed, angle, imposed, rate, delay, step, jitter=0.1):
+    """Clock, what is imposed and the angle, as a logger sees them: late by `delay`, rounded to `step`."""
+    times = np.arange(0, len(angle) * STEP, 1 / rate)
+    times[1:] += jitter / rate * np.clip(rng.standard_normal(len(times) - 1), -3, 3)
+    at = np.minimum((times / STEP).astype(int), len(angle) - 1)
+    shown = angle[np.maximum(at - round(delay / STEP), 0)]
+    return times, imposed[at], np.round(shown / step) * step
+
+
+def servo(rng, levels=(0.4, 0.7, 1.0, -0.6, -0.9), hold=1.2, dry=0.05):
+    """U d = k ω_m + R I, J dω/dt = i η (k I - M_f) - M_0 - K ω, of the template's numbers; angle in degrees."""
+    volts, r, k, friction, ratio, eta, viscous = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005
+    inertia = 0.0005 + eta * 1e-7 * ratio**2
+    duty = np.repeat(levels, round(hold / STEP))
+    speed, angle = np.zeros(len(duty)), np.zeros(len(duty))
+    for n in range(1, len(duty)):
+        w = speed[n - 1]
+        sense = np.tanh(w / 0.01) if abs(w) > 1e-6 else np.sign(duty[n])
+        torque = (
+            ratio * eta * (k * (volts * duty[n] - k * ratio * w) / r - friction * sense) - dry * sense - viscous * w
+        )
+        speed[n] = w + STEP * torque / inertia
+        angle[n] = angle[n - 1] + STEP * speed[n]
+    times, imposed, shown = sampled(rng, speed, np.degrees(angle), duty, 100.0, 0.0, 360 / 4096)
+    return {
+        "time_s": times,
+        "supply_voltage_V": np.full(len(times), volts),
+        "duty": imposed,
+        "output_angle_deg": shown,
+    }
+
+
+def carriage(rng, levels=(1.2, 1.6, 2.0, -1.4, -1.8), hold=1.5):
+    """m x'' = i k / r - F_0 - b x', of the template's numbers with more that rises with speed; position in mm."""
+    k, friction, mass, radius, dry, viscous = 0.05, 0.004, 2.5, 5e-3 / (2 * np.pi), 12.0, 400.0
+    inertia = mass * radius**2 + 1e-5
+    current = np.repeat(levels, round(hold / STEP))
+    speed, place = np.zeros(len(current)), np.zeros(len(current))
+    for n in range(1, len(current)):
+        w = speed[n - 1]
+        sense = np.tanh(w / 0.01) if abs(w) > 1e-6 else np.sign(current[n])
+        torque = k * current[n] - (friction + dry * radius) * sense - viscous * radius**2 * w
+        speed[n] = w + STEP * torque / inertia
+        place[n] = place[n - 1] + STEP * speed[n] * radius
+    times, imposed, shown = sampled(rng, speed, 1e3 * place, current, 200.0, 0.0, 0.005)
+    return {"time_s": times, "motor_current_A": imposed, "position_mm": shown}
+
+
+def test_a_servos_log_of_pwm_and_angle_settles(tmp_path):
+    rng = np.random.default_rng(1)
+    robot = written(tmp_path, "servo", servo(rng))
+    found = settling.settle(records.read(tmp_path / "log.csv", robot=robot))
+    volts, r, k, friction, ratio, eta, viscous, dry = 6.0, 4.0, 0.006, 2e-4, 200.0, 0.7, 0.005, 0.05
+    duty = np.array([0.4, 0.7, 1.0, -0.6, -0.9])
+    torque = ratio * eta * (k * volts * np.abs(duty) / r - friction) - dry
+    exact = np.sign(duty) * torque / (viscous + ratio * eta * k * k * ratio / r) * 30 / np.pi
+    assert [s.mean["output_speed"] for s in found.kept] == pytest.approx(exact, rel=5e-3)
+    table = found.table()
+    assert table["duty"] == pytest.approx(duty) and "output_angle_deg" not in table
+    z = (np.array([s.mean["output_speed"] for s in found.kept]) - exact) / [s.sd["output_speed"] for s in found.kept]
+    assert np.abs(z).max() < 5
+
+
+def test_a_carriages_log_of_current_and_position_settles(tmp_path):
+    robot = written(tmp_path, "carriage", carriage(np.random.default_rng(2)))
+    found = settling.settle(records.read(tmp_path / "log.csv", robot=robot))
+    radius = 5e-3 / (2 * np.pi)
+    current = np.array([1.2, 1.6, 2.0, -1.4, -1.8])
+    exact = np.sign(current) * (0.05 * np.abs(current) - 0.004 - 12.0 * radius) / (400.0 * radius**2) * radius * 1e3
+    assert [s.mean["speed"] for s in found.kept] == pytest.approx(exact, rel=5e-3)
+    assert found.table()["motor_current_A"] == pytest.approx(current)
+
+
+@pytest.mark.parametrize(("kind", "make", "column", "least"), [
+    ("servo", servo, "output_angle_deg", 0.05), ("carriage", carriage, "position_mm", 0.005),
+])  # fmt: skip
+def test_the_model_follows_such_a_log_with_the_numbers_that_it_was_made_of(tmp_path, kind, make, column, least):
+    robot = written(tmp_path, kind, make(np.random.default_rng(3), hold=0.4))
+    if kind == "carriage":
+        robot = robot_file.change(robot, {"carriage.loss_viscous": 400.0 * (5e-3 / (2 * np.pi)) ** 2}, "a test")
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+    ready = prepare(runs, robot)
+    shown = points.followed(ready.robot, runs, None)
+    error = np.std(shown[column] - runs[column])
+    assert error < 0.01 * np.ptp(runs[column]) and error > 0.1 * least

@@ -1,0 +1,135 @@
+"""Stages of the loop are kept as they end, the same command goes on, and a budget of time ends it with what there is."""
+
+from __future__ import annotations
+
+import concurrent.futures
+from types import SimpleNamespace
+
+import generator_rigs as gr
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from calibration.discovery import discover as room
+from calibration.discovery import kept
+from calibration.discovery.kept import OutOfTime
+from calibration.discovery.notes import Outstanding
+from sweeps import config
+from sweeps.commands import loop as command
+from sweeps.store import RunFolder
+
+
+def refuse():
+    raise AssertionError("made again")
+
+
+def test_a_stage_is_made_once_and_read_after_an_interrupt(tmp_path):
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "x", {"seed": 1}) as folder:
+        assert folder.stage("noise 0.5", lambda: (1, np.arange(3)))[0] == 1
+        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "x", {"seed": 1}) as folder:
+        assert folder.stage("noise 0.5", refuse)[1].tolist() == [0, 1, 2]
+        assert folder.stage("cannot be written", lambda: lambda: 1)() == 1
+        raise KeyboardInterrupt
+    with RunFolder(tmp_path / "x", {"seed": 2}) as folder:  # another command's are not taken
+        assert folder.stage("noise 0.5", lambda: 7) == 7
+
+
+def test_nothing_kept_leaves_nothing_behind(tmp_path):
+    with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "x", {}) as folder:
+        raise KeyboardInterrupt
+    assert not folder.partial.exists()
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90s", 90.0), ("5min", 300.0), ("1.5h", 5400.0), ("40", 40.0)])
+def test_a_budget_has_a_unit(text, seconds):
+    assert config.LoopBeside(within=text).seconds == seconds
+
+
+def test_a_budget_of_no_time_is_refused():
+    assert config.LoopBeside().seconds is None
+    with pytest.raises(BadConfiguration, match="within: got '5 weeks'"):
+        config.resolve_beside(config.LoopBeside, None, {"within": "5 weeks"})
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """A folder with a bench's file and its table."""
+    world = gr.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
+    gr.case(world).write(tmp_path)
+    return ["loop", "table.csv", "--robot", "rig.toml", "--no-report", "--out", "found"]
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, OutOfTime])
+def test_an_interrupted_loop_goes_on_after_its_last_stage(rig, mmrjax, monkeypatch, tmp_path, end):
+    def first(*_, keep, **__):
+        keep("verdict", lambda: SimpleNamespace(verdict="class"))
+        raise end
+
+    monkeypatch.setattr(command, "discover", first)
+    code, _, err = mmrjax(*rig)
+    assert code == 130 and "kept: verdict; the same command with --out found goes on" in err
+    assert "verdict so far: class; errors held out and other noises are outstanding" in err
+    assert not (tmp_path / "found").exists()
+
+    def again(*_, keep, **__):
+        assert keep("verdict", refuse).verdict == "class"
+        raise BadConfiguration("as far as this test goes")
+
+    monkeypatch.setattr(command, "discover", again)
+    code, _, err = mmrjax(*rig, "--within", "5min")  # which is no other command
+    assert code == 2 and "as far as this test goes" in err
+
+
+def test_time_that_is_out_before_the_verdict_ends_at_the_next_stage(rig, mmrjax, monkeypatch):
+    def late(*_, progress, left, **__):
+        assert left() == 0.0
+        progress("fitting the base model")
+        raise AssertionError("went on")
+
+    monkeypatch.setattr(command, "discover", late)
+    code, _, err = mmrjax(*rig, "--within", "0s")
+    assert code == 130 and "the loop goes on after its last whole stage" in err
+
+
+@pytest.mark.slow
+def test_a_loop_of_kept_stages_finds_what_it_found(tmp_path):
+    world = gr.world(np.random.default_rng(3), "bench", "voltage", rows=(16, 20))
+    gr.case(world, "iron_loss", 12.0).write(tmp_path)
+    text = (tmp_path / "table.csv").read_text().splitlines()
+    header = text[0].split(",")
+    shown = [
+        k for k, name in enumerate(header) if "_sd_" not in name
+    ]  # so that the noise is assumed, and others tried
+    rows = [",".join(line.split(",")[k] for k in shown) for line in text]
+    (tmp_path / "table.csv").write_text("\n".join(rows) + "\n")
+    robot = robot_file.read(tmp_path / "rig.toml")
+    runs = records.read(tmp_path / "table.csv", robot=robot)
+    stages: dict[str, object] = {}
+
+    def keep(name, make):
+        stages[name] = make()
+        return stages[name]
+
+    found = room.discover(runs, robot, replicates=250, keep=keep)
+    factors = tuple(float(name.split()[1]) for name in stages if name.startswith("noise"))
+    assert {"base", "bootstrap 0", "verdict", "result"} <= set(stages) and len(factors) == 2
+    again = room.discover(runs, robot, replicates=250, keep=lambda name, make: stages[name])
+    assert again.verdict == found.verdict and again.chi2 == found.chi2
+    assert [e.name for e in again.effects] == [e.name for e in found.effects]
+    assert again.sensitivity == found.sensitivity
+
+    def slow(name, make):  # other noises take longer than there is time
+        if name.startswith("noise"):
+            raise concurrent.futures.TimeoutError
+        return stages[name]
+
+    ended = room.discover(runs, robot, replicates=250, keep=slow, left=lambda: 0.0)
+    assert ended.verdict == found.verdict and not ended.sensitivity
+    assert [n.factors for n in ended.remarks if isinstance(n, Outstanding)] == [tuple(sorted(factors))]
+
+
+def test_nothing_is_kept_where_nobody_asks():
+    assert kept.nothing("base", lambda: 3) == 3

@@ -1,0 +1,262 @@
+"""Settled runs out of logs: they are those of the levels that were held, with sds that hold; what cannot be is said."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+
+import generator_logs as gl
+import generator_rigs as gr
+import numpy as np
+import pytest
+
+from calibration.data import robot_file, settling
+from calibration.data import runs as records
+from calibration.data.errors import BadData
+from calibration.words import settle as words
+
+
+def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
+    """A log of a random rig, written beside its file: the log, its world, the robot."""
+    rng = np.random.default_rng([27, seed])
+    world = gr.world(rng, kind, imposed, rows=(16, 60))
+    gr.case(world).write(tmp_path)
+    log = gl.log(world, rng, **options)
+    log.write(tmp_path / "log.csv")
+    return log, world, robot_file.read(tmp_path / "rig.toml")
+
+
+def settled(tmp_path, robot, **options):
+    return settling.settle(records.read(tmp_path / "log.csv", robot=robot), **options)
+
+
+def deviations(log, found):
+    """How far each mean is from what its level settles at, in its sds, shape (stretches, channels)."""
+    rows = [np.bincount(log.level[s.rows]).argmax() for s in found.kept]
+    z = [
+        [(s.mean[n] - log.settled[level, k]) / s.sd[n] for k, n in enumerate(log.channels)]
+        for level, s in zip(rows, found.kept, strict=True)
+    ]
+    return np.array(z)
+
+
+CASES = {
+    "a bench": (1, "bench", "voltage", {}),
+    "a duty, a vehicle": (2, "wheeled", "duty", {}),
+    "an imposed speed": (3, "linear", "motor_speed", {}),
+    "noise and a delay": (4, "winch", "voltage", {"noise": 5.0, "delay": 0.05}),
+    "coarse steps": (5, "bench", "voltage", {"noise": 0.2, "step": 3.0}),
+    "a slow lag": (6, "tracked", "voltage", {"lag": 0.3}),
+    "noise, steps and a jittering clock": (7, "wheeled", "voltage", {"noise": 4.0, "step": 2.0, "jitter": 0.3}),
+    "few samples": (8, "winch", "voltage", {"rate": 25.0, "hold": 3.0}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_means_are_those_of_the_levels_within_their_sds(tmp_path, case):
+    seed, kind, imposed, options = CASES[case]
+    log, world, robot = made(tmp_path, seed, kind, imposed, **options)
+    found = settled(tmp_path, robot)
+    assert len(found.kept) >= 0.8 * len(world.conditions)
+    z = deviations(log, found)
+    assert np.sqrt(np.mean(z**2, 0)) == pytest.approx(np.full(z.shape[1], 0.85), abs=0.55) and np.abs(z).max() < 5
+    for s in found.kept:  # no stretch holds samples of two levels, but for alike ones
+        assert np.ptp(log.settled[log.level[s.rows]], 0) == pytest.approx(np.zeros(z.shape[1]), abs=1e-9)
+
+
+def test_a_log_that_is_left_too_early_is_not_settled(tmp_path):
+    """The comparison can fail: with a lag of a quarter of the level hardly anything has settled."""
+    _, world, robot = made(tmp_path, 6, "tracked", "voltage", lag=0.5)
+    found = settled(tmp_path, robot)
+    assert len(found.kept) < 0.2 * len(world.conditions)
+    assert {s.why for s in found.stretches} <= {"", "settling", "accelerates"}
+
+
+def test_the_autocorrelation_of_readings_widens_their_mean():
+    rng = np.random.default_rng(3)
+    white = rng.standard_normal(4000)
+    slow = np.convolve(rng.standard_normal(4039), np.ones(40) / np.sqrt(40), "valid")
+    assert settling._correlation_time(white) == pytest.approx(1.0, abs=0.2)
+    assert settling._correlation_time(slow) == pytest.approx(40.0, rel=0.35)
+
+
+def bench(tmp_path, columns, channels='"total_current", "motor_speed"'):
+    """A bench's file and a table of these columns."""
+    text = f"""
+base = "none"
+channels = [{channels}]
+[motor]
+resistance = 1.0
+torque_constant = 0.05
+[gearbox]
+ratio = 10
+efficiency_load = 0.9
+[bench]
+load = "shaft"
+inertia = 0.002
+loss_coulomb = 0.1
+"""
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return robot_file.read(tmp_path / "rig.toml")
+
+
+def stairs(levels=(6.0, 12.0, 18.0), hold=200, seed=0):
+    """Columns of a log that goes up stairs, 100 samples a second."""
+    rng = np.random.default_rng(seed)
+    volts = np.repeat(levels, hold)
+    since = np.tile(np.arange(hold), len(levels)) / 100
+    share = 1 - np.exp(-since / 0.05)
+    return {
+        "time_s": np.round(np.arange(len(volts)) / 100, 4),
+        "supply_voltage_V": volts,
+        "total_current_A": 0.3 + 0.05 * volts + 0.002 * rng.standard_normal(len(volts)),
+        "motor_speed_rpm": 180 * volts * share + 0.5 * rng.standard_normal(len(volts)),
+    }
+
+
+def cut(columns, rows):
+    return {name: column[rows] for name, column in columns.items()}
+
+
+BAD = {
+    "time backward": (
+        lambda c: c | {"time_s": np.concatenate([c["time_s"][:300], c["time_s"][:300]])},
+        r"row 301, time_s: goes back from 2\.99 to 0 s; give each recording its own run_id, or sort the rows",
+    ),
+    "time twice": (
+        lambda c: c | {"time_s": np.repeat(c["time_s"][:300], 2)},
+        r"row 2, time_s: 0 s stands twice; give each sample its own time",
+    ),
+    "no time": (
+        lambda c: {k: v for k, v in c.items() if k != "time_s"},
+        r"column time_s is missing, and a row is a settled run already; give it to loop",
+    ),
+    "frozen": (
+        lambda c: c | {"motor_speed_rpm": np.full(600, 812.0)},
+        r"rows 1 to 600, motor_speed_rpm: 812 rpm in every row; the channel is frozen or not connected; remove",
+    ),
+    "never holds": (
+        lambda c: c | {"supply_voltage_V": np.round(12 + 6 * np.sin(8 * c["time_s"]), 5)},
+        r"no settled stretch: what is imposed holds for 0\.\d+ s at most \(rows \d+ to \d+\), and 0\.3 s are asked for; "
+        "hold each level longer, state --shortest, or give the log to loop as it is",
+    ),
+    "never settles": (
+        lambda c: c | {"supply_voltage_V": np.full(600, 12.0), "motor_speed_rpm": 300 + 200 * c["time_s"]},
+        r"never settles: at the end of its longest level \(rows 1 to 600\) motor_speed still changes by .* state --drift",
+    ),
+    "few samples": (lambda c: cut(c, slice(5)), r"5 samples in its longest run; at least 8 are needed"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_settled_is_said_with_row_and_remedy(tmp_path, case):
+    change, said = BAD[case]
+    robot = bench(tmp_path, change(stairs()))
+    with pytest.raises(BadData, match=said):
+        settled(tmp_path, robot)
+
+
+def test_a_duty_beyond_one_is_refused_with_its_row(tmp_path):
+    columns = stairs()
+    robot = bench(tmp_path, columns | {"duty": np.where(np.arange(600) == 7, 1.2, 1.0)})
+    with pytest.raises(BadData, match=r"row 8, duty: got 1\.2; expected -1 to 1"):
+        settled(tmp_path, robot)
+
+
+def test_missing_samples_divide_a_level_and_are_said(tmp_path):
+    columns = stairs(levels=(12.0,), hold=600)
+    robot = bench(tmp_path, cut(columns, np.r_[0:300, 400:600]))
+    found = settled(tmp_path, robot)
+    assert found.gaps == (299,) and len(found.kept) == 2
+    assert words.remarks(found, 12)[0].startswith("samples are missing after 1 rows (300); no stretch goes across")
+
+
+def test_days_between_rows_are_a_gap(tmp_path):
+    columns = stairs(levels=(12.0,), hold=400)
+    columns["time_s"] = columns["time_s"] + np.where(np.arange(400) < 200, 0.0, 86400.0)
+    found = settled(tmp_path, bench(tmp_path, columns))
+    assert len(found.kept) == 2 and found.gaps == (199,)
+
+
+def test_a_saturated_channel_leaves_its_stretch_out(tmp_path):
+    columns = stairs()
+    columns["total_current_A"] = np.minimum(columns["total_current_A"], 1.15)  # of 1.2 A at 18 V
+    found = settled(tmp_path, bench(tmp_path, columns))
+    assert [s.why for s in found.stretches] == ["", "", "stuck"] and found.stretches[2].channel == "total_current"
+    assert "total_current shows one number for long: saturated or frozen" in words.left_out(found.stretches)[0]
+
+
+def test_what_does_not_move_and_what_nothing_drives_is_left_out(tmp_path):
+    columns = stairs(levels=(0.0, 1.0, 12.0))
+    columns["motor_speed_rpm"] = np.where(columns["supply_voltage_V"] < 2, 0.0, columns["motor_speed_rpm"])
+    found = settled(tmp_path, bench(tmp_path, columns))
+    assert [s.why for s in found.stretches] == ["idle", "rest", ""]
+
+
+def test_an_acceleration_that_takes_current_is_no_settled_run(tmp_path):
+    from sweeps.commands.settle import inertia
+
+    columns = stairs(levels=(12.0,), hold=600)
+    columns["motor_speed_rpm"] = 2000 + 2.0 * columns["time_s"]  # 0.6 % over the log
+    robot = bench(tmp_path, columns)
+    assert not settled(tmp_path, robot).stretches[0].why
+    heavy = inertia(robot)
+    rate = 0.002 / 100 / 0.05 * np.pi / 30  # load's inertia at the motor over the torque constant, of an rpm a second
+    assert heavy["bench"].per_rate == pytest.approx(rate + float(robot.motor.inertia) / 0.05 * np.pi / 30)
+    slow = {"bench": settling.Inertia("motor_speed", "total_current", 0.02, 1e-3)}
+    with pytest.raises(BadData, match=r"never settles: .* motor_speed still changes by 4\.\d+ %"):
+        settled(tmp_path, robot, inertia=slow)
+
+
+def test_levels_that_are_held_again_widen_sds_by_what_they_differ_by(tmp_path):
+    columns = stairs(levels=(6.0, 12.0) * 6)
+    shift = np.repeat(np.random.default_rng(4).standard_normal(12) * 0.02, 200)
+    columns["total_current_A"] = columns["total_current_A"] + shift
+    found = settled(tmp_path, bench(tmp_path, columns))
+    assert found.scatter["total_current"] == pytest.approx(0.02, rel=0.5)
+    assert all(s.sd["total_current"] > 0.9 * found.scatter["total_current"] for s in found.kept)
+
+
+def test_an_angle_shows_the_speed_of_its_shaft(tmp_path):
+    columns = stairs()
+    rate = columns.pop("motor_speed_rpm") / 10 * 6  # of the output, deg/s
+    angle = np.cumsum(rate) / 100
+    whole = bench(tmp_path, columns | {"output_angle_deg": np.round(angle, 2)}, '"total_current", "output_angle"')
+    found = settled(tmp_path, whole)
+    speeds = [s.mean["output_speed"] for s in found.kept]
+    assert speeds == pytest.approx([108.0, 216.0, 324.0], rel=0.01)
+    assert any("add output_speed to channels" in said for said in words.remarks(found, 3))
+
+
+def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrjax):
+    _, world, robot = made(tmp_path)
+    code, out, err = mmrjax("settle", "log.csv", "--robot", "rig.toml", "--out", "found")
+    assert code == 0, err
+    assert f"{len(world.conditions)} settled runs, " in " ".join(out.split())
+    runs = records.read(tmp_path / "found" / "settled.csv", robot=robot)
+    assert not runs.sampled and len(runs) == len(world.conditions)
+    assert np.isfinite(runs.deviations()).all() and not runs.unknown
+    with (tmp_path / "found" / "stretches.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert rows[0]["first_row"] == "1" and float(rows[0]["motor_speed_change_rpm"]) < 10
+    document = json.loads((tmp_path / "found" / "result.json").read_text())
+    assert document["settled"] == len(runs) and document["schema"] == "mmrjax.settle/1"
+    page = (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
+    assert "The log." in page and (tmp_path / "found" / "figures" / "log.svg").is_file()
+
+
+def test_25_000_rows_are_settled_in_seconds(tmp_path):
+    _, _, robot = made(tmp_path, 9, "bench", "voltage", rate=250.0)
+    text = (tmp_path / "log.csv").read_text().splitlines()
+    rows = min(len(text) - 1, 25_000)
+    (tmp_path / "log.csv").write_text("\n".join(text[: rows + 1]) + "\n")
+    began = time.process_time()
+    assert rows > 15_000 and settled(tmp_path, robot).kept
+    assert time.process_time() - began < 10 * rows / 25_000
+
+
+def test_every_reason_has_words():
+    assert set(words.WHY) == set(settling.REASONS)

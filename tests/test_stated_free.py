@@ -1,0 +1,118 @@
+"""What a rig's file states with ± is what a calibration frees, with the width that stands there."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import generator_rigs as gr
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
+from calibration.inference import foresight, priors, remarks
+from calibration.inference.calibrate import calibrate
+from calibration.inference.notes import FarFromPrior, HeldByPrior
+
+RIG = """
+base = "none"
+channels = ["total_current", "motor_speed"]
+[motor]
+resistance = "1.2 ± 5 %"
+torque_constant = "0.05 ± 3 %"
+inertia = "1e-5 ± 10 %"
+friction_coulomb = "0.004 ± 0.002"
+[gearbox]
+ratio = 10
+efficiency_load = 0.9
+[bench]
+load = "shaft"
+inertia = "0.001 ± 20 %"
+loss_coulomb = 0.1
+"""
+
+
+def bench(tmp_path, change=lambda text: text):
+    (tmp_path / "rig.toml").write_text(change(RIG), encoding="utf-8")
+    return robot_file.read(tmp_path / "rig.toml")
+
+
+def test_everything_stated_with_a_width_is_freed_that_the_data_show(tmp_path):
+    robot = bench(tmp_path)
+    over_time = (
+        "motor.resistance",
+        "motor.torque_constant",
+        "motor.inertia",
+        "motor.friction_coulomb",
+        "bench.inertia",
+    )
+    assert set(priors.stated_names(robot, ["bench"])) == set(over_time)
+    settled = priors.stated_names(robot, ["bench"], priors.OVER_TIME)
+    assert set(settled) == {n for n in over_time if not n.endswith(".inertia")}
+    assert not [n for n in priors.stated_names(robot, ["other"]) if n.startswith("bench")]
+    driven = bench(tmp_path, lambda text: text.replace(', "motor_speed"]', ']\nimposed = "motor_speed"'))
+    assert "motor.resistance" not in priors.stated_names(driven, ["bench"])  # nothing shows it
+    exact = bench(tmp_path, lambda text: text.replace("1.2 ± 5 %", "1.2 ± 0"))
+    assert "motor.resistance" not in priors.stated_names(exact, ["bench"])
+
+
+def test_a_calibration_frees_what_its_rig_states(tmp_path, monkeypatch):
+    world = gr.world(np.random.default_rng(4), "bench", "voltage", rows=(16, 24))
+    gr.case(world).write(tmp_path)
+    robot = robot_file.read(tmp_path / "rig.toml")
+    runs = records.read(tmp_path / "table.csv", robot=robot)
+    asked = []
+
+    def chosen(robot, names, *others, **further):
+        asked.extend(names)
+        raise InterruptedError  # what follows is the search
+
+    monkeypatch.setattr(priors, "coordinates", chosen)
+    with pytest.raises(InterruptedError):
+        calibrate(runs, robot)
+    stated = {world.rig.public(name) for name in world.rig.tolerances}
+    assert {"motor.resistance", "motor.torque_constant"} < stated <= set(asked)
+
+
+def test_a_prior_is_shown_as_it_is_stated(tmp_path):
+    robot = bench(tmp_path)
+    names = ("motor.friction_coulomb", "motor.resistance")
+    sds = priors.coordinates(robot, names).prior_sd
+    assert sds == pytest.approx([0.002, 0.06])  # the slope of the log-normal one is 0.0019
+    (tmp_path / "runs.csv").write_text(
+        "supply_voltage_V,total_current_A,motor_speed_rpm\n12,2.0,1600\n24,2.1,3900\n", encoding="utf-8"
+    )
+    seen = foresight.foresee(records.read(tmp_path / "runs.csv", robot=robot), robot)
+    assert {p.name: p.prior_sd for p in seen.parameters}[names[0]] == pytest.approx(0.002)
+
+
+def test_nothing_to_fit_is_not_put_down_to_an_option_that_nobody_gave(tmp_path):
+    robot = bench(
+        tmp_path, lambda text: text.replace('"1.2 ± 5 %"', "1.2").replace("loss_coulomb = 0.1", "loss_coulomb = 0.0")
+    )
+    with pytest.raises(
+        BadConfiguration, match=r"^no parameter to fit: every loss .* state what is not known"
+    ) as error:
+        priors.choose(robot, ())
+    assert "--fix" not in str(error.value)
+    with pytest.raises(BadConfiguration, match="--fix leaves no parameter to fit"):
+        priors.choose(robot, ("motor.resistance",), fix=("motor.resistance",))
+
+
+def test_a_width_of_the_programs_is_said(tmp_path, mmrjax):
+    bench(tmp_path, lambda text: text.replace('"1.2 ± 5 %"', "1.2"))
+    code, out, err = mmrjax("rig", "check", "rig.toml")
+    assert code == 0, err
+    assert "without ±, so with the program's: motor.resistance (±5 %)" in " ".join(out.split())
+    assert "bench.loss_coulomb (±50 %)" in " ".join(out.split())
+
+
+def test_what_lies_far_from_its_prior_is_not_said_to_be_held_by_it():
+    parameter = lambda shift: SimpleNamespace(shift=shift, at_bound="")  # noqa: E731
+    found = SimpleNamespace(
+        parameters={"near": parameter(0.5), "far": parameter(-6.5)}, held_by_prior=("near", "far"), searched=None
+    )
+    said = list(remarks._parameters(found))
+    assert [n.names for n in said if isinstance(n, HeldByPrior)] == [("near",)]
+    assert [(n.name, n.sds) for n in said if isinstance(n, FarFromPrior)] == [("far", 6.5)]
