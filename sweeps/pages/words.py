@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from mmrjax import channels
@@ -54,6 +54,32 @@ STATUSES: dict[str, Status] = {
         "the cells stayed below their cut-off voltage for longer than they may, with charge left",
     ),
 }
+
+#: What lies in a run folder beside its page.
+FILES = {
+    "robot.toml": "the robot; every command takes it with --robot",
+    "runs.csv": "every run, a row each",
+    "rows.csv": "every row: measured, simulated, residuals",
+    "comparison.csv": "every row: measured, simulated, errors",
+    "history.csv": "every instant",
+    "segments.csv": "every segment of the mission",
+    "result.json": "everything on this page, for programs",
+    "config.resolved.toml": "every option of the command",
+    "manifest.json": "versions, machine, time, hashes",
+    "figures/": "the figures, as SVG",
+}
+
+
+def of_curves(names: Sequence[str]) -> str:
+    """A warning of a robot with curves that nobody has named; empty for none."""
+    if not names:
+        return ""
+    curves = " and ".join(f"<code>{n}</code>" for n in names)
+    return (
+        f"This robot holds {curves}: a smooth curve fitted to what its model lacks, of a cause that nobody has named. "
+        "Trust it only under the conditions of the runs that it was fitted to."
+    )
+
 
 FLAGS = {
     "motor_overspeed": "motor faster than it is permitted to turn",
