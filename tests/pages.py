@@ -47,6 +47,8 @@ def outside(folder: Path) -> list[str]:
     for document in ((folder / "report.html").read_text(), *(p.read_text() for p in (folder / "figures").iterdir())):
         links = re.findall(r'(?:src|href|xlink:href)="([^"]*)"', document)
         beside = [link for link in links if not link.startswith(("#", "data:"))]
-        found += [link for link in beside if not (folder / link).exists()]
+        found += [
+            link for link in beside if link != "manifest.json" and not (folder / link).exists()
+        ]  # it comes last
         found += re.findall(r"url\(http|@import|<script[^>]*\ssrc|fetch\(|XMLHttp", document)
     return found + re.findall(r"https?://", (folder / "report.html").read_text())
