@@ -15,7 +15,10 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 #: Width of the text of an A4 page with margins of 12 mm [px of CSS].
 PAPER = 703
 #: The DevTools protocol is spoken over file descriptors 3 and 4 of the browser.
-LAUNCH = "import os, sys; r, w = (os.dup(int(x)) for x in sys.argv[1:3]); os.dup2(r, 3); os.dup2(w, 4); os.execvp(sys.argv[3], sys.argv[3:])"
+LAUNCH = (
+    "import fcntl, os, sys; r, w = (fcntl.fcntl(int(x), fcntl.F_DUPFD, 10) for x in sys.argv[1:3]); "
+    "os.dup2(r, 3); os.dup2(w, 4); os.execvp(sys.argv[3], sys.argv[3:])"
+)
 
 
 def found() -> str | None:

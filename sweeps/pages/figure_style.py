@@ -126,13 +126,23 @@ def _place(fig: Figure, axes: Axes) -> dict[str, Any]:
     width, height = 72 * fig.get_size_inches()
     box = axes.get_position(original=False)
     place = [box.x0 * width, (1 - box.y1) * height, box.width * width, box.height * height]
-    return {"box": [round(v, 1) for v in place], "x": _run(axes.xaxis), "y": _run(axes.yaxis)}
+    # an inner axis has its label at the edge of its row or column, or of the figure
+    column = [a.xaxis for a in fig.axes if a.get_position().x0 == axes.get_position().x0]
+    row = [a.yaxis for a in fig.axes if a.get_position().y0 == axes.get_position().y0]
+    both = {}
+    for name, axis, beside, whole in (
+        ("x", axes.xaxis, column, fig.get_supxlabel()),
+        ("y", axes.yaxis, row, fig.get_supylabel()),
+    ):
+        labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
+        both[name] = {**_run(axis), "label": next(filter(None, labels), "").split("\n")[0]}
+    return {"box": [round(v, 1) for v in place], **both}
 
 
 def _run(axis: Axis) -> dict[str, Any]:
-    """The ends of an axis, its label, whether it is logarithmic, and its names where its ticks have any."""
+    """The ends of an axis, whether it is logarithmic, and its names where its ticks have any."""
     ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
-    known: dict[str, Any] = {"ends": ends, "label": axis.get_label_text(), "log": axis.get_scale() == "log"}
+    known: dict[str, Any] = {"ends": ends, "log": axis.get_scale() == "log"}
     if not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter):
         names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
         if names and all(name for _, name in names):

@@ -171,9 +171,9 @@ def ladder(found: DiscoveryResult) -> Figure:
     axes.barh(range(len(rungs)), root, color=colours, height=0.72)
     level = found.before.kinds["single"].threshold
     axes.axvline(level, color=ORANGE, lw=1.6)
-    axes.text(level, -0.9, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
+    axes.text(level, -0.6, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
-    axes.invert_yaxis()
+    axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="score: what the effect alone, at a plausible size, would explain beside the base [σ], linearly")
     axes.set_title("blue: found; light blue: these data cannot tell it from one that was found")

@@ -41,8 +41,8 @@ document.querySelectorAll("svg[data-axes]").forEach(svg => {
   };
   const value = (axis, share) => {
     const [low, high] = axis.ends, x = axis.log ? low * (high / low) ** share : low + (high - low) * share;
-    if (!axis.names) return (axis.label ? axis.label + ": " : "") + Number(x.toPrecision(4));
-    return axis.names.reduce((a, b) => Math.abs(b[0] - x) < Math.abs(a[0] - x) ? b : a)[1];
+    const nearest = (a, b) => Math.abs(b[0] - x) < Math.abs(a[0] - x) ? b : a;
+    return (axis.label ? axis.label + ": " : "") + (axis.names ? axis.names.reduce(nearest)[1] : Number(x.toPrecision(4)));
   };
   svg.addEventListener("pointermove", event => {
     const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
