@@ -23,7 +23,10 @@ def api() -> str:
     """Every public name with its signature and docstring."""
     import mmrjax as mm
 
-    parts = ["# The public names", "`import mmrjax as mm` is the one door; SI units unless a name says otherwise. Made of the docstrings."]
+    parts = [
+        "# The public names",
+        "`import mmrjax as mm` is the one door; SI units unless a name says otherwise. Made of the docstrings.",
+    ]
     for name in sorted((n for n in mm.__all__ if not n.startswith("_")), key=str.lower):
         thing = getattr(mm, name)
         if not callable(thing):
@@ -52,7 +55,9 @@ def glossary() -> str:
     from sweeps.pages.words import GLOSSARY
 
     lines = [f"**{word}**\n: {meaning}\n" for word, meaning in GLOSSARY.items()]
-    return "# Words\n\nWhat pages and terminal say; `mmrjax explain NAME` explains every other name.\n\n" + "\n".join(lines)
+    return "# Words\n\nWhat pages and terminal say; `mmrjax explain NAME` explains every other name.\n\n" + "\n".join(
+        lines
+    )
 
 
 def example(folder: Path) -> str:
@@ -62,7 +67,10 @@ def example(folder: Path) -> str:
     cells = lambda errors: " | ".join(f"{errors[c]['rms_percent']:.1f}" for c in labels)  # noqa: E731
     reached = lambda errors: f"{max(e['rows'] for e in errors.values())}/{d['rows']}"  # noqa: E731
     lines = [("as stated", d["errors"]["as_stated"]["fitted"])]
-    lines += [(what, d["errors"][when]["fitted"]) for what, when in (("refitted", "before"), ("with what was found", "after"))]
+    lines += [
+        (what, d["errors"][when]["fitted"])
+        for what, when in (("refitted", "before"), ("with what was found", "after"))
+    ]
     if d["errors"]["before"].get("held_out"):
         lines += [
             (f"{what}, slopes that the fit has not seen", d["errors"][when]["held_out"])
