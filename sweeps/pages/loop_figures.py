@@ -224,15 +224,8 @@ def errors(found: DiscoveryResult) -> Figure:
     return fig
 
 
-#: What reveals an effect, by what it changes with: column and words; else what is imposed.
-REVEALS = {
-    "current": ("total_current_A", "total current [A]"),
-    "load": ("total_current_A", "total current [A]"),
-    "speed": ("motor_speed_rpm", "motor speed [rpm]"),
-    "demand": ("slope_deg", "slope [deg]"),
-    "slope": ("slope_deg", "slope [deg]"),
-    "weight": ("payload_kg", "payload [kg]"),
-}
+#: By what an effect changes with, the equation whose variable reveals it.
+REVEALS = {"current": "electrical", "load": "electrical", "speed": "track", "demand": "slip", "slope": "slip"}
 
 
 def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:
@@ -241,10 +234,8 @@ def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[
     fig, grid = figure(1, len(changes), 3.4)
     for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
         c, own = change.channel, imposed(table)
-        driver = BY_NAME[name].driver if name in BY_NAME else ""
-        column, label = REVEALS.get(driver, (own, IMPOSED_WORDS[own]))
-        if column not in table or np.unique(table[column]).size == 1:
-            column, label = own, IMPOSED_WORDS[own]
+        reveals = REVEALS.get(BY_NAME[name].driver) if name in BY_NAME else None
+        x, label = _over(table, *DEFECT_WORDS[reveals][2:]) if reveals else (table[own], IMPOSED_WORDS[own])
         measured = found.readings_of_rows.measured[:, [x.name for x in found.channels].index(c.name)]
         axes.axhline(0, color=FAINT, lw=0.8)
         for what, values, look in (
@@ -252,7 +243,7 @@ def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[
             ("with it", change.with_it, {"marker": "_", "color": BLUE, "ms": 13, "mew": 2.2}),
         ):
             y = (values - change.without)[found.included] / c.factor
-            axes.plot(table[column][found.included], y, ls="none", label=what, **look)
+            axes.plot(x[found.included], y, ls="none", label=what, **look)
         axes.set(xlabel=label, ylabel=f"{c.label}, less without it [{c.unit}]", title=name)
     grid[0, 0].legend(loc="best")
     return fig
