@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/ready
 
-.PHONY: demo test test-all slow lint mutants campaign bench clean
+.PHONY: demo test test-all slow lint mutants campaign bench docs clean
 
 demo: $(READY)
 	$(BIN)/mmrjax loop measured --out runs/demo/loop --force
@@ -44,8 +44,16 @@ bench: $(READY)
 	$(BIN)/python benchmarks/steady.py
 	$(BIN)/python benchmarks/drive.py
 
+# The docs as a site, in an environment of its own; open site/index.html, no network needed.
+docs: $(READY)
+	$(BIN)/python docs/site.py
+	$(PYTHON) -m venv runs/docs-venv
+	runs/docs-venv/bin/pip install --quiet --disable-pip-version-check "mkdocs-material>=9.5,<10"
+	NO_MKDOCS_2_WARNING=1 runs/docs-venv/bin/mkdocs build --strict --quiet
+	@echo "open site/index.html"
+
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) runs site
 
 $(READY): requirements.lock pyproject.toml
 	$(PYTHON) -c "import sys; sys.exit('mmrjax needs Python 3.11 or newer' if sys.version_info < (3, 11) else 0)"

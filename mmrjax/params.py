@@ -159,6 +159,10 @@ M = TypeVar("M", bound=eqx.Module)
 def replace(component: M, values: dict[str, Any]) -> M:
     """Return `component` with the named parameters replaced; values may be tracers or batches.
 
+    Args:
+        component: a robot or a part of one.
+        values: dotted names, such as `motor.resistance`, and their values [SI].
+
     Raises:
         KeyError: a name is no parameter of `component`; the message says what is near it.
     """

@@ -46,6 +46,9 @@ def outside(folder: Path) -> list[str]:
     found = []
     for document in ((folder / "report.html").read_text(), *(p.read_text() for p in (folder / "figures").iterdir())):
         links = re.findall(r'(?:src|href|xlink:href)="([^"]*)"', document)
-        found += [link for link in links if not link.startswith(("#", "data:"))]
-        found += re.findall(r"url\(http|@import|<script", document)
+        beside = [link for link in links if not link.startswith(("#", "data:"))]
+        found += [
+            link for link in beside if link != "manifest.json" and not (folder / link).exists()
+        ]  # it comes last
+        found += re.findall(r"url\(http|@import|<script[^>]*\ssrc|fetch\(|XMLHttp", document)
     return found + re.findall(r"https?://", (folder / "report.html").read_text())

@@ -70,8 +70,10 @@ def test_what_the_data_do_not_narrow_is_held(seed, parameters, readings, dead, a
 def test_rule_is_a_ratio_of_sds_and_holds_what_is_not_known():
     assert HELD == 0.9
     np.testing.assert_array_equal(held_by_prior(np.array([0.0, 0.71, 0.9, 0.90001, 1.0, np.nan, np.inf])), [0, 0, 0, 1, 1, 1, 1])  # fmt: skip
-    assert sentence(HeldByPrior(("a",))) == "held by its prior (posterior sd above 0.9 of the prior's): a"
-    assert sentence(HeldByPrior(("a", "b"))).startswith("held by their priors (")
+    assert (
+        sentence(HeldByPrior(("a", "b")))
+        == "not determined by these runs (posterior sd above 0.9 of the prior's): a, b"
+    )
 
 
 def stated(noise):
@@ -115,22 +117,22 @@ def test_calibration_says_it_of_every_parameter_everywhere(case, found, capsys, 
     assert {name for name, p in made.parameters.items() if p.held_by_prior} == held
     document = json.loads(json.dumps(made.to_json()))
     assert {name for name, p in document["parameters"].items() if p["held_by_prior"]} == held
-    notes = [note for note in made.notes if note.startswith("held by ")]
+    notes = [note for note in made.notes if note.startswith("not determined ")]
     listed = set(notes[0].split("): ")[1].split(", ")) if notes else set()
     assert listed == held and len(notes) <= 1
     command.print_calibration(made)
     printed = capsys.readouterr().out
     lines = {line.split()[0]: line.rstrip() for line in printed.splitlines() if line.split()[:1] and line.split()[0] in made.parameters}  # fmt: skip
-    assert {name for name, line in lines.items() if line.endswith("yes")} == held and set(lines) == set(
+    assert {name for name, line in lines.items() if line.endswith("no")} == held and set(lines) == set(
         made.parameters
     )
     page = Tables(calibration_page.write(tmp_path, made, robot_name="nominal").read_text("utf-8"))
     head, *rows = page.tables["parametertable"]
-    at = head.index("held by its prior")
-    assert {row[0] for row in rows if row[at].startswith("yes")} == held
+    at = head.index("determined")
+    assert {row[0] for row in rows if row[at].startswith("no")} == held
     made.save(tmp_path)
     first = (tmp_path / "robot.toml").read_text("utf-8").split("schema")[0]
-    assert all(name in first.split("held by")[-1] for name in held)
+    assert all(name in first.split("not determined")[-1] for name in held)
 
 
 @pytest.mark.slow
@@ -151,7 +153,9 @@ def test_calibrations_have_what_the_rule_is_for(found):
 
 def test_no_other_word_is_left_for_it():
     root = Path(__file__).parents[1]
-    old = re.compile(r"prior says more than the data of:|prior only|held by the prior\b|data say more; grey")
+    old = re.compile(
+        r"prior says more than the data of:|prior only|held by the prior\b|['\"]held by (its|their) prior|stands in for something"
+    )
     for path in [
         *root.glob("calibration/**/*.py"),
         *root.glob("sweeps/**/*.py"),

@@ -107,7 +107,7 @@ def test_numbers_of_a_page_agree(shown, capsys, name):
         fall = got.found.chi2[0] - got.found.chi2[1]
         assert e.score == pytest.approx(fall, abs=0.1) or len(got.found.effects) > 1
     assert got.text.count('id="definitions"') == 1
-    for heading in ("Explains:", "Family-wise p:", "Rise of χ²:", "Score:"):
+    for heading in ("Lowers the misfit by:", "Family-wise p:", "Rise of χ²:", "Score:"):
         assert got.page.text.count(heading) == 1
 
 
@@ -221,10 +221,9 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     (effect,) = found.effects
     assert words.answer(found) == f"No: missing is a {effect.families[0]}." and words.answer(found) in page.text
     a = effect.parameters["amplitude"]
-    assert page.tables["found"][1] == [
-        f"{effect.families[0]}{effect.name}", f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", "established",
-        words.alike(effect) or "-",
-    ]  # fmt: skip
+    size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changed(found, effect.name)
+    size += f", which is {100 * change.rms:.2g} % of the {change.channel.label}"
+    assert f"{effect.families[0]} ({effect.name}): {size}; {words.how_sure(found, effect)}." in page.text
     stated, again, with_it = page.tables["summary"][1:]
     assert [line[0] for line in (stated, again, with_it)] == ["as stated", "fitted again", "with what was found"]
     for k, c in enumerate(c.name for c in found.channels):
@@ -232,16 +231,57 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
         assert with_it[1 + k].startswith(f"{seen['rms_percent']:.1f} % ({unseen['rms_percent']:.1f} %)")
         better = found.errors[1][c]["rms_percent"] < found.errors[0][c]["rms_percent"] - 0.05
         assert with_it[1 + k].endswith("↓") == better
-    head = got.text[: got.text.index("The verdict in full")]
-    assert all(line in page.text for line in words.use_it(found)) and len(words.use_it(found)) == len(
-        found.errors_held_out
-    )
-    assert len(re.sub(r"<[^>]+>", " ", head[head.index("<h1>") :]).split()) < 220
+    head = got.text[: got.text.index('<nav id="contents"')]
+    assert all(line in page.text for line in words.use_it(found))
+    assert len(words.use_it(found)) == 1 + len(found.errors_held_out)
+    without_table = re.sub(r"<table.*?</table>|<[^>]+>", " ", head[head.index("<h1>") :], flags=re.S)
+    assert len(without_table.split()) <= 120
     weak = NameTest(effect.name, 6.0, 3.3, (), 5.0, 7, 2.5)
     tentative = dataclasses.replace(found, support=NameSupport(False, "beside", tests=(weak,)))
     assert words.answer(tentative) == f"No: perhaps a {effect.families[0]}."
     assert words.how_sure(tentative, effect) == "tentative: it predicts, but rests on row 7"
     assert words.answer(dataclasses.replace(found, verdict="none", effects=())).startswith("Yes")
+
+
+def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):
+    """And the law that is drawn is of the robot that is written, as the dots are."""
+    found = shown("churning", capsys).found
+    (effect,) = found.effects
+    change = loop_page.changed(found, effect.name)
+    k = [c.name for c in found.channels].index(change.channel.name)
+    here = found.included
+    np.testing.assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
+    assert change.rms > 0.01 and loop_page.changed(found, "brush_drop") is None
+    assert "laws" in drawn(shown("churning", capsys).text)
+
+
+def test_errors_better_and_worse_are_marked_with_the_rows_that_are_reached(shown, capsys):
+    got = shown("churning", capsys)
+    head, *lines = got.page.tables["errors"]
+    assert [line[0] for line in lines] == [
+        "seen by the fit",
+        *(f"unseen: another {words.blocks_room.in_words(k)}" for k in got.found.errors_held_out),
+    ]
+    for line, (before, after) in zip(lines, [got.found.errors, *got.found.errors_held_out.values()], strict=True):
+        for cell, c in zip(line[1:-1], before, strict=True):
+            assert cell.startswith(f"{before[c]['rms_percent']:.1f} → {after[c]['rms_percent']:.1f}")
+        assert line[-1].endswith(f" of {len(got.found.runs)}")
+    assert any(cell.endswith("↓") for line in lines for cell in line) and len(head) == len(lines[0])
+
+
+def test_a_page_of_nothing_missing_says_what_would_have_been_seen(shown, capsys, tmp_path):
+    found = shown("churning", capsys).found
+    none = dataclasses.replace(
+        found, verdict="none", effects=(), support=None, summary=dataclasses.replace(found.summary, verdict="none")
+    )
+    text = written(tmp_path, none)
+    assert "What was looked for" in text and "laws" not in drawn(text) and '<ul id="found">' not in text
+    listed = loop_page.would_be_seen(none)
+    assert [one["times"] for one in listed] == sorted(one["times"] for one in listed)
+    strong = next(s for s in none.scores if s.name == listed[0]["name"])
+    level = none.before.kinds["single"].threshold
+    assert listed[0]["times"] * strong.sigmas_per_prior_sd == pytest.approx(level)
+    assert Tables(text).tables["would_be_seen"][1][0] == listed[0]["name"]
 
 
 def test_squares_of_readings_and_of_priors_are_apart(shown, capsys):
@@ -262,7 +302,10 @@ def test_reading_that_weighs_most_is_named(shown, capsys):
     after[row, 1] += 40 * seen.sd[row, 1]
     off = dataclasses.replace(found, written=True, readings_of_rows=dataclasses.replace(seen, after=after))
     said = words.largest_share(off)
-    assert said.startswith(f"motor speed of row {found.numbers[row]} ({found.runs['configuration'][row]}, ")
+    assert (
+        said.startswith(f"Row {found.numbers[row]} ({found.runs['configuration'][row]}, ")
+        and "its motor speed" in said
+    )
     even = dataclasses.replace(seen, after=seen.measured + 0.5 * seen.sd)
     assert words.largest_share(dataclasses.replace(off, readings_of_rows=even)) == ""
 
@@ -298,11 +341,11 @@ def test_what_is_held_by_its_prior_is_said_everywhere(shown, capsys, tmp_path, n
     held = {n for n, p in seen.document["base_shift"].items() if p["held_by_prior"]}
     assert held == {n for n in made.held_by_prior if n in made.base_shift}
     assert all("held_by_prior" in p for e in seen.document["effects"] for p in e["parameters"].values())
-    (note,) = [n for n in made.notes if n.startswith("held by ")]
+    (note,) = [n for n in made.notes if n.startswith("not determined ")]
     assert tuple(note.split("): ")[1].split(", ")) == made.held_by_prior
     assert " ".join(note.split()) in seen.printed
     head, *rows = seen.page.tables["base"]
-    assert {row[0] for row in rows if row[head.index("held by its prior")] == "yes"} == held
+    assert {row[0] for row in rows if row[head.index("determined")] == "no"} == held
     made.save(tmp_path)
     assert note in (tmp_path / "robot.toml").read_text("utf-8")
 
@@ -337,7 +380,7 @@ def test_what_the_track_model_says_is_shown(shown, capsys, tmp_path, p, outside,
     page = Tables(written(tmp_path, found))
     assert says in page.text and "slip of the 10 rows on tracks 3.3 → 0.6 points rms" in page.text
     assert page.tables["resolved_constants"][1][0] == "running_gear.guide_recess"
-    assert [row[-1] for row in page.tables["resolved_constants"][1:]] == ["no", "yes"]
+    assert [row[-1] for row in page.tables["resolved_constants"][1:]] == ["yes", "no"]
     capsys.readouterr()
     room.print_discovery(found)
     assert says in " ".join(capsys.readouterr().out.split())

@@ -10,7 +10,7 @@ from typer.main import get_command
 from sweeps import cli
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "docs" / "rigs" / "README.md"]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def commands(text):
@@ -32,7 +32,7 @@ def unknown(words):
     return next((w for w in words if w.startswith("--") and w.partition("=")[0] not in known), None)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_of_a_page_and_its_options_exist(page):
     for words in commands(page.read_text(encoding="utf-8")):
         assert unknown(words) is None, words
@@ -43,11 +43,23 @@ def test_a_command_that_does_not_exist_is_found():
     assert unknown(["rig", "check", "a.toml"]) is None
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def anchor(heading):
+    """What a link to a heading of a page says after `#`."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_link_of_a_page_resolves(page):
     text = page.read_text(encoding="utf-8")
-    for link in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
-        assert "://" in link or (page.parent / link).exists(), link
+    for link in re.findall(r"\]\(([^)\s]+)[^)]*\)", text):
+        if "://" in link:
+            continue
+        file, _, place = link.partition("#")
+        target = page.parent / file if file else page
+        assert target.exists(), link
+        if place and target.suffix == ".md":
+            headings = re.findall(r"^#+ (.*)", target.read_text(encoding="utf-8"), re.M)
+            assert place in map(anchor, headings), link
 
 
 def test_the_readme_can_be_read_in_a_minute():

@@ -451,13 +451,13 @@ def test_rig_check_says_what_a_table_can_determine(mmrjax, bench):
         "motor.friction_coulomb", "motor.friction_viscous", "gearbox.efficiency_load",
     }  # fmt: skip
     assert shares["motor.torque_constant"] < 0.2 and shares["bench.loss_viscous"] < 0.3
-    assert "would be held by their priors" in found["statement"]
+    assert "would not be determined by these runs" in found["statement"]
 
 
 def test_rig_check_of_data_says_the_same_in_words(mmrjax, bench):
     code, out, _ = mmrjax("rig", "check", "my-rig.toml", "runs.csv")
     assert code == 0 and "total_current_A, yours total_current_mA" in out
-    assert "gearbox.efficiency_load" in out and "held by its prior" in out
+    assert "gearbox.efficiency_load" in out and "not determined" in out
     assert "room: without a role" in out and "add output_torque to channels" in out
 
 

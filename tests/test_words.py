@@ -25,9 +25,12 @@ from mmrjax import channels
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes, and what is said of them.
 SAMPLES = [
-    (of_fit.HeldByPrior(("a",)), "held by its prior (posterior sd above 0.9 of the prior's): a"),
-    (of_fit.HeldByPrior(("a", "b")), "held by their priors (posterior sd above 0.9 of the prior's): a, b"),
-    (of_fit.FarFromPrior("m", 3.2, "loop"), "m lies 3.2 prior sds from its prior: it stands in for something"),
+    (of_fit.HeldByPrior(("a",)), "not determined by these runs (posterior sd above 0.9 of the prior's): a"),
+    (of_fit.HeldByPrior(("a", "b")), "not determined by these runs (posterior sd above 0.9 of the prior's): a, b"),
+    (
+        of_fit.FarFromPrior("m", 3.2, "loop"),
+        "m is implausible, 3.2 prior sds from its prior: it probably absorbs a missing effect",
+    ),
     (
         of_fit.FarFromPrior("m", 3.2, "calibration"),
         "m lies 3.2 prior sds from its prior: the prior or the model is wrong",
@@ -210,7 +213,7 @@ SAMPLES = [
     (of_loop.Copies((3, 4)), "rows 3, 4 are exact copies of earlier ones and count once"),
     (
         of_loop.KeptOut((1, 2), "unusable"),
-        "rows 1, 2 cannot be simulated: the fitted model slides or fails there; they are kept out",
+        "rows 1, 2 are not used: the fitted model slides or fails there",
     ),
     (
         of_loop.KeptOut((7,), "outliers"),

@@ -86,7 +86,15 @@ class RobotFile:
 
 
 def load(name_or_path: str, library: Library = effects.BY_NAME, notes: list[str] | None = None) -> Robot:
-    """The robot alone of `find`."""
+    """A robot by its name or from its file.
+
+    Args:
+        name_or_path: `nominal`, `sm1`, `sm2`, or a TOML file that `calibrate`, `loop` or `rig new` wrote.
+        library: effects by name that the file may hold; notes: takes what is worth saying of the file.
+
+    Raises:
+        BadConfiguration: no such name or file, or a value in it that is none.
+    """
     return find(name_or_path, library, notes).robot
 
 

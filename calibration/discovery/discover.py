@@ -660,6 +660,7 @@ def assemble_result(
     if traced.verdict == "unnamed" and where is not None:
         progress(Step("shape"))
         curve = fit_discrepancy(space, base, left.linear, where.place, where.variable)
+    beside = None if curve is None else diagnosis_beside(space, curve, screened.bases, left)
     observe, rows = space.bare.observe, len(runs)
     numbers = np.arange(1, rows + 1) if numbers is None else numbers
     included = space.included[:rows]
@@ -669,9 +670,8 @@ def assemble_result(
     posterior = of_fit(space, best.active, best.z, ends.linear)
     if best is not base:
         after = findings.Fitted(space.problem(best.active), best.z, space.library.indices(best.active))
-    elif curve is not None:
-        after = findings.Fitted(curve.problem, curve.z, None)
-        ends = diagnosis_beside(space, curve, screened.bases, left)
+    elif curve is not None and beside is not None:
+        after, ends = findings.Fitted(curve.problem, curve.z, None), beside
         robot, z, sd = curve.robot, curve.z, np.sqrt(np.diag(curve.covariance))
         posterior = of_curve(space, best.active, curve)
         cost, converged = curve.chi2[1] / 2, curve.converged
@@ -708,7 +708,9 @@ def assemble_result(
         concealed = findings.hidden_effects(
             space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
         )
-    unnamed = None if curve is None or where is None else findings.unnamed(curve, where, p, rows)
+    unnamed = None
+    if curve is not None and where is not None and beside is not None:
+        unnamed = findings.unnamed(curve, where, p, beside.linear, rows)
     said = summary(traced, numbers)
     result = DiscoveryResult(
         verdict=traced.verdict,

@@ -20,6 +20,7 @@ from calibration.discovery.experiments import Proposal
 from calibration.discovery.hidden import Hidden
 from calibration.discovery.location import DiscrepancyLocation
 from calibration.discovery.notes import RuledOut
+from calibration.discovery.projection import Defect, defect
 from calibration.discovery.result import (
     Alternative,
     BaseShift,
@@ -48,7 +49,7 @@ from calibration.inference import priors
 from calibration.inference.errors import summary
 from calibration.inference.held_out import held_out
 from calibration.inference.identifiability import held_by_prior
-from calibration.inference.linearization import amplitude_of, shape_of, shape_scales, shaped
+from calibration.inference.linearization import Linearization, amplitude_of, shape_of, shape_scales, shaped
 from calibration.inference.optimizers import linearised, read
 from calibration.inference.problem import Observation, Problem
 from mmrjax import channels
@@ -149,9 +150,20 @@ def _without_each(
     return [2 * (c.cost - best.cost) for c in without_each(space, best, settings, ladder)]
 
 
-def unnamed(found: Discrepancy, where: DiscrepancyLocation, p_value: float, rows: int) -> UnnamedDiscrepancy:
-    """The discrepancy of an `unnamed` verdict, over the rows of the table."""
-    f, lacks, happens = found.proposal, found.defect, bases_room.window(where.variable)
+def unnamed(
+    found: Discrepancy, where: DiscrepancyLocation, p_value: float, linear: Linearization, rows: int
+) -> UnnamedDiscrepancy:
+    """The discrepancy of an `unnamed` verdict, over the rows of the table; curve and rows are of one fit.
+
+    Args:
+        linear: the fit with the curve, linearised.
+    """
+    f, lacks, happens = found.proposal, None, bases_room.window(where.variable)
+    if found.defect is not None:
+        lacks = defect(linear, found.balance)
+        x = np.asarray(linear.variable(where.variable if happens is None else happens.axis))
+        turn = 2 * np.pi if where.variable in bases_room.ORDERS else None
+        lacks = Defect(np.interp(x, found.grid, found.curve, period=turn) + lacks.value, lacks.sd)
     return UnnamedDiscrepancy(
         **dataclasses.asdict(where),
         unit=found.unit,

@@ -135,7 +135,8 @@ class UnnamedDiscrepancy(DiscrepancyLocation):
         p_value: family-wise; score: fall of χ² by the curve [σ²]; score_free_in_each_run: by a wave with a phase
             of its own in each run, None for other curves.
         at: of the variable [SI]; value, sd: of the curve there [unit].
-        defect, defect_sd: of the balance in each row [unit], None where single rows do not show it.
+        defect, defect_sd: of the balance in each row [unit], the curve there and what its fit leaves of the row; None
+            where single rows do not show it.
         proposal: a formula.
     """
 

@@ -80,7 +80,7 @@ def calibrate(
             None takes `POPULATION` where parameters are free that `steady` does not read, else none.
         generations: at most, None `population.GENERATIONS`; members: file in which those that were run are kept, and
             from which the same calibration goes on.
-        profiles: whether to profile every parameter.
+        seed: of the starts and of all that is drawn; profiles: whether to profile every parameter.
         blocks: kinds of blocks to hold out; True: all that tell something of such data.
             These three by default as the kind of data and the fidelity say.
         tell: is given a sentence now and then while a long calibration goes on.

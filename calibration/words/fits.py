@@ -41,13 +41,12 @@ if TYPE_CHECKING:
 
 def held_by_prior(note: HeldByPrior) -> str:
     """Which parameters are held by their priors."""
-    whose = "its prior" if len(note.names) == 1 else "their priors"
-    return f"held by {whose} (posterior sd above {HELD:g} of the prior's): {', '.join(note.names)}"
+    return f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {', '.join(note.names)}"
 
 
 #: What a parameter far from its prior means, by what it is told of.
 FAR = {
-    "loop": "{} lies {:.1f} prior sds from its prior: it stands in for something",
+    "loop": "{} is implausible, {:.1f} prior sds from its prior: it probably absorbs a missing effect",
     "calibration": "{} lies {:.1f} prior sds from its prior: the prior or the model is wrong",
     "edge": "{}: its posterior mean lies {:.1f} prior sds from its prior, at the edge of where the search looked: "
     "widen the prior and search again, or doubt the model",

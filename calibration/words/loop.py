@@ -203,13 +203,23 @@ def how_sure(found: DiscoveryResult, effect: FoundEffect) -> str:
 
 def use_it(found: DiscoveryResult) -> list[str]:
     """How well the robot that is written predicts runs that its fit has not seen, by kind of block."""
-    lines, when = [], 1 if found.written else 0
+    when = 1 if found.written else 0
+    lines = (
+        [f"Like these runs: errors up to {_worst(found.errors[when], len(found.runs))}."]
+        if found.errors[when]
+        else []
+    )
     for kind, both in found.errors_held_out.items():
-        rows = max(int(e["rows"]) for e in both[when].values())
-        each = [f"{channels.of(c).label} {e['rms_percent']:.1f} %" for c, e in both[when].items() if e["rows"]]
-        few = f" ({rows} of {len(found.runs)} rows)" if rows < len(found.runs) else ""
-        lines.append(f"At another {blocks_room.in_words(kind)}: {', '.join(each)}{few}.")
+        lines.append(f"Another {blocks_room.in_words(kind)}: {_worst(both[when], len(found.runs))}.")
     return lines
+
+
+def _worst(errors: Errors, of: int) -> str:
+    """The largest rms error of any channel, and of how many rows where not all are reached: `16.7 % (14/20)`."""
+    rows = max(int(e["rows"]) for e in errors.values())
+    worst = max((float(e["rms_percent"]) for e in errors.values() if e["rows"]), default=math.nan)
+    few = f" ({rows}/{of} reached)" if rows < of else ""
+    return f"{worst:.1f} %{few}" if rows else "not reached"
 
 
 def largest_share(found: DiscoveryResult) -> str:
@@ -223,7 +233,7 @@ def largest_share(found: DiscoveryResult) -> str:
     row, k = np.unravel_index(int(np.nanargmax(squares)), squares.shape)
     columns = {c: runs[c][row] for c in ("configuration", *runs.axes) if runs.has(c)}
     at, label = _conditions(columns), found.channels[k].label
-    return f"{label} of row {found.numbers[row]} ({at}) makes {share:.0f} % of the squares that are left: is it right"
+    return f"Row {found.numbers[row]} ({at}): its {label} makes {share:.0f} % of the misfit that is left"
 
 
 def _conditions(columns: Mapping[str, str | float]) -> str:
@@ -452,7 +462,7 @@ def resolved(found: Resolved) -> str:
             f"leave it ({slip}, χ² falls by {found.fall:.0f}, p = {found.p:.2g}{why}){on}"
         )
     held = len(found.constants) - len(found.known_from_rows)
-    known = f"held by their priors: {held} of {len(found.constants)} constants"
+    known = f"not determined by these rows: {held} of {len(found.constants)} constants"
     return (
         f"The track model was asked about {asked(found.asked)}: a running gear within its priors leaves it ({slip}, "
         f"χ² falls by {found.fall:.0f}, p = {found.p:.2g}): {gear}; {known}{on}"
@@ -495,10 +505,10 @@ def copies(note: Copies) -> str:
 def kept_out(note: KeptOut) -> str:
     """Rows that do not count."""
     why = {
-        "unusable": "cannot be simulated: the fitted model slides or fails there",
-        "outliers": "stand alone: outliers, which no effect explains",
+        "unusable": "are not used: the fitted model slides or fails there",
+        "outliers": "stand alone: outliers, which no effect explains; they are kept out",
     }
-    return f"rows {', '.join(map(str, note.rows))} {why[note.why]}; they are kept out"
+    return f"rows {', '.join(map(str, note.rows))} {why[note.why]}"
 
 
 def phases_differ(note: PhasesDiffer) -> str:

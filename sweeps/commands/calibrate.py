@@ -48,13 +48,14 @@ def print_calibration(found: CalibrationResult) -> None:
     """Whether the fit is adequate; parameters, errors and remarks, for a person."""
     say(found.adequacy.statement)
     shown = Table(title=f"{len(found)} rows, {found.model}", title_justify="left", box=None, pad_edge=False)
-    for heading in ("parameter", "value", "95 % interval", "shift [σ]", "held by its prior"):
-        left = heading in ("parameter", "held by its prior")
+    for heading in ("parameter", "value", "95 % interval", "shift [σ]", "determined"):
+        left = heading in ("parameter", "determined")
         shown.add_column(heading, justify="left" if left else "right", no_wrap=True, overflow="ignore")
     for name, p in found.parameters.items():
         low, high = (f"{v:.3g}" for v in p.interval)
         marks = "> " * p.interval_open[1] + "< " * p.interval_open[0]  # the end lies further out
-        shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", "yes" * p.held_by_prior)
+        determined = "no" if p.held_by_prior else "yes"
+        shown.add_row(name, f"{p.value:.4g}", f"{marks}{low} .. {high}", f"{p.shift:+.1f}", determined)
     say(shown)
     errors = Table(title=f"rms of simulated - measured [% of {found.percent_of}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):

@@ -41,7 +41,13 @@ def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
             say(_wrapped(kind, ", ".join(those)))
         say("mmrjax explain NAME says what one means.")
         return 0
-    found = [(kind, lines) for kind, about in EXPLAINED.items() if (lines := list(about(name, library)))]
+    found = False
+    for kind, about in EXPLAINED.items():
+        for k, (heading, text) in enumerate(about(name, library)):
+            if k == 0:
+                say(f"{name}: {kind}")
+            say(_wrapped(heading, text))
+            found = True
     if not found:
         below = [p for p in known["parameters"] if p.endswith(f".{name}")]
         if below:
@@ -49,10 +55,6 @@ def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
         close = near(name, [n for those in known.values() for n in those], 3)
         hint = f"did you mean {', '.join(close)}? " if close else ""
         raise BadConfiguration(f"explain: got {name}; {hint}mmrjax explain lists the names that there are")
-    for kind, lines in found:
-        say(f"{name}: {kind}")
-        for heading, text in lines:
-            say(_wrapped(heading, text))
     return 0
 
 

@@ -167,11 +167,7 @@ class RigCheck:
         held = [p.name for p in self.foresight.parameters if p.held]
         told = [p.name for p in self.foresight.parameters if not p.held]
         parts = [f"These data determine {', '.join(told)}" if told else "These data determine no parameter"]
-        parts += (
-            [f"{', '.join(held)} would be held by {'its prior' if len(held) == 1 else 'their priors'}"]
-            if held
-            else []
-        )
+        parts += [f"{', '.join(held)} would not be determined by these runs"] * bool(held)
         return "; ".join(parts) + "."
 
     def to_json(self) -> dict[str, Any]:
@@ -331,10 +327,10 @@ def _print_data(found: RigCheck, runs: Runs, seen: Foresight) -> None:
     title = "\nwhat these data can determine (posterior sd over prior sd, at the numbers of the file)"
     shown = _table(title, "parameter", "value>r", "prior ±>r", "unit", "posterior/prior>r", "")
     for p in sorted(seen.parameters, key=lambda p: p.share):
-        said = "held by its prior" if p.held else "determined"
+        said = "not determined" if p.held else "determined"
         shown.add_row(p.name, f"{p.value:.4g}", f"{p.prior_sd:.2g}", p.unit, f"{p.share:.2f}", said)
     say(shown)
-    say(f"held by its prior: above {identifiability.HELD:g}")
+    say(f"not determined: above {identifiability.HELD:g}")
     for one, other, size in seen.alike:
         say(f"- {one} and {other} act alike in these data (correlation {size:+.2f})")
 

@@ -34,7 +34,7 @@ def parameters(found: CalibrationResult) -> Figure:
     axes.set(xlabel="shift from the prior [prior sds]")
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
-    axes.set_title("grey: held by its prior; band: the prior's 95 %")
+    axes.set_title("grey: not determined by these runs; band: the prior's 95 %")
     return fig
 
 

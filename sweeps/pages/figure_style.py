@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import io
+import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -11,9 +13,13 @@ from typing import TYPE_CHECKING, Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.text import Text
+from matplotlib.ticker import LogFormatter, NullFormatter, ScalarFormatter
 
 from mmrjax.channels import Channel
 
@@ -38,7 +44,7 @@ def axis_label(channel: Channel) -> str:
 
 
 _RC: dict[RcKeyType, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib
+    "font.family": "DejaVu Sans",  # comes with matplotlib; browsers without it have Verdana, of the same widths
     "font.size": 9.5,
     "axes.titlesize": 10,
     "axes.titleweight": "bold",
@@ -56,7 +62,7 @@ _RC: dict[RcKeyType, Any] = {
     "legend.fontsize": 8.5,
     "hatch.color": "#9a9a9a",
     "hatch.linewidth": 0.7,
-    "svg.fonttype": "path",
+    "svg.fonttype": "none",
     "svg.hashsalt": "mmrjax",
     "figure.facecolor": "white",
 }
@@ -76,13 +82,72 @@ def figure(rows: int, columns: int, height: float, **keywords: Any) -> tuple[Fig
     return fig, fig.subplots(rows, columns, squeeze=False, **keywords)
 
 
+#: Least size of text in a figure [pt], and least contrast of a text's colour to white paper (WCAG 2, AA).
+LEAST, CONTRAST = 8.5, 4.6
+
+
 def svg(fig: Figure) -> str:
-    """The figure as an SVG document that refers to nothing outside itself."""
+    """The figure as an SVG document that refers to nothing outside itself; its text is text.
+
+    `data-axes` of the document says where its axes are and what they run over, so that a page can show values.
+    """
+    for written in fig.findobj(lambda artist: isinstance(artist, Text)):
+        assert isinstance(written, Text)
+        written.set_fontsize(max(written.get_fontsize(), LEAST))
+        written.set_color(readable(written.get_color()))
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
     text = re.sub(r"<!DOCTYPE[^>]*>\s*", "", text)
-    return re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S)
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.S).replace(
+        "'DejaVu Sans'", "'DejaVu Sans', Verdana"
+    )
+    axes = html.escape(json.dumps([_place(fig, a) for a in fig.axes if a.axison and a.get_visible()]))
+    return text.replace("<svg ", f'<svg data-axes="{axes}" ', 1)
+
+
+def readable(colour: Any) -> Any:
+    """A text's colour, darkened until it can be read on white paper; what is near white is for a dark ground, and
+    stays."""
+    channels = np.array(to_rgb(colour))
+    while 1.25 < 1.05 / (_luminance(channels) + 0.05) < CONTRAST:
+        channels = channels * 0.97
+    return tuple(channels)
+
+
+def _luminance(channels: np.ndarray) -> float:
+    """Relative luminance of sRGB, as WCAG 2 defines it."""
+    linear = np.where(channels <= 0.03928, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def _place(fig: Figure, axes: Axes) -> dict[str, Any]:
+    """Where axes are in the drawing [pt from its upper left corner], and what they run over."""
+    width, height = 72 * fig.get_size_inches()
+    box = axes.get_position(original=False)
+    place = [box.x0 * width, (1 - box.y1) * height, box.width * width, box.height * height]
+    # an inner axis has its label at the edge of its row or column, or of the figure
+    column = [a.xaxis for a in fig.axes if a.get_position().x0 == axes.get_position().x0]
+    row = [a.yaxis for a in fig.axes if a.get_position().y0 == axes.get_position().y0]
+    both = {}
+    for name, axis, beside, whole in (
+        ("x", axes.xaxis, column, fig.get_supxlabel()),
+        ("y", axes.yaxis, row, fig.get_supylabel()),
+    ):
+        labels = (axis.get_label_text(), *(other.get_label_text() for other in beside), whole)
+        both[name] = {**_run(axis), "label": next(filter(None, labels), "").split("\n")[0]}
+    return {"box": [round(v, 1) for v in place], **both}
+
+
+def _run(axis: Axis) -> dict[str, Any]:
+    """The ends of an axis, whether it is logarithmic, and its names where its ticks have any."""
+    ends = [float(f"{end:.6g}") for end in axis.get_view_interval()]
+    known: dict[str, Any] = {"ends": ends, "log": axis.get_scale() == "log"}
+    if not isinstance(axis.get_major_formatter(), ScalarFormatter | LogFormatter | NullFormatter):
+        names = [(float(t.get_loc()), t.label1.get_text() or t.label2.get_text()) for t in axis.get_major_ticks()]
+        if names and all(name for _, name in names):
+            known["names"] = names
+    return known
 
 
 def label_end(axes: Axes, x: np.ndarray, y: np.ndarray, words: str, colour: str, **keywords: Any) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import mmrjax as mm
 from calibration.data.columns import Layout
 from calibration.discovery.result import DiscoveryResult
 from calibration.inference import blocks
@@ -15,8 +17,12 @@ from calibration.inference.details import Detail, EquationDefects, TimeStatistic
 from calibration.inference.notes import FarFromPrior
 from calibration.words import loop as words
 from calibration.words.notes import sentence
+from mmrjax import params
+from mmrjax.channels import Channel
+from mmrjax.effects import BY_NAME
 from sweeps.pages import cluster_figures, loop_figures
-from sweeps.pages.page import Album, columns, conditions, first_rows, render, rms, words_shown
+from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, rms, words_shown
+from sweeps.pages.words import GLOSSARY
 
 #: Change of an rms error that is marked [%].
 NOTABLE = 0.05
@@ -62,9 +68,76 @@ def findings(found: DiscoveryResult) -> list[dict[str, str]]:
     for e in found.effects:
         a = e.parameters["amplitude"]
         size = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}"
+        if (change := changed(found, e.name)) is not None:
+            size += f", which is {100 * change.rms:.2g} % of the {change.channel.label}"
         sure, other = words.how_sure(found, e), words.alike(e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
     return listed
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """What an effect of the robot that is written changes in the readings of the runs.
+
+    Attributes:
+        channel: the one that it changes most; rms: by how much, as a share of the reading.
+        without, with_it: simulated without and with it, all else alike [SI], shape (rows,).
+    """
+
+    channel: Channel
+    rms: float
+    without: np.ndarray
+    with_it: np.ndarray
+
+
+def changed(found: DiscoveryResult, name: str) -> Change | None:
+    """What an effect changes in settled runs; None of histories, and where it is not in the robot that is written."""
+    if not isinstance(found.detail, EquationDefects) or name not in {e.name for e in found.robot.effects}:
+        return None
+    conditions = found.runs.conditions(found.robot)
+    none = params.replace(found.robot, {f"effects.{name}.amplitude": np.asarray(0.0)})
+    without, with_it = (mm.simulate(robot, conditions).reading for robot in (none, found.robot))
+    changes = []
+    for c in found.channels:
+        a, b = np.asarray(without[c.name]), np.asarray(with_it[c.name])
+        there = found.included & np.isfinite(a) & np.isfinite(b) & (b != 0)
+        if there.any():
+            changes.append(Change(c, float(np.sqrt(np.mean((a[there] / b[there] - 1) ** 2))), a, b))
+    return max(changes, key=lambda change: change.rms, default=None)
+
+
+def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
+    """From what size each effect of the library would have been noticed, the first in its typical sizes first."""
+    level, listed = found.before.kinds["single"].threshold, []
+    for s in found.scores:
+        if s.name in BY_NAME and s.sigmas_per_prior_sd > 0:
+            spec = next(p.spec for p in params.walk(BY_NAME[s.name]()) if p.spec.amplitude)
+            times = level / s.sigmas_per_prior_sd
+            size = f"{times * spec.prior_sd(0.0):.2g} {spec.unit}"
+            listed.append({"name": s.name, "what": BY_NAME[s.name].family(), "size": size, "times": times})
+    return sorted(listed, key=lambda one: one["times"])
+
+
+def unseen(found: DiscoveryResult) -> list[dict[str, Any]]:
+    """Errors of the refit and with what was found, by kind of block held out, with the rows that each reaches; marked
+    where they are better or worse."""
+    of, many = len(found.runs), found.verdict != "none"
+    lines = []
+    for kind, both in {"": found.errors, **found.errors_held_out}.items():
+        worse = {w.channel for w in found.held_out_worse if w.kind == kind}
+        cells = []
+        for c in both[0]:
+            texts = [f"{e[c]['rms_percent']:.1f}" if e[c]["rows"] else "-" for e in both[: 1 + many]]
+            change = both[1][c]["rms_percent"] - both[0][c]["rms_percent"] if many else 0.0
+            up = c in worse if kind else change > NOTABLE
+            mark = "bad" if up else "good" if change < -NOTABLE else ""
+            arrow = {"bad": " ↑", "good": " ↓", "": ""}[mark]
+            cells.append({"text": " → ".join(texts) + arrow, "mark": mark})
+        rows = [max(int(e["rows"]) for e in one.values()) for one in both[: 1 + many]]
+        what = f"unseen: another {blocks.in_words(kind)}" if kind else "seen by the fit"
+        shown = f"{rows[0]} → {rows[-1]}" if rows[0] != rows[-1] else str(rows[0])
+        lines.append({"what": what, "cells": cells, "reached": f"{shown} of {of}"})
+    return lines
 
 
 def summary(found: DiscoveryResult) -> list[dict[str, Any]]:
@@ -94,7 +167,8 @@ def check_first(found: DiscoveryResult) -> list[str]:
     far = [sentence(note) for note in found.remarks if isinstance(note, FarFromPrior)]
     against = [note for note in found.remarks if isinstance(note, str)]
     said = [words.largest_share(found), *far, *against[:1]]
-    return [f"{text[0].upper()}{text[1:].rstrip('.')}{'?' if k == 0 else '.'}" for k, text in enumerate(said) if text]
+    # a sentence begins with a capital, a parameter's name does not
+    return [f"{text if '.' in text.split()[0] else text[0].upper() + text[1:]}." for text in said if text]
 
 
 def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
@@ -113,6 +187,9 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
     if found.residual_clusters:
         album.add("clusters", lambda: cluster_figures.clusters(found.residual_clusters))
     album.add("errors", lambda: loop_figures.errors(found))
+    changes = {e.name: change for e in found.effects if (change := changed(found, e.name)) is not None}
+    if changes:
+        album.add("laws", lambda: loop_figures.laws(found, table, changes))
     if found.unnamed is not None:
         curve = found.unnamed
         album.add("curve", lambda: loop_figures.curve(rows_of(found), curve, float(found.robot.sides)))
@@ -129,6 +206,15 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         answer=words.answer(found),
         findings=findings(found),
         summary=summary(found),
+        unseen=unseen(found),
+        would_be_seen=would_be_seen(found),
+        glossary=GLOSSARY,
+        curves=curves(found.robot),
+        files={
+            "robot.toml": f"the robot {'with what was found' if found.written and found.effects else 'refitted'}",
+            "fitted.toml": "the robot refitted, with nothing added",
+            "posterior.nc": "what the fit leaves open, for --posterior",
+        },
         seen_by=next((blocks.in_words(kind) for kind in found.errors_held_out), "nothing"),
         use_it=words.use_it(found),
         check_first=check_first(found),

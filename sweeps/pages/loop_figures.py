@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -12,6 +13,7 @@ from calibration.inference import blocks
 from calibration.inference.bases import in_words
 from calibration.inference.details import TimeStatistics
 from mmrjax.channels import MM, RPM, Channel
+from mmrjax.effects import BY_NAME
 from sweeps.pages.figure_style import (
     BLUE,
     FAINT,
@@ -25,6 +27,9 @@ from sweeps.pages.figure_style import (
     short,
 )
 from sweeps.pages.sweep_figures import UNITS, imposed
+
+if TYPE_CHECKING:
+    from sweeps.pages.loop import Change
 
 #: Effects on the ladder and on the map of look-alikes.
 RUNGS, ALIKE = 20, 14
@@ -166,9 +171,9 @@ def ladder(found: DiscoveryResult) -> Figure:
     axes.barh(range(len(rungs)), root, color=colours, height=0.72)
     level = found.before.kinds["single"].threshold
     axes.axvline(level, color=ORANGE, lw=1.6)
-    axes.text(level, -0.9, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
+    axes.text(level, -0.6, f" threshold {level:.1f}", color=ORANGE, fontsize=8.5, va="bottom")
     axes.set_yticks(range(len(rungs)), [f"{r.name}  ({r.balance})" for r in rungs])
-    axes.invert_yaxis()
+    axes.set_ylim(len(rungs) - 0.4, -1.8)
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="score: what the effect alone, at a plausible size, would explain beside the base [σ], linearly")
     axes.set_title("blue: found; light blue: these data cannot tell it from one that was found")
@@ -216,6 +221,31 @@ def errors(found: DiscoveryResult) -> Figure:
         axes.set_title(channel.label)
         axes.set_xlabel("rms error [%]")
     grid[0, -1].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
+    return fig
+
+
+#: By what an effect changes with, the equation whose variable reveals it.
+REVEALS = {"current": "electrical", "load": "electrical", "speed": "track", "demand": "slip", "slope": "slip"}
+
+
+def laws(found: DiscoveryResult, table: dict[str, np.ndarray], changes: Mapping[str, Change]) -> Figure:
+    """What each effect that was found explains: readings less the same robot without it, and what it adds, over what
+    reveals it."""
+    fig, grid = figure(1, len(changes), 3.4)
+    for axes, (name, change) in zip(grid[0], changes.items(), strict=True):
+        c, own = change.channel, imposed(table)
+        reveals = REVEALS.get(BY_NAME[name].driver) if name in BY_NAME else None
+        x, label = _over(table, *DEFECT_WORDS[reveals][2:]) if reveals else (table[own], IMPOSED_WORDS[own])
+        measured = found.readings_of_rows.measured[:, [x.name for x in found.channels].index(c.name)]
+        axes.axhline(0, color=FAINT, lw=0.8)
+        for what, values, look in (
+            ("measured", measured, {"marker": "o", "color": ORANGE}),
+            ("with it", change.with_it, {"marker": "_", "color": BLUE, "ms": 13, "mew": 2.2}),
+        ):
+            y = (values - change.without)[found.included] / c.factor
+            axes.plot(x[found.included], y, ls="none", label=what, **look)
+        axes.set(xlabel=label, ylabel=f"{c.label}, less without it [{c.unit}]", title=name)
+    grid[0, 0].legend(loc="best")
     return fig
 
 
@@ -297,7 +327,7 @@ def base_shift(found: DiscoveryResult) -> Figure:
     axes.invert_yaxis()
     axes.grid(axis="y", visible=False)
     axes.set(xlabel="shift from the prior [prior sds]")
-    axes.set_title("orange: before, blue: after; a far one stands in for something that is missing")
+    axes.set_title("orange: before, blue: after; one far off probably absorbs a missing effect")
     return fig
 
 
@@ -318,7 +348,7 @@ def curve(table: dict[str, np.ndarray], found: UnnamedDiscrepancy, sides: float 
     if found.defect is not None and found.defect_sd is not None and column in table:
         there = np.isfinite(found.defect)
         axes.errorbar(np.asarray(table[column])[there] * factor, found.defect[there], 2 * found.defect_sd[there],
-                      fmt="o", ms=4, color=ORANGE, lw=0.7, label="defect of each run, ±2 sd")  # fmt: skip
+                      fmt="o", ms=4, color=ORANGE, lw=0.7, label="each run, ±2 sd")  # fmt: skip
     scale = SHOWN.get(variable, 1.0)
     if found.window is not None:
         axes.axvspan(float(found.window["low"]), float(found.window["high"]), color="#eeeeee", lw=0, zorder=0)

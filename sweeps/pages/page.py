@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from pathlib import Path
@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
+from markupsafe import Markup
 
-from mmrjax import __version__, channels, params
+from mmrjax import __version__, channels, effects, params
 from mmrjax.channels import Channel
 from sweeps import capabilities
 from sweeps.pages import words
@@ -27,12 +28,12 @@ _PAPERS_NAMES = {"nominal": "nominal (PM)", "sm1": "SM-1", "sm2": "SM-2"}
 
 
 class Album:
-    """Draws figures into `folder/figures` and keeps them, encoded, for the page."""
+    """Draws figures into `folder/figures` and keeps them for the page."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = Path(folder) / "figures"
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.pictures: dict[str, str] = {}
+        self.pictures: dict[str, Markup] = {}
 
     def add(self, name: str, draw: Callable[[], Any]) -> Any:
         """Draw one figure; `draw` returns it, alone or followed by numbers, which are returned."""
@@ -41,8 +42,16 @@ class Album:
             figure, *numbers = drawn if isinstance(drawn, tuple) else (drawn,)
             text = svg(figure)
         (self.folder / f"{name}.svg").write_text(text, encoding="utf-8")
-        self.pictures[name] = "data:image/svg+xml;base64," + base64.b64encode(text.encode()).decode()
+        self.pictures[name] = Markup(_inline(text, name))
         return numbers[0] if numbers else None
+
+
+def _inline(svg: str, name: str) -> str:
+    """An SVG document as an element of a page: only what is referred to has an id, which is of this figure alone."""
+    element = re.sub(r' xmlns(?::\w+)?="[^"]*"', "", svg[svg.index("<svg") :])
+    wanted = set(re.findall(r'(?:href="|url\()#([^")]+)', element))
+    element = re.sub(r' id="([^"]+)"', lambda m: f' id="{name}-{m[1]}"' if m[1] in wanted else "", element)
+    return re.sub(r'((?:href="|url\()#)(?=[^")]+)', rf"\g<1>{name}-", element)
 
 
 def named(file: RobotFile) -> dict[str, Any]:
@@ -54,11 +63,17 @@ def named(file: RobotFile) -> dict[str, Any]:
     from mmrjax.robots import ROBOTS
 
     robot, name = file.robot, file.name
+    known: dict[str, Any] = {"robot": name, "changed": [], "own": [], "curves": curves(robot)}
     if not robot.rig.inherits:
-        return {"robot": name, "changed": [], "own": capabilities.parameters(file)}
+        return known | {"own": capabilities.parameters(file)}
     if name in ROBOTS and changed_parameters(robot, ROBOTS[name]()):
         name = f"{name}, changed"
-    return {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]()), "own": []}
+    return known | {"robot": words_shown(name), "changed": changed_parameters(robot, ROBOTS["nominal"]())}
+
+
+def curves(robot: Robot) -> list[str]:
+    """Curves of a robot for what is missing without a name."""
+    return [e.name for e in robot.effects if e.name in effects.UNNAMED]
 
 
 def words_shown(name: str) -> str:
@@ -187,6 +202,9 @@ def _grade(value: Any) -> str:
 def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[Channel] = (), **known: Any) -> Path:
     """Write `report.html` from a template, the album's pictures and what the template asks for.
 
+    What every page has comes here: a warning of curves that nobody has named (`curves`), contents after the answer,
+    what lies beside the page (`files`: meanings that are not the usual ones), tables that scroll in themselves.
+
     Args:
         of_channels: that the page is about.
     """
@@ -205,8 +223,39 @@ def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[C
         "settled_words": words.SETTLED,
         "version": __version__,
     }
+    known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
     page = environment.get_template(template).render(pictures=album.pictures, **known)
-    page = page.replace("<table", '<div class="scroll"><table').replace("</table>", "</table></div>")
+    page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
+    page = _with_contents(page, words.of_curves(known.get("curves", [])))
     path = Path(folder) / "report.html"
     path.write_text(page, encoding="utf-8")
     return path
+
+
+def _beside(folder: Path, meanings: dict[str, str]) -> dict[str, str]:
+    """Files that a run folder has, or is about to have, with what they are; what is known first."""
+    there = {p.name + "/" * p.is_dir() for p in folder.iterdir()} | {"manifest.json"}
+    there -= {"chunks/", "identity", "report.html"}
+    return {
+        name: meanings.get(name, "")
+        for name in [*(n for n in meanings if n in there), *sorted(there - set(meanings))]
+    }
+
+
+_HEADING = re.compile(r"<h2(?: id=\"([^\"]+)\")?>(.*?)</h2>", re.S)
+
+
+def _with_contents(page: str, warning: str) -> str:
+    """A page with links to its headings, and a warning if there is one, before the first of them."""
+    links = []
+
+    def with_id(found: re.Match[str]) -> str:
+        text = re.sub("<.*?>", "", found[2])
+        name = found[1] or "section-" + re.sub(r"\W+", "-", text.lower()).strip("-")
+        links.append(f'<a href="#{name}">{text}</a>')
+        return f'<h2 id="{name}">{found[2]}</h2>'
+
+    page = _HEADING.sub(with_id, page)
+    first = page.index("<h2")
+    card = f'<div class="card warn" id="curve-warning"><span>{warning}</span></div>\n' if warning else ""
+    return f'{page[:first]}{card}<nav id="contents" aria-label="contents">{" ".join(links)}</nav>\n{page[first:]}'

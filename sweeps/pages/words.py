@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from mmrjax import channels
@@ -55,6 +55,54 @@ STATUSES: dict[str, Status] = {
     ),
 }
 
+#: What lies in a run folder beside its page.
+FILES = {
+    "robot.toml": "the robot; every command takes it with --robot",
+    "runs.csv": "every run, a row each",
+    "rows.csv": "every row: measured, simulated, residuals",
+    "comparison.csv": "every row: measured, simulated, errors",
+    "history.csv": "every instant",
+    "segments.csv": "every segment of the mission",
+    "result.json": "everything on this page, for programs",
+    "config.resolved.toml": "every option of the command",
+    "manifest.json": "versions, machine, time, hashes",
+    "figures/": "the figures, as SVG",
+}
+
+
+def of_curves(names: Sequence[str]) -> str:
+    """A warning of a robot with curves that nobody has named; empty for none."""
+    if not names:
+        return ""
+    curves = " and ".join(f"<code>{n}</code>" for n in names)
+    return (
+        f"This robot holds {curves}: a smooth curve fitted to what its model lacks, which nobody has named. "
+        "Trust it only under the conditions of the runs that it was fitted to."
+    )
+
+
+#: What a page's reader meets and may not know; docs/glossary.md is made of it.
+GLOSSARY = {
+    "balance": "one of the model's equations, such as volts along the motor's circuit or torque at the "
+    "driving wheel; every effect enters one",
+    "effect": "a term that the model may lack, with an equation and a size; `mmrjax explain NAME` says "
+    "what it is and how to test for it",
+    "established": "an effect that chance, a smooth curve, one run or one block of runs cannot account for",
+    "tentative": "an effect that is in the robot because it predicts better, while something speaks against its name",
+    "class": "effects that these data cannot tell apart",
+    "refit": "the same model with its parameters fitted to the runs, and nothing added",
+    "seen, held out": "errors of runs that the fit was made with, and of runs that it has not seen: a whole "
+    "slope, voltage or configuration at a time",
+    "rms error": "root of the mean square of simulated less measured, in percent of the reading",
+    "σ (sd)": "standard deviation of an instrument: 2 of 3 readings are within 1 σ of the truth, 19 of 20 within 2 σ",
+    "misfit, χ²": "sum of (simulated less measured)² / σ² over all readings; noise alone leaves about one a reading",
+    "prior": "what a bench or a maker states of a parameter, with its standard deviation, before any "
+    "run is looked at",
+    "p": "how often noise alone would look like this",
+    "nat": "unit of how probable held-out readings are: +0.1 a reading is a clear gain over 60 readings",
+    "reached": "runs of which the robot has a steady state; on others it slides or stands",
+}
+
 FLAGS = {
     "motor_overspeed": "motor faster than it is permitted to turn",
     "gearbox_overspeed": "gearbox input faster than its catalogue permits",
@@ -75,7 +123,7 @@ FLAGS = {
 #: In place of a winding's temperature after long running, at a current that heats it without an end.
 NONE_SETTLES = "none settles"
 #: A current that never brings a winding to its limit.
-FOR_EVER = "for ever"
+FOR_EVER = "continuously"
 
 #: Statuses of runs that ended as their conditions ask, with numbers; `signals.DONE` by name.
 SETTLED = ("converged", "reverses")

@@ -48,7 +48,7 @@ def current_over_slope(robot: Robot, rows: data.Rows) -> tuple[Figure, list[dict
             stop = np.nonzero(np.isfinite(own))[0]
             if stop.size and stop[-1] < len(slopes) - 1:
                 axes.plot(slopes[stop[-1]], own[stop[-1]], "x", color=colour, ms=7, mew=2)
-            label_end(axes, slopes, raised, f"{mode}", colour, fontweight="bold")
+            label_end(axes, slopes, raised, f"{mode}", colour, fontweight="bold", offset=(5 + 9 * (mode % 2), 0))
             table = rows.conditions
             pick = (
                 (table["configuration"] == kind)

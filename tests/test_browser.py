@@ -1,0 +1,112 @@
+"""Every report in a headless browser, on a phone, a laptop, a wide screen and paper: nothing is cut off or printed over,
+nothing scrolls sideways but tables and figures in themselves, nothing is asked of a network, and all can be read."""
+
+import sys
+
+import pytest
+from browser import MEASURE, PAPER, Browser, found
+from test_loop_command import commanded
+
+from sweeps import cli
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(found() is None, reason="NO BROWSER: pages are not looked at; install chromium"),
+]
+
+#: Width [px], medium, and whether the reader wants it dark.
+VIEWS = [
+    (390, "screen", False),
+    (1280, "screen", False),
+    (1920, "screen", False),
+    (PAPER, "print", False),
+    (1280, "screen", True),
+]
+GRID = "--configurations 4W2T,6T2A --voltages 15,33 --payloads 0,8 --slopes 0,10,20"
+PAGES = {
+    "run": "simulate --configuration 6T2A --voltage 24 --slope 10",
+    "start": "simulate --model drive --slope 10",
+    "mission": "simulate --profile patrol --battery --payload 5",
+    "sweep": f"sweep {GRID}",
+    "comparison": "compare measured",
+    "calibration": "calibrate measured --starts 2 --no-profiles",
+    "check": "check paper",
+    "sensitivity": "sensitivity --outputs speed --payloads 3 --voltages 24 --slopes 10 --method local",
+    "paper": "reproduce",
+}
+FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p>
+<p style="color:#bbb">faint</p><p style="font-size:7px">tiny</p>
+<div style="position:relative;height:40px"><span style="position:absolute;top:0">one text</span>
+<span style="position:absolute;top:2px;left:10px">over another</span></div>
+<div style="overflow:hidden;width:60px;white-space:nowrap">what is cut off at its end</div>
+<figure id="f"><svg width="100" height="50"><text x="70" y="20">beyond the edge</text></svg></figure>
+<script>console.error("no"); fetch("http://localhost:1234/x").catch(() => 0); undefinedThing()</script></body></html>"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with Browser() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("browser")
+
+
+def made(name, folder):
+    """The page of a command."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["mmrjax", *PAGES[name].split(), "--out", name])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+    assert end.value.code == 0
+    return folder / name / "report.html"
+
+
+def wrong(browser, page):
+    """What is wrong with a page, by view."""
+    seen = {}
+    for width, media, dark in VIEWS:
+        browser.open(page, width, media=media, dark=dark)
+        kinds = {kind: where for kind, where in browser.value(MEASURE).items() if where}
+        if said := browser.complaints():
+            kinds["complaints"] = said
+        if kinds:
+            seen[f"{width} {media}{' dark' * dark}"] = kinds
+    return seen
+
+
+def test_a_faulty_page_is_found(browser, folder):
+    """Or none of what follows means anything."""
+    page = folder / "faulty.html"
+    page.write_text(FAULTY.replace("{long}", "a line that never ends, " * 20))
+    kinds = wrong(browser, page)["390 screen"]
+    assert set(kinds) == {"sideways", "outside", "clipped", "overlapping", "contrast", "small", "complaints"}
+    assert len(kinds["clipped"]) == 2 and len(kinds["complaints"]) >= 3
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_can_be_read_everywhere(browser, folder, name):
+    assert wrong(browser, made(name, folder)) == {}
+
+
+def test_the_page_of_the_loop_can_be_read_everywhere(browser):
+    assert wrong(browser, commanded().folder / "found" / "report.html") == {}
+
+
+def test_a_table_is_sorted_by_its_headings_and_a_figure_says_its_values(browser, folder):
+    page = folder / "sweep" / "report.html"
+    browser.open(page if page.exists() else made("sweep", folder), 1280)
+    texts = "[...document.querySelectorAll('#extremes tr td:nth-child(2)')].map(c => parseFloat(c.textContent))"
+    head = "document.querySelector('#extremes th:nth-child(2)')"
+    assert browser.value(f"{head}.click(), {texts}") == sorted(browser.value(texts))
+    assert browser.value(f"{head}.click(), {texts}") == sorted(browser.value(texts), reverse=True)
+    said = browser.value("""(() => {
+      const svg = document.querySelector("svg[data-axes]"), [x, y, w, h] = JSON.parse(svg.dataset.axes)[0].box;
+      const at = new DOMPoint(x + w / 2, y + h / 2).matrixTransform(svg.getScreenCTM());
+      svg.dispatchEvent(new PointerEvent("pointermove", {clientX: at.x, clientY: at.y}));
+      return document.getElementById("reading").textContent;
+    })()""")
+    assert "slope" in said and any(c.isdigit() for c in said)

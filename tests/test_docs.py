@@ -1,0 +1,87 @@
+"""The docs: pages that are made are what makes them, every page is in the site, every schema is one."""
+
+import importlib.util
+import inspect
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+import mmrjax as mm
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+
+
+def site():
+    """The module that makes pages."""
+    spec = importlib.util.spec_from_file_location("docs_site", DOCS / "site.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", ["api", "glossary"])
+def test_a_page_that_is_made_is_what_makes_it(name):
+    """Else: python docs/site.py."""
+    assert (DOCS / f"{name}.md").read_text("utf-8") == getattr(site(), name)()
+
+
+def test_every_public_name_has_a_docstring_with_what_it_takes():
+    for name in (n for n in mm.__all__ if n.islower() and not n.startswith("_")):
+        thing = getattr(mm, name)
+        doc = inspect.getdoc(thing) or ""
+        taken = [p for p in inspect.signature(thing).parameters.values() if p.kind is not p.VAR_KEYWORD]
+        assert doc and ("Args:" in doc or not taken), name
+        assert all(re.search(rf"\b{p.name}\b", doc) for p in taken), name
+
+
+def test_every_page_is_in_the_site():
+    named = set(re.findall(r"[\w/-]+\.md", (ROOT / "mkdocs.yml").read_text("utf-8")))
+    assert named == {str(p.relative_to(DOCS)) for p in DOCS.rglob("*.md")}
+
+
+def test_the_site_asks_nothing_of_a_network():
+    text = (ROOT / "mkdocs.yml").read_text("utf-8")
+    assert "font: false" in text and "offline" not in text.split("plugins:")[1].split("\n")[0]
+    assert not re.search(r"https?://", text)
+
+
+@pytest.mark.parametrize("path", sorted((DOCS / "schemas").glob("*.json")), ids=lambda path: path.stem)
+def test_every_schema_is_one_and_is_listed(path):
+    jsonschema.validators.validator_for(schema := json.loads(path.read_text("utf-8"))).check_schema(schema)
+    assert f"schemas/{path.name}" in (DOCS / "schemas.md").read_text("utf-8")
+
+
+def test_twenty_questions_are_answered_somewhere():
+    lines = re.findall(r"^\| (\d+) \| (.*?\?) \| (.+) \|$", (DOCS / "lab" / "questions.md").read_text("utf-8"), re.M)
+    assert [int(number) for number, _, _ in lines] == list(range(1, 21))
+
+
+def test_figures_have_claim_machine_command_and_date():
+    lines = [line for line in (DOCS / "benchmarks.md").read_text("utf-8").splitlines() if line.startswith("| ")]
+    head, *rows = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines)
+    assert head == ["claim", "figure", "goal", "machine", "command", "date"] and len(rows) >= 20
+    for row in rows:
+        assert len(row) == 6 and all(row), row
+        for script in re.findall(r"benchmarks/\w+\.py", row[4]):
+            assert (ROOT / script).exists(), script
+
+
+def test_extras_of_the_project_are_those_that_the_docs_name():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    assert {"test", "cluster", "bench", "docs"} <= set(extras)
+
+
+@pytest.mark.slow
+def test_the_example_is_what_the_loop_says_today(tmp_path, mmrjax):
+    """Else: mmrjax loop measured --out found; python docs/site.py found."""
+    assert mmrjax("loop", "measured", "--out", "found", "--no-report")[0] == 0
+    numbers = r"[-+−]?\d+(?:\.\d+)?"
+    said, made = (DOCS / "example.md").read_text("utf-8"), site().example(tmp_path / "found")
+    assert re.sub(numbers, "N", said) == re.sub(numbers, "N", made)
+    for a, b in zip(re.findall(numbers, said), re.findall(numbers, made), strict=True):
+        assert float(a) == pytest.approx(float(b), rel=0.02, abs=0.11), (a, b)
