@@ -47,6 +47,7 @@ CASES = {
     "an imposed speed": (3, "linear", "motor_speed", {}),
     "noise and a delay": (4, "winch", "voltage", {"noise": 5.0, "delay": 0.05}),
     "coarse steps": (5, "bench", "voltage", {"noise": 0.2, "step": 3.0}),
+    "steps that hide the noise": (10, "linear", "voltage", {"rate": 50.0, "hold": 1.0, "step": 4.0, "lag": 0.02}),
     "a slow lag": (6, "tracked", "voltage", {"lag": 0.3}),
     "noise, steps and a jittering clock": (7, "wheeled", "voltage", {"noise": 4.0, "step": 2.0, "jitter": 0.3}),
     "few samples": (8, "winch", "voltage", {"rate": 25.0, "hold": 3.0}),
@@ -63,6 +64,28 @@ def test_means_are_those_of_the_levels_within_their_sds(tmp_path, case):
     assert np.sqrt(np.mean(z**2, 0)) == pytest.approx(np.full(z.shape[1], 0.85), abs=0.55) and np.abs(z).max() < 5
     for s in found.kept:  # no stretch holds samples of two levels, but for alike ones
         assert np.ptp(log.settled[log.level[s.rows]], 0) == pytest.approx(np.zeros(z.shape[1]), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_sds_hold_over_random_logs(tmp_path):
+    """Holds of 1 to 4 s, lags up to 0.4 s, 50 to 250 Hz, noise, steps, delays and clocks that jitter."""
+    z, levels, kept = [], 0, 0
+    for seed in range(16):
+        rng = np.random.default_rng([77, seed])
+        world = gr.world(rng, rows=(16, 60))
+        gr.case(world).write(tmp_path)
+        log = gl.log(
+            world, rng, hold=rng.uniform(1, 4), rate=rng.choice([50, 100, 250]), lag=rng.uniform(0.02, 0.4),
+            noise=rng.uniform(0.5, 6), jitter=rng.uniform(0, 0.3), delay=rng.choice([0, 0, 0.05]),
+            step=rng.choice([0, 0, 1, 3]),
+        )  # fmt: skip
+        log.write(tmp_path / "log.csv")
+        found = settled(tmp_path, robot_file.read(tmp_path / "rig.toml"))
+        z.append(np.abs(deviations(log, found)).ravel())
+        levels, kept = levels + len(world.conditions), kept + len(found.kept)
+    every = np.concatenate(z)
+    assert 0.8 < np.sqrt(np.mean(every**2)) < 1.25 and np.mean(every > 3) < 0.03 and np.mean(every > 5) < 5e-3
+    assert kept > 0.8 * levels
 
 
 def test_a_log_that_is_left_too_early_is_not_settled(tmp_path):
@@ -133,6 +156,10 @@ BAD = {
     "no time": (
         lambda c: {k: v for k, v in c.items() if k != "time_s"},
         r"column time_s is missing, and a row is a settled run already; give it to loop",
+    ),
+    "time of day": (
+        lambda c: c | {"time_s": c["time_s"] + 1.7e9},
+        r"row 1, time_s: got 17\d+\.0; is it the time of day\? subtract that of the first row; expected 0 to 1e\+06",
     ),
     "frozen": (
         lambda c: c | {"motor_speed_rpm": np.full(600, 812.0)},

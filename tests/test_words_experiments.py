@@ -22,7 +22,7 @@ ONE = Reach(
 )  # fmt: skip
 LEVEL = dataclasses.replace(ONE, used=(Used("rover", 0, (12.0,), (0.0,), (0.0,), 4.0),))
 BENCH = dataclasses.replace(LEVEL, has_ground=False)
-DRIVEN = dataclasses.replace(BENCH, imposed="motor_speed", speeds=(52.36, 209.44))
+DRIVEN = dataclasses.replace(BENCH, imposed="motor_speed", levels=(52.36, 209.44))
 
 
 def on(reach):

@@ -397,6 +397,8 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
         found = _WITH_UNIT.fullmatch(cell)
         return "" if found is None else _unit_hint(found[1], found[2], mine, named)
     far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
+    if far and meaning.column in TIME:
+        return "is it the time of day? subtract that of the first row; "
     for unit, column in named.items():
         low, high = quantity.limits(unit)
         if far and unit != mine and low <= value <= high:

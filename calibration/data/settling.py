@@ -34,6 +34,8 @@ SDS = 3.0
 OF_CHANGE = 12**0.5
 #: Beginnings of a stretch that are tried, and share of the largest change from which on a change is slight.
 TRIES, SLIGHT = 5, 0.05
+#: Share of readings up to which there are different ones where an instrument has coarse steps.
+COARSE = 0.2
 #: Equal readings one after the other that an instrument with noise does not show, and up to what share of all steps
 #: readings that are equal to the one before are noise's chance.
 STUCK, CHANCE = 20, 0.2
@@ -269,9 +271,15 @@ RATES = (("output_angle_deg", "output_speed", 1 / 6), ("position_mm", "speed", 1
 
 
 def _step(runs: Runs, channel: Channel) -> float:
-    """Step of a channel's instrument [unit of the column]: that which its readings show, else the file's."""
+    """Step of a channel's instrument [unit of the column]: that which its readings show, else the file's, else of
+    readings that mostly come again the smallest difference."""
+    shown = runs[channel.column]
     stated = (i.quantum or 0.0 for i in runs.layout.instruments if i.channel == channel.name)
-    return step_of(runs[channel.column]) or next(stated, 0.0) / channel.factor
+    if found := step_of(shown) or next(stated, 0.0) / channel.factor:
+        return found
+    levels = np.unique(shown[np.isfinite(shown)])
+    coarse = 1 < len(levels) < COARSE * np.isfinite(shown).sum()
+    return float(np.median(np.diff(levels)[np.diff(levels) < 1.5 * np.diff(levels).min()])) if coarse else 0.0
 
 
 def _rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
@@ -534,7 +542,8 @@ def _mean(signal: Signal, time: np.ndarray, rows: np.ndarray) -> tuple[float, fl
     spread = float(np.std(rest))
     sd = spread * math.sqrt(_correlation_time(rest) / len(x))
     if signal.step > 0:  # without noise readings round alike; with it their mean is off by less
-        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0)
+        # Of two readings alone nobody knows how often noise carries one to the other.
+        within = max(spread**2 / signal.step**2 - 1 / 12, 0.0) if len(np.unique(shown[there])) > 2 else 0.0
         rounding = min(1 / math.sqrt(12), math.exp(-2 * math.pi**2 * within) / (math.pi * math.sqrt(2)))
         sd = math.hypot(sd, rounding * signal.step)
     return mean, max(sd, 1e-6 * abs(mean), 1e-9 * signal.largest), slope * float(np.ptp(t))
