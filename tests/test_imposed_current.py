@@ -9,6 +9,7 @@ import pytest
 from calibration.data import robot_file
 from calibration.data import runs as records
 from calibration.data.errors import BadConfiguration, BadData
+from calibration.inference import blocks as holdout
 from calibration.inference import observers
 from calibration.inference.calibrate import calibrate
 from mmrjax import params
@@ -125,6 +126,12 @@ def settled_table(tmp_path, robot, dry):
         "motor_current_A,motor_speed_rpm,motor_speed_sd_rpm\n" + "\n".join(rows) + "\n", encoding="utf-8"
     )
     return records.read(tmp_path / "runs.csv", robot=robot)
+
+
+def test_levels_of_the_current_are_blocks_to_hold_out(robot, tmp_path):
+    runs = settled_table(tmp_path, robot, DRY)
+    kinds = holdout.distinct(runs, observers.kind(runs).blocks)
+    assert list(kinds) == ["current"] and len(kinds["current"]) == 8
 
 
 @pytest.mark.slow

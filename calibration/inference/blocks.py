@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.data.columns import SPEED
+from calibration.data.columns import CURRENT, SPEED
 from calibration.data.courses import names as runs_of
 from calibration.data.courses import varies
 from calibration.data.runs import Runs
@@ -19,6 +19,7 @@ BLOCKS: dict[str, tuple[str, ...]] = {
     "slope": ("slope_deg",),
     "voltage": ("supply_voltage_V",),
     "speed": (SPEED,),
+    "current": (CURRENT,),
     "payload": ("payload_kg",),
     "configuration": ("configuration",),
     "voltage_configuration": ("configuration", "supply_voltage_V"),
@@ -33,8 +34,8 @@ def in_words(by: str, joint: str = " and ") -> str:
 
 #: Columns of blocks that are labels.
 NO_CONDITIONS = ("configuration", "run_id")
-#: Share of a value by which the next has to be larger to be of another level [-]: a speed that a controller holds is
-#: measured, and not twice the same. Blocks of a quantity that has no levels.
+#: Share of a value by which the next has to be larger to be of another level [-]: a speed or current that is
+#: controlled is measured, and not twice the same. Blocks of a quantity that has no levels.
 APART, PARTS = 0.1, 4
 
 
@@ -62,7 +63,7 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
         return {}
     if by == "voltage_configuration" and not runs.layout.complete and len(np.unique(runs["configuration"])) == 1:
         return {}  # those of `voltage`
-    values = {c: levels(runs[c]) if c == SPEED else runs[c] for c in columns}
+    values = {c: levels(runs[c]) if c in (SPEED, CURRENT) else runs[c] for c in columns}
     labels = np.array([" ".join(str(values[c][k]) for c in columns) for k in range(len(runs))])
     changes = varies(runs, BLOCKS[by])
     if changes.all() and by != "run":

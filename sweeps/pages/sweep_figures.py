@@ -26,8 +26,8 @@ PLURAL = {"supply_voltage_V": "voltages", "motor_speed_rpm": "motor speeds", "mo
 
 
 def imposed(runs: dict[str, np.ndarray]) -> str:
-    """Column of what is imposed in runs."""
-    return next(column for column in UNITS if column in runs)
+    """Column of what is imposed in runs: conditions stand before readings."""
+    return next(column for column in runs if column in UNITS)
 
 
 def on_ground(runs: dict[str, np.ndarray]) -> bool:
