@@ -134,7 +134,7 @@ def print_discovery(found: DiscoveryResult) -> None:
             )  # fmt: skip
         say(shown)
         say(
-            "lowers misfit by: rise of χ² without it, all else fitted again; own p: among the strongest of the library"
+            "lowers misfit by: rise of χ² without it, all else refitted; own p: among the strongest of the library"
         )
     if found.hidden:
         say(said_of.hidden(found))
