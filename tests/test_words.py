@@ -541,12 +541,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
-            "something is missing and the parameters may stand in for it; mmrjax loop finds what",
+            "something is missing and the parameters may absorb it; mmrjax loop finds what",
         ),
         (
             Adequacy(False, 60.0, 60.0, 0.0021, Shown("motor_speed", "follow", "slope_deg"), False),
             "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
-            "so something is missing and the parameters may stand in for it; mmrjax loop finds what",
+            "so something is missing and the parameters may absorb it; mmrjax loop finds what",
         ),
         (
             Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),

@@ -133,9 +133,7 @@ def print_discovery(found: DiscoveryResult) -> None:
                 f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(e) or "-",
             )  # fmt: skip
         say(shown)
-        say(
-            "lowers misfit by: rise of χ² without it, all else refitted; own p: among the strongest of the library"
-        )
+        say("lowers misfit by: rise of χ² without it, all else refitted; own p: among the strongest of the library")
     if found.hidden:
         say(said_of.hidden(found))
     if found.unnamed is not None:
