@@ -71,12 +71,11 @@ def example(folder: Path) -> str:
         (what, d["errors"][when]["fitted"])
         for what, when in (("refitted", "before"), ("with what was found", "after"))
     ]
-    if d["errors"]["before"].get("held_out"):
-        lines += [
-            (f"{what}, slopes that the fit has not seen", d["errors"][when]["held_out"])
-            for what, when in (("refitted", "before"), ("with what was found", "after"))
-        ]
     table = "\n".join(f"| {what} | {cells(errors)} | {reached(errors)} |" for what, errors in lines)
+    unseen = "\n".join(
+        f"| another {kind.replace('_', ' and ')} | {cells(by['before'])} | {reached(by['before'])} | {cells(by['after'])} | {reached(by['after'])} |"
+        for kind, by in d["held_out_by"].items()
+    )
     found = "\n".join(
         f"* **{', or '.join(e['families'])}** (`{e['name']}`, {e['standing']}): {e['parameters']['amplitude']['value']:.3g} ± "
         f"{e['parameters']['amplitude']['sd']:.2g} {e['parameters']['amplitude']['unit']}; {e['equation'].rstrip('.')}."
@@ -114,6 +113,10 @@ Of each effect, the reading that it changes most, less the same robot without it
 An effect that is real puts its dashes on the dots along all of the axis.
 
 ## May I use the robot it wrote?
+| rms error [%] of runs that the fit has not seen | refitted: {" | ".join(labels.values())} | reached | with what was found: {" | ".join(labels.values())} | reached |
+|---|---|---|---|---|---|---|---|---|
+{unseen}
+
 ![Errors of runs that the fit has seen and has not](example/errors.svg)
 
 Each kind of block is left out in turn, and predicted by a fit that has not seen it. So a robot may be used where the kind of

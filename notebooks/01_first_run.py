@@ -20,30 +20,24 @@
 
 # %%
 import jax
-
-jax.config.update("jax_enable_x64", True)  # double precision; before anything is computed
-
-import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 
-from mmrjax import params, robots
-from mmrjax.conditions import Conditions
-from mmrjax.fidelities.steady import steady_batch
-from mmrjax.signals import STATUSES
+import mmrjax as mm  # double precision, unless JAX_ENABLE_X64 says otherwise
 
 # %% [markdown]
 # ## One operating point
 # The robot is a tree of parameters, each with its unit and source. Conditions say what is set from outside.
 
 # %%
-robot = robots.nominal()
-one = Conditions(voltage=jnp.array([15.0]), slope_deg=jnp.array([5.0]), total_mass=jnp.array([13.1]))
-answer = steady_batch(robot, one)
+robot = mm.nominal()
+one = mm.Conditions("6T2A", voltage=15.0, slope_deg=5.0, total_mass=13.1)
+answer = mm.simulate(robot, one)
 
-print(f"status       {STATUSES[int(answer.status[0])]}")
-print(f"current      {float(answer.total_current[0]):.2f} A    (measured: 2.75 A)")
-print(f"motor speed  {float(answer.motor_speed[0]) * 30 / np.pi:.0f} rpm (measured: 4800 rpm)")
-print(f"speed        {float(answer.speed[0]) * 1e3:.0f} mm/s  (measured: 400 mm/s)")
+print(f"status       {answer.statuses}")
+print(f"current      {answer.total_current:.2f} A    (measured: 2.75 A)")
+print(f"motor speed  {answer.motor_speed * 30 / np.pi:.0f} rpm (measured: 4800 rpm)")
+print(f"speed        {answer.speed * 1e3:.0f} mm/s  (measured: 400 mm/s)")
 
 # %% [markdown]
 # ## Every slope at once, and a status for each
@@ -52,33 +46,17 @@ print(f"speed        {float(answer.speed[0]) * 1e3:.0f} mm/s  (measured: 400 mm/
 
 # %%
 slopes = np.linspace(0.0, 25.0, 1001)
-climbs = steady_batch(robot, Conditions(voltage=15.0, slope_deg=slopes, total_mass=13.1))
-slides = np.asarray(climbs.status) == STATUSES.index("slides")
+climbs = mm.simulate(robot, mm.Conditions("6T2A", voltage=15.0, slope_deg=slopes, total_mass=13.1))
+slides = climbs.statuses == "slides"
 print(f"steady up to {slopes[~slides].max():.1f} deg, slides from {slopes[slides].min():.1f} deg")
 
 # %%
-import io
-
-from IPython.display import Image
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
-
-def show(figure):
-    """A figure as a picture in the notebook."""
-    FigureCanvasAgg(figure)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=80)
-    return Image(data=picture.getvalue())
-
-
-figure = Figure(figsize=(8, 3), layout="constrained")
-left, right = figure.subplots(1, 2)
+_, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
 left.plot(slopes, climbs.total_current)
 left.set(xlabel="slope [deg]", ylabel="total current [A]")
 right.plot(slopes, 1e3 * climbs.speed)
 right.set(xlabel="slope [deg]", ylabel="speed [mm/s]")
-show(figure)
+plt.show()
 
 # %% [markdown]
 # ## A gradient
@@ -92,7 +70,7 @@ name = "6T2A.ground.rolling_resistance"
 
 def current(resistance):
     """Total current [A] at 5 degrees as a function of the rolling resistance coefficient."""
-    return steady_batch(params.replace(robot, {name: resistance}), one).total_current[0]
+    return mm.simulate(mm.replace(robot, {name: resistance}), one).total_current
 
 
 slope_of_current = float(jax.grad(current)(0.06))
@@ -100,7 +78,7 @@ twice = float(current(0.06 + 1e-6) - current(0.06 - 1e-6)) / 2e-6
 print(f"dI/df = {slope_of_current:.4f} A (twice run: {twice:.4f}), so 0.01 more costs {slope_of_current / 100:.3f} A")
 
 # %%
-assert STATUSES[int(answer.status[0])] == "converged"
-assert abs(float(answer.total_current[0]) - 2.75) / 2.75 < 0.10  # the paper's model, nothing fitted
+assert answer.statuses == "converged"
+assert abs(answer.total_current - 2.75) / 2.75 < 0.10  # the paper's model, nothing fitted
 assert 12 < slopes[slides].min() < 18
 assert abs(slope_of_current - twice) < 1e-6 * abs(twice)

@@ -22,23 +22,12 @@
 
 # %%
 import jax
-
-jax.config.update("jax_enable_x64", True)
-
-import io
-
-import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import Image
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-import calibration
-from calibration.inference import priors
-from mmrjax import params
-from mmrjax.fidelities.steady import steady_batch
+import mmrjax as mm
 
-runs = calibration.read_runs("measured")
-base = calibration.read_robot("nominal")
+runs, base = mm.read_runs("measured"), mm.nominal()
 print(f"{len(runs)} runs of {', '.join(np.unique(runs['configuration']))}")
 
 # %% [markdown]
@@ -50,13 +39,6 @@ print(f"{len(runs)} runs of {', '.join(np.unique(runs['configuration']))}")
 # Guide friction and guide share act only as a product, so no data can separate them; the friction stays at
 # its measured 0.20 and the share is free.
 
-# %%
-names = priors.default_names(runs["configuration"], base)
-fields = priors.known(base)
-for name in names:
-    p = fields[name]
-    print(f"{name:<40}{float(p.value):>8.3g} {p.spec.unit:<6} +- {p.spec.prior_sd(float(p.value)):.2g}")
-
 # %% [markdown]
 # ## Fit
 # The objective is a sum of squares: each reading's error over its standard deviation, and each parameter's
@@ -66,29 +48,12 @@ for name in names:
 # finite and a penalty leads back to robots that can climb.
 
 # %%
-found = calibration.calibrate(runs, base)
+found = mm.calibrate(runs, base)
 print(found.starts.statement(), f"({found.starts.infeasible} began where a row slides)")
 for name, p in found.parameters.items():
     low, high = p.interval
-    held = ", held by its prior" if p.held_by_prior else ""
-    print(f"{name:<40}{p.value:>9.4g}  [{low:.3g}, {high:.3g}]  {p.shift:+.1f} sd{held}")
-
-# %%
-from sweeps.pages import calibration_figures, comparison_figures
-from sweeps.pages.figure_style import style
-
-
-def show(draw, *arguments):
-    """A figure of the report as a picture in the notebook."""
-    with style():
-        figure = draw(*arguments)
-        FigureCanvasAgg(figure)
-        picture = io.BytesIO()
-        figure.savefig(picture, format="png", dpi=72)
-    return Image(data=picture.getvalue())
-
-
-show(calibration_figures.parameters, found)
+    prior = f"prior {p.prior.median:.3g}, shift {p.shift:+.1f} sd{', not determined' * p.held_by_prior}"
+    print(f"{name:<40}{p.value:>9.4g}  [{low:.3g}, {high:.3g}]  {prior}")
 
 # %% [markdown]
 # ## How sure
@@ -97,7 +62,15 @@ show(calibration_figures.parameters, found)
 # 20 degrees at all; more of it is hardly contradicted.
 
 # %%
-show(calibration_figures.profiles, found)
+profiled = {name: p for name, p in found.parameters.items() if p.profile is not None}
+fig, grid = plt.subplots(-(-len(profiled) // 4), 4, figsize=(11, 6), sharey=True, layout="constrained")
+for axes, (name, p) in zip(grid.flat, profiled.items(), strict=False):
+    axes.axhline(3.84, color="tab:orange")
+    axes.axvspan(*p.interval, color="#e3eef7")
+    axes.plot(p.profile.value, p.profile.rise, "o-", ms=3)
+    axes.set(title=name.replace("ground.", ""), ylim=(0, 10), xlabel=f"[{p.unit}]")
+    axes.title.set_fontsize(8)
+plt.show()
 
 # %% [markdown]
 # ## Errors, and on data not seen
@@ -105,7 +78,13 @@ show(calibration_figures.profiles, found)
 # predict it.
 
 # %%
-show(calibration_figures.before_after, found)
+lines = {"before": found.errors_before, "fitted": found.errors_after}
+lines |= {
+    f"held out by {kind}": block.errors for kind, block in found.held_out.items() if kind in found.held_out_alike
+}
+for what, errors in lines.items():
+    shown = ", ".join(f"{name} {e.rms_percent:4.1f} %" for name, e in errors.items())
+    print(f"{what:<40}{shown} ({max(e.rows for e in errors.values())} of {len(found)} rows)")
 
 # %% [markdown]
 # ## What friction cannot explain
@@ -115,7 +94,16 @@ show(calibration_figures.before_after, found)
 # both voltages. Finding those effects is another tool's work; freeing the electrics here would only hide them.
 
 # %%
-show(comparison_figures.errors_over, found.rows(), found.channels)
+table = found.rows()
+fig, grid = plt.subplots(1, 3, figsize=(11, 3), layout="constrained")
+for axes, channel in zip(grid, found.channels, strict=True):
+    for name in np.unique(table["configuration"]):
+        mine = table["configuration"] == name
+        error = 100 * (table[f"after_{channel.column}"] / table[channel.column] - 1)
+        axes.plot(table["slope_deg"][mine], error[mine], "o", label=name)
+    axes.set(xlabel="slope [deg]", ylabel=f"{channel.label}, simulated over measured [%]")
+grid[0].legend()
+plt.show()
 
 # %%
 for note in found.notes:
@@ -132,11 +120,11 @@ name, row = "6T2A.track.guide_share", 2
 
 def current(value):
     """Total current of one row [A] as a function of the guide share."""
-    robot = params.replace(found.robot, {name: value})
-    return steady_batch(robot, runs.conditions(robot)).total_current[row]
+    robot = mm.replace(found.robot, {name: value})
+    return mm.simulate(robot, runs.conditions(robot)).total_current[row]
 
 
-share, step = jnp.asarray(found.parameters[name].value), 1e-6
+share, step = float(found.parameters[name].value), 1e-6
 exact = jax.jacfwd(current)(share)
 twice = (current(share + step) - current(share - step)) / (2 * step)
 print(f"d current / d guide share: {float(exact):.6f} A, twice run {float(twice):.6f}")

@@ -429,7 +429,7 @@ def rig_check(
     """Say what was understood of a rig's file, where each number comes from, and whether it makes sense.
 
     With data: which columns are used for what, over what range, and which parameters these data can determine;
-    one whose posterior sd is above 0.9 of its prior's is held by its prior. Nothing is fitted or written.
+    one whose posterior sd is above 0.9 of its prior's is not determined. Nothing is fitted or written.
     Exit codes: 0 it can be used; 2 the file cannot; 4 the data cannot.
     """
     _start_jax(no_cache)

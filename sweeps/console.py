@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +21,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
+#: Widest line of text on a terminal.
+COLUMNS = 80
 _WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
 _out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
@@ -27,12 +30,23 @@ _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
 
 def say(what: Any) -> None:
     """Print text or a table to stdout."""
-    _out.print(what)
+    _out.print(wrapped(what) if isinstance(what, str) and sys.stdout.isatty() else what)
 
 
 def tell(text: str) -> None:
     """Print a line to stderr, where what is not the result goes."""
-    _err.print(text)
+    _err.print(wrapped(text) if sys.stderr.isatty() else text)
+
+
+def wrapped(text: str) -> str:
+    """Text for a terminal, in lines of at most `COLUMNS`, what is listed indented; a file gets it as it is."""
+    return "\n".join(
+        textwrap.fill(
+            line, COLUMNS, subsequent_indent="  " * line.startswith("- "), break_long_words=False,
+            break_on_hyphens=False,
+        )
+        for line in text.split("\n")
+    )  # fmt: skip
 
 
 class RateColumn(ProgressColumn):

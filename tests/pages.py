@@ -31,6 +31,8 @@ class Tables(HTMLParser):
             self._name = None
 
     def handle_data(self, data):
+        if self.cdata_elem:  # a script or a style
+            return
         self.text += data
         if self._name and self.tables[self._name] and self.tables[self._name][-1]:
             self.tables[self._name][-1][-1] += data.strip()

@@ -21,6 +21,7 @@ from calibration.sensitivity import notes as of_study
 from calibration.words import fits, loop, steps, tables
 from calibration.words.notes import SAID, in_words, sentence
 from mmrjax import channels
+from sweeps import console
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Notes, and what is said of them.
@@ -540,12 +541,12 @@ def test_what_the_track_model_is_asked_about(about, said):
         (
             Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True),
             "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
-            "something is missing and the parameters may stand in for it; mmrjax loop finds what",
+            "something is missing and the parameters may absorb it; mmrjax loop finds what",
         ),
         (
             Adequacy(False, 60.0, 60.0, 0.0021, Shown("motor_speed", "follow", "slope_deg"), False),
             "Not adequate: the residuals of motor speed follow slope_deg (p = 0.0021, the noise estimated from them), "
-            "so something is missing and the parameters may stand in for it; mmrjax loop finds what",
+            "so something is missing and the parameters may absorb it; mmrjax loop finds what",
         ),
         (
             Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),
@@ -621,3 +622,12 @@ def test_what_would_measure_is_found_by_either_end_of_a_name():
     assert tables.would_measure("motor.inductance").startswith("a time history of the start-up current")
     assert re.search("slippery slope", tables.would_measure("6T2A.ground.friction.dynamic"))
     assert tables.would_measure("x.y") == "runs under conditions in which it acts"
+
+
+def test_lines_of_a_terminal_have_80_columns_and_those_of_a_file_are_whole(monkeypatch, capsys):
+    text = "- " + "a sentence that goes on " * 8 + "\n" + "x" * 100
+    lines = console.wrapped(text).split("\n")
+    assert all(len(line) <= 80 for line in lines[:-1]) and lines[-1] == "x" * 100 and lines[1].startswith("  ")
+    assert " ".join(console.wrapped(text).split()) == " ".join(text.split())
+    console.say(text)
+    assert capsys.readouterr().out.rstrip("\n") == text

@@ -268,8 +268,8 @@ def adequacy(found: Adequacy) -> str:
     if not found.adequate:
         why = f"{chi2}, {p}" if found.noise_known else f"{p}, the noise estimated from them"
         return (
-            f"Not adequate: {shown_by(found.shown_by)} ({why}), so something is missing and the parameters may stand "
-            "in for it; mmrjax loop finds what"
+            f"Not adequate: {shown_by(found.shown_by)} ({why}), so something is missing and the parameters may "
+            "absorb it; mmrjax loop finds what"
         )
     if found.noise_known:
         return f"Adequate: the residuals are what the stated noise leaves ({chi2}, {p})"

@@ -110,7 +110,7 @@ def _say_kept(stages: dict[str, Any], folder: RunFolder, robot_name: str) -> Non
 
 
 def print_discovery(found: DiscoveryResult) -> None:
-    """Verdict, effects, errors and remarks, for a person."""
+    """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
     say(f"{found.verdict}: {found.statement}")
     if not found.robot.has_ground and found.verdict != "none":
         say("The balance track of a shaft is what its load loses.")
@@ -122,8 +122,9 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(rise)
     if found.effects:
         shown = Table(box=None, pad_edge=False)
-        for heading in ("effect", "what is missing", "amplitude", "explains [σ²]", "own p", "indistinguishable from"):
-            number = heading in ("amplitude", "explains [σ²]", "own p")
+        numbers = ("amplitude", "lowers misfit by", "own p")
+        for heading in ("effect", "what is missing", *numbers, "indistinguishable from"):
+            number = heading in numbers
             shown.add_column(heading, justify="right" if number else "left", no_wrap=number or heading == "effect")
         for e in found.effects:
             a = e.parameters["amplitude"]
@@ -132,7 +133,7 @@ def print_discovery(found: DiscoveryResult) -> None:
                 f"{e.score:.0f}", f"{e.p_value:.2g}", said_of.alike(e) or "-",
             )  # fmt: skip
         say(shown)
-        say("explains: rise of χ² without it, all else fitted again; own p: among the strongest of the library")
+        say("lowers misfit by: rise of χ² without it, all else refitted; own p: among the strongest of the library")
     if found.hidden:
         say(said_of.hidden(found))
     if found.unnamed is not None:
@@ -141,10 +142,6 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(found.resolved.statement)
         for note in found.resolved.notes:
             say(f"- track model: {note}")
-    after = found.next_experiment
-    if after is not None:
-        sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""
-        say(f"next: {after.name}: {after.description}{sigma}")
     errors = Table(title=f"rms error [% of the {found.percent_of}]", title_justify="left")
     for heading in ("", "rows", *(c.label for c in found.channels)):
         errors.add_column(heading, justify="right" if heading else "left")
@@ -168,3 +165,8 @@ def print_discovery(found: DiscoveryResult) -> None:
         say(f"{said_of.at_other_noise(found.sensitivity)}")
     for note in found.notes:
         say(f"- {note}")
+    say(said_of.answer(found))
+    after = found.next_experiment
+    if after is not None:
+        sigma = f" (expected {after.expected_sigma:.1f} σ)" if after.separates else ""
+        say(f"Next: {after.name}: {after.description}{sigma}")

@@ -42,7 +42,11 @@ DEFECT_WORDS = {
 
 #: The same of a rig, whose output need be no pulley.
 RIG_WORDS = {"track": "torque missing at the output"}
-IMPOSED_WORDS = {"supply_voltage_V": "supply voltage [V]", "motor_speed_rpm": "motor speed [rpm]"}
+IMPOSED_WORDS = {
+    "supply_voltage_V": "supply voltage [V]",
+    "motor_speed_rpm": "motor speed [rpm]",
+    "motor_current_A": "motor current [A]",
+}
 
 
 def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verdict: str) -> Figure:
@@ -75,13 +79,7 @@ def before_after(table: dict[str, np.ndarray], channels: Sequence[Channel], verd
                            [groups[a] for a in starts])  # fmt: skip
     grid[-1, 0].grid(axis="x", visible=False)
     varied = own == "supply_voltage_V" or any(np.unique(table[c]).size > 1 for c in beside)
-    within = (
-        "by slope, then payload"
-        if beside and varied
-        else "by motor speed"
-        if own == "motor_speed_rpm"
-        else "by voltage"
-    )
+    within = "by slope, then payload" if beside and varied else f"by {IMPOSED_WORDS[own].partition(' [')[0]}"
     grid[-1, 0].set_xlabel(f"runs, in each group {within}; band: ±2σ of the instruments")
     return fig
 

@@ -1,0 +1,89 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Close the loop
+#
+# Twenty runs were measured. What does the model lack, how sure is that, and does the robot that has it predict
+# runs that it has not seen? The same as `mmrjax loop measured`, from Python.
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mmrjax as mm
+
+robot, runs = mm.nominal(), mm.read_runs("measured")
+found = mm.discover(runs, robot)
+print(found.statement)
+
+# %% [markdown]
+# ## What was found
+# An effect has an equation, a size and a standing: *established*, or *tentative* with what speaks against it.
+
+# %%
+for effect in found.effects:
+    size = effect.parameters["amplitude"]
+    print(f"{effect.name}: {size.value:.3g} ± {size.sd:.2g} {size.unit}")
+    print(f"    {effect.equation}")
+for note in found.notes:
+    print("-", note)
+
+# %% [markdown]
+# ## Before and after, run by run
+# Simulated less measured, in standard deviations of the instruments.
+
+# %%
+table = found.rows_table()
+fig, grid = plt.subplots(len(found.channels), 1, figsize=(9, 6), sharex=True, layout="constrained")
+for axes, channel in zip(grid, found.channels, strict=True):
+    axes.axhspan(-2, 2, color="#eeeeee")
+    for when, look in (("before", {"mfc": "none", "color": "#d55e00"}), ("after", {"color": "#0072b2"})):
+        axes.plot(table["row"], table[f"residual_{when}_{channel.name}_sigma"], "o", label=when, **look)
+    axes.set_ylabel(f"{channel.label} [σ]")
+grid[-1].set_xlabel("row of the table")
+grid[0].legend(ncols=2)
+plt.show()
+
+# %% [markdown]
+# ## Does it predict?
+# Each slope is left out in turn and predicted by a fit that has not seen it. Errors are in percent of the reading.
+
+# %%
+before, after = found.errors_held_out["slope"]
+for name in before:
+    print(f"{name:15s} {before[name]['rms_percent']:5.1f} % -> {after[name]['rms_percent']:5.1f} %")
+
+# %% [markdown]
+# ## Use what was found
+# The robot that was found is one like any other.
+
+# %%
+slopes = np.linspace(0.0, 20.0, 81)
+fig, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")
+for label, one in (("as stated", robot), ("with what was found", found.robot)):
+    climb = mm.simulate(one, mm.Conditions("6T2A", voltage=33.0, slope_deg=slopes, payload=8.0))
+    axes.plot(slopes, 1e3 * np.where(climb.status == "converged", climb.speed, np.nan), label=label)
+measured = (table["configuration"] == "6T2A") & (table["supply_voltage_V"] == 33.0)
+axes.plot(table["slope_deg"][measured], table["speed_mm_s"][measured], "ko", label="measured")
+axes.set(xlabel="slope [deg]", ylabel="speed [mm/s]", title="6T2A, 33 V, 8 kg")
+axes.legend()
+plt.show()
+
+# %% [markdown]
+# ## What to measure next
+
+# %%
+print(found.next_experiment.name)
+print(found.next_experiment.description)
+assert found.verdict in ("named", "class", "unnamed") and after["total_current"]["rms_percent"] < 5
