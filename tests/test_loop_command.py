@@ -218,8 +218,9 @@ def test_report_tells_the_story_in_order(done):
     text = (done.folder / "found" / "report.html").read_text(encoding="utf-8")
     assert done.result["statement"].split(" (")[0] in text
     order = [
-        'id="effects"', 'id="before_after"', 'id="errors"', 'id="next"', 'id="notes"', 'id="defects"', 'id="ladder"',
-        'id="look_alikes"', 'id="unseen"', 'id="base_shift"',
+        'id="answer"', 'id="found"', 'id="summary"', 'id="use"', 'id="contents"', 'id="before_after"', 'id="laws"',
+        'id="defects"', '<figure id="errors"', 'id="next"', 'id="notes"', 'id="effects"', 'id="ladder"',
+        'id="look_alikes"', 'id="unseen"', 'id="base_shift"', 'class="glossary"', 'id="files"',
     ]  # fmt: skip
     at = [text.find(mark) for mark in order]
     assert -1 not in at and at == sorted(at)
