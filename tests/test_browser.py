@@ -33,6 +33,8 @@ PAGES = {
     "check": "check paper",
     "sensitivity": "sensitivity --outputs speed --payloads 3 --voltages 24 --slopes 10 --method local",
     "paper": "reproduce",
+    "resonance": "resonance",
+    "size": "size",
 }
 FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p>
 <p style="color:#bbb">faint</p><p style="font-size:7px">tiny</p>

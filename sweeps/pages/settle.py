@@ -15,6 +15,12 @@ from calibration.words import settle as words
 from sweeps.pages.figure_style import BLUE, FAINT, INK, VERMILION, figure
 from sweeps.pages.page import ROWS, Album, render
 
+#: What is imposed, and the unit of `applied`.
+IMPOSED = {
+    "voltage": ("voltage", "V"),
+    "motor_speed": ("motor speed", "rpm"),
+    "motor_current": ("motor current", "A"),
+}
 #: Most points of a line of a figure, in pairs of the least and the greatest of as many samples.
 POINTS = 3000
 
@@ -32,6 +38,7 @@ def write(folder: Path, found: Settled) -> Path:
         statement=words.statement(found),
         notes=words.remarks(found, SettledRuns.fewest),
         left=words.left_out(found.stretches),
+        imposed="{} [{}]".format(*IMPOSED[found.runs.layout.imposed]),
         settled=_rows(found),
         count=len(found.kept),
     )
@@ -62,7 +69,7 @@ def over_log(found: Settled) -> Figure:
         clock[mine] = begin + runs["time_s"][mine] - runs["time_s"][mine[0]]
         begin = float(clock[mine[-1]])
     order = every[np.argsort(clock[every], kind="stable")]
-    lines = [("imposed", applied(runs))]
+    lines = [("{}\n[{}]".format(*IMPOSED[runs.layout.imposed]), applied(runs))]
     lines += [(f"{s.channel.label}\n[{s.channel.unit}]", s.shown) for s in found.signals]
     fig, grid = figure(len(lines), 1, 1.9 * len(lines), sharex=True)
     for axes, (label, values), signal in zip(grid[:, 0], lines, (None, *found.signals), strict=True):
