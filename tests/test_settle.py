@@ -272,7 +272,11 @@ def test_the_command_leaves_a_table_that_is_read_as_settled_runs(tmp_path, mmrja
     document = json.loads((tmp_path / "found" / "result.json").read_text())
     assert document["settled"] == len(runs) and document["schema"] == "mmrjax.settle/1"
     page = (tmp_path / "found" / "report.html").read_text(encoding="utf-8")
-    assert "The log." in page and "<th>voltage [V]</th>" in page and (tmp_path / "found" / "figures" / "log.svg").is_file()
+    assert (
+        "The log." in page
+        and "<th>voltage [V]</th>" in page
+        and (tmp_path / "found" / "figures" / "log.svg").is_file()
+    )
 
 
 def test_25_000_rows_are_settled_in_seconds(tmp_path):
