@@ -39,6 +39,7 @@ campaign: $(READY)
 	$(BIN)/python benchmarks/loop.py --clean-wide 1000 --noise 100 --library 500 --variants 300 --outside 300 --pairs 200 --triples 150 --drift 100 --cluster 120 --coverage 600 --clean-unstated 300 --clean-heavy 120 --clean-uneven 120 --clean-rounded 120 --library-unstated 150 --outside-unstated 100 --pairs-unstated 60
 	$(BIN)/python benchmarks/loop_series.py --clean-wide 300 --noise 20 --library 120 --outside 60 --pairs 60 --event 60
 	$(BIN)/python benchmarks/rigs.py --clean 500 --library 400 --outside 250
+	$(BIN)/python benchmarks/rig_logs.py --clean 80 --library 80 --outside 40
 
 bench: $(READY)
 	$(BIN)/python benchmarks/steady.py

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from shaking import shaking
 
-from mmrjax import balances, mjcf, params
+from mmrjax import balances, masses, mjcf, params
 from mmrjax.conditions import Conditions
 from mmrjax.contact import force_contact, step
 from mmrjax.fidelities.ripple import period_pitch, ripple
@@ -95,7 +95,7 @@ def chain(gear: RunningGear, robot: Robot | None = None) -> Chain:
     robot = dataclasses.replace(nominal() if robot is None else robot, running_gear=gear)
     run = Conditions(voltage=33.0)
     rest = State(*(jnp.zeros(()) for _ in range(4)))
-    half = mjcf.masses(robot, run, balances.begin(robot, run, rest).mass)
+    half = masses.masses(robot, run, balances.begin(robot, run, rest).mass)
     link = (2 * gear.wheelbase + 2 * jnp.pi * robot.configurations["6T2A"].radius) / TEETH_BELT
     radius = link / (2 * jnp.sin(jnp.pi / TEETH_PULLEY))
     return Chain(

@@ -25,7 +25,7 @@ def api() -> str:
 
     parts = [
         "# The public names",
-        "`import mmrjax as mm` is the one door; SI units unless a name says otherwise. Made of the docstrings.",
+        "`import mmrjax as mm` gives every public name; SI units unless a name says otherwise. This page is made from the docstrings.",
     ]
     for name in sorted((n for n in mm.__all__ if not n.startswith("_")), key=str.lower):
         thing = getattr(mm, name)
@@ -91,7 +91,7 @@ of it complete? One command asks, in a minute on two cores:
 mmrjax loop measured --out found
 ```
 
-Everything below is of `found/result.json`; `found/report.html` shows the same with all that lies behind.
+All figures below come from `found/result.json`; `found/report.html` shows them with everything behind them.
 
 ## Is it complete?
 {d["statement"]}
@@ -104,13 +104,13 @@ Everything below is of `found/result.json`; `found/report.html` shows the same w
 
 ![Residuals of every reading, before and after](example/before_after.svg)
 
-Each dot is a reading, less what the model says of it, in standard deviations of the instrument: orange the model with its
-parameters fitted again, blue with what was found. Noise stays in the grey band.
+Each dot is one reading: simulated less measured, in standard deviations of the instrument. Orange: the model with its
+parameters fitted again; blue: with what was found. Noise stays in the grey band.
 
 ![What each effect explains, on its readings](example/laws.svg)
 
-Of each effect, the reading that it changes most, less the same robot without it: dots are measured, dashes are simulated.
-An effect that is real puts its dashes on the dots along all of the axis.
+For each effect, the reading that it changes most, less that of the same robot without it: dots measured, dashes simulated.
+If an effect is real, its dashes follow the dots along the whole axis.
 
 ## May I use the robot it wrote?
 | rms error [%] of runs that the fit has not seen | refitted: {" | ".join(labels.values())} | reached | with what was found: {" | ".join(labels.values())} | reached |
@@ -119,8 +119,8 @@ An effect that is real puts its dashes on the dots along all of the axis.
 
 ![Errors of runs that the fit has seen and has not](example/errors.svg)
 
-Each kind of block is left out in turn, and predicted by a fit that has not seen it. So a robot may be used where the kind of
-step that you plan has small errors, and not where they are large.
+Each kind of block is left out in turn, and predicted by a fit that has not seen it. Use the robot for the kinds of
+step that have small errors here, and not for those that have large ones.
 
 ## What next?
 **{after["name"].capitalize()}.** {after["description"]}.

@@ -7,19 +7,25 @@ All three fidelities are compositions of these functions.
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, Protocol
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from mmrjax import channels, contact, ground, power
+from mmrjax import channels, contact, ground, masses, power
 from mmrjax import chassis as chassis_room
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Load, Robot
 from mmrjax.shaft import Shaft
-from mmrjax.signals import GRAVITY, Signals, State
+from mmrjax.signals import GRAVITY, PlaneMotion, Signals, State
+from mmrjax.trigonometry import cosine, sine
+from mmrjax.turning import SIDES, Grip, Stance, grip
 
 #: Every balance with its unit and what it closes.
 BALANCES = {
@@ -33,6 +39,8 @@ BALANCES = {
     "track": ("N·m", "loss at the pulley, eqs. (24), (26)"),
     "ground": ("N", "traction = resistance + gravity + m dV/dt, eqs. (1), (5)"),
     "slip": ("m/s", "V = r_k ω_k - slip speed, eqs. (32), (33)"),
+    "lateral": ("N", "m (dv_y/dt + ω v_x) = sum of lateral forces, of a robot that turns"),
+    "yaw": ("N·m", "J_ψ dω/dt = sum of x F_y - y F_x, of a robot that turns"),
     "sensor": ("", "what the instruments show, each channel in its unit"),
 }
 
@@ -42,7 +50,7 @@ def absent(robot: Robot) -> frozenset[str]:
     voltage where the motors' speed or current is imposed."""
     supply = set() if robot.rig.imposed == "voltage" else {"supply"}
     winding = set() if robot.rig.shows_voltage else {"electrical", "inductance"}
-    return robot.lacks | supply | winding
+    return robot.lacks | supply | winding | (set() if robot.rig.turns else {"lateral", "yaw"})
 
 
 def added(robot: Robot, signals: Signals, balance: str, channel: str = "") -> Scalar:
@@ -69,7 +77,11 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.speed_still
     duty = robot.driver.duty_limited(conditions.duty, state.current)
+    straight = dict.fromkeys(
+        ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y"), jnp.zeros_like(state.speed)
+    )
     signals = Signals(
+        **straight,
         configuration=conditions.configuration,
         on_tracks=chassis.on_tracks,
         slope=conditions.slope,
@@ -245,13 +257,28 @@ CURRENT_STEPS = 4
 
 def _current(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """Current with which the motors accelerate as the imposed speed does [A]."""
+    return _current_of(robot, conditions, lambda x: _moving(robot, conditions, dataclasses.replace(state, current=x)))
+
+
+def _speed_imposed(robot: Robot, conditions: Conditions, chassis: Chassis, signals: Signals) -> Signals:
+    """The signals of a side whose motor speed is imposed, its traction known."""
+
+    def at(current: Scalar) -> Signals:
+        total = robot.sides * current * signals.duty
+        moved = electrical(robot, conditions, _fill(signals, current=current, total_current=total))
+        return gearbox(robot, chassis, motor(robot, moved))
+
+    return at(_current_of(robot, conditions, at))
+
+
+def _current_of(robot: Robot, conditions: Conditions, signals: Callable[[Scalar], Signals]) -> Scalar:
+    """Current with which the motors accelerate as the imposed speed does [A], of signals by their current."""
     asked = 0.0 if conditions.motor_acceleration is None else conditions.motor_acceleration
 
     def lacking(current: Scalar) -> Scalar:
-        signals = _moving(robot, conditions, dataclasses.replace(state, current=current))
-        return signals.acceleration_wheel * robot.gearbox.ratio - asked
+        return signals(current).acceleration_wheel * robot.gearbox.ratio - asked
 
-    current = jnp.zeros_like(state.speed_motor)
+    current = jnp.zeros_like(jnp.asarray(conditions.motor_speed))
     for _ in range(CURRENT_STEPS):
         at = jax.lax.stop_gradient(current)
         left, rise = jax.jvp(lacking, (at,), (jnp.ones_like(at),))
@@ -360,6 +387,104 @@ def settled(robot: Robot, conditions: Conditions, state: State, direction: Scala
     else:
         creep = chassis.ground.speed_creep(signals.demand, signals.normal, signals.adhesion)
     return gearbox(robot, chassis, track(robot, chassis, signals)), creep
+
+
+class Travel(eqx.Module):
+    """All of an instant of a robot that turns.
+
+    Attributes:
+        signals: of each side, a leading axis of 2: left, right; totals and what the robot does as a whole alike.
+        grip: what the ground does to each side.
+        acceleration, acceleration_lateral: dv_x/dt and dv_y/dt [m/s²]; acceleration_yaw: dω/dt [rad/s²].
+    """
+
+    signals: Signals
+    grip: Grip
+    acceleration: Scalar
+    acceleration_lateral: Scalar
+    acceleration_yaw: Scalar
+
+
+def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar) -> Stance:
+    """How a robot of this mass with its payload [kg] stands: the centre of mass of all, over axles that are a radius,
+    on tracks and a grouser, above the ground."""
+    half = masses.masses(robot, conditions, mass)
+    share = half.chassis / (mass / robot.sides)  # pulleys and wheels sit on the axles
+    axle = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height
+    lateral = chassis.turning.lateral
+    if conditions.adhesion_lateral is not None:
+        lateral = lateral * conditions.adhesion_lateral / conditions.adhesion
+    return Stance(
+        length=robot.running_gear.wheelbase,
+        width=chassis.turning.width,
+        height=axle + share * half.up,
+        ahead=share * half.forward,
+        on_tracks=chassis.on_tracks,
+        lateral=lateral,
+        rule=chassis.turning.rule,
+        nodes=chassis.turning.nodes,
+    )
+
+
+def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel:
+    """All signals of a robot free to turn: both sides by the balances above, the supply and the ground between them.
+
+    Each side travels at V_s = v_x - ω y_s, on the part of the slope that lies along its heading. What effects lower
+    the speed of a side by is read at equal loads of both.
+    """
+    chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
+    y = SIDES * chassis.turning.width
+    speed = motion.speed - motion.yaw_rate * y
+
+    def both(x: Scalar) -> Array:
+        return jnp.broadcast_to(x, speed.shape)
+
+    none, drawn = both(0.0), both(motion.discharge)
+    state = State(motion.current, motion.speed_motor, speed, drawn, motion.memory, distance=none)
+    signals = jax.vmap(functools.partial(begin, robot))(own, state)
+    sine_slope, mass = sine(conditions.slope), jnp.max(jnp.asarray(signals.mass))
+    signals = _fill(
+        signals,
+        total_current=both(jnp.mean(signals.total_current)),
+        slope=both(jnp.arcsin(sine_slope * cosine(motion.heading))),
+        **{
+            name: both(getattr(motion, name))
+            for name in ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
+        },
+    )
+    even = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
+    rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
+    units = robot.sides / 2
+    stands = stance(robot, conditions, chassis, mass)
+    load, sliding = jnp.sum(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
+    held = grip(
+        stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
+        jnp.asarray(rolling),
+    )  # fmt: skip
+    own_load = jax.vmap(lambda s: travel(robot, chassis, s))(_fill(even, normal=held.normal / units))
+    lateral, yaw = (
+        units * jnp.sum(both(jax.vmap(lambda s, name=name: added(robot, s, name))(own_load)))
+        for name in ("lateral", "yaw")
+    )
+    pull = held.ahead - units * own_load.resistance
+    along = jnp.sum(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
+    across = jnp.sum(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
+    turn = (jnp.sum(held.moment) - jnp.sum(y * pull) - yaw) / chassis.turning.inertia
+    acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
+    pulled = _fill(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
+    pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
+    if own.motor_speed is None:
+        pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
+    else:
+        pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(own, pulled)
+        pulled = _fill(pulled, total_current=both(jnp.mean(pulled.total_current)))
+    return Travel(
+        pulled,
+        held,
+        acceleration,
+        across / mass - motion.yaw_rate * motion.speed,
+        turn,
+    )
 
 
 def sensor(robot: Robot, signals: Signals) -> dict[str, Scalar]:

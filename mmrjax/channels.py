@@ -38,6 +38,7 @@ class Channel:
         directed: whether its sign is that of the motion; an angle counts on from where it was.
         settled, over_time: whether settled runs and histories can show it.
         other_units: what is often written in its column by mistake, and the SI value of each.
+        side: 0 or 1 of what the left or the right side alone shows; None: what both together do.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Channel:
     settled: bool = True
     over_time: bool = True
     other_units: tuple[tuple[str, float], ...] = ()
+    side: int | None = None
 
     @property
     def unit_shown(self) -> str:
@@ -76,8 +78,27 @@ def _winding_temperature(robot: Robot, signals: Signals) -> Any:
     return robot.motor.temperature_settled(signals.current)
 
 
-#: Every channel that there is.
-EVERY: tuple[Channel, ...] = (
+#: Of a robot that turns: of one side, and of the robot in the plane of the ground.
+_SIDES = ("left", "right")
+
+
+def _of_side(channel: Channel, side: int) -> Channel:
+    """What one side shows of a channel that both sides have."""
+    stem, unit = channel.column.rsplit("_", 1)
+    name = f"{channel.name}_{_SIDES[side]}"
+    return dataclasses.replace(
+        channel,
+        name=name,
+        column=f"{stem}_{_SIDES[side]}_{unit}",
+        sd_column=f"{stem}_{_SIDES[side]}_sd_{unit}",
+        label=f"{channel.label}, {_SIDES[side]}",
+        word=name,
+        side=side,
+    )
+
+
+#: Of either kind of travel.
+_EITHER: tuple[Channel, ...] = (
     Channel(
         name="total_current",
         column="total_current_A",
@@ -243,6 +264,88 @@ EVERY: tuple[Channel, ...] = (
         directed=False,
     ),
 )
+
+_BY_NAME = {c.name: c for c in _EITHER}
+#: Those of a robot that turns alone: of each side, and in the plane of the ground.
+OF_TURNS: tuple[Channel, ...] = (
+    *(_of_side(_BY_NAME[f"motor_{what}"], side) for what in ("current", "speed", "voltage") for side in (0, 1)),
+    Channel(
+        name="yaw_rate",
+        column="yaw_rate_rad_s",
+        sd_column="yaw_rate_sd_rad_s",
+        unit="rad/s",
+        factor=1.0,
+        label="yaw rate",
+        word="yaw_rate",
+        range=(-100.0, 100.0),
+        sd_largest=10.0,
+        read=lambda robot, signals: signals.yaw_rate,
+        sd_share=0.02,
+        resolution=3,
+        zero_at_rest=True,
+        other_units=(("deg/s", math.pi / 180), ("rpm", RPM)),
+    ),
+    Channel(
+        name="lateral_speed",
+        column="lateral_speed_mm_s",
+        sd_column="lateral_speed_sd_mm_s",
+        unit="mm/s",
+        factor=MM,
+        label="lateral speed",
+        word="lateral_speed",
+        range=(-10_000.0, 10_000.0),
+        sd_largest=5_000.0,
+        read=lambda robot, signals: signals.speed_lateral,
+        sd_share=0.02,
+        unit_si="m/s",
+        zero_at_rest=True,
+        other_units=(("m/s", 1.0), ("cm/s", 1e-2)),
+    ),
+    Channel(
+        name="yaw",
+        column="yaw_deg",
+        sd_column="yaw_sd_deg",
+        unit="deg",
+        factor=math.pi / 180,
+        label="yaw angle from uphill",
+        word="yaw",
+        range=(-1e6, 1e6),
+        sd_largest=360.0,
+        read=lambda robot, signals: signals.heading,
+        sd_share=0.01,
+        resolution=2,
+        unit_si="rad",
+        directed=False,
+        settled=False,
+        other_units=(("rad", 1.0),),
+    ),
+    *(
+        Channel(
+            name=name,
+            column=f"{name[-1]}_mm",
+            sd_column=f"{name[-1]}_sd_mm",
+            unit="mm",
+            factor=MM,
+            label=label,
+            word=name,
+            range=(-1e7, 1e7),
+            sd_largest=1e4,
+            read=read,
+            sd_share=0.01,
+            unit_si="m",
+            zero_at_rest=True,
+            directed=False,
+            settled=False,
+            other_units=(("m", 1.0), ("cm", 1e-2)),
+        )
+        for name, label, read in (
+            ("place_x", "place uphill", lambda robot, signals: signals.place_x),
+            ("place_y", "place to the left", lambda robot, signals: signals.place_y),
+        )
+    ),
+)
+#: Every channel that there is.
+EVERY: tuple[Channel, ...] = _EITHER + OF_TURNS
 
 #: Of a robot whose file states none.
 USUAL = ("total_current", "motor_speed", "speed")

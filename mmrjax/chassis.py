@@ -11,6 +11,7 @@ from mmrjax.params import Scalar, as_float, parameter
 from mmrjax.signals import GRAVITY
 from mmrjax.track import Track
 from mmrjax.trigonometry import cosine
+from mmrjax.turning import Turning
 
 
 class Chassis(eqx.Module):
@@ -18,6 +19,7 @@ class Chassis(eqx.Module):
 
     Attributes:
         on_tracks: 1 on tracks, 0 on wheels [-].
+        turning: what straight travel does not show.
         lacks: balances that it has not; torque_constant, torque_gravity, backlash: of a `Shaft`, none here.
     """
 
@@ -49,6 +51,8 @@ class Chassis(eqx.Module):
         relative_sd=0.1,
         source="Table 7: pulleys, wheels, and the tracks' mass at r_k",
     )
+
+    turning: Turning = eqx.field(default_factory=Turning, kw_only=True)
 
     @property
     def speed_still(self) -> Scalar:

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 Number = float | Sequence[float] | np.ndarray | Array
 
+#: Conditions that are stated of either side.
+OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
+
 
 class Conditions(eqx.Module):
     """The conditions of one run, or of a batch: every field broadcast to one shape.
@@ -38,6 +41,12 @@ class Conditions(eqx.Module):
         motor_acceleration: of an imposed speed [rad/s²]; None: none.
         motor_current: imposed on each motor [A], whatever voltage that takes; None: it follows.
         begin: which of the beginnings of `Rig.begins` is a history's, its index; None: it starts from rest.
+        duty_left, duty_right: as `duty`, of either side; None: `duty`. Stating anything of a side makes the robot
+            free to turn.
+        open_left, open_right: as `open`, of either side; None: `open`.
+        motor_speed_left, motor_speed_right: as `motor_speed`, of either side; None: `motor_speed`.
+        heading_deg: at the start, from uphill, positive to the left [deg]; None: 0. It too frees the robot to turn.
+        adhesion_lateral: as `adhesion`, across the travel; None: `adhesion`.
     """
 
     configuration: Int[Array, "..."] | np.ndarray
@@ -55,6 +64,14 @@ class Conditions(eqx.Module):
     motor_acceleration: Float[Array, "..."] | None
     motor_current: Float[Array, "..."] | None
     begin: Int[Array, "..."] | None
+    duty_left: Float[Array, "..."] | None
+    duty_right: Float[Array, "..."] | None
+    open_left: Float[Array, "..."] | None
+    open_right: Float[Array, "..."] | None
+    motor_speed_left: Float[Array, "..."] | None
+    motor_speed_right: Float[Array, "..."] | None
+    heading_deg: Float[Array, "..."] | None
+    adhesion_lateral: Float[Array, "..."] | None
 
     def __init__(
         self,
@@ -73,6 +90,14 @@ class Conditions(eqx.Module):
         motor_acceleration: Number | None = None,
         begin: Number | None = None,
         motor_current: Number | None = None,
+        duty_left: Number | None = None,
+        duty_right: Number | None = None,
+        open_left: Number | bool | None = None,
+        open_right: Number | bool | None = None,
+        motor_speed_left: Number | None = None,
+        motor_speed_right: Number | None = None,
+        heading_deg: Number | None = None,
+        adhesion_lateral: Number | None = None,
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
@@ -80,7 +105,9 @@ class Conditions(eqx.Module):
         given = (voltage, slope_deg, payload, battery, discharge, adhesion, order, duty, open)
         numbers = [_number(v) for v in given]
         others = {"total_mass": total_mass, "motor_speed": motor_speed, "motor_acceleration": motor_acceleration}
-        others["motor_current"] = motor_current
+        others |= {"motor_current": motor_current, "heading_deg": heading_deg, "adhesion_lateral": adhesion_lateral}
+        others |= {"duty_left": duty_left, "duty_right": duty_right, "open_left": open_left, "open_right": open_right}
+        others |= {"motor_speed_left": motor_speed_left, "motor_speed_right": motor_speed_right}
         optional = {name: _number(value) for name, value in others.items() if value is not None}
         shapes = [x.shape for x in (which, *numbers, *optional.values())]
         try:
@@ -103,8 +130,8 @@ class Conditions(eqx.Module):
         self.voltage, self.slope_deg, self.payload, self.battery, self.discharge, self.adhesion = numbers[:6]
         self.order, self.duty, self.open = numbers[6:]
         held = {name: _broadcast(x, shape) for name, x in optional.items()}
-        self.total_mass, self.motor_speed = held.get("total_mass"), held.get("motor_speed")
-        self.motor_acceleration, self.motor_current = held.get("motor_acceleration"), held.get("motor_current")
+        for name in others:
+            setattr(self, name, held.get(name))
         self.begin = None if begin is None else _broadcast(_number(begin, int), shape)
 
     @property
@@ -116,6 +143,21 @@ class Conditions(eqx.Module):
     def voltage_follows(self) -> bool:
         """Whether the motors' voltage is what an imposed speed or current takes."""
         return self.motor_speed is not None or self.motor_current is not None
+
+    @property
+    def turns(self) -> bool:
+        """Whether the sides are driven apart, or the robot heads elsewhere than uphill: it is then free to turn."""
+        return any(getattr(self, name) is not None for name in (*OF_SIDES, "heading_deg"))
+
+    def of_sides(self) -> Conditions:
+        """Those of left and right side, a leading axis of 2."""
+
+        def side(name: str) -> Conditions:
+            stated = {key: getattr(self, f"{key}_{name}") for key in ("duty", "open", "motor_speed")}
+            own: dict[str, Any] = dict.fromkeys(OF_SIDES)
+            return dataclasses.replace(self, **own | {k: x for k, x in stated.items() if x is not None})
+
+        return jax.tree.map(lambda left, right: jnp.stack([left, right]), side("left"), side("right"))
 
     @property
     def slope(self) -> Float[Array, "..."]:

@@ -80,6 +80,15 @@ class Friction(eqx.Module):
         rising = self.static * direction(speed, self.speed_static)
         return jnp.where(size < self.speed_static, rising, jnp.sign(speed) * falling)
 
+    def per_speed(self, square: Scalar) -> Scalar:
+        """Coefficient over sliding speed [s/m] at the square of that speed [m²/s²]: finite at rest, with its
+        derivatives."""
+        slow = square < self.speed_static**2
+        creeping = self.static * (3 - square / self.speed_static**2) / (2 * self.speed_static)
+        size = jnp.sqrt(jnp.where(slow, self.speed_static**2, square))
+        falling = step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
+        return jnp.where(slow, creeping, falling / size)
+
     def rise(self, speed: Scalar) -> Scalar:
         """How fast the coefficient rises with sliding `speed` [s/m]; negative between V_s and V_d."""
         size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 
+from mmrjax.balances import Travel
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import Signals
+from mmrjax.signals import GRAVITY, PlaneMotion, Signals
+from mmrjax.trigonometry import sine
 
 #: Where energy goes, in the order of the chain: name, and what it is.
 SINKS: dict[str, str] = {
@@ -62,3 +67,24 @@ def stored(robot: Robot, signals: Signals) -> Scalar:
     rotating = robot.motor.inertia * signals.speed_motor**2 + inertia * signals.speed_wheel**2
     magnetic = signals.inductance * signals.current**2
     return 0.5 * (signals.mass * signals.speed**2 + robot.sides * (rotating + magnetic))
+
+
+def sinks_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[str, Scalar]:
+    """The same of a robot that turns: sliding is Σ F·u over all contacts, lift follows its heading."""
+    signals = travel.signals
+    each = jax.vmap(lambda c, s: sinks(robot, c, s))(conditions.of_sides(), signals)
+    found: dict[str, Scalar] = {name: jnp.mean(jnp.asarray(power)) for name, power in each.items()}
+    weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
+    across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
+    found["sliding"] = found["sliding"] + jnp.sum(travel.grip.across)
+    found["lift"] = found["lift"] - weight * across
+    return found
+
+
+def stored_turning(robot: Robot, travel: Travel, motion: PlaneMotion) -> Scalar:
+    """The same of a robot that turns, lateral and yaw motion with it [J]."""
+    signals = dataclasses.replace(travel.signals, speed=jnp.broadcast_to(motion.speed, (2,)))
+    turning = robot.chassis(jnp.max(jnp.asarray(signals.configuration))).turning
+    own = jnp.mean(jax.vmap(lambda s: stored(robot, s))(signals))
+    across = jnp.mean(jnp.asarray(signals.mass)) * motion.speed_lateral**2
+    return own + 0.5 * (across + turning.inertia * motion.yaw_rate**2)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mmrjax import channels
@@ -18,6 +19,8 @@ STARTS = ("rest", "measured", "free")
 #: What may be imposed: the voltage of supply or battery (times the duty), the speed of the motors' shafts, or the
 #: current of each motor by an amplifier, whatever voltage these take.
 IMPOSED = ("voltage", "motor_speed", "motor_current")
+#: What is imposed between the rows of a history: as at the row before, or on a straight line to the next.
+BETWEEN = ("held", "linear")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +104,7 @@ class Rig(eqx.Module):
         priors: (parameter, mean, sd) [SI] that the file states, in place of the parameters' own; of sd 0 it is exact.
         start: of histories: `rest`, `measured` (by the first samples) or `free`, which those are the prior of.
         begins: of histories that do not begin at rest, once their table is known.
+        between_rows: of histories, one of `BETWEEN`; an imposed speed is on straight lines in any case.
         surfaces: (configuration, another from which it differs by its ground alone).
         inherits: whether what its file leaves open is a packaged robot's; if not, nothing in it is another robot's.
         loose: whether the load on the shaft has backlash, which histories then follow as a state.
@@ -122,16 +126,20 @@ class Rig(eqx.Module):
     columns: tuple[tuple[str, str, float], ...] = eqx.field(default=(), static=True)
     priors: tuple[tuple[str, float, float], ...] = eqx.field(default=(), static=True)
     start: str = eqx.field(default="rest", static=True)
+    between_rows: str = eqx.field(default=BETWEEN[0], static=True)
     surfaces: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
     inherits: bool = eqx.field(default=True, static=True)
     loose: bool = eqx.field(default=False, static=True)
 
     def for_equations(self) -> Rig:
         """Without what only files, priors and reports read."""
-        if not (self.instruments or self.columns or self.priors or self.surfaces or self.start != STARTS[0]):
+        usual = self.start == STARTS[0] and self.between_rows == BETWEEN[0]
+        if usual and not (self.instruments or self.columns or self.priors or self.surfaces):
             return self
         rectified = tuple(Instrument(i.channel, signed=False) for i in self.instruments if i.signed is False)
-        return dataclasses.replace(self, instruments=rectified, columns=(), priors=(), start=STARTS[0], surfaces=())
+        return dataclasses.replace(
+            self, instruments=rectified, columns=(), priors=(), start=STARTS[0], between_rows=BETWEEN[0], surfaces=()
+        )
 
     def late(self, times: Float[Array, " times"], values: Array, at: Scalar) -> Array:
         """What happens at instants, by the clock of tables, whose column of what is imposed acts `delay` later.
@@ -164,7 +172,12 @@ class Rig(eqx.Module):
     @property
     def prompt(self) -> bool:
         """Whether it is known that what is imposed acts when its column says."""
-        return not isinstance(self.delay, jax.core.Tracer) and not bool(jnp.any(jnp.asarray(self.delay) != 0))
+        return not isinstance(self.delay, jax.core.Tracer) and not np.any(np.asarray(self.delay) != 0)
+
+    @property
+    def turns(self) -> bool:
+        """Whether an instrument shows what a robot does that turns."""
+        return not {c.name for c in channels.OF_TURNS}.isdisjoint(self.channels)
 
     @property
     def stated(self) -> frozenset[str]:

@@ -26,6 +26,7 @@ from mmrjax.tables import (
     adhesion_ratio,
 )
 from mmrjax.track import Track
+from mmrjax.turning import Turning
 
 __all__ = [
     "BENCH",
@@ -64,6 +65,7 @@ def nominal() -> Robot:
         mass=13.1,
         radius=RADIUS_PULLEY,
         inertia=pulleys + belt + belts_flippers,
+        turning=Turning(lateral=bench.tracked_y / bench.tracked_x, inertia=0.23),
     )
     wheeled = Chassis(
         track=Track(loss_coulomb=0.070, loss_viscous=0.003, guide_share=0.0),
@@ -72,6 +74,7 @@ def nominal() -> Robot:
         mass=11.5,
         radius=RADIUS_WHEEL,
         inertia=pulleys + belt + 2 * 152e-6,
+        turning=Turning(lateral=bench.wheeled_y / bench.wheeled_x, inertia=0.19),
     )
     return Robot(Battery(), Motor(), Gearbox(), Configurations({TRACKED: tracked, WHEELED: wheeled}))
 

@@ -64,6 +64,29 @@ class State(eqx.Module):
     gap: Scalar | None = None
 
 
+class PlaneMotion(eqx.Module):
+    """What a run of a robot that turns remembers: of each side, left and right, and of the robot in the plane.
+
+    Attributes:
+        current: of one motor of each side [A], shape (2,); speed_motor: motor shaft speeds [rad/s], shape (2,).
+        speed, speed_lateral: of the centre of mass, ahead and to the left [m/s]; yaw_rate: to the left [rad/s].
+        heading: from uphill, to the left [rad]; place_x, place_y: uphill of the start, and to the left of it [m].
+        discharge: charge taken from the battery C_b [C].
+        memory: of each effect that has one, by its name, shape (2,).
+    """
+
+    current: Scalar
+    speed_motor: Scalar
+    speed: Scalar
+    speed_lateral: Scalar
+    yaw_rate: Scalar
+    heading: Scalar
+    place_x: Scalar
+    place_y: Scalar
+    discharge: Scalar
+    memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
+
+
 class Signals(eqx.Module):
     """Every quantity of one instant, filled in order by `balances`; per side unless `total` is said.
 
@@ -84,6 +107,12 @@ class Signals(eqx.Module):
     speed_motor: Scalar = UNSET  # [rad/s]
     speed: Scalar = UNSET  # V of the robot [m/s]
     temperature: Scalar | None = None  # of the winding, where it is followed [°C]
+    # of the robot in the plane of the ground; of one that travels straight nothing
+    speed_lateral: Scalar = 0.0  # v_y to the left [m/s]
+    yaw_rate: Scalar = 0.0  # ω, positive to the left [rad/s]
+    heading: Scalar = 0.0  # ψ from uphill, positive to the left [rad]
+    place_x: Scalar = 0.0  # uphill of where the run started [m]
+    place_y: Scalar = 0.0  # to the left of that [m]
     # kinematics
     direction: Scalar = UNSET  # of the shafts, -1..1, 0 at rest [-]
     direction_travel: Scalar = UNSET  # of the robot, -1..1 [-]

@@ -36,6 +36,14 @@ CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
     "motor_speed": (-1e4, 1e4, "rad/s"),
     "motor_acceleration": (-1e7, 1e7, "rad/s^2"),
     "motor_current": (-2000.0, 2000.0, "A"),
+    "duty_left": (-1.0, 1.0, ""),
+    "duty_right": (-1.0, 1.0, ""),
+    "open_left": (0.0, 1.0, ""),
+    "open_right": (0.0, 1.0, ""),
+    "motor_speed_left": (-1e4, 1e4, "rad/s"),
+    "motor_speed_right": (-1e4, 1e4, "rad/s"),
+    "heading_deg": (-360.0, 360.0, "deg"),
+    "adhesion_lateral": (1e-3, 100.0, ""),
 }
 
 
@@ -63,3 +71,9 @@ def adhesion_ratio(surface: str, on_tracks: bool) -> float:
     """Adhesion of `surface` over that of the bench [-], Table 5; right for a robot whose friction is the bench's."""
     here, bench = SURFACES[surface], SURFACES[BENCH]
     return here.tracked_x / bench.tracked_x if on_tracks else here.wheeled_x / bench.wheeled_x
+
+
+def lateral_ratio(surface: str, on_tracks: bool) -> float:
+    """The same across the travel: lateral adhesion of `surface` over that of the bench [-], Table 5."""
+    here, bench = SURFACES[surface], SURFACES[BENCH]
+    return here.tracked_y / bench.tracked_y if on_tracks else here.wheeled_y / bench.wheeled_y

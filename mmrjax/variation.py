@@ -39,6 +39,14 @@ CONDITIONS: dict[str, str] = {
     "motor_speed": "motor speed imposed on the shafts",
     "motor_acceleration": "acceleration of an imposed motor speed",
     "motor_current": "current imposed on each motor",
+    "duty_left": "share of the supply's voltage at the left motor",
+    "duty_right": "share of the supply's voltage at the right motor",
+    "open_left": "1 where the left motor's circuit is open",
+    "open_right": "1 where the right motor's circuit is open",
+    "motor_speed_left": "motor speed imposed on the left side",
+    "motor_speed_right": "motor speed imposed on the right side",
+    "heading_deg": "heading at the start, from uphill, positive to the left",
+    "adhesion_lateral": "the same as adhesion, across the travel",
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
 STATUS, FLAGS = CODES

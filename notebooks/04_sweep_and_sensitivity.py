@@ -15,47 +15,44 @@
 # # A sweep, and which parameters matter
 #
 # What does a robot do over a range of conditions, how sure is that, and which of its parameters would one have to
-# know better? The same from the command line: `mmrjax sweep` and `mmrjax sensitivity`.
+# know better? `mmrjax sweep` and `mmrjax sensitivity` answer this from the command line, for all parameters at once
+# and with confidence intervals; here is what they do, in a few lines each.
 
 # %%
-import jax
-
-jax.config.update("jax_enable_x64", True)
-
-import io
 import tempfile
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
-from IPython.display import Image
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from calibration.sensitivity import inputs as uncertain
-from calibration.sensitivity.analyse import analyse
-from calibration.sensitivity.model import chosen_outputs
-from calibration.sensitivity.result import Points
-from calibration.sensitivity.study import Study
-from mmrjax import nominal
-from mmrjax.conditions import Conditions
-from mmrjax.variation import Variation, evaluate
+import mmrjax as mm
 
-robot = nominal()
+robot = mm.nominal()
 
 # %% [markdown]
 # ## A sweep
-# Anything may vary, conditions and parameters by their names. `Variation` says what; `evaluate` computes any outputs
-# of all points in one compiled call.
+# `mm.sweep` takes a grid of conditions. A parameter of the robot can vary too: `mm.replace` changes it by its name,
+# and `jax.vmap` runs all robots in one call.
 
 # %%
-variation = Variation(robot, ("slope_deg", "6T2A.track.guide_share"))
 slopes, shares = np.linspace(0, 12, 25), np.linspace(0, 1, 21)
-values = jnp.asarray(np.stack(np.meshgrid(slopes, shares, indexing="ij"), -1).reshape(-1, 2))
-made = evaluate(variation, "steady", values, Conditions(0, voltage=24.0), {}, ("total_current", "speed"))
-current = np.asarray(made["total_current"]).reshape(25, 21)
-print(f"{len(values)} points, {int((np.asarray(made['status']) == 0).sum())} of them travel")
-print(f"current {current.min():.2f} to {current.max():.2f} A")
+
+
+def climb(share):
+    """Every slope, with a share of the weight on the track's guides."""
+    return mm.simulate(
+        mm.replace(robot, {"6T2A.track.guide_share": share}),
+        mm.Conditions("6T2A", voltage=24.0, slope_deg=slopes),
+    )
+
+
+made = jax.jit(jax.vmap(climb))(jnp.asarray(shares))
+current = np.where(made.statuses == "converged", made.total_current, np.nan).T  # a row for each slope
+print(f"{current.size} points, {int(np.isfinite(current).sum())} of them travel")
+print(f"current {np.nanmin(current):.2f} to {np.nanmax(current):.2f} A")
 
 # %% [markdown]
 # ## Its store
@@ -72,64 +69,102 @@ with tempfile.TemporaryDirectory() as folder:
 again["total_current"].sel(slope_deg=[0, 6, 12]).sel(guide_share=[0.0, 0.5, 1.0], method="nearest")
 
 # %% [markdown]
-# ## Which parameters matter
-# The guides' share is only one of some thirty parameters that are not known exactly. Each has a prior. *Sobol
-# indices* say what share of an output's variance each is to blame for: alone (first order), and with all that it acts
-# together with (total).
+# ## Which parameters matter, at the robot's own values
+# Suppose that six parameters are known to the tolerances below. A derivative says what each of them does to a
+# reading: the *elasticity*, percent of current or speed for one percent of the parameter. Derivatives are exact and
+# come with the run, so all of them at four operating points are one call.
 
 # %%
-names = uncertain.default_names(robot, ("6T2A",), battery=False)
-inputs = uncertain.of_priors(robot, names, {})
-points = Points(
-    np.full(4, "6T2A"), np.array([15.0, 33.0, 15.0, 33.0]), np.full(4, 3.0), np.array([0.0, 0.0, 5.0, 5.0])
-)
-study = Study(robot, inputs, points, chosen_outputs(("total_current", "speed", "slip", "steepest_slope"), robot))
-found = analyse(study, "sobol", evaluations=100_000)
-print(found.statement())
-print(f"{found.evaluations} runs of the model")
+known = {  # relative standard deviation
+    "motor.torque_constant": 0.02,
+    "motor.resistance": 0.05,
+    "motor.inductance": 0.10,
+    "gearbox.efficiency_load": 0.03,
+    "6T2A.track.guide_share": 0.40,
+    "6T2A.ground.rolling_resistance": 0.15,
+}
+motor, tracks = robot.motor, robot.configurations["6T2A"]
+electrics = (motor.torque_constant, motor.resistance, motor.inductance)
+mechanics = (robot.gearbox.efficiency_load, tracks.track.guide_share, tracks.ground.rolling_resistance)
+nominal = np.array([*electrics, *mechanics])
+points = mm.Conditions("6T2A", voltage=[15.0, 33.0, 15.0, 33.0], payload=3.0, slope_deg=[0.0, 0.0, 5.0, 5.0])
+
+
+def readings(values):
+    """Current [A] and speed [m/s] at the four points, and whether all of them travel."""
+    runs = mm.simulate(mm.replace(robot, dict(zip(known, values, strict=True))), points)
+    return jnp.stack([runs.total_current, runs.speed]), jnp.all(runs.status == mm.STATUSES.index("converged"))
+
+
+(at_nominal, _), (slope, _) = readings(nominal), jax.jacfwd(readings, has_aux=True)(nominal)
+elasticity = np.asarray(slope * nominal / at_nominal[..., None])  # reading, point, parameter
+for k, name in enumerate(known):
+    print(f"{name:<32} current {elasticity[0, 2, k]:+.3f}   speed {elasticity[1, 2, k]:+.3f}   (15 V, 5 deg)")
 
 # %%
-for name, output in found.outputs.items():
-    for k in np.argsort(-output.overall_share)[:3]:
-        total = output.overall["total"][k]
-        print(f"{name:<16}{found.names[k]:<36}{float(total.value):6.3f}  [{total.low:.3f}, {total.high:.3f}]")
-
-# %%
-from sweeps.pages import sensitivity_figures
-from sweeps.pages.figure_style import style
-
-
-def show(draw, *arguments):
-    """A figure of the report as a picture in the notebook."""
-    with style():
-        figure = draw(*arguments)
-        FigureCanvasAgg(figure)
-        picture = io.BytesIO()
-        figure.savefig(picture, format="png", dpi=72)
-    return Image(data=picture.getvalue())
-
-
-show(sensitivity_figures.indices, found.outputs["total_current"], found)
+_, (left, right) = plt.subplots(1, 2, figsize=(9, 3), sharey=True, layout="constrained")
+names, sds = list(known), np.array(list(known.values()))
+for axes, values, title in ((left, elasticity[0, 2], "total current"), (right, elasticity[1, 2], "speed")):
+    axes.barh(names, 100 * values * sds)
+    axes.axvline(0, color="k", lw=0.7)
+    axes.set(xlabel="change by one standard deviation [%]", title=f"{title}, 15 V, 5 deg")
+plt.show()
 
 # %% [markdown]
-# ## At the robot's own values
-# Derivatives are exact, so that they cost hardly more than the runs: of every output by every parameter at every
-# operating point, in one batch. The heat map is the share of each parameter in each output to first order.
+# ## Over the whole range
+# Derivatives hold near one robot. *Sobol indices* look at all robots that the tolerances allow: which share of a
+# reading's variance does each parameter cause? First order: by itself. Total: with all that it acts together with.
+# Two independent sets of robots are drawn, and one parameter at a time of the first is replaced by that of the second
+# (Saltelli 2010, Jansen 1999).
 
 # %%
-local = analyse(study, "local")
-show(sensitivity_figures.overview, local)
+ROBOTS = 4096
+rng = np.random.default_rng(0)
+a, b = nominal * np.exp(sds * rng.standard_normal((2, ROBOTS, len(known))))  # log-normal: none is negative
+run = jax.jit(jax.vmap(readings))
+both = [a, b]
+for k in range(len(known)):
+    mixed = a.copy()
+    mixed[:, k] = b[:, k]
+    both.append(mixed)
+values, travels = run(jnp.asarray(np.concatenate(both)))
+values = np.asarray(values).reshape(len(both), ROBOTS, 2, 4)
+whole = np.asarray(travels).reshape(len(both), ROBOTS).all(0)  # a robot that slides has no reading
+values = values[:, whole]
+print(f"{len(both) * ROBOTS * 4} runs; {whole.sum()} of {ROBOTS} robots travel at all points")
 
 # %%
-speed = local.outputs["speed"]
-k = local.names.index("motor.torque_constant")
-print(f"1 % more torque constant changes the speed at 15 V by {speed.elasticity[0, k]:+.2f} %")
-show(sensitivity_figures.tornado, speed, local)
+one, other, *with_one = values
+variance = values[:2].var(axis=(0, 1))
+first = np.array(
+    [((other - other.mean(0)) * (x - one)).mean(0) / variance for x in with_one]
+)  # parameter, reading, point
+total = np.array([((x - one) ** 2).mean(0) / 2 / variance for x in with_one])
+for name, s, t in zip(known, first, total, strict=True):
+    print(f"{name:<32} current {s[0, 2]:5.2f} {t[0, 2]:5.2f}   speed {s[1, 2]:5.2f} {t[1, 2]:5.2f}")
 
 # %%
+_, axes = plt.subplots(figsize=(7, 3), layout="constrained")
+place = np.arange(len(known))
+for shift, reading, label in ((-0.2, 0, "total current"), (0.2, 1, "speed")):
+    axes.barh(place + shift, total[:, reading, 2], 0.36, label=label)
+axes.set(xlabel="total share of the variance, 15 V, 5 deg", yticks=place, yticklabels=names)
+axes.legend()
+plt.show()
+
+# %% [markdown]
+# The guides' share of the weight is what one would have to know better to predict the current; the torque constant
+# sets the speed, since the no-load speed is voltage over torque constant. A settled run does not depend on the
+# inductance at all. `mmrjax sensitivity --outputs total_current,speed,slip` does the same for every parameter that
+# has a prior, and proposes the runs that would tell most.
+
+# %%
+share, constant, inductance = (
+    names.index(n) for n in ("6T2A.track.guide_share", "motor.torque_constant", "motor.inductance")
+)
 assert np.isfinite(current).all() and current[-1, -1] > current[0, 0]
 assert float(again["total_current"].max()) == current.max()
-assert found.outputs["total_current"].overall_share.argmax() == found.names.index("6T2A.track.guide_share")
-assert found.outputs["speed"].overall_share.argmax() == k
-assert "motor.inductance" in found.negligible
-assert -1.1 < speed.elasticity[0, k] < -0.9  # the no-load speed is voltage over torque constant
+assert total[:, 0, 2].argmax() == share and total[:, 1, 2].argmax() == constant
+assert np.all(elasticity[..., inductance] == 0) and np.all(total[inductance] < 1e-12)
+assert -1.1 < elasticity[1, 2, constant] < -0.9
+assert np.all(np.abs(first.sum(0) - 1) < 0.15)  # hardly any interaction

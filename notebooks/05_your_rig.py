@@ -22,31 +22,18 @@
 # `mmrjax loop settled.csv --robot robotino.toml --noise current=5%,speed=10%`.
 
 # %%
-import dataclasses
-import io
+import tempfile
 from pathlib import Path
 
-import jax
-
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.display import Image
 
-import calibration
-from calibration.data import surfaces
-from calibration.discovery.scales import library_for
-from mmrjax import channels, effects
-from mmrjax.fidelities.steady import steady_batch
+import mmrjax as mm
 
-FOLDER = next(
-    p for p in (Path("docs"), Path("../docs"), Path(calibration.__file__).parents[1] / "docs") if p.is_dir()
-)
-FOLDER = FOLDER / "rigs" / "robotino"
-rig = calibration.read_robot(str(FOLDER / "robotino.toml"))
-runs = calibration.read_runs(str(FOLDER / "settled.csv"), robot=rig)
+DOCS = Path("docs") if Path("docs").is_dir() else Path(mm.__file__).parents[1] / "docs"
+FOLDER = DOCS / "rigs" / "robotino"
+rig = mm.read_robot(str(FOLDER / "robotino.toml"))
+runs = mm.read_runs(str(FOLDER / "settled.csv"), robot=rig)
 print(f"{len(runs)} runs on {', '.join(np.unique(runs['surface']))}; imposed: {rig.rig.imposed}")
 print(f"channels: {', '.join(rig.rig.channels)}; columns without a role: {', '.join(runs.unknown)}")
 
@@ -58,18 +45,21 @@ print(f"channels: {', '.join(rig.rig.channels)}; columns without a role: {', '.j
 
 
 # %%
+def ground_speed(robot):
+    """Ground speed of every run [mm/s]."""
+    return 1e3 * np.asarray(mm.simulate(robot, runs.conditions(robot)).speed)
+
+
 def rms(robot, rows):
     """Root mean square error of the ground speed [mm/s] over some rows."""
-    conditions = runs.conditions(robot)
-    error = np.asarray(steady_batch(robot, conditions).speed) - channels.MM * runs["speed_mm_s"]
-    return 1e3 * float(np.sqrt(np.mean(error[rows] ** 2)))
+    return float(np.sqrt(np.mean((ground_speed(robot) - runs["speed_mm_s"])[rows] ** 2)))
 
 
 fast = runs.extras["set_speed_m_s"] > 0.25
 every = np.ones(len(runs), bool)
 options = {"noise": "current=5%,speed=8%", "starts": 4, "profiles": False, "blocks": False}
-plain = calibration.calibrate(runs, rig, **options)
-plain_held = calibration.calibrate(runs.where(~fast), rig, **options)
+plain = mm.calibrate(runs, rig, **options)
+plain_held = mm.calibrate(runs.where(~fast), rig, **options)
 print(
     f"plain law: {rms(plain.robot, every):.1f} mm/s, fitted without 0.3 m/s and asked there: "
     f"{rms(plain_held.robot, fast):.1f} mm/s"
@@ -77,39 +67,47 @@ print(
 
 # %% [markdown]
 # ## What it lacks
-# The loop finds, without being told, that slip goes with the speed (`nonlinear_slip`: a share of the speed that
-# depends on how much of the adhesion is used). Its run takes a minute or two; here its answer is fitted directly. The
-# priors of effects are brought to the rig's size first.
+# `mm.discover(runs, rig)` finds, without being told, that slip goes with the speed (`nonlinear_slip`: a share of the
+# speed that depends on how much of the adhesion is used). That takes a minute or two; here its answer is put into the
+# rig's file and fitted. `scaled` widens the library's prior and limits, which are for tracks on wood.
 
 # %%
-separated = surfaces.with_surface_configurations(rig, runs)
-library = library_for(separated, runs.conditions(separated), effects.BY_NAME)
-with_slip = dataclasses.replace(rig, effects=(library["nonlinear_slip"](amplitude=jnp.asarray(0.5)),))
-found = calibration.calibrate(runs, with_slip, **options)
-found_held = calibration.calibrate(runs.where(~fast), with_slip, **options)
+SLIP = """
+[effects.nonlinear_slip]
+amplitude = 0.5
+scaled = [10, 1, 10]  # sd of the amplitude, shape and limits, each times the library's
+"""
+with tempfile.TemporaryDirectory() as folder:
+    path = Path(folder) / "robotino_slip.toml"
+    path.write_text((FOLDER / "robotino.toml").read_text() + SLIP)
+    with_slip = mm.read_robot(str(path))
+found = mm.calibrate(runs, with_slip, **options)
+found_held = mm.calibrate(runs.where(~fast), with_slip, **options)
 inside, outside = rms(found.robot, every), rms(found_held.robot, fast)
 print(f"with slip that goes with speed: {inside:.1f} mm/s, held out at 0.3 m/s {outside:.1f} mm/s")
 
 # %%
-figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
+_, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
 wheel = (
-    runs["motor_speed_rpm"] * channels.RPM / float(rig.gearbox.ratio) * float(rig.configurations.members[0].radius)
+    1e3
+    * np.pi
+    / 30
+    * runs["motor_speed_rpm"]
+    / float(rig.gearbox.ratio)
+    * float(rig.configurations["robotino"].radius)
 )
-measured = channels.MM * runs["speed_mm_s"]
+measured = runs["speed_mm_s"]
 for ax, (title, robot) in zip(axes, (("plain law", plain.robot), ("slip goes with speed", found.robot)), strict=True):
-    shown = np.asarray(steady_batch(robot, runs.conditions(robot)).speed)
+    shown = ground_speed(robot)
     for k, surface in enumerate(np.unique(runs["surface"])):
         mine = runs["surface"] == surface
         order = np.argsort(wheel[mine])
-        ax.plot(1e3 * wheel[mine], 1e3 * measured[mine], "o", ms=4, color=f"C{k}", label=f"{surface}, measured")
-        ax.plot(1e3 * wheel[mine][order], 1e3 * shown[mine][order], "-", color=f"C{k}")
+        ax.plot(wheel[mine], measured[mine], "o", ms=4, color=f"C{k}", label=f"{surface}, measured")
+        ax.plot(wheel[mine][order], shown[mine][order], "-", color=f"C{k}")
     ax.set(title=title, xlabel="rolling speed of the wheels [mm/s]")
 axes[0].set_ylabel("ground speed [mm/s]")
 axes[0].legend(fontsize=7, frameon=False)
-picture = io.BytesIO()
-figure.savefig(picture, dpi=90)
-plt.close(figure)
-Image(picture.getvalue())
+plt.show()
 
 # %% [markdown]
 # ## What is left clusters

@@ -130,7 +130,7 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
     config.Simulate,
     beside=config.OneRun,
     example="mmrjax simulate --configuration 4W2T --voltage 24 --slope 10 --payload 5 --model drive; "
-    "mmrjax simulate --profile patrol --battery --payload 5",
+    "mmrjax simulate --profile patrol --battery --payload 5; mmrjax simulate --left 33 --right 15",
 )
 def simulate(
     told: Told,
@@ -145,6 +145,8 @@ def simulate(
     With --model drive or track the run starts from standstill, and history.csv holds current and speeds over
     time; with track, reactions.csv holds every load inside the running gear too. With --profile it follows a mission:
     energy (Wh, Wh/m), distance, peaks, temperatures and charge, of the whole and in segments.csv of each segment.
+    With --left and --right the sides are driven apart: how the robot circles on level ground, and what each motor
+    takes; with --model drive its path over time, on slopes too (docs/turning.md).
     """
     cells = told.beside.model_dump()
     given = cells if runs is None else str(runs)
@@ -152,6 +154,10 @@ def simulate(
         from sweeps.commands import missions
 
         return missions.simulate(told.config, given, {c for c, v in cells.items() if v is not None}, out, force)
+    if told.config.turns:
+        from sweeps.commands import turn
+
+        return turn.simulate(told.config, given, out, force)
     from sweeps.commands import simulate as room
 
     return room.simulate(told.config, given, out, force)

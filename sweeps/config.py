@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from calibration.data.columns import CONDITIONS
+from calibration.data.columns import CONDITIONS, SIDES
 from calibration.data.errors import BadConfiguration, choices, toml_content, toml_text
 from mmrjax import channels, fidelities
 from mmrjax.tables import BENCH, PAYLOADS_KG, SLOPES_DEG, SURFACES, VOLTAGES_V
@@ -260,6 +260,37 @@ class LoopBeside(MembersPart):
         return float(number) * {"min": 60.0, "h": 3600.0}.get(self.within.removeprefix(number), 1.0)
 
 
+_DUTY = SIDES["duty_left"]
+Duty = Annotated[float, Field(ge=_DUTY[0], le=_DUTY[1], allow_inf_nan=False)]
+
+
+class TurnPart(Part):
+    """How the sides of one run are driven apart; None: alike."""
+
+    left_V: Voltage | None = about(None, "Voltage of the left motor (V); with --right the robot is free to turn")
+    right_V: Voltage | None = about(None, "Voltage of the right motor (V)")
+    duty_left: Duty | None = about(None, "Share of the supply's voltage at the left motor, in place of --left")
+    duty_right: Duty | None = about(None, "Share of the supply's voltage at the right motor")
+    heading_deg: Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)] | None = about(
+        None, "Heading at the start, from uphill, positive to the left"
+    )
+
+    @property
+    def turns(self) -> bool:
+        """Whether the robot is free to turn."""
+        return any(getattr(self, name) is not None for name in TurnPart.model_fields)
+
+    @model_validator(mode="after")
+    def _of_both_sides(self) -> Self:
+        for left, right in (("left_V", "right_V"), ("duty_left", "duty_right")):
+            if (getattr(self, left) is None) != (getattr(self, right) is None):
+                one, other = (left, right) if getattr(self, right) is None else (right, left)
+                raise PydanticCustomError("idle", f"{one} acts with {other} only; state both sides")
+        if self.left_V is not None and self.duty_left is not None:
+            raise PydanticCustomError("idle", "left_V acts without duty_left only; state voltages or duties")
+        return self
+
+
 class PosteriorPart(Part):
     """Whether results come with the uncertainty of a calibrated robot."""
 
@@ -309,11 +340,18 @@ class ProfilePart(FidelityPart):
         return super().options if self.profile is None else {}
 
 
-class Simulate(RobotPart, ProfilePart, SupplyPart, PosteriorPart, OutputPart):
+class Simulate(RobotPart, ProfilePart, SupplyPart, TurnPart, PosteriorPart, OutputPart):
     """A few given runs; those over time from standstill, or over a profile."""
 
     @model_validator(mode="after")
     def _certain(self) -> Self:
+        if self.turns:
+            beside = [name for name in ("profile", "posterior") if getattr(self, name) is not None]
+            beside += ["model track"] * (self.model == "track")
+            if beside:
+                raise PydanticCustomError("idle", f"left, right and heading act without {beside[0]} only")
+            if self.battery and self.left_V is not None:
+                raise PydanticCustomError("idle", "left_V acts without battery only; state duty_left and duty_right")
         if self.profile is not None and self.posterior is not None:
             raise PydanticCustomError("idle", "posterior acts without profile only")
         return self

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import textwrap
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -23,6 +25,8 @@ from rich.text import Text
 
 #: Widest line of text on a terminal.
 COLUMNS = 80
+#: Longest silence of a long computation [s].
+SILENCE = 10.0
 _WIDTH = None if sys.stdout.isatty() else 120  # a file has no width of its own
 _out = Console(highlight=False, soft_wrap=True, markup=False, width=_WIDTH)
 _err = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
@@ -47,6 +51,49 @@ def wrapped(text: str) -> str:
         )
         for line in text.split("\n")
     )  # fmt: skip
+
+
+@contextmanager
+def pulse(tell: Callable[[str], None], doing: str, silence: float = SILENCE) -> Iterator[Callable[[str], None]]:
+    """A function that says what goes on; where nothing has been said for a while, the latest is said again, with how
+    long it has gone on and what was compiled meanwhile.
+
+    Args:
+        tell: says a line; doing: what goes on until the first; silence: the longest [s].
+    """
+    import jax
+
+    from calibration.words.steps import still
+
+    compiled, said = 0, [(doing, time.monotonic(), 0)]
+    spoke, over = threading.Event(), threading.Event()
+
+    def count(event: str, duration_secs: float, **_: Any) -> None:
+        nonlocal compiled
+        compiled += event.endswith("backend_compile_duration")
+
+    def say_it(text: str) -> None:
+        said[:] = [(text, time.monotonic(), compiled)]
+        spoke.set()
+        tell(text)
+
+    def beat() -> None:
+        while not over.is_set():
+            heard = spoke.wait(silence)
+            spoke.clear()
+            if not heard and not over.is_set():
+                text, since, before = said[0]
+                tell(still(text, time.monotonic() - since, compiled - before))
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield say_it
+    finally:
+        over.set()
+        spoke.set()
+        thread.join()
 
 
 class RateColumn(ProgressColumn):

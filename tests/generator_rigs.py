@@ -508,7 +508,8 @@ class World:
         torque, *_ = _nominal(self.constants, self.rig.supply)
         current = self.rig.supply / s.R / 12
         return SimpleNamespace(**signals | {"torque": max(signals["B"], 0.5 * torque), "sides": s.sides, "ratio": s.ratio,
-                                            "current": max(signals["I"], 0.5 * current), "C": s.C, "supply": self.rig.supply})  # fmt: skip
+                                            "current": max(signals["I"], 0.5 * current), "C": s.C, "supply": self.rig.supply,
+                                            "rated": 0.3 * self.rig.supply / s.R})  # fmt: skip
 
     def posterior(self) -> dict[str, float]:
         """Posterior sd of each constant over its prior's, linear at the truth: of how much the table says of it."""

@@ -1,7 +1,7 @@
 """Laws of effects that a rig's file may leave unstated: those of the library by their equations, and others.
 
 Each is written in the signals of `generator_rigs` and sized by the rig at hand: `scale` holds the largest size of each
-signal over its rows, `torque` [N·m] at the output, `current` [A] of one motor.
+signal over its rows, `torque` [N·m] at the output, `current` [A] of one motor, and `rated` [A], 0.3 of that at stall.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ LIBRARY: dict[str, Form] = {
     "windage": Form("windage", "motor", lambda s, q: s.w * abs(s.w), lambda r: _motor(0.06)(r) / r.w**2),
     "stribeck_motor": Form("stribeck_motor", "motor", lambda s, q: np.exp(-abs(s.w) / q["fade"]) * s.d, _motor(0.06), shapes=_fade_motor),
     "iron_loss": Form("iron_loss", "motor", lambda s, q: _lag(s.w, q["critical"]), _motor(0.06), shapes=lambda r: {"critical": (0.3 * r.w, 1.2 * r.w)}),
-    "torque_constant_saturation": Form("torque_constant_saturation", "motor", lambda s, q: s.C * s.I**3, lambda r: 0.05 / r.current**2),
+    "torque_constant_saturation": Form("torque_constant_saturation", "motor", lambda s, q: s.C * s.I**3, lambda r: 0.15 / max(r.current, r.rated) ** 2),
     "gear_load_loss": Form("gear_load_loss", "gearbox", lambda s, q: abs(s.B) * s.d, lambda r: 0.05),
     "gear_quadratic_loss": Form("gear_quadratic_loss", "gearbox", lambda s, q: s.B**2 * s.d, lambda r: 0.06 / r.torque),
     "stribeck_gear": Form("stribeck_gear", "gearbox", lambda s, q: np.exp(-abs(s.w) / q["fade"]) * s.d, _output(0.06), shapes=_fade_motor),

@@ -19,7 +19,7 @@ from reference import CELLS, NOMINAL, SIDES, G
 STEP = 2e-4  # [s]; the armature's time constant is 1.9e-4 s, the method is stable to 2.7 of them
 FINER = 8  # times smaller steps through the first 20 ms
 LARGEST = 20.0  # ordinary sizes; an effect that needs more comes with fewer sigmas
-STATES = ("I", "w", "V", "theta", "C_b", "T", "q", "z")  # T [K], q [A], z [-]: memories of single effects
+STATES = ("I", "w", "V", "theta", "C_b", "T", "q", "z", "b")  # T [K], q [A], z and b [-]: memories of single effects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +50,9 @@ FORMS: dict[str, Moving] = {
     "thermal_drift": Moving("electrical", lambda s, q: g.COPPER * s.R * s.I * s.T, 1.0, {}, "thermal_drift"),
     "battery_sag": Moving("supply", lambda s, q: s.q * s.battery, 0.2, {}, "battery_sag"),
     "stick_slip": Moving("track", lambda s, q: s.z, 0.1, {}, "stick_slip"),
+    "presliding": Moving("track", lambda s, q: s.b - s.sign, 0.1, {}, "presliding"),
+    "angle_friction": Moving("track", lambda s, q: np.sin(s.theta / s.i + q["phase"]) * s.sign, 0.05, _PHASE, "angle_friction"),
+    "position_friction": Moving("track", lambda s, q: s.theta / s.i * s.sign, 0.01, {}, "position_friction"),
     "series_resistance": Moving("electrical", lambda s, q: s.I, 0.4, {}, "series_resistance"),
     "churning": Moving("track", lambda s, q: s.w_k**2 * s.sign, 5e-4, {}, "churning"),
     "supply_sag": Moving("supply", lambda s, q: SIDES * s.I, 0.2, {}, "supply_sag"),
@@ -82,7 +85,7 @@ def _friction(v, mu_s, mu_d, V_s, V_d):
 
 
 def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str, Any], terms) -> np.ndarray:
-    """d/dt of STATES, shape (8, runs); terms are (form, amplitude, shapes); `p` as from `_of_runs`."""
+    """d/dt of STATES, shape (9, runs); terms are (form, amplitude, shapes); `p` as from `_of_runs`."""
 
     def both(name: str) -> np.ndarray:
         return p[name]
@@ -127,6 +130,7 @@ def _rates(time: float, y: np.ndarray, c: g.Conditions, battery, p: Mapping[str,
         (1.7 * s.R * s.I**2 - s.T) / 16.3,
         (SIDES * s.I - s.q) / 20.0,
         (s.w_k * np.exp(-((s.w_k / 3.0) ** 2)) - s.w_k * s.sign * s.z) / 0.01,
+        (s.w_k - s.w_k * s.sign * s.b) / 0.02,
     ])  # fmt: skip
 
 

@@ -1,13 +1,16 @@
 """Every report in a headless browser, on a phone, a laptop, a wide screen and paper: nothing is cut off or printed over,
 nothing scrolls sideways but tables and figures in themselves, nothing is asked of a network, and all can be read."""
 
-import sys
+import dataclasses
+import shutil
+from pathlib import Path
 
 import pytest
 from browser import MEASURE, PAPER, Browser, found
-from test_loop_command import commanded
+from test_loop_command import commanded, few_effects, mmrjax, starts_churning
+from test_settle import made as made_log
 
-from sweeps import cli
+from sweeps.pages import loop as loop_page
 
 pytestmark = [
     pytest.mark.slow,
@@ -35,6 +38,8 @@ PAGES = {
     "paper": "reproduce",
     "resonance": "resonance",
     "size": "size",
+    "store": f"sweep {Path(__file__).parent / 'record' / 'commands' / 'plan.toml'}",
+    "track": "simulate --model track --slope 5",
 }
 FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p>
 <p style="color:#bbb">faint</p><p style="font-size:7px">tiny</p>
@@ -56,14 +61,10 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("browser")
 
 
-def made(name, folder):
+def made(folder, name, command):
     """The page of a command."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(folder)
-        patch.setattr(sys, "argv", ["mmrjax", *PAGES[name].split(), "--out", name])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-    assert end.value.code == 0
+    answer = mmrjax(folder, *command.split(), "--out", name)
+    assert answer.code == 0, answer.err
     return folder / name / "report.html"
 
 
@@ -92,16 +93,48 @@ def test_a_faulty_page_is_found(folder):
 
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_can_be_read_everywhere(browser, folder, name):
-    assert wrong(browser, made(name, folder)) == {}
+    assert wrong(browser, made(folder, name, PAGES[name])) == {}
+
+
+def test_the_page_of_settled_runs_can_be_read_everywhere(browser, tmp_path):
+    made_log(tmp_path)
+    assert wrong(browser, made(tmp_path, "found", "settle log.csv --robot rig.toml")) == {}
 
 
 def test_the_page_of_the_loop_can_be_read_everywhere(browser):
     assert wrong(browser, commanded().folder / "found" / "report.html") == {}
 
 
+def test_the_page_of_nothing_missing_can_be_read_everywhere(browser, tmp_path):
+    found = commanded().found
+    summary = dataclasses.replace(found.summary, verdict="none")
+    none = dataclasses.replace(found, verdict="none", effects=(), support=None, summary=summary)
+    assert wrong(browser, loop_page.write(tmp_path, none, robot_name="nominal")) == {}
+
+
+def test_the_page_of_histories_can_be_read_everywhere(browser, tmp_path):
+    with few_effects():
+        assert starts_churning(tmp_path).answer.code == 0
+    assert wrong(browser, tmp_path / "found" / "report.html") == {}
+
+
+def test_a_page_from_disk_has_a_worker(browser, tmp_path):
+    """As the search of the docs' site needs one, and browsers refuse it."""
+    shutil.copy(Path(__file__).parents[1] / "docs" / "assets" / "iframe-worker.js", tmp_path)
+    (tmp_path / "double.js").write_text('addEventListener("message", e => postMessage(2 * e.data))')
+    (tmp_path / "page.html").write_text('<body><script src="iframe-worker.js"></script></body>')
+    browser.open(tmp_path / "page.html", 1280)
+    answer = """new Promise(done => {
+      const worker = new Worker("double.js");
+      worker.addEventListener("message", e => done(e.data));
+      worker.postMessage(21);
+    })"""
+    assert browser.value(answer) == 42 and browser.complaints() == []
+
+
 def test_a_table_is_sorted_by_its_headings_and_a_figure_says_its_values(browser, folder):
     page = folder / "sweep" / "report.html"
-    browser.open(page if page.exists() else made("sweep", folder), 1280)
+    browser.open(page if page.exists() else made(folder, "sweep", PAGES["sweep"]), 1280)
     texts = "[...document.querySelectorAll('#extremes tr td:nth-child(2)')].map(c => parseFloat(c.textContent))"
     head = "document.querySelector('#extremes th:nth-child(2)')"
     assert browser.value(f"{head}.click(), {texts}") == sorted(browser.value(texts))

@@ -26,10 +26,11 @@ from mmrjax.effects import ALL, BY_NAME, Effect, base
 from mmrjax.effects.contract import readable
 from mmrjax.effects.periodic import Periodic
 from mmrjax.fidelities import half_robot
-from mmrjax.fidelities.drive import drive, rates
+from mmrjax.fidelities.drive import drive, rates, start, state_of
 from mmrjax.fidelities.steady import steady, steady_batch
 from mmrjax.fidelities.track import track
 from mmrjax.params import Scalar, parameter
+from mmrjax.rig import Begin, Begins
 from mmrjax.robot import Configurations
 from mmrjax.shaft import Shaft
 from mmrjax.signals import CONVERGED, STALLED, Signals, State
@@ -244,6 +245,7 @@ DRIVERS = {
     "configuration": ("configuration", "on_tracks"),
     "direction": ("direction",),
     "angle": (),
+    "position": (),
 }  # fmt: skip
 #: Of what a term without a driver is the same share everywhere, by its balance or channel; 1: the same everywhere.
 SHARED = {
@@ -650,8 +652,8 @@ ORDER = """
 mass_error mass_offset rotating_inertia supply_sag battery_sag series_resistance brush_drop winding_heating
 thermal_drift armature_inductance windage stribeck_motor iron_loss torque_constant_saturation cogging gear_load_loss
 gear_quadratic_loss stribeck_gear backdriving_loss churning stribeck_track tension_friction centrifugal_tension
-bending_loss stick_slip directional_friction stribeck_exponent speed_rolling adhesive_drag weight_transfer
-sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
+bending_loss stick_slip directional_friction stribeck_exponent directional_viscous torque_offset presliding
+angle_friction position_friction speed_rolling adhesive_drag weight_transfer sinkage slope_bias grouser_polygon rolling_radius belt_creep nonlinear_slip speed_slip load_slip pulley_eccentricity
 vibration_slip ammeter_gain ammeter_offset encoder_scale speed_gain
 """.split()  # noqa: SIM905
 MODULES = [m.name for m in pkgutil.iter_modules(effects.__path__, "mmrjax.effects.")]
@@ -1006,9 +1008,53 @@ def test_new_effects_of_a_load_on_a_shaft_are_torques_at_its_output():
         np.testing.assert_allclose(
             found, current(constant, (0.05 + 0.1 * np.exp(-((output / 8) ** 2))) * sign), rtol=1e-5
         )
+        found = _on_shaft(constant, fitted(BY_NAME["directional_viscous"], 5e-4))
+        np.testing.assert_allclose(found, current(constant, 0.05 * sign + 5e-4 * np.abs(output)), rtol=1e-9)
+        found = _on_shaft(constant, fitted(BY_NAME["torque_offset"], 0.02))
+        np.testing.assert_allclose(found, current(constant + 0.02, 0.05 * sign), rtol=1e-9)
         found = _on_shaft(constant, fitted(BY_NAME["backdriving_loss"], 0.3))
         np.testing.assert_allclose(found, current(constant, 0.05 * sign, 0.3), rtol=1e-9)
     assert (current(0.3, 0.05 * sign)[1::2] * sign[1::2] < 0).all()
+
+
+def _torque(name, memory, **signals):
+    at = Signals(memory={name: jnp.asarray(memory)}, **{k: jnp.asarray(float(v)) for k, v in signals.items()})
+    effect = fitted(BY_NAME[name], 0.3)
+    return float(effect.term(robots.nominal(), at)), float(effect.rate(robots.nominal(), at))
+
+
+def test_presliding_is_dahls_friction_in_place_of_coulombs():
+    """After a turn θ from rest z = 1 - e^(-θ/θ_s) (Dahl 1968); once it turns back by θ, z = -1 + 2 e^(-θ/θ_s)."""
+    bent = 1 - np.exp(-0.03 / 0.02)
+    term, rate = _torque("presliding", bent, speed_wheel=4.0, direction=1.0)
+    assert term == pytest.approx(0.3 * (bent - 1)) and rate == pytest.approx(4.0 * np.exp(-1.5) / 0.02)
+    back = -1 + 2 * np.exp(-0.03 / 0.02)
+    term, rate = _torque("presliding", back, speed_wheel=-4.0, direction=-1.0)
+    assert term == pytest.approx(0.3 * (back + 1)) and rate == pytest.approx(-4.0 * 2 * np.exp(-1.5) / 0.02)
+    settled = fitted(BY_NAME["presliding"], 0.3)
+    assert (terms(settled, signals=dataclasses.replace(STATES, memory={})) == 0).all()
+
+
+def test_friction_along_the_travel_and_over_a_turn_turns_round_with_the_speed():
+    for way in (1.0, -1.0):
+        term, rate = _torque("position_friction", 2.5, speed_wheel=4.0 * way, direction=way)
+        assert (term, rate) == pytest.approx((0.3 * 2.5 * way, 4.0 * way))
+        term, rate = _torque("angle_friction", 2.5, speed_motor=4.0 * way, direction=way)
+        ratio = float(robots.nominal().gearbox.ratio)
+        assert (term, rate) == pytest.approx((0.3 * np.sin(2.5) * way, 4.0 * way / ratio))
+
+
+def test_friction_by_the_position_begins_where_a_history_does():
+    names = ("position_friction", "angle_friction", "presliding")
+    load = Shaft(inertia=1e-3, loss_coulomb=0.05, loss_viscous=1e-3)
+    robot = robots.blank(Configurations({"bench": load}))
+    begins = Begins({"begin_a": Begin(angle=1.5), "begin_b": Begin(angle=-2.0)})
+    rig = dataclasses.replace(robot.rig, begins=begins, start="measured")
+    robot = dataclasses.replace(with_effects(*(BY_NAME[n]() for n in names), robot=robot), rig=rig)
+    for begin, angle in enumerate((1.5, -2.0)):
+        run = jax.tree.map(lambda x: x[0], Conditions([0], voltage=[0.0], begin=[begin]))
+        memory = state_of(robot, start(robot, run)).memory
+        assert [float(memory[n]) for n in names] == [angle, angle, 0.0]
 
 
 # --- what effects declare, so that nobody needs their names ---------------------------------------------
@@ -1016,9 +1062,12 @@ def test_new_effects_of_a_load_on_a_shaft_are_torques_at_its_output():
 
 def test_library_declares_what_the_loop_asks_for():
     assert [e.name for e in ALL if e.needs_battery] == ["battery_sag"]
-    assert [e.name for e in ALL if e.needs_reverse] == ["directional_friction"]
-    assert {e.name: e.settles_to for e in ALL if e.settles_to} == {"thermal_drift": "winding_heating"}
-    assert [e.name for e in ALL if e.odd_in_travel] == ["directional_friction", "slope_bias"]
+    both_ways = ["directional_friction", "directional_viscous", "torque_offset"]
+    assert [e.name for e in ALL if e.needs_reverse] == both_ways
+    assert {e.name: e.settles_to for e in ALL if e.settles_to} == {
+        "thermal_drift": "winding_heating", "torque_offset": "directional_friction",
+    }  # fmt: skip
+    assert [e.name for e in ALL if e.odd_in_travel] == [*both_ways, "slope_bias"]
     assert {e.name: e.movers for e in ALL if e.movers} == {
         "mass_offset": "wheels", "grouser_polygon": "tracks", "vibration_slip": "tracks",
     }  # fmt: skip

@@ -111,8 +111,8 @@ def done(request):
     return commanded(every=True) if request.param == "every" else commanded()
 
 
-@pytest.fixture(scope="module")
-def quick():
+@contextlib.contextmanager
+def few_effects():
     """The command with a library of three effects beside the user's: small programs, compiled fast."""
     with pytest.MonkeyPatch.context() as patch:
         some = {n: BY_NAME[n] for n in ("churning", "series_resistance", "load_slip")}
@@ -121,6 +121,12 @@ def quick():
             return some | {e.name: e for path in paths for e in effect_file.read(Path(path))}
 
         patch.setattr(room, "effect_file", SimpleNamespace(library=library))
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick():
+    with few_effects():
         yield
 
 
@@ -294,7 +300,7 @@ BAD = {
     ),
     "two runs as one": (
         "\n".join([f"{HEADER},time_s", *(f"{moving(t)},{t % 15 / 10}" for t in range(30))]),
-        "runs.csv, time_s: run (no run_id) has 2 samples at 0 s; give each run its own run_id",
+        "runs.csv row 16, time_s: goes back from 1.4 to 0 s; give each recording its own run_id, or sort the rows",
     ),
     "two configurations in a run": (
         "\n".join([
@@ -364,15 +370,18 @@ def test_interrupt_leaves_nothing(tmp_path, monkeypatch):
 # --- histories ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def started(quick, tmp_path_factory):
+def starts_churning(folder) -> SimpleNamespace:
     """The whole command on six starts of a robot whose tracks churn, one sample given twice."""
-    folder = tmp_path_factory.mktemp("started")
     table, label = gs.case(["churning"], 14.0, seed=5, duration=0.8)
     written(folder / "starts.csv", {k: np.append(v, v[40]) for k, v in table.items()})
     priors = [*PRIORS, *(a.replace("static=0.6±0.09", "dynamic=0.48±0.08") for a in PRIORS)]
     answer = mmrjax(folder, "loop", "starts.csv", "--replicates", 250, "--out", "found", *priors)
     return SimpleNamespace(folder=folder, label=label["effects"][0], answer=answer)
+
+
+@pytest.fixture(scope="module")
+def started(quick, tmp_path_factory):
+    return starts_churning(tmp_path_factory.mktemp("started"))
 
 
 @pytest.mark.slow

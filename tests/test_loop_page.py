@@ -189,7 +189,7 @@ def test_what_happens_for_a_while_has_a_window(shown, capsys):
     # the place is told to within half a window
     assert window["low"] >= 25 and window["high"] <= 50
     assert f"in runs {window['low']:.0f} to {window['high']:.0f}" in got.printed
-    assert not any("everywhere alike" in note for note in got.document["notes"])
+    assert not any("conditions alike" in note for note in got.document["notes"])
     assert "curve" in drawn(got.text) and "order" in got.found.rows_table()
     assert got.document["next_experiment"]["name"] == "the same runs again"
     assert f"runs {window['low']:.0f} to {window['high']:.0f} again" in got.document["next_experiment"]["description"]
@@ -222,7 +222,7 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     assert words.answer(found) == f"No: missing is a {effect.families[0]}." and words.answer(found) in page.text
     a = effect.parameters["amplitude"]
     size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changed(found, effect.name)
-    size += f", which is {100 * change.rms:.2g} % of the {change.channel.label}"
+    size += f", which changes the {change.channel.label} by {100 * change.rms:.2g} %"
     assert f"{effect.families[0]} ({effect.name}): {size}; {words.how_sure(found, effect)}." in page.text
     stated, again, with_it = page.tables["summary"][1:]
     assert [line[0] for line in (stated, again, with_it)] == ["as stated", "fitted again", "with what was found"]

@@ -175,7 +175,7 @@ def curves(tmp_path_factory):
 def test_mass_of_the_table_is_taken_and_said(robot):
     runs = table({"6T2A": 13.1, "4W2T": 13.1})
     assert own_mass.remarks(robot, runs) == [
-        "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg; 13.1 kg is fitted with and written"
+        "4W2T: the table states 13.1 kg without payload, the robot's file 11.5 kg; 13.1 kg is used, and written to robot.toml"
     ]
     taken = own_mass.with_table_mass(robot, runs)
     assert float(taken.configurations["4W2T"].mass) == 13.1 and float(taken.configurations["6T2A"].mass) == 13.1

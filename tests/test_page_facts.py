@@ -1,6 +1,7 @@
 """What pages say of limits, scales and tables: what is judged, by which measure, and that nothing overruns."""
 
 import dataclasses
+import inspect
 import re
 
 import matplotlib.pyplot as plt
@@ -8,10 +9,11 @@ import numpy as np
 import pytest
 
 import mmrjax as mm
-from mmrjax import params, robots
+from mmrjax import effects, params, robots
 from mmrjax.tables import TRACKED, WHEELED
+from sweeps.pages import page as frame
 from sweeps.pages import runs as page
-from sweeps.pages import sweep_figures
+from sweeps.pages import sweep_figures, words
 from sweeps.pages.history_figures import Start
 from sweeps.paper import runs as paper_runs
 from sweeps.results.resonance import ResonanceResult
@@ -80,6 +82,16 @@ def test_every_table_of_a_page_scrolls_in_itself(mmrjax, tmp_path):
     tables = re.findall(r"(.{0,24})<table", text)
     assert len(tables) > 1 and all(before.endswith('"scroll" tabindex="0">') for before in tables)
     assert text.count("</table></div>") == len(tables) and ".scroll { overflow-x: auto; }" in text
+
+
+def test_every_page_warns_of_curves_that_nobody_has_named(robot):
+    """No page is rendered without a word on them; the warning comes before the contents."""
+    assert inspect.signature(frame.render).parameters["curves"].default is inspect.Parameter.empty
+    curved = dataclasses.replace(robot, effects=(effects.UNNAMED["curve_electrical_current"](), effects.ALL[0]()))
+    assert frame.curves(robot) == [] and frame.curves(curved) == ["curve_electrical_current"]
+    text = frame._with_contents("<h1>a</h1><h2>b</h2>", words.of_curves(frame.curves(curved)))
+    assert 0 < text.index("<code>curve_electrical_current</code>") < text.index('<nav id="contents"')
+    assert "curve-warning" not in frame._with_contents("<h1>a</h1><h2>b</h2>", words.of_curves([]))
 
 
 def test_legend_of_the_energy_split_has_what_is_drawn():

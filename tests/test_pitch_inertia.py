@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mmrjax import mjcf, params
+from mmrjax import masses, params
 from mmrjax.conditions import Conditions
 
 OUTSTRETCHED = {"running_gear.lever_front": 0.0, "running_gear.lever_rear": np.pi}
@@ -37,7 +37,7 @@ def changed(robot, values):
 
 def half(robot, configuration="6T2A", payload=0.0):
     run = Conditions(configuration, payload=payload).resolved(robot)
-    return mjcf.masses(robot, run, robot.chassis(run.configuration).mass + payload)
+    return masses.masses(robot, run, robot.chassis(run.configuration).mass + payload)
 
 
 def whole(robot, configuration="6T2A", payload=0.0):
@@ -127,7 +127,7 @@ def test_inertia_stated_as_a_whole_is_that_of_the_folded_robot_without_payload(r
 def test_robot_lighter_than_its_parts_is_refused(robot):
     light = changed(robot, {"6T2A.mass": 2.0})
     with pytest.raises(ValueError, match=r"6T2A\.mass: got 2 kg; expected more than 2\.8 kg, what its pulleys"):
-        mjcf.check_parts(light)
+        masses.check_parts(light)
 
 
 @pytest.mark.parametrize(
@@ -138,6 +138,6 @@ def test_stated_inertia_below_that_of_the_parts_is_refused(robot, name, least):
     with pytest.raises(
         ValueError, match=rf"running_gear\.{name}: got 0\.01 kg·m\^2; expected 0, or more than {least}"
     ):
-        mjcf.check_parts(small)
-    mjcf.check_parts(changed(robot, {f"running_gear.{name}": 0.1}))
-    mjcf.check_parts(dataclasses.replace(robot, sides=jnp.asarray(1.0)))
+        masses.check_parts(small)
+    masses.check_parts(changed(robot, {f"running_gear.{name}": 0.1}))
+    masses.check_parts(dataclasses.replace(robot, sides=jnp.asarray(1.0)))

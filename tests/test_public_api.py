@@ -325,6 +325,11 @@ def test_vmap_and_jit_go_through(robot):
     assert len(batch.table().splitlines()) == 4
 
 
+def test_a_delay_is_known_under_jit_where_the_robot_is_no_argument(robot):
+    """Or no history passes `jax.jit`."""
+    assert jax.eval_shape(lambda x: x if robot.rig.prompt else (x, x), 1.0).shape == ()
+
+
 def test_derivative_by_conditions_and_through_bad_values_passes_the_door(robot):
     slope = jax.grad(lambda angle: mm.simulate(robot, mm.Conditions(slope_deg=angle)).total_current)(5.0)
     assert np.isfinite(slope) and slope > 0

@@ -70,3 +70,11 @@ def test_share_is_the_variance_between_levels():
     assert campaign_figures.share(x, y) < 0.01
     assert campaign_figures.share(y, y) > 0.98
     assert campaign_figures.share(x, 3 * x + y * 3 * x.std()) == pytest.approx(0.5, abs=0.02)
+
+
+def test_few_points_fill_few_bins():
+    """No panel is empty where samples have few points each."""
+    resistance, voltage = np.tile(np.linspace(0.5, 0.7, 12), 2), np.repeat([15.0, 33.0], 12)
+    varied = {"voltage": campaign_figures.Varied(voltage, "V"), "r": campaign_figures.Varied(resistance, "r")}
+    histogram, *bands, _, _ = campaign_figures.spread(0.1 * voltage + resistance, "I", varied).axes
+    assert [len(b.lines[0].get_xdata()) for b in bands] == [2, 6] and len(histogram.patches) == 6

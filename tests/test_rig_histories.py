@@ -9,6 +9,7 @@ import pytest
 
 from calibration.data import robot_file
 from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from mmrjax import channels, params
@@ -187,6 +188,20 @@ def test_histories_are_compared_with_a_robot(tmp_path, mmrjax):
     assert code == 2 and "they need --model drive" in err
 
 
+@pytest.mark.parametrize(
+    ("stated", "free"), [("", True), ("0.0", True), ('"0 ± 0.05"', True), ("0.03", True), ('"0 ± 0"', False)]
+)
+def test_the_loop_looks_for_a_delay_that_no_file_rules_out(tmp_path, stated, free):
+    path = tmp_path / "rig.toml"
+    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
+    path.write_text(text.replace('delay = "0 ± 0.05"', f"delay = {stated}" if stated else ""))
+    robot = robot_file.load(str(path))
+    names = priors.free_names(robot, ("bench",), *observers.Histories.free())
+    assert ("rig.delay" in names) == free and "motor.inertia" in names
+    of_settled = priors.free_names(robot, ("bench",), *observers.KINDS[1].free())
+    assert "rig.delay" not in of_settled
+
+
 def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, monkeypatch):
     """A second of a voltage at 50 Hz, against steps that stay short after each change."""
     path = tmp_path / "rig.toml"
@@ -207,3 +222,64 @@ def test_steps_follow_the_rows_of_a_log_whose_input_changes_at_each(tmp_path, mo
     assert made.times.size < 45 * len(runs) and 3 * made.times.size < fine.times.size
     error = np.sqrt(np.mean((shown - exact) ** 2, 0) / np.mean(exact**2, 0))
     assert (error < 2e-3).all() and (error > 1e-6).all()
+
+
+def test_a_voltage_on_lines_is_the_mean_of_each_step_and_no_jump(tmp_path):
+    """The means of all steps make up the integral of the broken line; nothing else than what is imposed is on lines."""
+    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
+    (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
+    robot = robot_file.load(str(tmp_path / "rig.toml"))
+    (tmp_path / "log.csv").write_text(
+        "time_s,supply_voltage_V,duty,motor_speed_rpm\n0,2,1,0\n0.1,12,1,0\n0.3,4,0.5,0\n0.4,4,0.5,0\n"
+    )
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+    made = observers.kind(runs).of(runs, robot)
+    volts, times = np.asarray(made.conditions.voltage)[0], np.asarray(made.times)[0]
+    assert np.sum(volts[:-1] * np.diff(times)) == pytest.approx(0.1 * 7 + 0.2 * 8 + 0.1 * 4)
+    after = np.searchsorted(times, 0.1)
+    assert volts[after] == pytest.approx(12 - 40 * 0.5 * (times[after + 1] - 0.1)) and volts[-1] == 4
+    duty = np.asarray(made.conditions.duty)[0]
+    assert duty[np.searchsorted(times, 0.2)] == pytest.approx(0.75, abs=0.01)
+    held = observers.kind(runs).of(
+        runs, dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, between_rows="held"))
+    )
+    assert held.times.size > 1.5 * made.times.size
+
+
+@pytest.mark.slow
+def test_what_is_imposed_is_held_or_goes_on_lines_between_rows(tmp_path):
+    """A ramp of 50 rows a second: on lines it is a ramp of finer rows; held it is late by half a row."""
+    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH.replace(
+        '"0 ± 0.05"', '"0 ± 0"'
+    )
+    text = text.replace("inertia = 0.02", "inertia = 0.002")
+
+    def shown(word, step):
+        (tmp_path / "rig.toml").write_text(text.replace('start = "rest"', f'start = "rest"\nbetween_rows = "{word}"'))
+        robot = robot_file.load(str(tmp_path / "rig.toml"))
+        t = np.arange(0, 0.8 + 1e-9, step)
+        volts = np.interp(t, [0, 0.3, 0.5, 0.8], [2.0, 14.0, 14.0, -5.0])
+        rows = [f"{a:.4f},{b:.6f},0" for a, b in zip(t, volts, strict=True)]
+        (tmp_path / "log.csv").write_text("time_s,supply_voltage_V,motor_speed_rpm\n" + "\n".join(rows))
+        runs = records.read(tmp_path / "log.csv", robot=robot)
+        made = observers.kind(runs).of(runs, robot)
+        reading = np.asarray(made(robot).reading)[:, 0]
+        return reading[:: round(0.02 / step)], made.times.size
+
+    exact, _ = shown("linear", 0.0025)
+    linear, few = shown("linear", 0.02)
+    held, many = shown("held", 0.02)
+    assert np.abs(linear - exact).max() < 2e-3 * np.abs(exact).max()
+    assert np.abs(held - exact).max() > 10 * np.abs(linear - exact).max() and few < 0.7 * many
+
+
+def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):
+    path = tmp_path / "rig.toml"
+    text = DRIVE.format(imposed="voltage", channels='"motor_speed"', start="rest") + BENCH
+    path.write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "spline"'))
+    with pytest.raises(BadConfiguration, match=r"rig.toml, between_rows: got spline; .*allowed: held, linear"):
+        robot_file.load(str(path))
+    path.write_text(text.replace('start = "rest"', 'start = "rest"\nbetween_rows = "linear"'))
+    robot = robot_file.load(str(path))
+    robot_file.write(robot, tmp_path / "robot.toml")
+    assert robot_file.load(str(tmp_path / "robot.toml")).rig.between_rows == robot.rig.between_rows == "linear"

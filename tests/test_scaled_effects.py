@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from calibration.data.errors import BadConfiguration
 from calibration.discovery import scales
 from mmrjax import effects, params
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
+from sweeps.commands import rig_new
 
 #: Of rigs: kind and what is imposed; the largest and the smallest that a few draws give.
 RIGS = [("bench", "voltage"), ("linear", "motor_speed"), ("wheeled", "voltage")]
@@ -89,6 +91,39 @@ def test_an_instrument_is_off_by_no_more_than_a_share_of_what_it_shows(tmp_path,
     )
 
 
+def test_what_grows_with_the_load_is_judged_at_the_rated_current_of_the_motor(tmp_path):
+    """A bench at a fifth of its rated current, 0.3 of that at stall: friction of a size of its own is as before, and a
+    saturation leaves something of the torque constant, and a resistance something of the voltage, at that current."""
+    robot, runs, library = rig("bench", "voltage", tmp_path)
+    used = float(np.nanmax(np.abs(runs["total_current_A"]))) / float(robot.sides)
+    volts = float(np.nanmax(np.abs(runs["supply_voltage_V"])))
+    rated = 0.3 * volts / float(robot.motor.resistance)
+    assert rated > 3 * used
+
+    def most(name):
+        return amplitude_of(library[name]()).spec.bounds[1]
+
+    assert 0.2 < most("torque_constant_saturation") * rated**2 < 2
+    assert most("torque_constant_saturation") * used**2 < 0.15
+    assert most("series_resistance") * rated < 2 * volts
+    for name in ("stribeck_motor", "stribeck_track", "brush_drop", "gear_load_loss", "churning"):
+        sd, _, limits = library[name].factors
+        assert limits == pytest.approx(sd, rel=0.1)
+    assert library["torque_constant_saturation"].factors[2] < 0.1 * library["torque_constant_saturation"].factors[0]
+
+
+def test_a_motor_that_states_what_it_bears_is_judged_by_that(tmp_path):
+    robot, runs, _ = rig("bench", "voltage", tmp_path)
+    limits = []
+    for hot in (90.0, 125.0):
+        motor = dataclasses.replace(robot.motor, temperature_limit=hot)
+        motor = params.replace(motor, {"resistance_thermal_winding": 4.0, "resistance_thermal_housing": 400.0})
+        able = dataclasses.replace(robot, motor=motor)
+        kind = scales.library_for(able, runs.conditions(able), effects.BY_NAME)["torque_constant_saturation"]
+        limits.append(amplitude_of(kind()).spec.bounds[1] * float(motor.current_continuous) ** 2)
+    assert limits[0] == pytest.approx(limits[1], rel=1e-6)
+
+
 def test_one_class_for_the_same_factors():
     kind = effects.BY_NAME["churning"]
     assert scaled(kind, (2.0, 1.0, 2.0)) is scaled(kind, (2.0, 1.0, 2.0)) is not scaled(kind, (3.0, 1.0, 3.0))
@@ -101,3 +136,32 @@ def test_factors_are_three_positive_numbers(tmp_path, stated):
         BadConfiguration, match=r"effects\.churning\.scaled: got .* expected three numbers more than 0"
     ):
         robot_file.read(tmp_path / "robot.toml")
+
+
+def test_friction_along_the_travel_is_sized_by_the_travel_and_looked_for_where_a_channel_shows_it(tmp_path):
+    robot = servo(tmp_path)
+    rows = ["0.4,0,0", "0.7,1.5,360", "1,3.0,720", "-0.9,4.0,-720"]
+    (tmp_path / "log.csv").write_text(
+        "supply_voltage_V,duty,time_s,output_angle_deg\n" + "\n".join(f"6,{r}" for r in rows) + "\n"
+    )
+    runs = records.read(tmp_path / "log.csv", robot=robot)
+    turned = scales.turned_in(runs, robot)
+    assert turned == pytest.approx(2 * np.pi * np.sqrt((1 + 4 + 4) / 3))
+    kinds = [
+        scales.library_for(robot, runs.conditions(robot), effects.BY_NAME, x)["position_friction"]
+        for x in (turned, 2 * turned)
+    ]
+    one, two = (amplitude_of(kind()).spec for kind in kinds)
+    assert two.sd == pytest.approx(0.5 * one.sd) and two.bounds[1] == pytest.approx(0.5 * one.bounds[1])
+    # At its sd it is as large over the travel as a torque of the same share.
+    offset = scales.library_for(robot, runs.conditions(robot), effects.BY_NAME, turned)["presliding"]
+    assert one.sd * turned == pytest.approx(amplitude_of(offset()).spec.sd, rel=0.2)
+    blind = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=("output_speed",)))
+    assert not scales.present(effects.BY_NAME["position_friction"], blind)
+    assert scales.present(effects.BY_NAME["angle_friction"], blind)
+
+
+def servo(folder):
+    """The robot of the template of a servo."""
+    (folder / "rig.toml").write_text(rig_new.template("servo"), encoding="utf-8")
+    return robot_file.read(folder / "rig.toml")

@@ -15,6 +15,7 @@ from calibration.data import robot_file, settling
 from calibration.data import runs as records
 from calibration.data.errors import BadData
 from calibration.words import settle as words
+from sweeps.commands.settle import rolling
 
 
 def made(tmp_path, seed=1, kind="bench", imposed="voltage", **options):
@@ -186,10 +187,89 @@ def test_what_cannot_be_settled_is_said_with_row_and_remedy(tmp_path, case):
         settled(tmp_path, robot)
 
 
+def both_ways(**changes):
+    """A bench that goes up and down with an ammeter, a speed and an angle of its output."""
+    columns = stairs(levels=(6.0, 12.0, -6.0, -12.0))
+    sign = np.sign(columns["supply_voltage_V"])
+    columns["total_current_A"] = sign * (0.3 + 0.05 * np.abs(columns["supply_voltage_V"])) + 0.002 * np.cos(
+        np.arange(800.0)
+    )
+    columns["output_angle_deg"] = np.round(np.cumsum(columns["motor_speed_rpm"] / 10 * 6) / 100, 3)
+    return columns | {name: change(columns[name]) for name, change in changes.items()}
+
+
+WRONG = {
+    "a current without sign": (
+        dict(total_current_A=np.abs),
+        r"rows 4\d\d to 600, total_current_A: shows 0\.6 A at -6 V; expected readings with their signs, negative "
+        r"backward; or state \[instruments\.total_current\] signed = false",
+    ),
+    "a speed turned round": (
+        dict(motor_speed_rpm=lambda x: -x),
+        r"rows \d+ to 200, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; state "
+        r"\[columns\] motor_speed_rpm = \{column = \.\.\., factor = -1\}",
+    ),
+    "a voltage without sign": (
+        dict(supply_voltage_V=np.abs),
+        r"rows \d+ to 600, motor_speed_rpm: shows -1080 rpm at 6 V; expected the sign of what is imposed; give "
+        "supply_voltage_V the sign of its direction",
+    ),
+    "an angle in radians": (
+        dict(output_angle_deg=np.radians),
+        r"rows \d+ to 200, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm says with the ratio of the rig's "
+        r"file; is it radians for degrees\? write all rows in its unit, or state .* factor = 57\.3\}",
+    ),
+    "recordings in two units": (
+        dict(output_angle_deg=lambda x: np.where(np.arange(800) < 400, x - x[399], np.radians(x - x[399]))),
+        r"rows \d+ to 600, output_angle_deg: 0\.01745 times as fast as motor_speed_rpm says",
+    ),
+    "an angle that changes its unit": (
+        dict(output_angle_deg=lambda x: np.where(np.arange(800) < 350, x, np.radians(x))),
+        r"row 351, output_angle_deg: goes from 3133 to 5\d\.?\d* between two samples, as degrees beside radians",
+    ),
+    "an angle that wraps": (
+        dict(output_angle_deg=lambda x: np.mod(x, 360.0)),
+        r"output_angle_deg: jumps by -?3\d\d\.?\d* deg from the sample before, as an angle that wraps",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_signs_and_units_that_cannot_be_are_said_with_rows_and_remedy(tmp_path, case):
+    changes, said = WRONG[case]
+    robot = bench(tmp_path, both_ways(**changes), '"total_current", "motor_speed", "output_angle"')
+    with pytest.raises(BadData, match=said):
+        settled(tmp_path, robot, rolling=rolling(robot))
+
+
+def test_an_angle_that_is_frozen_is_named_itself(tmp_path):
+    columns = {k: v for k, v in both_ways(output_angle_deg=lambda x: 0 * x + 12.5).items() if k != "motor_speed_rpm"}
+    robot = bench(tmp_path, columns, '"total_current", "output_angle"')
+    with pytest.raises(
+        BadData, match=r"rows 1 to 800, output_angle_deg: 12\.5 deg in every row; the channel is frozen"
+    ):
+        settled(tmp_path, robot)
+
+
+def test_signs_and_units_that_are_right_are_not_doubted(tmp_path):
+    robot = bench(tmp_path, both_ways(), '"total_current", "motor_speed", "output_angle"')
+    assert len(settled(tmp_path, robot, rolling=rolling(robot)).kept) == 4
+    text = (tmp_path / "rig.toml").read_text() + "[instruments.total_current]\nsigned = false\n"
+    bench(tmp_path, both_ways(total_current_A=np.abs), '"total_current", "motor_speed", "output_angle"')
+    (tmp_path / "rig.toml").write_text(text)
+    robot = robot_file.read(tmp_path / "rig.toml")
+    assert len(settled(tmp_path, robot, rolling=rolling(robot)).kept) == 4
+
+
 def test_a_duty_beyond_one_is_refused_with_its_row(tmp_path):
     columns = stairs()
     robot = bench(tmp_path, columns | {"duty": np.where(np.arange(600) == 7, 1.2, 1.0)})
     with pytest.raises(BadData, match=r"row 8, duty: got 1\.2; expected -1 to 1"):
+        settled(tmp_path, robot)
+    robot = bench(tmp_path, columns | {"duty": np.full(600, 255)})
+    with pytest.raises(
+        BadData, match=r"row 1, duty: got 255; a command of another size\? divide .*; expected -1 to 1"
+    ):
         settled(tmp_path, robot)
 
 

@@ -668,7 +668,7 @@ def test_campaigns_and_notebooks_take_the_way_of_users():
         if name not in own.get(file.stem, ())
     }
     assert found == set(CALLED)
-    for campaign in ("loop", "loop_series", "loop_baselines", "rigs"):
+    for campaign in ("loop", "loop_series", "loop_baselines", "rigs", "rig_logs"):
         tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
         assert any(name == "calibration.discovery.discover.prepared" for name, _ in names_imported(tree, "")), (
             campaign

@@ -43,11 +43,11 @@ SAMPLES = [
     ),
     (
         of_fit.NoiseOff("", 10.04, "stated"),
-        "residuals are 10 times the stated sds in every channel and everywhere alike: are the sds right?",
+        "residuals are 10 times the stated sds in every channel, under all conditions alike: are the sds right?",
     ),
     (
         of_fit.NoiseOff("speed", 3.0, "assumed"),
-        "residuals of speed are 3 times the assumed sds, everywhere alike: are these sds right?",
+        "residuals of speed are 3 times the assumed sds, under all conditions alike: are these sds right?",
     ),
     (of_fit.Fact("no grip"), "no run grips: static friction, and slip below it, are known by their priors alone"),
     (
@@ -131,8 +131,8 @@ SAMPLES = [
     ),
     (
         of_fit.OfRows((1, 2), "limited", 0.01),
-        "rows 1, 2 use all the adhesion but the margin of 1%: the limit holds their static friction from below, and the "
-        "slip that they show is not all explained",
+        "rows 1, 2 are within 1% of the adhesion limit: it bounds their static friction from below, and does not explain "
+        "all of their slip",
     ),
     (
         of_fit.OfRows((3,), "jumps"),
@@ -228,6 +228,11 @@ SAMPLES = [
     (
         of_loop.StillLacks("motor_speed", "speed_motor"),
         "what was found does not explain everything: the reading of motor speed still lacks something over speed motor",
+    ),
+    (
+        of_loop.Late(0.0312, 0.0004),
+        "what is imposed acts 31.2 ± 0.4 ms later than its column says, and the rig's file states no delay: with [rig] "
+        'delay = "0.0312 ± 0.0004" it begins there',
     ),
     (
         of_loop.Led(("a", "b"), (3.0, 2.0), 0, 0, 1, "fit", "fit", 0.01, 0.0),
@@ -388,7 +393,7 @@ OVER = CurveOver("slip", ("slope",))
         ),
         (
             NameSupport(False, "curve alone", curves=(OVER,)),
-            "one smooth curve in the balance slip over slope leaves nothing",
+            "one smooth curve in the slip balance over slope leaves nothing",
         ),
         (
             NameSupport(
@@ -400,7 +405,7 @@ OVER = CurveOver("slip", ("slope",))
                     NameTest("c", 5.0, 3.41, (), 9.0, again=0.75, larger=("d", "e"), remains=True),
                 ),
             ),
-            "a explains 1.2 σ beside smooth curves (balance slip over slope), and chance reaches 3.4; b is a worse "
+            "a explains 1.2 σ beside smooth curves (slip balance over slope), and chance reaches 3.4; b is a worse "
             "explanation than a smooth curve in its place and rests on row 10; c is chosen again in 75 % of the data "
             "with a block left out, has a rival of an implausible size (d and e) and leaves something in its own "
             "equation",
@@ -441,7 +446,7 @@ def test_verdict_tells_what_is_tentative():
     only = Missing(("b",), (), ("slip",), False)
     said = loop.statement(Summary("unnamed", 0.001, place, (only,), support=curve))
     assert "no effect of the library is established" in said
-    assert said.endswith("predicts better: b (one smooth curve in the balance slip over slope leaves nothing).")
+    assert said.endswith("predicts better: b (one smooth curve in the slip balance over slope leaves nothing).")
 
 
 def test_verdicts_at_other_noise_are_one_sentence():
@@ -451,10 +456,10 @@ def test_verdicts_at_other_noise_are_one_sentence():
     sure, weak = Missing(("a", "c"), (), ("x",)), Missing(("b",), (), ("y",), False)
     assert loop.at_other_noise(()) == ""
     assert loop.at_other_noise([other(0.7, "class", sure, weak), other(1.4, "class", sure, weak)]) == (
-        "with 0.7 and with 1.4 times that noise class: a established, b tentative"
+        "with 0.7 and with 1.4 times that noise the verdict is class: a established, b tentative"
     )
     assert loop.at_other_noise([other(0.5, "unnamed", weak), other(2, "none")]) == (
-        "with 0.5 times that noise unnamed: b tentative; with 2 times that noise none"
+        "with 0.5 times that noise the verdict is unnamed: b tentative; with 2 times that noise the verdict is none"
     )
 
 
@@ -523,7 +528,7 @@ def test_what_is_predicted_worse_is_said_with_its_rows(found, before, after, sai
 @pytest.mark.parametrize(
     ("about", "said"),
     [
-        (("missing", "slip", "speed_motor"), "what is missing in the balance slip over speed motor"),
+        (("missing", "slip", "speed_motor"), "what is missing in the slip balance over speed motor"),
         (("found", "", "", ("a", "b")), "a, b, found by the lumped model"),
         (("near", "", "", ("a",)), "a, which explains the readings nearly as well"),
     ],

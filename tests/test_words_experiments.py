@@ -181,7 +181,7 @@ MORE = [
 @pytest.mark.parametrize(("reach", "variable", "said"), MORE, ids=[v for _, v, _ in MORE])
 def test_more_runs_are_said_within_reach(reach, variable, said):
     assert words.instruction(more_runs("slip", variable, reach)) == (
-        f"{said}; read every channel. What the balance slip lacks then shows its shape"
+        f"{said}; read every channel. What the slip balance lacks then shows its shape"
     )
 
 

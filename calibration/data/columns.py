@@ -30,6 +30,10 @@ TIME: dict[str, tuple[float, float]] = {"time_s": (0.0, 1e6)}
 DUTY: dict[str, tuple[float, float]] = {"duty": (-1.0, 1.0)}
 DRIVEN = ("voltage", "brake", "coast")
 DRIVING = ("duty", "mode")
+#: What a table may state of a robot whose sides are driven apart: the shares of the supply's voltage that the motors
+#: of either side get; and where it heads at the start, from uphill, positive to the left.
+SIDES: dict[str, tuple[float, float]] = {"duty_left": (-1.0, 1.0), "duty_right": (-1.0, 1.0)}
+HEADING: dict[str, tuple[float, float]] = {"heading_deg": (-360.0, 360.0)}
 #: Place of a row in the sequence in which runs were made; without it that of the row in the file.
 ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
 #: Columns that say when a row was measured; a table without either was measured in the order of its rows.
@@ -52,6 +56,9 @@ _OF_CONDITIONS = {
     "slope_deg": Quantity("slope", units.ANGLE, CONDITIONS["slope_deg"], slope=True),
     "time_s": Quantity("time", units.TIME, TIME["time_s"]),
     "duty": Quantity("duty", units.SHARE, DUTY["duty"]),
+    "duty_left": Quantity("duty_left", units.SHARE, SIDES["duty_left"]),
+    "duty_right": Quantity("duty_right", units.SHARE, SIDES["duty_right"]),
+    "heading_deg": Quantity("heading", units.ANGLE, HEADING["heading_deg"]),
 }
 
 
@@ -59,7 +66,7 @@ def ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
     readings = {c.column: c.range for c in channels.EVERY}
     deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.EVERY}
-    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **ORDER}
+    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **SIDES, **HEADING, **ORDER}
 
 
 def _of_channel(channel: Channel) -> dict[str, Quantity]:
@@ -193,7 +200,9 @@ class Layout:
 
     def known(self) -> tuple[str, ...]:
         """Every column that means something."""
-        driven = DRIVING if self.imposed == "voltage" else ()
+        driven: tuple[str, ...] = DRIVING if self.imposed == "voltage" else ()
+        if driven and self.has_ground:
+            driven = (*driven, *SIDES, *HEADING)
         named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns, "surface")
         return tuple(dict.fromkeys(c for c in (*named, "run_id", "time_s", *driven, *ORDER) if c not in self.idle))
 

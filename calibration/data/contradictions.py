@@ -17,6 +17,10 @@ TOO_SMALL, LEAST = 0.5, 0.2
 MAGNITUDES = {"motor_voltage_V": "motor_voltage"}
 #: Jump of an angle between samples that is a turn lost [deg], and least multiple of the step that is usual.
 TURN, UNUSUAL = 180.0, 4.0
+#: Share of rows before which time goes back, up to which they are no rows in another order.
+SELDOM = 0.02
+#: Degrees of a radian, and within what share of that an angle that jumps is in the other unit.
+RADIAN, ALIKE = 180 / np.pi, 0.03
 
 
 def check(runs: Runs, robot: Robot) -> None:
@@ -24,12 +28,14 @@ def check(runs: Runs, robot: Robot) -> None:
 
     Raises:
         BadData: a vehicle without mass, an imposed speed that the stated voltage cannot turn the motors at, or an
-            angle that wraps.
+            angle that wraps or whose unit changes, or time that goes back now and then.
     """
     _mass(runs, robot)
     if robot.rig.imposed == "motor_speed" and not runs.sampled:
         for column in (SUPPLY, "motor_voltage_V"):
             _voltage(runs, robot, column)
+    if runs.sampled:
+        _time(runs)
     if runs.sampled and runs.has("output_angle_deg"):
         _angle(runs)
 
@@ -65,9 +71,26 @@ def _voltage(runs: Runs, robot: Robot, column: str) -> None:
         )
 
 
+def _time(runs: Runs) -> None:
+    """Rows may come in any order; time that goes back now and then is of several recordings, or its clock was set."""
+    time, run = runs["time_s"], _run(runs)
+    for name in np.unique(run):
+        mine = np.flatnonzero(run == name)
+        back = np.flatnonzero(np.diff(time[mine]) < 0)
+        if 0 < back.size <= max(SELDOM * len(mine), 1):
+            row, was, now = mine[back[0] + 1] + 1, time[mine[back[0]]], time[mine[back[0] + 1]]
+            raise BadData(
+                f"{runs.source} row {row}, time_s: goes back from {number(was)} to {number(now)} s; "
+                "give each recording its own run_id, or sort the rows"
+            )
+
+
+def _run(runs: Runs) -> np.ndarray:
+    return runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+
+
 def _angle(runs: Runs) -> None:
-    angle, time = runs["output_angle_deg"], runs["time_s"]
-    run = runs["run_id"] if runs.has("run_id") else np.zeros(len(runs), str)
+    angle, time, run = runs["output_angle_deg"], runs["time_s"], _run(runs)
     for name in np.unique(run):
         mine = np.flatnonzero(run == name)
         mine = mine[np.argsort(time[mine], kind="stable")]
@@ -84,4 +107,15 @@ def _angle(runs: Runs) -> None:
             raise BadData(
                 f"{runs.source} row {row + 1}, output_angle_deg: jumps by {number(float(f'{step[jumps[0]]:.4g}'))} "
                 "deg from the sample before, as an angle that wraps; expected one that counts on beyond a turn"
+            )
+        with np.errstate(divide="ignore", invalid="ignore"):
+            times = np.abs(angle[mine][1:] / angle[mine][:-1])
+        other = np.abs(np.abs(np.log(np.where(times > 0, times, 1.0))) / np.log(RADIAN) - 1) < ALIKE / np.log(RADIAN)
+        mixed = np.flatnonzero(other & (np.abs(step) > UNUSUAL * max(usual, 1.0)))
+        if mixed.size:
+            row, k = int(mine[mixed[0] + 1]), mixed[0]
+            was, now = (number(float(f"{x:.4g}")) for x in angle[mine][k : k + 2])
+            raise BadData(
+                f"{runs.source} row {row + 1}, output_angle_deg: goes from {was} to {now} between two samples, as "
+                "degrees beside radians; write all rows in one unit"
             )

@@ -102,7 +102,7 @@ def remarks(robot: Robot, runs: Runs) -> list[str]:
         elif abs(stated.median - own) > ROUNDING:
             said.append(
                 f"{name}: the table states {stated.median:.6g} kg without payload, the robot's file {own:.6g} kg; "
-                f"{stated.median:.6g} kg is fitted with and written"
+                f"{stated.median:.6g} kg is used, and written to robot.toml"
             )
     of_table5 = np.zeros(len(runs), bool)
     if runs.has("surface"):

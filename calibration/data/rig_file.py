@@ -13,7 +13,7 @@ from calibration.data import units
 from calibration.data.columns import Layout
 from calibration.data.errors import BadConfiguration, choices, is_number
 from mmrjax import channels, params
-from mmrjax.rig import IMPOSED, STARTS, Instrument, Rig
+from mmrjax.rig import BETWEEN, IMPOSED, STARTS, Instrument, Rig
 from mmrjax.robot import Robot
 from mmrjax.robots import DYNAMIC_SHARE
 from mmrjax.signals import GRAVITY
@@ -21,7 +21,7 @@ from mmrjax.signals import GRAVITY
 #: Base of a robot that starts from nothing.
 NONE = "none"
 #: Keys and tables of a robot file that state the rig.
-KEYS = ("imposed", "channels", "start", "columns", "instruments", "surfaces")
+KEYS = ("imposed", "channels", "start", "between_rows", "columns", "instruments", "surfaces")
 #: What may be imposed, in short: `current` for `motor_current`.
 SHORT = {word.removeprefix("motor_"): word for word in IMPOSED}
 #: What a configuration may be.
@@ -154,6 +154,7 @@ def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: b
     stated = content.pop("imposed", IMPOSED[0])
     imposed = _one_of(SHORT.get(stated, stated) if isinstance(stated, str) else stated, IMPOSED, f"{where}, imposed")
     start = _one_of(content.pop("start", STARTS[0]), STARTS, f"{where}, start")
+    between = _one_of(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
     usual = [name for name in channels.USUAL if travels or name != "speed"]
     names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
     if imposed in names:
@@ -167,6 +168,7 @@ def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: b
         instruments=_instruments(content.pop("instruments", {}), names, where),
         columns=_columns(content.pop("columns", {}), where),
         start=start,
+        between_rows=between,
         surfaces=_surfaces(content.pop("surfaces", {}), loads, where),
         inherits=inherits,
     )
@@ -333,6 +335,7 @@ def lines(rig: Rig) -> tuple[list[str], dict[str, list[str]]]:
         f'imposed = "{rig.imposed}"  # on the drives: voltage, motor_speed or motor_current',
         f"channels = {json.dumps(list(rig.channels))}  # what its instruments show",
         f'start = "{rig.start}"  # of histories: rest, measured or free',
+        f'between_rows = "{rig.between_rows}"  # what is imposed, in histories: held or linear',
     ]
     tables: dict[str, list[str]] = {}
     if rig.columns:

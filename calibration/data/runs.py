@@ -20,6 +20,7 @@ from calibration.data.columns import (
     DEFAULTS,
     DRIVEN,
     DUTY,
+    SIDES,
     SUPPLY,
     TIME,
     WHEN,
@@ -123,11 +124,14 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     layout = dataclasses.replace(layout, instruments=instruments.infer_instruments(layout.instruments, columns))
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
+    _check_sides(name, columns)
     _check_mass(name, columns)
     _check_deviations(name, columns, layout.channels)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
-    elif measured and not set(TIME) <= set(columns):  # a history may stop, and go on forwards against its motors
+    elif (
+        measured and not set(TIME) <= set(columns) and not set(SIDES) & set(columns)
+    ):  # a history may stop, and go on forwards against its motors
         _check_signs(name, columns, layout)
     if not any(column in columns for column in WHEN):
         columns["order"] = np.arange(1.0, len(rows))
@@ -397,6 +401,8 @@ def _hint(meaning: Meaning, cell: str, readings: tuple[str, ...]) -> str:
         found = _WITH_UNIT.fullmatch(cell)
         return "" if found is None else _unit_hint(found[1], found[2], mine, named)
     far = abs(value) > FAR * max(map(abs, quantity.limits(mine)))
+    if far and meaning.column in DUTY:
+        return "a command of another size? divide by its largest, of a log by [columns] duty = {column, factor}; "
     if far and meaning.column in TIME:
         return "is it the time of day? subtract that of the first row; "
     for unit, column in named.items():
@@ -428,6 +434,16 @@ def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
         if mode != DRIVEN[0] and not math.isnan(duty) and duty != 0:
             raise BadData(f"{name} row {row}, duty: got {number(duty)} in mode {mode}; expected 0 or an empty cell")
     columns["duty"] = np.nan_to_num(columns["duty"])
+
+
+def _check_sides(name: str, columns: dict[str, np.ndarray]) -> None:
+    stated = [c for c in SIDES if c in columns]
+    if len(stated) == 1:
+        (other,) = set(SIDES) - set(stated)
+        raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state the duty of both sides")
+    if stated and set(columns) & {"duty", "mode"}:
+        beside = min(set(columns) & {"duty", "mode"})
+        raise BadData(f"{name}: column {beside} beside {stated[0]}, which says how either side is driven; keep one")
 
 
 def _check_mass(name: str, columns: dict[str, np.ndarray]) -> None:

@@ -166,6 +166,7 @@ def settle(
     shortest: float | None = None,
     drift: float = 0.02,
     inertia: Mapping[str, Inertia] | None = None,
+    rolling: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Settled:
     """The settled runs of a log.
 
@@ -179,9 +180,11 @@ def settle(
         shortest: stretch [s]; None: 0.3 s, and at least 20 samples.
         drift: largest change of a mean within a stretch, as a share of it.
         inertia: by configuration; a stretch whose acceleration takes more than `drift` of its current is left out.
+        rolling: by configuration, what channels show while the motors turn by 1 rad/s, by name [unit of the column].
 
     Raises:
-        BadData: time that does not increase, a channel that shows one number only, or no stretch at all.
+        BadData: time that does not increase, a channel that shows one number only, no stretch at all, speeds or
+            currents without a sign, or speeds and rates of angles in other units than their columns say.
     """
     if not runs.sampled:
         raise BadData(f"{runs.source}: column time_s is missing, and a row is a settled run already; give it to loop")
@@ -207,6 +210,8 @@ def settle(
     result = Settled(runs, tuple(found), signals, shortest, drift, tuple(gaps), scatter)
     if not result.kept:
         raise BadData(_nothing(result))
+    _check_signs(result)
+    _check_units(result, rolling or {})
     return result
 
 
@@ -292,10 +297,13 @@ def _rate(time: np.ndarray, x: np.ndarray, half: int) -> np.ndarray:
 def _check_alive(runs: Runs, signal: Signal) -> None:
     shown = signal.shown[np.isfinite(signal.shown)]
     if len(shown) > STUCK and np.ptp(shown) == 0:
+        column, value, unit = signal.channel.column, shown[0], signal.channel.unit
+        if len(signal.angle):
+            column, _, factor = next(x for x in RATES if x[1] == signal.channel.name)
+            value, unit = signal.angle[np.isfinite(signal.angle)][0] / factor, column.rpartition("_")[2]
         raise BadData(
-            f"{runs.source} rows 1 to {len(runs)}, {signal.channel.column}: {number(shown[0])} {signal.channel.unit} "
-            "in every row; the channel is frozen or not connected; remove the column, or the channel from the rig's "
-            "file"
+            f"{runs.source} rows 1 to {len(runs)}, {column}: {number(value)} {unit} in every row; the channel is "
+            "frozen or not connected; remove the column, or the channel from the rig's file"
         )
 
 
@@ -580,6 +588,92 @@ def _scatter(runs: Runs, found: list[Stretch], signals: tuple[Signal, ...], larg
 
 def _wider(stretch: Stretch, scatter: Mapping[str, float]) -> Stretch:
     return dataclasses.replace(stretch, sd={name: math.hypot(sd, scatter[name]) for name, sd in stretch.sd.items()})
+
+
+#: Sds beyond zero from which on a mean has a sign.
+SIGNED = 5.0
+#: What a speed may be off by where a unit is another one, and how near it has to come.
+UNITS = {
+    "degrees for radians": 180 / math.pi, "radians for degrees": math.pi / 180, "deg/s for rpm": 6.0,
+    "rpm for deg/s": 1 / 6, "rad/s for rpm": math.pi / 30, "rpm for rad/s": 30 / math.pi,
+    "turns for degrees": 1 / 360, "degrees for turns": 360.0, "turns/s for rpm": 1 / 60, "rpm for turns/s": 60.0,
+    "m for mm": 1e-3, "mm for m": 1e3,
+}  # fmt: skip
+NEAR = 0.03
+
+
+def _shows(found: Settled, s: Stretch, channel: Channel) -> str:
+    """Where a stretch is, and what a channel shows there at what is imposed."""
+    shown, unit = number(_digits(s.mean[channel.name], 4)), found.runs.layout.imposed_column.rpartition("_")[2]
+    return (
+        f"{found.runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {channel.column}: shows {shown} "
+        f"{channel.unit} at {number(_digits(s.imposed, 4))} {unit}"
+    )
+
+
+def _check_signs(found: Settled) -> None:
+    """Refuse speeds and currents of stretches both ways that have one sign; gravity may drive a motor, and a bridge
+    that turns the voltage round turns the supply's current."""
+    layout, runs = found.runs.layout, found.runs
+    pulled = layout.weight or (runs.has("slope_deg") and runs["slope_deg"].any())
+    for signal in found.signals:
+        channel = signal.channel
+        if layout.magnitude(channel.name) or channel.name == "motor_voltage" or not channel.directed:
+            continue
+        if not channel.zero_at_rest and (pulled or (runs.has("duty") and channel.name == "total_current")):
+            continue
+        least = {id(s): max(SIGNED * s.sd[channel.name], STILL * signal.largest) for s in found.kept}
+        clear = [s for s in found.kept if abs(s.mean[channel.name]) > least[id(s)]]
+        back, ahead = ([s for s in clear if way * s.imposed > 0] for way in (-1, 1))
+        turned = channel.zero_at_rest and ahead and all(s.mean[channel.name] < 0 for s in ahead)
+        if back and all(s.mean[channel.name] > 0 for s in back) and not turned:
+            raise BadData(
+                f"{_shows(found, back[0], channel)}; expected readings with their signs, negative backward; or state "
+                f"[instruments.{channel.name}] signed = false in the rig's file, if it shows magnitude alone"
+            )
+        wrong = [s for s in ahead if s.mean[channel.name] < 0]
+        if wrong and channel.zero_at_rest and not pulled:
+            cure = (
+                f"state [columns] {channel.column} = {{column = ..., factor = -1}} in the rig's file"
+                if len(wrong) == len(ahead)
+                else f"give {'duty' if runs.has('duty') else layout.imposed_column} the sign of its direction"
+            )
+            raise BadData(f"{_shows(found, wrong[0], channel)}; expected the sign of what is imposed; {cure}")
+
+
+def _check_units(found: Settled, rolling: Mapping[str, Mapping[str, float]]) -> None:
+    """Refuse speeds, and rates of angles, that differ from another channel's by the factor between two units."""
+    runs = found.runs
+    angles = {rate: angle for angle, rate, _ in RATES}
+    # What an angle shows is doubted first: nobody reads its rate.
+    order = sorted(found.signals, key=lambda s: not len(s.angle))
+    for s in found.kept:
+        shown = rolling.get(str(runs["configuration"][s.rows[0]]), {})
+        turns = {
+            x.channel.name: abs(s.mean[x.channel.name] / shown[x.channel.name])
+            for x in order
+            if shown.get(x.channel.name)
+        }
+        if runs.layout.imposed == "motor_speed":
+            turns["motor_speed"] = abs(s.imposed) * math.pi / 30
+        for one, other in ((a, b) for k, a in enumerate(turns) for b in list(turns)[k + 1 :]):
+            if not (turns[one] > 0 and turns[other] > 0):
+                continue
+            off = turns[one] / turns[other]
+            unit = next((word for word, x in UNITS.items() if abs(math.log(off / x)) < NEAR), None)
+            if unit is not None:
+                column = angles[one] if one in angles and not _read(runs, one) else channels.of(one).column
+                raise BadData(
+                    f"{runs.source} rows {s.rows[0] + 1} to {s.rows[-1] + 1}, {column}: {off:.4g} times as fast as "
+                    f"{channels.of(other).column} says with the ratio of the rig's file; is it {unit}? write all "
+                    f"rows in its unit, or state [columns] {column} = {{column = ..., factor = {1 / off:.3g}}} in "
+                    "the rig's file"
+                )
+
+
+def _read(runs: Runs, channel: str) -> bool:
+    """Whether a channel is read itself, and is no rate of an angle."""
+    return runs.has(channels.of(channel).column)
 
 
 def _nothing(found: Settled) -> str:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data import surfaces
-from calibration.data.columns import DRIVEN, DUTY, IMPOSED, SUPPLY, TIME, Layout
+from calibration.data.columns import DRIVEN, DUTY, HEADING, IMPOSED, SIDES, SUPPLY, TIME, Layout
 from calibration.data.errors import BadData, choices
 from mmrjax import channels
 from mmrjax.channels import Channel
-from mmrjax.tables import adhesion_ratio
+from mmrjax.tables import adhesion_ratio, lateral_ratio
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
@@ -55,6 +55,11 @@ class Runs:
         return column in self.columns
 
     @property
+    def turns(self) -> bool:
+        """Whether its robot is free to turn: its sides are driven apart, or it heads elsewhere than uphill."""
+        return any(self.has(name) for name in (*SIDES, *HEADING))
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """That its readings are of, in the order of arrays."""
         return self.layout.channels
@@ -88,7 +93,7 @@ class Runs:
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
         duty = () if self.sampled else DUTY
-        return tuple(c for c in (*self.layout.axes, *duty) if self.has(c))
+        return tuple(c for c in (*self.layout.axes, *duty, *SIDES, *HEADING) if self.has(c))
 
     @property
     def sampled(self) -> bool:
@@ -171,13 +176,17 @@ class Runs:
 
         which = self.configurations(robot)
         held = self["mode"] != DRIVEN[0] if self.has("mode") else np.zeros(len(self), bool)
-        adhesion = np.ones(len(self))
+        adhesion, lateral = np.ones(len(self)), np.ones(len(self))
         if self.has("surface"):
             on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[which]
             scaled = surfaces.scaled(robot, self["configuration"], self["surface"])
             adhesion[scaled] = [
                 adhesion_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
             ]
+            lateral[scaled] = [
+                lateral_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
+            ]
+        sides = {name: self[name] for name in (*SIDES, *HEADING) if self.has(name)}
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
         if imposed and not self.has(column):
@@ -190,6 +199,8 @@ class Runs:
             battery=battery,
             discharge=discharge,
             adhesion=adhesion,
+            adhesion_lateral=lateral if sides else None,
+            **sides,
             total_mass=self["total_mass_kg"] if self.has("total_mass_kg") else None,
             order=self["order"] if self.has("order") else 0.0,
             duty=np.where(held, 0.0, self["duty"] if self.has("duty") else 1.0),

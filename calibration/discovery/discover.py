@@ -33,6 +33,7 @@ from calibration.discovery.notes import (
     Copies,
     FreedValue,
     KeptOut,
+    Late,
     LostReplicates,
     Missing,
     NameSupport,
@@ -83,6 +84,8 @@ FACTORS = {"assumed": (0.5, 2.0), "estimated": (0.7, 1.4)}
 SCREENINGS = 4
 #: Share of the largest speed or voltage that is no noise about rest [-].
 EITHER_WAY = 0.05
+#: Sds of a delay from zero from which on it is one.
+LATE = 4.0
 #: Share of rows set aside beyond which that is said first.
 MANY = 0.03
 #: Is told what the loop does next.
@@ -122,12 +125,12 @@ def discover(
         BadData, BadConfiguration: data that contradict themselves or are too few, priors that cannot be, experiments
             that are not known.
     """
+    tell = in_words(progress)
     ready = prepared(
         runs, robot, noise=noise, stated=stated, library=library, replicates=replicates, seed=seed, prefer=prefer,
         forbidden=forbidden,
     )  # fmt: skip
     distinct, known = ready.runs, ready.noise
-    tell = in_words(progress)
     for note in ready.foreign:
         tell(note)
     space = pose(distinct, ready.robot, known.sd, ready.settings, ready.stated, ready.library)
@@ -229,7 +232,8 @@ def prepared(
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
-    library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library)
+    turned = scales.turned_in(distinct, ready.robot)
+    library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
     return LoopInput(
         distinct, numbers, ready.robot, ready.noise, ready.stated, settings, library, said, ready.foreign
@@ -540,8 +544,8 @@ def visible(
 
 def both_ways(runs: Runs) -> bool:
     """Whether runs go forward as well as backward, by any speed that they state or by what drives them."""
-    moved = [c.column for c in channels.EVERY if c.zero_at_rest]
-    columns = [runs[name] for name in (*moved, "supply_voltage_V", "duty") if runs.has(name)]
+    moved = [c.column for c in channels.EVERY if c.zero_at_rest and c.directed]
+    columns = [runs[name] for name in (*moved, runs.layout.imposed_column, "duty") if runs.has(name)]
     found = [x[np.isfinite(x)] for x in columns]
     return any(min(x.max(), -x.min()) > EITHER_WAY * np.abs(x).max() for x in found if x.size)
 
@@ -840,6 +844,9 @@ def remarks(found: DiscoveryResult) -> Notes:
     wave = found.unnamed
     if wave is not None and wave.score_free_in_each_run and wave.score < 0.5 * wave.score_free_in_each_run:
         said.append(PhasesDiffer(wave.score_free_in_each_run, wave.score))
+    delay = found.base_shift.get(priors.DELAY)
+    if delay is not None and priors.DELAY not in found.robot.rig.stated and abs(delay.after) > LATE * delay.sd_after:
+        said.append(Late(delay.after, delay.sd_after))
     if found.remains is not None:
         said.append(StillLacks(found.remains.place, found.remains.variable))
     names = [e.name for e in found.effects]

@@ -274,6 +274,14 @@ class StillLacks(Note):
 
 
 @dataclasses.dataclass(frozen=True)
+class Late(Note):
+    """A delay of what is imposed that the rig's file does not state, with its sd [s]."""
+
+    delay: float
+    sd: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Led(Note):
     """By what the leader of a class was chosen.
 

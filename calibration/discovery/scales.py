@@ -3,7 +3,9 @@
 A loss of 0.7 mN·m is a fifth of the friction of a motor of 60 W and nothing beside that of one of 1 kW. What carries
 over from rig to rig is how much of its balance a term is. So the prior sd of an amplitude is scaled until a term of
 one sd is the same share of its balance at the rig's operating points as at those of the nominal robot over Table 8;
-and a shape parameter that is a speed or a current is scaled with those of the rig.
+and a shape parameter that is a speed or a current is scaled with those of the rig. The limits of an amplitude are met
+up to what the motors are good for: a saturation of the torque constant that a table shows at a tenth of the rated
+current would leave nothing of it at the rated one.
 """
 
 from __future__ import annotations
@@ -18,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data.effect_file import Library
+from calibration.data.runs import Runs
+from calibration.discovery.reach import LOADED, RUNNING
 from mmrjax import channels, params, robots
 from mmrjax.balances import BALANCES, absent, added
 from mmrjax.conditions import Conditions
@@ -49,6 +53,8 @@ SCALED_WITH: dict[str, Callable[[Signals], object]] = {
     "N": lambda s: s.demand,
     "V": lambda s: s.voltage,
 }
+#: Channels that show where the output is.
+PLACED = ("output_angle", "position")
 AT_THE_OUTPUT = ("track", "ground", "slip")
 #: Shares of slip are those of tracks and tyres on the paper's grounds; small wheels on soft ones slip by half.
 SLIPPERY = 16.0
@@ -59,13 +65,25 @@ UNKNOWN = 4.0
 #: Most that an instrument is taken to be off by, as a share of what its channel shows (rms): beyond it whoever reads
 #: it would know; 47 A on readings of 114 A are no ammeter's offset.
 MOST_OFF = 0.25
+#: What of the signals grows with the motors' current, and what with their speed.
+LOADS = (
+    "current",
+    "total_current",
+    "torque_electromagnetic",
+    "torque_motor",
+    "torque_load",
+    "torque_track_loss",
+    "traction",
+)
+SPEEDS = ("speed_motor", "speed_wheel", "speed_theoretical", "speed", "speed_output")
 
 
-def library_for(robot: Robot, conditions: Conditions, library: Library) -> Library:
+def library_for(robot: Robot, conditions: Conditions, library: Library, turned: float = math.nan) -> Library:
     """`library` with the priors of a rig's size; as it is for robots that are not a rig's from nothing.
 
     Args:
         robot: of the rig; conditions: of its table, shape (runs,).
+        turned: how far its output goes, see `turned_in`; NaN: not known.
     """
     if robot.rig.inherits:
         return library
@@ -75,13 +93,32 @@ def library_for(robot: Robot, conditions: Conditions, library: Library) -> Libra
     for name, kind in library.items():
         if not present(kind, robot):
             continue
-        sized[name] = _sized(kind, (robot, mine), (nominal, theirs))
+        sized[name] = _sized(kind, (robot, _placed(mine, kind, turned)), (nominal, _placed(theirs, kind)))
     return sized
+
+
+def turned_in(runs: Runs, robot: Robot) -> float:
+    """Root mean square of the angles of the output that a table's channels show [rad]; NaN where none does."""
+    measured = runs.measured()
+    for k, channel in enumerate(runs.channels):
+        if channel.name in PLACED and math.isfinite(size := _size(measured[:, k])):
+            return size / (float(robot.configurations.members[0].radius) if channel.name == "position" else 1.0)
+    return math.nan
+
+
+def _placed(signals: Signals, kind: type[Effect], turned: float | None = None) -> Signals:
+    """Signals of an effect that goes with the position, at such an angle; None: at the one that it is stated for."""
+    if kind.driver != "position" or kind.memory_size is None:
+        return signals
+    at = jnp.full(jnp.shape(signals.speed_motor), kind.memory_size if turned is None else turned)
+    return dataclasses.replace(signals, memory={**signals.memory, kind.name: at})
 
 
 def present(kind: type[Effect], robot: Robot) -> bool:
     """Whether a rig has the balance that an effect enters, and what it needs there."""
     if kind.balance in absent(robot) or (not robot.has_ground and (kind.movers or kind.needs_belt)):
+        return False
+    if kind.driver == "position" and not set(PLACED) & set(robot.rig.channels):
         return False
     return kind.balance != "sensor" or kind.channel in robot.rig.channels
 
@@ -137,10 +174,30 @@ def _sized(kind: type[Effect], mine: tuple[Robot, Signals], theirs: tuple[Robot,
         factor = _ratio(_unit_share(effect, *theirs), _unit_share(grown, *mine))
     factor *= SLIPPERY if kind.balance == "slip" and amplitude.spec.unit == "-" else UNKNOWN
     limits = factor
-    if kind.balance == "sensor":
+    if kind.balance != "sensor":
+        here, there = (_unit_share(grown, mine[0], s) for s in (mine[1], _rated(*mine)))
+        limits = factor * min(1.0, _ratio(here, there))
+    else:
         low, high = amplitude_of(grown).spec.bounds
         limits = min(factor, MOST_OFF / (max(-low, high) * _unit_share(grown, *mine)))
     return scaled(kind, (float(factor), float(stretch), float(limits)))
+
+
+def _rated(robot: Robot, signals: Signals) -> Signals:
+    """The operating points of a rig at the largest load and speed that its motors are good for: for long at the
+    current that they bear, or a share of that at stall, where resistance and voltage are known. No smaller than they
+    are."""
+    motor, rig = robot.motor, robot.rig
+    largest = lambda x: float(np.nanmax(np.abs(np.asarray(x)), initial=0.0))  # noqa: E731
+    current, speed, volts = largest(signals.current), largest(signals.speed_motor), largest(signals.voltage)
+    if not (rig.shows_voltage and current and speed and volts and float(motor.resistance)):
+        return signals
+    volts = max(volts, motor.voltage_limit or 0.0)
+    load = min(float(motor.current_continuous), LOADED * volts / float(motor.resistance)) / current
+    fast = min(motor.speed_limit, RUNNING * volts / float(motor.torque_constant)) / speed
+    grown = {name: max(load, 1.0) * getattr(signals, name) for name in LOADS}
+    grown |= {name: max(fast, 1.0) * getattr(signals, name) for name in SPEEDS}
+    return dataclasses.replace(signals, **grown)
 
 
 def _unit_share(effect: Effect, robot: Robot, signals: Signals) -> float:

@@ -126,8 +126,8 @@ def balance_of(place: str) -> str:
 
 
 def in_words(place: str) -> str:
-    """`balance slip`, `reading of motor speed`."""
-    return f"reading of {place}".replace("_", " ") if in_readings(place) else f"balance {place}"
+    """`slip balance`, `reading of motor speed`."""
+    return f"reading of {place}".replace("_", " ") if in_readings(place) else f"{place} balance"
 
 
 def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarray:

@@ -120,6 +120,8 @@ def calibrate(
         default = (*default, *priors.delays(robot, observe.free()[0]))
         names = priors.choose(robot, default, *words)
         if unread := fidelities.unread(model, names):
+            if fidelities.OF_TURNS in unread[0]:
+                raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
             reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread))
             raise BadConfiguration(f"--free {unread[0]}: --model {model} does not read it; allowed: --model {reads}")
         return names

@@ -168,8 +168,10 @@ def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
 
 def _uncertain(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     """Those of a robot's parameters that are not held: what the rig's file states as exact is, and what is set to
-    zero, unless the file says how sure that zero is."""
-    fields, stated, exact = known(robot), robot.rig.stated, robot.rig.exact
+    zero, unless the file says how sure that zero is. Whether a rig's log is late nobody knows who does not say so: of
+    a rig the delay is uncertain unless it is exact."""
+    fields, exact = known(robot), robot.rig.exact
+    stated = robot.rig.stated if robot.rig.inherits else {*robot.rig.stated, DELAY}
     mine = (n for n in names if n in fields and n not in exact)
     return tuple(n for n in mine if float(fields[n].value) != 0.0 or n in stated)
 

@@ -20,6 +20,7 @@ VARY = {
     "load": "the load (slope or payload at one voltage)", "slope": "the slope", "weight": "the payload",
     "configuration": "the configuration", "direction": "the direction of travel",
     "demand": "the demand on adhesion (slope or payload)", "angle": "nothing: sample fast enough to see a turn",
+    "position": "the position: go over the whole travel both ways at one voltage",
     "": "nothing: it is the same share everywhere",
 }  # fmt: skip
 WEIGH = "Weigh the robot, unladen and laden, and take the stated mass from it"

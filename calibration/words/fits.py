@@ -81,12 +81,12 @@ def noise_off(note: NoiseOff) -> str:
     """By what sds are off."""
     if not note.channel:
         return (
-            f"residuals are {note.factor:.2g} times the {note.source} sds in every channel and everywhere alike: are "
-            "the sds right?"
+            f"residuals are {note.factor:.2g} times the {note.source} sds in every channel, under all conditions "
+            "alike: are the sds right?"
         )
     return (
         f"residuals of {channels.of(note.channel).label} are {note.factor:.2g} times the {note.source} sds, "
-        "everywhere alike: are these sds right?"
+        "under all conditions alike: are these sds right?"
     )
 
 
@@ -112,8 +112,8 @@ def of_rows(note: OfRows) -> str:
     rows = f"rows {', '.join(map(str, note.rows))}"
     if note.what == "limited":
         return (
-            f"{rows} use all the adhesion but the margin of {note.share:.0%}: the limit holds their static friction "
-            "from below, and the slip that they show is not all explained"
+            f"{rows} are within {note.share:.0%} of the adhesion limit: it bounds their static friction from below, "
+            "and does not explain all of their slip"
         )
     if note.what == "jumps":
         return f"{rows}: the calibrated robot's running gear jumps; it leaves the ground at times"

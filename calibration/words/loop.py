@@ -16,6 +16,7 @@ from calibration.discovery.notes import (
     CurveOver,
     FreedValue,
     KeptOut,
+    Late,
     Led,
     LostReplicates,
     Missing,
@@ -97,7 +98,10 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
     same: dict[str, list[str]] = {}
     for one in found:
         same.setdefault(brief(one.summary), []).append(f"{one.factor:g}")
-    each = [f"with {' and with '.join(factors)} times that noise {words}" for words, factors in same.items()]
+    each = [
+        f"with {' and with '.join(factors)} times that noise the verdict is {words}"
+        for words, factors in same.items()
+    ]
     return "; ".join(each)
 
 
@@ -123,7 +127,7 @@ def _tentative(those: Sequence[Missing], support: NameSupport | None) -> str:
 
 
 def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
-    others = [bases.in_words(p).removeprefix("balance ") for p in where.alike if p != where.place]
+    others = [bases.in_words(p).removesuffix(" balance") for p in where.alike if p != where.place]
     also = f" (or {', '.join(others)}, which act alike in these data)" if others else ""
     what = f": {where.family}" if where.variable in bases.VARIABLES else ""
     well = [shown_over(v).removeprefix("best shown ") for v in where.variables_alike]
@@ -317,7 +321,7 @@ def _curve(c: CurveOver) -> str:
 
 
 def _over(place: str, *variables: str) -> str:
-    """`balance slip over speed motor and slope`."""
+    """`slip balance over speed motor and slope`."""
     return f"{bases.in_words(place)} over {' and '.join(v.replace('_', ' ') for v in variables)}"
 
 
@@ -440,7 +444,7 @@ def _change(before: float, after: float) -> str:
 def asked(about: Asked) -> str:
     """What the track model was asked about."""
     return {
-        "missing": f"what is missing in the balance {about.balance} over {about.variable.replace('_', ' ')}",
+        "missing": f"what is missing in the {about.balance} balance over {about.variable.replace('_', ' ')}",
         "found": f"{', '.join(about.effects)}, found by the lumped model",
         "near": f"{', '.join(about.effects)}, which explains the readings nearly as well",
     }[about.why]
@@ -523,6 +527,15 @@ def still_lacks(note: StillLacks) -> str:
     """What the effects found leave."""
     place, over = bases.in_words(note.place), note.variable.replace("_", " ")
     return f"what was found does not explain everything: the {place} still lacks something over {over}"
+
+
+def late(note: Late) -> str:
+    """How late what is imposed acts, and what to state."""
+    when = "later" if note.delay > 0 else "earlier"
+    return (
+        f"what is imposed acts {1e3 * abs(note.delay):.3g} ± {1e3 * note.sd:.2g} ms {when} than its column says, and "
+        f'the rig\'s file states no delay: with [rig] delay = "{note.delay:.3g} ± {note.sd:.2g}" it begins there'
+    )
 
 
 def led(note: Led) -> str:

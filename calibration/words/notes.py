@@ -51,6 +51,7 @@ SAID: dict[type, Callable[[Any], str]] = {
     of_loop.KeptOut: loop.kept_out,
     of_loop.PhasesDiffer: loop.phases_differ,
     of_loop.StillLacks: loop.still_lacks,
+    of_loop.Late: loop.late,
     of_loop.Led: loop.led,
     of_loop.LostReplicates: loop.lost_replicates,
     of_loop.Outstanding: loop.outstanding,

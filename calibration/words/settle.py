@@ -8,14 +8,14 @@ from calibration.data.settling import Settled, Stretch
 
 #: Of each of `settling.REASONS`: what is so, and what to do where it is much.
 WHY = {
-    "changes": ("what is imposed changes all the time", "hold it, or give these samples to loop as time histories"),
-    "short": ("what is imposed holds too short", "hold it longer, or state --shortest"),
+    "changes": ("the imposed quantity changes all the time", "hold it, or give loop the log as it is"),
+    "short": ("the level is held too briefly", "hold it longer, or state --shortest"),
     "settling": ("still changes at the end of its level", "hold the level longer, or state --drift"),
     "accelerates": ("still accelerates at the end of its level", "hold the level longer, or state --drift"),
-    "idle": ("nothing drives the motors", "no need: a table of settled runs has driven ones"),
-    "rest": ("does not move", "no need: friction holds it there; histories tell of it"),
+    "idle": ("nothing drives the motors", "nothing: settled runs are driven ones"),
+    "rest": ("does not move", "nothing: friction holds it there; time histories use it"),
     "stuck": ("shows one number for long: saturated or frozen", "mend the instrument or its range"),
-    "undriven": ("the driver brakes or coasts", "no need: histories tell of it"),
+    "undriven": ("the driver brakes or coasts", "nothing: time histories use it"),
 }
 
 
@@ -43,8 +43,8 @@ def statement(found: Settled) -> str:
     back = sum(s.imposed < 0 for s in kept)
     ways = f", {len(kept) - back} forward and {back} backward" if back else ""
     return (
-        f"{len(kept)} settled run{'s' * (len(kept) != 1)}{ways}, of {rows} of {len(found.runs)} samples "
-        f"(shortest {found.shortest:.3g} s, means change by {100 * found.drift:g} % at most)."
+        f"{len(kept)} settled run{'s' * (len(kept) != 1)}{ways}, from {rows} of {len(found.runs)} samples "
+        f"(each at least {found.shortest:.3g} s long, its means steady to {100 * found.drift:g} %)."
     )
 
 
@@ -68,7 +68,7 @@ def remarks(found: Settled, fewest: int) -> list[str]:
     for signal in (s for s in found.signals if s.channel.name in wide):
         said.append(
             f"{signal.channel.column}: levels that were held several times differ by "
-            f"{wide[signal.channel.name]:.2g} {signal.channel.unit} beyond their noise; sds have it"
+            f"{wide[signal.channel.name]:.2g} {signal.channel.unit} beyond their noise; the sds include it"
         )
     if len(found.kept) < fewest:
         said.append(f"the loop asks for {fewest} settled runs; hold more levels, or give the log to loop as it is")

@@ -41,3 +41,9 @@ def step(now: Step) -> str:
     """A step in a sentence."""
     about = (" and ".join(x) if isinstance(x, tuple) else x for x in now.about)
     return STEPS[now.name].format(*about)
+
+
+def still(doing: str, seconds: float, compiled: int) -> str:
+    """That a step goes on, how long it has, and how many programs were compiled in it."""
+    programs = f", {compiled} program{'s' * (compiled != 1)} compiled" if compiled else ""
+    return f"still {doing} ({seconds:.0f} s{programs})"

@@ -48,7 +48,8 @@ class Effect(eqx.Module):
         balance: the balance it enters, one of `balances.BALANCES`, whose unit its term has; has no default. A
             positive term takes away: a voltage drop, a loss torque, a resisting force, a lost speed; in `mass`,
             `inertia` and `inductance` it adds, and in `sensor` it adds to the reading of `channel`.
-        driver: what its term changes with: `speed`, `current`, `load`, ...; `direction` if with that alone. Effects
+        driver: what its term changes with: `speed`, `current`, `load`, ...; `direction` if it is the way round that
+            it is about. Effects
             of one equation with one driver are a family: the forms of a law that data may not tell apart. Empty where
             it is the same share everywhere.
         rests_on: dotted names of parameters of the robot in proportion to which its term is, for whoever finds its
@@ -147,6 +148,10 @@ class Effect(eqx.Module):
     def settled(self, robot: Robot, signals: Signals) -> Scalar:
         """Its memory after long steady travel; may read any signal computed before its balance."""
         raise NotImplementedError(f"{self.name} has a memory and no settled value")
+
+    def begun(self, robot: Robot, angle: Scalar) -> Scalar:
+        """Its memory where a history begins with the output at an angle [rad]: as at rest."""
+        return jnp.zeros_like(angle)
 
     def recall(self, robot: Robot, signals: Signals) -> Scalar:
         """Its memory: of the run so far where one is kept (`drive`, `track`), else settled."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from mmrjax.effects.base import Effect, amplitude
-from mmrjax.params import Scalar, parameter
+from mmrjax.effects.periodic import Periodic, phase_parameter
+from mmrjax.params import Index, Scalar, parameter
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -222,11 +223,11 @@ class DirectionalFriction(TrackEffect):
 
     Dry friction that is larger one way round than the other.
 
-    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who states the Coulomb friction of a
-    drive's joint for each direction by itself; seals with a lip, teeth and belts that bear on another flank. The
-    mean of both directions is eq. (24)'s M_t0, half their difference is a: runs one way alone show their sum, and
-    this is M_t0 by another name. It takes power beside an M_t0 that is larger, and by itself it gives it one way, so
-    it is not dissipative.
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who states the Coulomb friction of a drive's
+    joint for each direction by itself; seals with a lip, teeth and belts that bear on another flank. The mean of both
+    directions is eq. (24)'s M_t0, half their difference is a: runs one way alone show their sum, and this is M_t0 by
+    another name. A constant torque (`torque_offset`) is the same wherever the shaft turns. It takes power beside an
+    M_t0 that is larger, and by itself it gives it one way, so it is not dissipative.
     """
 
     driver = "direction"
@@ -288,3 +289,170 @@ class StribeckExponent(TrackEffect):
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         share = (signals.speed_wheel / self.speed_fade) ** 2 + 1e-3**2
         return self.amplitude * jnp.exp(-(share ** (0.5 * self.exponent))) * signals.direction
+
+
+class DirectionalViscous(TrackEffect):
+    """ΔM_t = a |ω_k|: a viscous loss of K + a forward and of K - a backward.
+
+    Friction whose growth with speed is larger one way round than the other.
+
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), who fits viscous friction of a joint for
+    each direction by itself; seals with a lip and guides that draw their lubricant in one way. Beside
+    `directional_friction`, which is even in the speed too, it is what grows with it. The mean of both directions is
+    eq. (24)'s viscous loss: runs one way alone show their sum.
+    """
+
+    driver = "direction"
+    odd_in_travel = True
+    needs_reverse = True
+
+    amplitude: Scalar = amplitude(
+        unit="N·m·s",
+        meaning="viscous loss forward beyond the mean of both directions",
+        bounds=(-0.05, 0.05),
+        sd=5e-3,
+        source="a third of the viscous loss of Table 3",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        # With the shaft's smooth sign: |ω| alone has no derivative at rest.
+        return self.amplitude * signals.speed_wheel * signals.direction
+
+
+class TorqueOffset(TrackEffect):
+    """ΔM_t = a, whichever way the shaft turns and at rest too; at its radius a force a / r_k.
+
+    Something pulls one way all the time: a cable, a spring, a counterweight, a command or meter of torque with an
+    offset.
+
+    Source: Swevers, Verdonck and De Schutter, Dynamic model identification for industrial robots, IEEE Control
+    Systems 27 (2007) 58: an offset beside dry and viscous friction of each joint. While a shaft turns it is
+    `directional_friction`, which fades at rest: histories through rest alone tell them apart. Of the motor it is
+    a i η_rm at the output. A stated torque of a load on a shaft (`torque_constant`) is the same.
+    """
+
+    needs_reverse = True
+    odd_in_travel = True
+    settles_to = "directional_friction"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="torque that acts against forward rotation",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="a seventh of M_t0 of Table 3",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * jnp.ones_like(signals.speed_motor)
+
+
+class Presliding(TrackEffect):
+    """ΔM_t = a (z - sign ω_k), θ_s z' = ω_k - |ω_k| z, z(0) = 0: of the dry loss a share a acts through bristles.
+
+    Dry friction builds up over a small turn instead of at once, as contacts yield before they slide.
+
+    Source: Dahl, A solid friction model (1968), with exponent 1; it is the first order of Canudas de Wit, Olsson,
+    Åström and Lischinsky (1995) without their damping of the bristles. Settled z = sign ω_k: travel shows nothing
+    of it, reversals do. The memory is z [-]. At a = M_t0 all of the dry friction is Dahl's. `stick_slip` is what the
+    contacts hold beyond M_t0 before they let go.
+    """
+
+    driver = "direction"
+    transient = True
+    memory_size = 1.0
+    memory_unit = "-"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="dry loss that acts through bristles",
+        bounds=(-0.5, 2.0),
+        sd=0.1,
+        source="a third of M_t0 of Table 3",
+    )
+    angle_breakaway: Scalar = parameter(
+        0.02,
+        unit="rad",
+        meaning="turn of the pulley over which the contacts yield θ_s",
+        bounds=(1e-4, 2.0),
+        relative_sd=0.5,
+        source="1 mm of belt, a degree of a geared shaft",
+    )
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return signals.direction
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        speed = signals.speed_wheel
+        return speed * (1 - signals.direction * signals.memory[self.name]) / self.angle_breakaway
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * (self.recall(robot, signals) - signals.direction)
+
+
+class AngleFriction(Periodic, TrackEffect):
+    """ΔM_t = a sin(θ_k + φ) sign ω_k: dry friction that changes over a turn of the driven shaft.
+
+    A bent shaft, a bearing or a guide that is tight at one place of each turn.
+
+    Source: Popović and Goldenberg, Modeling of friction using spectral analysis, IEEE Trans. Robotics and Automation
+    14 (1998) 114: friction of a joint by its angle, its first order here. Where a history begins at a measured angle
+    the phase is that of the shaft, else of each run's beginning. It is friction, so that it turns round with the
+    speed; as large as M_t0 it would stop being a loss at some angle.
+    """
+
+    driver = "angle"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="amplitude of the dry loss over a turn",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="a seventh of M_t0 of Table 3",
+    )
+    phase: Scalar = phase_parameter()
+
+    def order(self, robot: Robot, configuration: Index) -> Scalar:
+        return 1 / robot.gearbox.ratio
+
+    def begun(self, robot: Robot, angle: Scalar) -> Scalar:
+        return angle
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * self.wave(signals) * signals.direction
+
+
+class PositionFriction(TrackEffect):
+    """ΔM_t = a θ sign ω_k, θ' = ω_k: dry friction that grows along the travel.
+
+    Guides or a screw that run tighter towards one end.
+
+    Source: Armstrong-Hélouvry, Control of Machines with Friction (1991), ch. 4: friction of a joint by its position,
+    to first order. The memory is θ [rad], counted as the channel of the angle or position is, which a rig has to
+    show; without one it is 0 at the start of each run. Its mean over the travel is M_t0.
+    """
+
+    driver = "position"
+    transient = True
+    memory_size = 10.0
+    memory_unit = "rad"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m/rad",
+        meaning="dry loss over the angle of the driven shaft",
+        bounds=(-0.1, 0.1),
+        sd=0.01,
+        source="over ten radians a third of M_t0 of Table 3",
+    )
+
+    def begun(self, robot: Robot, angle: Scalar) -> Scalar:
+        return angle
+
+    def settled(self, robot: Robot, signals: Signals) -> Scalar:
+        return jnp.zeros_like(signals.speed_motor)
+
+    def rate(self, robot: Robot, signals: Signals) -> Scalar:
+        return signals.speed_wheel
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * self.recall(robot, signals) * signals.direction

@@ -156,10 +156,14 @@ def facts(name: str) -> Facts:
     return TABLE[name]
 
 
-def unread(name: str, parameters: Iterable[str]) -> tuple[str, ...]:
-    """Those of some parameters, by dotted name, that a fidelity does not read and others do."""
+#: What names of parameters have in them that straight travel does not read, in any fidelity.
+OF_TURNS = ".turning."
+
+
+def unread(name: str, parameters: Iterable[str], turns: bool = False) -> tuple[str, ...]:
+    """Those of some parameters, by dotted name, that a fidelity does not read in straight travel, or in turns."""
     of_others = {head for other in TABLE.values() for head in other.resolves} - set(facts(name).resolves)
-    return tuple(p for p in parameters if p.startswith(tuple(of_others)))
+    return tuple(p for p in parameters if p.startswith(tuple(of_others)) or (OF_TURNS in p and not turns))
 
 
 def get(name: str) -> Fidelity:

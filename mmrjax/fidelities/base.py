@@ -45,10 +45,16 @@ class History(eqx.Module):
 
     @staticmethod
     def of(
-        robot: Robot, time: Array, distance: Array, signals: Signals, reactions: Reactions | None = None
+        robot: Robot,
+        time: Array,
+        distance: Array,
+        signals: Signals,
+        reactions: Reactions | None = None,
+        shown: Mapping[str, Scalar] | None = None,
     ) -> History:
-        """A history with its readings, of runs known at `time` since what is imposed acts."""
-        shown = balances.sensor(robot, signals)
+        """A history with its readings, of runs known at `time` since what is imposed acts; what its instruments show
+        follows from the signals where it is not given."""
+        shown = balances.sensor(robot, signals) if shown is None else shown
         reading = {c.name: shown[c.name] for c in channels.EVERY if c.over_time}
         clock, (distance, signals, reading, reactions) = as_tables(
             robot.rig, time, (distance, signals, reading, reactions)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import diffrax
 import equinox as eqx
@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 from mmrjax import balances
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
-from mmrjax.fidelities.rest import current_at_rest, firmness, status_moving, voltage_at_rest
+from mmrjax.fidelities.rest import holds, status_moving, voltage_at_rest
 from mmrjax.fidelities.result import result, withhold
 from mmrjax.fidelities.rosenbrock import Rodas4
 from mmrjax.fidelities.steady import operating_signals
@@ -51,7 +52,7 @@ class Trajectory(eqx.Module):
 
     Attributes:
         time: [s], shape (times,).
-        distance: travelled along the slope [m], shape (times,).
+        distance: travelled along the slope; of a robot that turns from where it started [m], shape (times,).
         signals: every signal at those times; each field has shape (times,).
         time_end: last of those times before the battery is empty, else of the run [s].
         result: the state at the end, with the run's status.
@@ -122,7 +123,11 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
             radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
             rest = rest.at[2].set(radius * conditions.motor_speed / units[2])
     if robot.rig.begins is not None and conditions.begin is not None:
-        rest = rest.at[:4].set(_begun(robot, conditions) / units[:4])
+        first = _begun(robot, conditions)
+        angle = first[3] / robot.chassis(conditions.configuration).radius
+        memory = [effect.begun(robot, angle) for effect in robot.remembering]
+        known = jnp.stack([*first, jnp.asarray(conditions.discharge, units.dtype), *memory])
+        rest = rest.at[: len(known)].set(known / units[: len(known)])
     if not rolling:
         return rest
     settled = operating_signals(robot, conditions)
@@ -182,28 +187,13 @@ def drive(
         run out: signals after `time_end` and the result's numbers are NaN; `failed` when
         the integrator gave up, its numbers NaN too. Derivatives are forward (`jax.jvp`, `jax.jacfwd`).
     """
+    if conditions.turns:
+        return _turning(robot, conditions, times, tolerance, max_steps, rolling)
     y0 = start(robot, conditions, rolling)
     imposed = conditions.motor_speed is not None
     parked = jnp.asarray(False) if rolling or imposed else holds(robot, conditions)
     moves = jnp.where(parked, jnp.zeros_like(y0).at[jnp.asarray([0, 4])].set(1.0), 1.0)
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda _, y, run: rates(run[0], run[1], y) * run[2]),
-        Rodas4(),
-        times[0],
-        times[-1],
-        dt0=jnp.asarray(1e-4, y0.dtype),
-        y0=y0,
-        args=(robot, conditions, moves),
-        saveat=diffrax.SaveAt(ts=times),
-        max_steps=max_steps,
-        throw=False,
-        stepsize_controller=diffrax.PIDController(
-            rtol=tolerance, atol=tolerance, norm=_norm, dtmax=_step_longest(robot, conditions)
-        ),
-        adjoint=diffrax.ForwardMode(),
-    )
-    assert solution.ys is not None
-    ys = solution.ys
+    ys, went = _integrated(rates, _norm, robot, conditions, moves, y0, times, tolerance, max_steps)
     signals = jax.vmap(lambda y: balances.moving(robot, conditions, state_of(robot, y)))(ys)
     # Friction at rest carries what gravity and the motors ask of a robot that it holds.
     still = jnp.zeros_like(signals.acceleration)
@@ -216,7 +206,7 @@ def drive(
         acceleration_wheel=jnp.where(parked, still, signals.acceleration_wheel),
     )
     end = jax.tree.map(lambda x: x[-1], signals)
-    status = _status(robot, conditions, end, parked, solution.result == diffrax.RESULTS.successful)
+    status = _status(robot, conditions, end, parked, went)
     # The battery's parabola goes on past empty, the run does not: a clear end, and no numbers after it.
     going = (conditions.battery < 0.5) | ~robot.battery.empty(signals.discharge)
     signals, distance = jax.tree.map(lambda x: jnp.where(going, x, jnp.nan), (signals, ys[:, 3] * _UNITS[3]))
@@ -226,16 +216,61 @@ def drive(
     return Trajectory(times, distance, signals, time_end, answer)
 
 
-def holds(robot: Robot, conditions: Conditions) -> Array:
-    """Whether friction at rest holds a robot that stands.
+def _integrated(
+    law: Callable[[Robot, Conditions, Array], Array],
+    norm: Callable[[Array], Scalar],
+    robot: Robot,
+    conditions: Conditions,
+    moves: Array | float,
+    y0: Array,
+    times: Array,
+    tolerance: float,
+    max_steps: int,
+) -> tuple[Float[Array, "times unknowns"], Array]:
+    """The unknowns at those times, and whether the integrator got to the last of them.
 
-    The ground grips, and motors and gravity can turn the shafts neither way at the motors' current at rest, which
-    flows a millisecond after the start.
+    Args:
+        law: rates of the unknowns; norm: of an error of them; moves: 0 for those that stand, else 1.
     """
-    units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
-    rest = state_of(robot, jnp.zeros_like(units).at[4].set(conditions.discharge / units[4]))
-    settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
-    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda _, y, run: law(run[0], run[1], y) * run[2]),
+        Rodas4(inverted=conditions.turns),
+        times[0],
+        times[-1],
+        dt0=jnp.asarray(1e-4, y0.dtype),
+        y0=y0,
+        args=(robot, conditions, moves),
+        saveat=diffrax.SaveAt(ts=times),
+        max_steps=max_steps,
+        throw=False,
+        stepsize_controller=diffrax.PIDController(
+            rtol=tolerance, atol=tolerance, norm=norm, dtmax=_step_longest(robot, conditions)
+        ),
+        adjoint=diffrax.ForwardMode(),
+    )
+    assert solution.ys is not None
+    return solution.ys, solution.result == diffrax.RESULTS.successful
+
+
+def _turning(
+    robot: Robot, conditions: Conditions, times: Array, tolerance: float, max_steps: int, rolling: bool
+) -> Trajectory:
+    """`drive` of a robot whose sides are driven apart; its signals have a last axis of left and right side."""
+    y0 = turning.start(robot, conditions, rolling)
+    parked = jnp.asarray(False) if rolling else turning.holds(robot, conditions)
+    moves = jnp.where(parked, turning.at_rest(y0), 1.0)
+    ys, went = _integrated(turning.rates, turning.norm, robot, conditions, moves, y0, times, tolerance, max_steps)
+    motion = jax.vmap(lambda y: turning.motion_of(robot, y))(ys)
+    travel = jax.vmap(lambda m: balances.turning(robot, conditions, m))(motion)
+    end = jax.tree.map(lambda x: x[-1], (travel, motion))
+    status = jnp.where(parked, STALLED, turning.status_moving(robot, conditions, *end))
+    status = jnp.where(went, status, FAILED)
+    going = (conditions.battery < 0.5) | ~robot.battery.empty(motion.discharge)
+    signals = jax.tree.map(lambda x: jnp.where(going.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan), travel.signals)
+    away = jnp.where(going, jnp.hypot(motion.place_x, motion.place_y), jnp.nan)
+    there = (status != BATTERY_EMPTY) & (status != FAILED)
+    answer = withhold(turning.result_of(robot, end[0], status), there, status != FAILED)
+    return Trajectory(times, away, signals, jnp.max(jnp.where(going, times, times[0])), answer)
 
 
 def _status(robot: Robot, conditions: Conditions, end: Signals, parked: Array, done: Array) -> Array:
@@ -280,7 +315,10 @@ def _histories(
     robot: Robot, conditions: Conditions, options: Mapping[str, float], progress: Progress | None = None
 ) -> Run:
     kept = drive_batch(robot, conditions, jnp.asarray(_instants(options["duration"])))
-    return Run(kept.result, history=History.of(robot, kept.time, kept.distance, kept.signals))
+    signals, shown = kept.signals, None
+    if conditions.turns:
+        signals, shown = turning.together(signals), turning.shown(robot, signals)
+    return Run(kept.result, history=History.of(robot, kept.time, kept.distance, signals, shown=shown))
 
 
 def _from_standstill(robot: Robot, conditions: Conditions) -> list[str]:

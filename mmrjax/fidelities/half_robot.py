@@ -22,7 +22,8 @@ from mmrjax.conditions import Conditions
 from mmrjax.contact_sums import Linearized
 from mmrjax.fidelities.linear import Factors, factorise, substitute
 from mmrjax.fidelities.steady import steady, voltage_at_rest
-from mmrjax.mjcf import Masses, mjx
+from mmrjax.masses import Masses, masses
+from mmrjax.mjcf import mjx
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import GRAVITY, ROLLS_BACK, Signals, State, done
@@ -69,7 +70,7 @@ def system(robot: Robot, conditions: Conditions, step: Scalar) -> System:
     """Constants of one run (scalar fields); the robot may hold tracers."""
     zero = jnp.zeros_like(conditions.voltage)
     mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
-    half = mjcf.masses(robot, conditions, mass)
+    half = masses(robot, conditions, mass)
     model, data = mjcf.template()
     gear = robot.running_gear
     model = mjcf.member(model, half, conditions.slope, gear.wheelbase, step)

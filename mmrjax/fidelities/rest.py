@@ -62,6 +62,19 @@ def _still(state: State) -> State:
     return dataclasses.replace(state, speed_motor=jnp.zeros_like(state.speed), speed=jnp.zeros_like(state.speed))
 
 
+def holds(robot: Robot, conditions: Conditions) -> Array:
+    """Whether friction at rest holds a robot that stands.
+
+    The ground grips, and motors and gravity can turn the shafts neither way at the motors' current at rest, which
+    flows a millisecond after the start.
+    """
+    none = jnp.zeros_like(conditions.voltage)
+    memory = {effect.name: none for effect in robot.remembering}
+    rest = State(none, none, none, conditions.discharge, memory, distance=none, gap=none if robot.loose else None)
+    settled = dataclasses.replace(rest, current=current_at_rest(robot, conditions, rest))
+    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
+
+
 def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
     """Adhesion less what gravity asks of it beyond rolling resistance [-], negative where a robot slides down."""
     along = jnp.maximum(backward.demand, -forward.demand)

@@ -38,9 +38,9 @@ def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
         power_gear=power_gear,
         power_ground=power_ground,
         power_lift=sides * signals.gravity * signals.speed,
-        efficiency_motor=_efficiency(power_motor, power_supply),
-        efficiency_gear=_efficiency(power_gear, power_motor),
-        efficiency_chassis=_efficiency(power_ground, power_gear),
+        efficiency_motor=efficiency(power_motor, power_supply),
+        efficiency_gear=efficiency(power_gear, power_motor),
+        efficiency_chassis=efficiency(power_ground, power_gear),
         winding_settled=temperature,
         voltage_cell=jnp.where(signals.battery > 0.5, signals.voltage_source / robot.battery.cells, 0.0),
         status=status,
@@ -91,7 +91,8 @@ def slips(robot: Robot, signals: Signals) -> Array:
     return jnp.abs(signals.speed_sliding) > robot.chassis(signals.configuration).speed_grip
 
 
-def _efficiency(out: Scalar, into: Scalar) -> Array:
+def efficiency(out: Scalar, into: Scalar) -> Array:
+    """Power out over power in [-]; 0 at rest and where power flows the other way."""
     # What comes back from a slope is no efficiency of the way there.
     forward = (out > 0) & (into >= out)
     return jnp.where(forward, quotient(out, into), 0.0)

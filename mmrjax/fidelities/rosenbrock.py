@@ -60,7 +60,12 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
 
     Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), Section IV.7, RODAS.
     Only for autonomous right-hand sides of one flat vector: the Jacobian in time is taken to be zero.
+
+    Attributes:
+        inverted: see `stages`.
     """
+
+    inverted: bool = False
 
     term_structure: ClassVar[Any] = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable[..., Any]] = RodasInterpolation
@@ -78,7 +83,7 @@ class Rodas4(diffrax.AbstractAdaptiveSolver):
         def rate(y: Any) -> tuple[Any, Any]:
             return terms.vf(t0, y, args), y[:0]
 
-        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0)
+        y1, _, u, _ = stages(rate, y0, y0[:0], t1 - t0, self.inverted)
         c2, c3 = (sum(d * v for d, v in zip(row, u[:5], strict=True)) for row in _D)
         dense = {"y0": y0, "y1": y1, "c2": c2, "c3": c3}
         return y1, u[-1], dense, None, RESULTS.successful
@@ -109,7 +114,7 @@ def stages(
         return found, found
 
     (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
-    solve = (_inverse if inverted else _solver)(jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian)
+    solve = (inverse if inverted else _solver)(jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian)
     u, v, y, q = [solve(f)], [], y0, q0
     v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
     for stage in range(1, 6):
@@ -131,8 +136,8 @@ def _solver(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float
     return lambda vector: jax.scipy.linalg.lu_solve(factors, vector)
 
 
-def _inverse(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
-    """By Gauss and Jordan in place, a column at a time."""
+def inverse(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
+    """Solves by the inverse, found in place by Gauss and Jordan, a column at a time; no rows are exchanged."""
     for k in range(matrix.shape[0]):
         pivot = matrix[k, k]
         row, column = matrix[k] / pivot, matrix[:, k].at[k].set(0.0)

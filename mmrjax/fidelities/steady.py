@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from mmrjax import balances, channels, outputs
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
@@ -127,6 +128,8 @@ def steady(robot: Robot, conditions: Conditions) -> Result:
         the mass not positive). A member that has no numbers has zero derivatives and harms no
         other.
     """
+    if conditions.turns:
+        return turning.steady(robot, conditions)
     point, sound = operating_point(robot, conditions)
     # What the contact's law gives a robot that stands as creep, friction at rest holds.
     crept = jnp.abs(point.speed) >= robot.chassis(conditions.configuration).speed_still
@@ -157,6 +160,8 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     Returns:
         The result, and whether robot and conditions are sound (see `_sound`).
     """
+    if conditions.turns:
+        return turning.operating_point(robot, conditions)
     signals, status, sound = operating(robot, conditions)
     return result(robot, signals, status), sound
 
@@ -267,7 +272,14 @@ def _run(robot: Robot, conditions: Conditions, options: Mapping[str, float], pro
 
 
 def _check(robot: Robot, conditions: Conditions, options: Mapping[str, float]) -> None:
-    """Refuse an arm that gravity pulls: it turns unevenly, or hangs where its friction lets it."""
+    """Refuse what has no steady state: an arm that gravity pulls, which turns unevenly, or hangs where its friction
+    lets it; and a turn on a slope."""
+    if conditions.turns and np.any(np.asarray(conditions.slope_deg) != 0):
+        steepest = np.asarray(conditions.slope_deg).flat[int(np.argmax(np.abs(np.asarray(conditions.slope_deg))))]
+        raise ValueError(
+            f"got a slope of {steepest:g} deg for a robot that turns: its heading changes there all the time, so it "
+            "has no steady state; follow it over time: --model drive"
+        )
     for k, (name, load) in enumerate(robot.configurations.items()):
         if np.any(np.asarray(load.torque_gravity) > 0) and np.any(np.asarray(conditions.configuration) == k):
             raise ValueError(

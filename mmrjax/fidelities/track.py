@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import contact, fidelities, mjcf, undercarriage
+from mmrjax import contact, fidelities, masses, undercarriage
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.base import Fidelity, History, Progress, Run
@@ -238,7 +238,7 @@ def check(robot: Robot, conditions: Conditions, *, duration: float, step: float,
                 f"{name}.inertia: got 0; expected the inertia of what turns with the movers of one side, which this "
                 "model needs [kg·m^2]"
             )
-    mjcf.check_parts(robot)
+    masses.check_parts(robot)
     refuse(robot, conditions, step, sample)
 
 

@@ -11,7 +11,7 @@ from calibration.inference import blocks, priors
 from calibration.inference.calibrate import calibrate as run
 from calibration.inference.result import CalibrationResult
 from sweeps import config as configuration
-from sweeps.console import say, tell
+from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.pages.page import rms
@@ -29,12 +29,12 @@ def calibrate(
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
     stated = priors.parse_priors(config.prior)
-    with open_folder("calibrate", config, robot, out, force, runs) as folder:
+    with open_folder("calibrate", config, robot, out, force, runs) as folder, pulse(tell, "fitting") as heard:
         found = run(
             runs, robot, free=config.free, fix=config.fix, stated=stated, noise=config.noise or None,
             model=config.model, starts=config.starts, population=config.population,
             generations=config.generations, members=members, seed=config.seed,
-            profiles=config.profiles, blocks=config.hold_out, tell=tell,
+            profiles=config.profiles, blocks=config.hold_out, tell=heard,
         )  # fmt: skip
         found.save(folder.partial, config.robot)
         print_calibration(found)

@@ -85,7 +85,7 @@ def _effect(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
     equation, meaning, source = words_of.about(effect)
     yield "equation", equation
     yield "stands for", meaning
-    yield "enters", f"the balance {effect.balance}{f', channel {effect.channel}' if effect.channel else ''}"
+    yield "enters", f"the {effect.balance} balance{f', channel {effect.channel}' if effect.channel else ''}"
     made = effect()
     for p in params.walk(made):
         if p.spec.amplitude:

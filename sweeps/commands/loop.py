@@ -21,7 +21,7 @@ from calibration.discovery.settings import fewest_replicates
 from calibration.inference import blocks, observers, priors
 from calibration.words import loop as said_of
 from sweeps import config as configuration
-from sweeps.console import say, tell
+from sweeps.console import pulse, say, tell
 from sweeps.inputs import load_robot, read_runs
 from sweeps.pages import words
 from sweeps.pages.page import rms
@@ -58,12 +58,15 @@ def loop(
     def left() -> float | None:
         return None if within is None else max(within - (time.monotonic() - began), 0.0)
 
-    def progress(text: str) -> None:
+    def timed(text: str) -> None:
         tell(f"{time.monotonic() - began:4.0f} s  {text}")
-        if left() == 0.0 and "verdict" not in stages:
-            raise OutOfTime
 
-    with open_folder("loop", config, robot, out, force, runs) as folder:
+    with open_folder("loop", config, robot, out, force, runs) as folder, pulse(timed, "preparing the table") as heard:
+
+        def progress(text: str) -> None:
+            heard(text)
+            if left() == 0.0 and "verdict" not in stages:
+                raise OutOfTime
 
         def keep(name: str, make: Callable[[], T]) -> T:
             found = stages[name] = folder.stage(name, make)
@@ -113,7 +116,7 @@ def print_discovery(found: DiscoveryResult) -> None:
     """Verdict, effects, errors and remarks, for a person; the answer and the next step last."""
     say(f"{found.verdict}: {found.statement}")
     if not found.robot.has_ground and found.verdict != "none":
-        say("The balance track of a shaft is what its load loses.")
+        say("The track balance of a shaft is what its load loses.")
     for said in (said_of.standing(found), said_of.ruled_out(found)):
         if said:
             say(said)

@@ -70,9 +70,10 @@ class RigCheck:
             "free": "start as a fit finds",
         }
         delay = float(rig.delay)
+        lines = ", on straight lines between the rows of histories" * (rig.between_rows == "linear")
         return [
             f"{motors}, through {gear}, {loads}.",
-            f"Imposed is {imposed}{f', {delay:g} s late' if delay else ''}; histories {starts[rig.start]}.",
+            f"Imposed is {imposed}{f', {delay:g} s late' if delay else ''}{lines}; histories {starts[rig.start]}.",
         ]
 
     def remarks(self) -> list[str]:

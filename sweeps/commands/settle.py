@@ -29,7 +29,9 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
     """Find what of a log has settled, and leave a run folder with the table; returns the exit code, 0."""
     robot = load_robot(config).robot
     runs = read_runs(source, robot, measured=True, series=True)
-    found = settling.settle(runs, shortest=config.shortest_s, drift=config.drift, inertia=inertia(robot))
+    found = settling.settle(
+        runs, shortest=config.shortest_s, drift=config.drift, inertia=inertia(robot), rolling=rolling(robot)
+    )
     with open_folder("settle", config, robot, out, force, runs) as folder:
         robot_file.write(robot, folder.partial / "robot.toml", note=f"the rig of this log, from {config.robot}")
         folder.write_table("settled.csv", found.table())
@@ -38,6 +40,18 @@ def settle(config: configuration.Settle, source: str, out: Path | None, force: b
         print_settled(found)
         shown = page("settle", found)
         return leave(folder, config, {"seed": None, "settled": len(found.kept)}, page=shown, runs=runs)
+
+
+def rolling(robot: Robot) -> dict[str, dict[str, float]]:
+    """Of each configuration what speeds show while the motors turn by 1 rad/s and the load rolls with them, by
+    channel [unit of the column]; of a vehicle, which slips, those of the shafts."""
+    found = {}
+    for k, (name, load) in enumerate(robot.configurations.items()):
+        none, turns = jnp.zeros(()), float(load.radius) / float(robot.gearbox.ratio)
+        state = State(none, jnp.ones(()), jnp.asarray(turns), none)
+        speeds = {c.name: _shown(robot, k, c, state) for c in settling.shown(robot) if c.zero_at_rest}
+        found[name] = {n: x for n, x in speeds.items() if n != "speed" or not robot.has_ground}
+    return found
 
 
 def inertia(robot: Robot) -> dict[str, Inertia]:

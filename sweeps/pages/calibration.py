@@ -8,7 +8,7 @@ from calibration.data.columns import Layout
 from calibration.inference.identifiability import HELD
 from calibration.inference.result import CalibrationResult
 from sweeps.pages import calibration_figures, cluster_figures, comparison_figures
-from sweeps.pages.page import Album, columns, conditions, first_rows, render, rms, words_shown
+from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, rms, words_shown
 
 
 def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
@@ -43,6 +43,7 @@ def write(folder: Path, found: CalibrationResult, *, robot_name: str) -> Path:
         album,
         of_channels=found.channels,
         title=f"Calibration of {words_shown(Path(robot_name).name)} to {Path(found.source).name}",
+        curves=curves(found.robot),
         document=found.to_json(),
         rows=first_rows(table),
         conditions=conditions(table),

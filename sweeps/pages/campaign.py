@@ -49,7 +49,7 @@ def write(folder: Path, file: RobotFile, layout: Layout, result: dict[str, Any])
                 n: Varied(values[usable, k], _label(n, known[n].get("units", "")), layout.labels.get(n, ()))
                 for k, n in enumerate(layout.design.names)
             }
-            drawing = partial(campaign_figures.spread, numbers, f"{label} [{unit}]", varied)
+            drawing = partial(campaign_figures.spread, numbers, _label(label, unit), varied)
             album.add(f"spread_{name}", drawing)
     total = result["points"]
     statuses = [

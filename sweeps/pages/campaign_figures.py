@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 
 from sweeps.pages.figure_style import BLUE, figure, note, short
 
-#: Bins of a histogram, and along a name at most.
+#: Bins of a histogram, and along a name at most; at least, and points of each that more need.
 BARS, BINS = 40, 24
-#: Points of a bin below which its median says nothing.
-FEW = 5
+LEAST, EACH = 6, 5
 
 
 class Varied(NamedTuple):
@@ -35,7 +34,7 @@ def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figu
     """
     names = sorted(varied, key=lambda name: -share(varied[name].values, output))[:2]
     fig, ((histogram, *others),) = figure(1, 2 + len(names) if len(names) == 2 else 2, 2.9)
-    histogram.hist(output, bins=BARS, color=BLUE)
+    histogram.hist(output, bins=_number(output, BARS), color=BLUE)
     histogram.set(xlabel=label, ylabel="points", title="how often")
     for axes, name in zip(others, names, strict=False):
         _band(axes, varied[name].values, output)
@@ -46,12 +45,17 @@ def spread(output: np.ndarray, label: str, varied: Mapping[str, Varied]) -> Figu
     return fig
 
 
+def _number(values: np.ndarray, most: int) -> int:
+    """Bins that so many values fill."""
+    return min(most, max(LEAST, len(values) // EACH))
+
+
 def bins(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bin of each value, and the bins' middles: its levels where there are few, else equal numbers of points."""
-    levels = np.unique(values)
-    if len(levels) <= BINS:
+    levels, number = np.unique(values), _number(values, BINS)
+    if len(levels) <= number:
         return np.searchsorted(levels, values), levels
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS + 1)))
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, number + 1)))
     return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2), (edges[1:] + edges[:-1]) / 2
 
 
@@ -66,10 +70,9 @@ def share(values: np.ndarray, output: np.ndarray) -> float:
 
 def _band(axes: Axes, values: np.ndarray, output: np.ndarray) -> None:
     which, middles = bins(values)
-    known = [k for k in range(len(middles)) if np.sum(which == k) >= FEW]
-    quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in known]).reshape(-1, 3)
-    axes.fill_between(middles[known], quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
-    axes.plot(middles[known], quantiles[:, 1], color=BLUE)
+    quantiles = np.array([np.quantile(output[which == k], (0.05, 0.5, 0.95)) for k in range(len(middles))])
+    axes.fill_between(middles, quantiles[:, 0], quantiles[:, 2], color=BLUE, alpha=0.2, linewidth=0)
+    axes.plot(middles, quantiles[:, 1], color=BLUE)
     note(axes, f"{100 * share(values, output):.0f} % of the variance")
 
 

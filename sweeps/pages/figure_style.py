@@ -95,6 +95,10 @@ def svg(fig: Figure) -> str:
         assert isinstance(written, Text)
         written.set_fontsize(max(written.get_fontsize(), LEAST))
         written.set_color(readable(written.get_color()))
+    if (engine := fig.get_layout_engine()) is not None:
+        fig.set_dpi(72)  # that of SVG
+        engine.execute(fig)
+        fig.set_layout_engine(None)  # or savefig draws everything once more to lay it out
     buffer = io.StringIO()
     fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
@@ -176,9 +180,7 @@ def note(axes: Axes, words: str, x: float = 0.02, y: float = 0.97, **keywords: A
 
 def colours_of(configurations: np.ndarray) -> dict[str, str]:
     """A colour for each configuration of a table, in the order of their first rows."""
-    palette = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
-    names = dict.fromkeys(map(str, configurations))
-    return {name: palette[k % len(palette)] for k, name in enumerate(names)}
+    return {name: colour for name, (colour, _) in looks(configurations).items()}
 
 
 def short(name: str) -> str:

@@ -69,7 +69,7 @@ def findings(found: DiscoveryResult) -> list[dict[str, str]]:
         a = e.parameters["amplitude"]
         size = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}"
         if (change := changed(found, e.name)) is not None:
-            size += f", which is {100 * change.rms:.2g} % of the {change.channel.label}"
+            size += f", which changes the {change.channel.label} by {100 * change.rms:.2g} %"
         sure, other = words.how_sure(found, e), words.alike(e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
     return listed
@@ -213,7 +213,6 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         files={
             "robot.toml": f"the robot {'with what was found' if found.written and found.effects else 'refitted'}",
             "fitted.toml": "the robot refitted, with nothing added",
-            "posterior.nc": "what the fit leaves open, for --posterior",
         },
         seen_by=next((blocks.in_words(kind) for kind in found.errors_held_out), "nothing"),
         use_it=words.use_it(found),

@@ -199,13 +199,22 @@ def _grade(value: Any) -> str:
     return "none" if not math.isfinite(size) else "good" if size <= 5 else "fair" if size <= 10 else "bad"
 
 
-def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[Channel] = (), **known: Any) -> Path:
+def render(
+    folder: Path,
+    template: str,
+    album: Album,
+    *,
+    curves: Sequence[str],
+    of_channels: Iterable[Channel] = (),
+    **known: Any,
+) -> Path:
     """Write `report.html` from a template, the album's pictures and what the template asks for.
 
-    What every page has comes here: a warning of curves that nobody has named (`curves`), contents after the answer,
-    what lies beside the page (`files`: meanings that are not the usual ones), tables that scroll in themselves.
+    What every page has comes here: contents after the answer, what lies beside the page (`files`: meanings that are
+    not the usual ones), tables that scroll in themselves.
 
     Args:
+        curves: of the robot that the page is about, which nobody has named (see `curves`): it warns of them.
         of_channels: that the page is about.
     """
     templates = resources.files("sweeps.pages") / "templates"
@@ -226,7 +235,7 @@ def render(folder: Path, template: str, album: Album, *, of_channels: Iterable[C
     known["files"] = _beside(Path(folder), words.FILES | known.get("files", {}))
     page = environment.get_template(template).render(pictures=album.pictures, **known)
     page = page.replace("<table", '<div class="scroll" tabindex="0"><table').replace("</table>", "</table></div>")
-    page = _with_contents(page, words.of_curves(known.get("curves", [])))
+    page = _with_contents(page, words.of_curves(curves))
     path = Path(folder) / "report.html"
     path.write_text(page, encoding="utf-8")
     return path

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from calibration.sensitivity.replicates import Estimate
 from calibration.sensitivity.result import NEGLIGIBLE, NextRuns, OutputStudy, SensitivityResult
-from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note, short
+from sweeps.pages.figure_style import BLUE, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, note, short
 
 #: Inputs that a figure shows at most, and operating points of a tornado.
 SHOWN, TALLEST, PANELS = 8, 10, 4
@@ -81,7 +81,8 @@ def tornado(study: OutputStudy, found: SensitivityResult) -> Figure:
                 if np.isfinite(end):
                     ax.barh(-place, end - value[n], left=value[n], color=colour, height=0.66)
                 else:
-                    ax.text(value[n], -place, " × does not travel", va="center", fontsize=7.5, color=FAINT)
+                    beside = np.nanmax([value[n], *swing[:, n, i]])
+                    ax.text(beside, -place, " × does not travel", va="center", fontsize=7.5, color=colour)
         ax.axvline(value[n], color=INK, linewidth=0.9)
         ax.set_title(_split(found.points.label(where[n])), fontsize=8.5)
         ax.tick_params(axis="x", labelsize=8)

@@ -33,8 +33,9 @@ def write(folder: Path, found: Settled) -> Path:
         folder,
         "settle.html.j2",
         album,
+        curves=(),  # nothing is simulated
         of_channels=tuple(s.channel for s in found.signals),
-        title=f"settled runs of {Path(found.runs.source).name}",
+        title=f"Settled runs of {Path(found.runs.source).name}",
         statement=words.statement(found),
         notes=words.remarks(found, SettledRuns.fewest),
         left=words.left_out(found.stretches),

@@ -37,6 +37,7 @@ def write(folder: Path, found: SizeResult, file: RobotFile) -> Path:
         title="Sizing",
         statement=found.statement(),
         source=found.asked.source,
+        start=words_shown(file.name),
         objectives=", ".join(OBJECTIVES[name][1] for name in found.objectives),
         starts=found.sizing.starts,
         evaluated=f"{found.sizing.evaluated:,}",

@@ -18,6 +18,8 @@ from sweeps.pages.page import reading
 
 _PANELS = 3  # voltages drawn of a configuration
 _CELLS = 12  # along an axis up to which cells are labelled
+#: Of text in a cell, which has no part in the layout of the figure.
+_INSIDE: dict[str, Any] = {"ha": "center", "va": "center", "in_layout": False}
 
 
 #: Axis of what is imposed: its unit, and words of several.
@@ -119,7 +121,7 @@ def _map(axes: Axes, runs: dict[str, np.ndarray], index: np.ndarray, channel: Ch
         for j, i in zip(*np.nonzero(np.isfinite(image)), strict=True):
             shade = colormaps["viridis"](norm(image[j, i]))
             ink = "white" if 0.299 * shade[0] + 0.587 * shade[1] + 0.114 * shade[2] < 0.52 else INK
-            axes.text(i, j, reading(image[j, i], channel.name), ha="center", va="center", fontsize=7.5, color=ink)
+            axes.text(i, j, reading(image[j, i], channel.name), color=ink, fontsize=7.5, **_INSIDE)
     for i, j, wide, tall in _blocks(set(missing), joined=not labelled):
         axes.add_patch(Rectangle((i - 0.5, j - 0.5), wide, tall, fc="#f4f4f4", ec="#b5b5b5", hatch="////", lw=0.4))
     _say_missing(axes, missing, labelled)
@@ -150,7 +152,7 @@ def _say_missing(axes: Axes, missing: dict[tuple[int, int], str], each: bool) ->
     box = {"fc": "white", "ec": "none", "pad": 0.6, "alpha": 0.85}
     if each:
         for (i, j), status in missing.items():
-            axes.text(i, j, words.short(str(status)), ha="center", va="center", fontsize=6.8, bbox=box)
+            axes.text(i, j, words.short(str(status)), fontsize=6.8, bbox=box, **_INSIDE)
         return
     for status in sorted(set(missing.values())):
         places = np.array([p for p, s in missing.items() if s == status], float)

@@ -196,7 +196,8 @@ def conditions(robot: Robot, runs: Runs) -> dict[str, np.ndarray]:
     if "total_mass_kg" in runs.layout.axes and "total_mass_kg" not in columns:
         own = np.array([float(chassis.mass) for chassis in robot.configurations.members])
         columns["total_mass_kg"] = own[runs.configurations(robot)] + runs["payload_kg"]
-    return {key: columns[key] for key in ("configuration", *runs.layout.axes, "surface", "run_id") if key in columns}
+    shown = ("configuration", *dict.fromkeys((*runs.layout.axes, *runs.axes)), "surface", "run_id")
+    return {key: columns[key] for key in shown if key in columns}
 
 
 def counts(table: dict[str, np.ndarray]) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """Time histories: one run from standstill for each `run_id`, one row a sample.
 
-The conditions of a run may change from sample to sample; each value holds from its sample until the next.
+The conditions of a run may change from sample to sample; each value holds from its sample until the next, but what is
+imposed where the rig's file says that it goes on straight lines (`Rig.between_rows`).
 """
 
 from __future__ import annotations
@@ -65,6 +66,8 @@ EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
 #: Fields of `Conditions` that may change within a run; and of those what makes for an inrush, with how much of the
 #: largest applied voltage a change has to be for steps to be short after it.
 CHANGING = ("voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open")
+#: Of these what is imposed.
+ON_LINES = ("voltage", "motor_current", "duty")
 INRUSH = 2e-3
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
@@ -172,14 +175,16 @@ class Histories(Observer):
         names, first, run = np.unique(_names(runs), return_index=True, return_inverse=True)
         mine = [np.flatnonzero(run == k) for k in range(len(names))]
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
-        grids = [grid(runs["time_s"][m], changes) for m, changes in zip(mine, _changes(runs, mine), strict=True)]
+        sudden = _changes(runs, mine, robot.rig)
+        grids = [grid(runs["time_s"][m], changes) for m, changes in zip(mine, sudden, strict=True)]
         longest, samples = max(map(len, grids)), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
         rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
         most = min(samples, KNOTS, max(8, int(KNOT_STEPS / times.size)))
         knots = np.stack([_knots(m, most) for m in mine])
-        conditions = _in_time(runs.conditions(robot), first, mine, runs["time_s"], times)
+        linear = robot.rig.between_rows == "linear"
+        conditions = _in_time(runs.conditions(robot), first, mine, runs["time_s"], times, ON_LINES if linear else ())
         if robot.rig.begins is not None:
             order = [robot.rig.begins.names.index(begin_name(str(n))) for n in names]
             conditions = eqx.tree_at(lambda c: c.begin, conditions, jnp.asarray(order), is_leaf=lambda x: x is None)
@@ -257,7 +262,7 @@ class Histories(Observer):
         if step > 2 * LONGEST:
             said.append(CoarseSteps(float(runs["time_s"].max()), float(step)))
         each = [np.flatnonzero(names == name) for name in np.unique(names)]
-        changes = max(len(c) for c in _changes(runs, each)) + 1
+        changes = max(len(c) for c in _changes(runs, each, robot.rig)) + 1
         if growth(float(runs["time_s"].max()), changes) > COARSE * GROWTH:
             said.append(ManyChanges(changes - 1))
         return said
@@ -635,8 +640,8 @@ def _autocorrelation(linear: Linearization, lags: int) -> dict[str, list[float]]
     return {name: [float(lag[k]) for lag in of] for k, name in enumerate(linear.channels)}
 
 
-def _changes(runs: Runs, each: list[np.ndarray]) -> list[np.ndarray]:
-    """Instants at which the supply of the motors of each run changes [s]."""
+def _changes(runs: Runs, each: list[np.ndarray], rig: Rig) -> list[np.ndarray]:
+    """Instants at which the supply of the motors of each run changes at once [s]."""
     volts, time = applied(runs), runs["time_s"]
     if runs.layout.imposed != "voltage":  # which no inrush follows
         return [np.zeros(0)] * len(each)
@@ -646,20 +651,27 @@ def _changes(runs: Runs, each: list[np.ndarray]) -> list[np.ndarray]:
     found = []
     for rows in each:
         rows = rows[np.argsort(time[rows], kind="stable")]
-        far = np.abs(np.diff(volts[rows])) > INRUSH * np.abs(volts[rows]).max()
+        far = (np.abs(np.diff(volts[rows])) > INRUSH * np.abs(volts[rows]).max()) & (rig.between_rows == "held")
         found.append(time[rows[1:]][far | (coasts[rows][1:] != coasts[rows][:-1])])
     return found
 
 
 def _in_time(
-    of_rows: Conditions, first: np.ndarray, each: list[np.ndarray], time: np.ndarray, times: np.ndarray
+    of_rows: Conditions,
+    first: np.ndarray,
+    each: list[np.ndarray],
+    time: np.ndarray,
+    times: np.ndarray,
+    on_lines: tuple[str, ...] = (),
 ) -> Conditions:
     """Conditions of runs, from those of rows: of shape (runs,), those that change within one (runs, instants).
 
     Args:
         of_rows: shape (rows,); first: a row of each run; each: rows of each run in the order of time.
         time: of rows; times: instants of each run [s].
+        on_lines: fields that go on straight lines from row to row: their mean over the step from each instant on.
     """
+    middle = np.concatenate([0.5 * (times[:, 1:] + times[:, :-1]), times[:, -1:]], 1)
     at = np.stack(
         [
             rows[np.maximum(np.searchsorted(time[rows], t, side="right") - 1, 0)]
@@ -670,12 +682,11 @@ def _in_time(
     for name in CHANGING:
         x = getattr(of_rows, name)
         if x is not None and any(np.ptp(np.asarray(x)[rows]) > 0 for rows in each):
-            conditions = eqx.tree_at(operator.attrgetter(name), conditions, x[at])
+            values = x[at] if name not in on_lines else _on_lines(np.asarray(x), each, time, middle)
+            conditions = eqx.tree_at(operator.attrgetter(name), conditions, jnp.asarray(values))
     if of_rows.motor_speed is None:
         return conditions
-    speed = np.stack(
-        [np.interp(t, time[rows], np.asarray(of_rows.motor_speed)[rows]) for rows, t in zip(each, times, strict=True)]
-    )
+    speed = _on_lines(np.asarray(of_rows.motor_speed), each, time, times)
     step = np.diff(times, axis=1)
     slope = np.where(step > 0, np.diff(speed, axis=1) / np.where(step > 0, step, 1.0), 0.0)
     slope = np.concatenate([slope, np.zeros((len(slope), 1))], 1)
@@ -686,6 +697,11 @@ def _in_time(
         (jnp.asarray(speed), jnp.asarray(slope)),
         is_leaf=lambda x: x is None,
     )
+
+
+def _on_lines(x: np.ndarray, each: list[np.ndarray], time: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values of rows at instants of each run, on straight lines between the rows; shape (runs, instants)."""
+    return np.stack([np.interp(t, time[rows], x[rows]) for rows, t in zip(each, at, strict=True)])
 
 
 def begin_name(run: str) -> str:

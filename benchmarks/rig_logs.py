@@ -1,0 +1,179 @@
+"""The closed loop on logs over time of random rigs: false findings, right classes, wrong names, robots read again,
+and errors held out against least squares of one's own.
+
+    python benchmarks/rig_logs.py --clean 80 --library 80 --outside 40 --jobs 16 --cache runs/cache --limit 3000
+
+Logs come from `tests/generator_rig_logs.py`, which shares nothing with the simulator: four runs of 200 rows, 50 to
+200 Hz, of one drive and a load on a shaft; voltage, current or speed imposed by turns; some read late, which no file
+states. What the loop gets is `rig.toml` and `table.csv`; labels are read by the scorer alone. Every log is one line
+of `--out` as it ends, and a campaign that is started again goes on where it ended. With `--brief` nothing is
+held out.
+"""
+
+from __future__ import annotations
+
+import functools
+import resource
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
+import generator_rig_logs as gl
+import loop_findings
+import loop_scores as scores
+from campaign import Task, campaign
+from loop import verdict
+
+KINDS = ("clean", "library", "outside")
+#: Sigmas of each effect, least and most; amplitudes of more than so many ordinary sizes are left out.
+SIGMAS, SIZES = {"library": (5.0, 15.0), "outside": (8.0, 15.0)}, 3.0
+#: Rigs that are drawn until one can have an effect of the wanted strength.
+TRIES = 6
+#: Of the error of one's own least squares, by how much the loop's may be larger.
+TENTH = 0.1
+
+
+@functools.lru_cache(maxsize=2)
+def attempt(kind: str, seed: int) -> gl.Case | str:
+    """The case of a kind and a seed, or why there is none."""
+    rng = np.random.default_rng([41, KINDS.index(kind), seed])
+    imposed = gl.IMPOSED[seed % len(gl.IMPOSED)]
+    if kind == "clean":
+        return gl.case(gl.rig(rng, imposed), "", 0.0, seed)
+    pool = [n for n, x in (gl.LIBRARY if kind == "library" else gl.OUTSIDE).items() if imposed in x.imposed]
+    name, why = pool[(seed // len(gl.IMPOSED)) % len(pool)], "no rig can have it"
+    for _ in range(TRIES):
+        case = gl.case(gl.rig(rng, imposed), name, float(rng.uniform(*SIGMAS[kind])), seed)
+        effect = case.label["effects"][0]
+        if case.label["finite"] and effect["sizes"] < SIZES and effect["sigmas"] > 0.9 * SIGMAS[kind][0]:
+            return case
+        why = (
+            f"{name} needs more than {SIZES:g} ordinary sizes" if case.label["finite"] else f"{name} is not followed"
+        )
+    return why
+
+
+@functools.cache
+def _ready() -> None:
+    import jax
+
+    from sweeps import compilation_cache
+
+    compilation_cache.enable()
+    jax.config.update("jax_enable_x64", True)
+
+
+def work(task: Task) -> dict:
+    """A log made, looped over and scored against its label."""
+    case = attempt(task.kind, task.seed)
+    if isinstance(case, str):
+        return {"skipped": case}
+    _ready()
+    from calibration.data import robot_file
+    from calibration.data import runs as records
+    from calibration.discovery.discover import assemble_result, prepared
+
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        case.write(Path(folder))
+        robot = robot_file.read(Path(folder) / "rig.toml")
+        runs = records.read(Path(folder) / "table.csv", robot=robot)
+        given = prepared(runs, robot, replicates=task.replicates, seed=task.seed)
+        found = given.trace()
+        line = {**verdict(found), **loop_findings.findings(given, found), "seconds": time.perf_counter() - began}
+        if not task.brief:
+            whole = assemble_result(
+                found, given.runs, given.numbers, given.settings, given.library, lambda note: None
+            )
+            line |= held_out(whole, case) | {"seconds_whole": time.perf_counter() - began}
+            robot_file.write(whole.robot, Path(folder) / "robot.toml")
+            again = robot_file.read(Path(folder) / "robot.toml")
+            line["read_again"] = [e.name for e in again.effects] == [e.name for e in whole.robot.effects]
+    kept = ("imposed", "every", "delay")
+    return {
+        **line,
+        "memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "made": {k: case.label[k] for k in kept},
+        "truth": case.label["effects"],
+    }
+
+
+def held_out(whole, case: gl.Case) -> dict:
+    """Errors of runs held out [sds, rms]: of the refit, of what is proposed, of least squares of one's own without
+    and with the true term; and the gain of what is proposed over the refit."""
+    seen = whole.readings_of_rows
+    off = [None, None]
+    if "run" in seen.held_out:
+        errors = [(x - seen.measured) / seen.sd for x in seen.held_out["run"]]
+        off = [float(np.sqrt(np.nanmean(e**2))) for e in errors]
+    without, with_term = gl.least_squares(case)
+    delay = whole.base_shift.get("rig.delay")
+    return {
+        "held_out": {"refit": off[0], "found": off[1], "own": without, "own_with_term": with_term},
+        "written": whole.written,
+        "gain": None if whole.gain is None else [whole.gain.mean, whole.gain.se],
+        "delay": None if delay is None else [delay.after, delay.sd_after],
+    }
+
+
+def program(task: Task) -> tuple[str]:
+    """What logs have in common that share what is compiled: what is imposed."""
+    return (gl.IMPOSED[task.seed % len(gl.IMPOSED)],)
+
+
+def summary(lines: list[dict]) -> list[str]:
+    """The figures of a campaign."""
+    f = scores.Figures(lines)
+    scores.findings(f)
+    clean, library, outside = f.of("clean"), f.of("library"), f.of("outside")
+    f.say("clean: a false finding (goal <= 5 %)", clean, scores.false_finding)
+    f.say("  with a name", clean, lambda x: x["classes"])
+    f.say("library, >= 5 sigma left: class right (goal >= 90 %)", library, scores.contains)
+    for name in gl.LIBRARY:
+        some = [x for x in library if x["truth"][0]["name"] == name]
+        wrong = Counter(str(x["classes"]) if x["classes"] else x["verdict"] for x in some if not scores.contains(x))
+        if wrong:
+            f.note(f"    {name}: right {len(some) - wrong.total()} of {len(some)}; {dict(wrong)}")
+    f.say("outside: a wrong established name (goal <= 3 %)", outside, lambda x: x["classes"])
+    f.say("  unnamed in the right equation", outside, scores.placed)
+    f.say("  nothing found", outside, lambda x: x["verdict"] == "none")
+    every = f.of(*KINDS)
+    for imposed in gl.IMPOSED:
+        some = [x for x in every if x["made"]["imposed"] == imposed]
+        f.say(f"  {imposed}: clean without a finding, library right, outside without a name", some, right)
+    f.say("robots read again (goal 100 %)", [x for x in every if "read_again" in x], lambda x: x["read_again"])
+    compared = [x for x in every if x.get("held_out") and x["held_out"]["found"] is not None]
+    f.say("held out: not below the refit's (goal >= 98 %)", compared,
+          lambda x: x["held_out"]["found"] <= 1.001 * x["held_out"]["refit"] or not x["written"])  # fmt: skip
+    f.say("held out within a tenth of one's own with the true term (goal >= 90 %)", compared,
+          lambda x: x["held_out"]["found"] <= (1 + TENTH) * x["held_out"]["own_with_term"])  # fmt: skip
+    f.say("  without it", compared, lambda x: x["held_out"]["found"] <= (1 + TENTH) * x["held_out"]["own"])
+    late = [x for x in every if x.get("delay")]
+    f.say("delay within 3 of its sds", late, lambda x: abs(x["delay"][0] - x["made"]["delay"]) < 3 * x["delay"][1])
+    for what in ("skipped", "error"):
+        for text, count in Counter(x[what][:150] for x in f.lines if what in x).most_common(12):
+            f.note(f"{what} {count}: {text}")
+    seconds = [x["seconds"] for x in every]
+    if seconds:
+        most = max(x.get("memory", 0) for x in every) / 1e9
+        f.note(
+            f"seconds to a verdict: median {np.median(seconds):.0f}, most {max(seconds):.0f}; memory {most:.1f} GB"
+        )
+    return f.out
+
+
+def right(x: dict) -> bool:
+    """Whether a verdict is the right one of its kind."""
+    if x["kind"] == "library":
+        return scores.contains(x)
+    return x["verdict"] == "none" if x["kind"] == "clean" else not x["classes"]
+
+
+if __name__ == "__main__":
+    campaign(__doc__, KINDS, work, program, summary, "runs/rig_logs.jsonl")

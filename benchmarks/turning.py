@@ -1,0 +1,86 @@
+"""The paper's robot on the spot: on each surface of Table 5, what turning takes, and from which voltage it turns.
+
+    python benchmarks/turning.py [--speed]
+
+With --speed: settled turns a second in one batch, and runs of 2 s that turn beside runs that travel straight.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mmrjax as mm
+from mmrjax.fidelities import drive, steady
+from mmrjax.signals import NOT_SETTLED
+from mmrjax.tables import SURFACES, adhesion_ratio, lateral_ratio
+
+VOLTAGES = np.concatenate([np.arange(0.5, 8.0, 0.25), [15.0, 24.0, 33.0]])
+#: Yaw rate from which a robot turns [rad/s].
+TURNS = 0.05
+
+
+def surfaces() -> None:
+    """Print the table of docs/turning.md."""
+    robot = mm.nominal()
+    names = [(c, s, p) for c in robot.configurations for s in SURFACES for p in (0.0, 8.0)]
+    rows = [(c, s, p, float(u)) for c, s, p in names for u in VOLTAGES]
+    tracks = {c: float(k.on_tracks) > 0.5 for c, k in robot.configurations.items()}
+    runs = mm.Conditions(
+        [r[0] for r in rows], voltage=[r[3] for r in rows], payload=[r[2] for r in rows], duty_left=-1.0,
+        duty_right=1.0, adhesion=[adhesion_ratio(r[1], tracks[r[0]]) for r in rows],
+        adhesion_lateral=[lateral_ratio(r[1], tracks[r[0]]) for r in rows],
+    )  # fmt: skip
+    found = mm.simulate(robot, runs).result
+    shape = len(names), len(VOLTAGES)
+    rate, current, power, status = (
+        np.asarray(x).reshape(shape)
+        for x in (found.reading["yaw_rate"], found.reading["motor_current_right"], found.power_supply, found.status)
+    )
+    print("| robot | surface | payload | turns from | 15 V | 24 V | 33 V | power at 33 V | not settled |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for k, (configuration, surface, payload) in enumerate(names):
+        turning = VOLTAGES[np.nan_to_num(rate[k]) > TURNS]
+        cells = [f"{rate[k, j]:.2f} rad/s, {current[k, j]:.2f} A" for j in (-3, -2, -1)]
+        least = f"{turning.min():g} V" if turning.size else "-"
+        print(
+            f"| {configuration} | {surface.replace('_', ' ')} | {payload:g} kg | {least} | {' | '.join(cells)} | "
+            f"{power[k, -1]:.0f} W | {(status[k] == NOT_SETTLED).sum()} |"
+        )
+
+
+def speed() -> None:
+    """Print settled turns a second, and the time of runs that turn over that of straight ones."""
+    robot = mm.nominal()
+    rng = np.random.default_rng(0)
+    points = 16_384
+    duties = rng.uniform(-1, 1, (2, points))
+    runs = mm.Conditions(["6T2A"] * points, voltage=33.0, duty_left=duties[0], duty_right=duties[1]).resolved(robot)
+    for name in ("compiled and run", "run"):
+        begun = time.perf_counter()
+        status = jax.block_until_ready(steady.steady_outputs(robot, runs, ("yaw_rate", "total_current", "status")))
+        took = time.perf_counter() - begun
+        print(f"steady, {points} turns, {name}: {took:.2f} s, {points / took:.3g} a second")
+    print("statuses", np.unique(np.asarray(status["status"]), return_counts=True))
+    straight = mm.Conditions(["6T2A"] * 180, voltage=np.linspace(10, 33, 180)).resolved(robot)
+    turning = mm.Conditions(
+        ["6T2A"] * 180, voltage=np.linspace(10, 33, 180), duty_left=1.0, duty_right=rng.uniform(-1, 1, 180)
+    ).resolved(robot)
+    times, took = jnp.asarray([0.0, 2.0]), {}
+    for name, batch in (("straight", straight), ("turning", turning)):
+        for _ in range(2):
+            begun = time.perf_counter()
+            jax.block_until_ready(drive.drive_batch(robot, batch, times))
+            took[name] = time.perf_counter() - begun
+    print(f"drive, 180 runs of 2 s: straight {took['straight']:.3f} s, turning {took['turning']:.3f} s, "
+          f"{took['turning'] / took['straight']:.1f} times")  # fmt: skip
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--speed", action="store_true")
+    (speed if parser.parse_args().speed else surfaces)()

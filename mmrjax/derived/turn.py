@@ -1,0 +1,49 @@
+"""What follows from how a robot turns: radius, instantaneous centre, effective width, what each side takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from mmrjax.channels import MM
+from mmrjax.robot import Robot
+
+#: Columns, with what they are.
+COLUMNS: dict[str, str] = {
+    "turning_radius_mm": "radius of the circle of the centre of mass, positive to the left; inf: straight",
+    "centre_x_mm": "instantaneous centre of rotation ahead of the centre of mass",
+    "centre_y_mm": "instantaneous centre of rotation to the left of the centre of mass",
+    "effective_width_mm": "effective track width (V_teor,right - V_teor,left) / yaw rate",
+    "power_left_W": "electrical power of the left motor", "power_right_W": "of the right motor",
+    "winding_left_C": "winding of the left motor after long running", "winding_right_C": "of the right motor",
+}  # fmt: skip
+
+
+def columns(robot: Robot, reading: Mapping[str, Any], radius: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of settled turns, of what their channels read [SI]; arrays of one shape.
+
+    Args:
+        radius: of the driving wheels [m].
+    """
+    turn = np.asarray(reading["yaw_rate"])
+    # A turn once in three hours is none: what is left of zero by rounding is no radius.
+    rate = np.where(np.abs(turn) > 1e-9, turn, np.nan)
+    shafts = {side: np.asarray(reading[f"motor_speed_{side}"]) for side in ("left", "right")}
+    rolled = {side: radius * n / float(robot.gearbox.ratio) for side, n in shafts.items()}
+    units = float(robot.sides) / 2
+    found = {
+        "turning_radius_mm": np.where(np.isnan(rate), np.inf, np.asarray(reading["speed"]) / rate / MM),
+        "centre_x_mm": -np.asarray(reading["lateral_speed"]) / rate / MM,
+        "centre_y_mm": np.asarray(reading["speed"]) / rate / MM,
+        "effective_width_mm": (rolled["right"] - rolled["left"]) / rate / MM,
+    }
+    for side in ("left", "right"):
+        current = np.asarray(reading[f"motor_current_{side}"])
+        found[f"power_{side}_W"] = units * np.asarray(reading[f"motor_voltage_{side}"]) * current
+    for side in ("left", "right"):
+        current = np.asarray(reading[f"motor_current_{side}"])
+        found[f"winding_{side}_C"] = np.asarray(robot.motor.temperature_settled(jnp.asarray(current)))
+    return {name: np.where(np.isnan(turn), np.nan, x) for name, x in found.items()}

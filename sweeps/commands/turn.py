@@ -1,0 +1,172 @@
+"""The command `simulate` of one run whose sides are driven apart: how it turns, what each motor takes, its path."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from calibration.data.columns import SIDES, SUPPLY
+from calibration.data.errors import BadConfiguration
+from mmrjax import channels, fidelities, outputs
+from mmrjax.channels import Channel
+from mmrjax.conditions import Conditions
+from mmrjax.derived import turn as derived
+from mmrjax.fidelities.base import History, Run
+from mmrjax.robot import Robot
+from sweeps import config as configuration
+from sweeps.console import say
+from sweeps.inputs import load_robot, one_run
+from sweeps.pages import turn_words
+from sweeps.points import run
+from sweeps.skeleton import page
+from sweeps.store import open_folder
+
+#: Duties of the inner side, as shares of the outer one's, over which a settled turn is shown.
+SHARES = np.linspace(1.0, -1.0, 25)
+#: Channels of a turn, beside the robot's own.
+SHOWN = tuple(c.name for c in channels.OF_TURNS)
+
+
+def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: Path | None, force: bool) -> int:
+    """Simulate one run of options whose sides are driven apart; leave a run folder; returns the exit code.
+
+    Raises:
+        BadConfiguration: runs of a file, a robot of one side, a turn without a steady state.
+    """
+    if isinstance(given, str):
+        raise BadConfiguration("--runs: got a file beside --left, --right or --heading; state columns duty_left and "
+                               "duty_right in it, or one run by options")  # fmt: skip
+    file = load_robot(config)
+    robot = file.robot
+    check(robot)
+    runs = one_run(robot, {**given, **_cells(config, given)}, config.battery)
+    settled = config.model == fidelities.NAMES[0]
+    with open_folder("simulate", config, robot, out, force, runs) as folder:
+        asked = run.commanded(robot, runs, config)
+        run.refuse(robot, asked, config)
+        shown = _channels(robot, settled)
+        if settled:
+            batch, swept = _with_others(robot, asked)
+            turns = {**_duties(swept), **_columns(robot, shown, swept, batch)}
+            folder.write_table("turns.csv", turns)
+            first, history = jax.tree.map(lambda x: x[:1], batch), None
+        else:
+            fidelity = fidelities.get(config.model)
+            assert fidelity.histories is not None  # of `drive`
+            first = jax.device_get(fidelity.histories(robot, asked, config.options))
+            turns, history = None, first.history
+            assert history is not None
+            folder.write_table("history.csv", history_table(history, shown))
+        table = {**run.conditions(robot, runs), **_columns(robot, shown, asked, first)}
+        turn = {name: _number(table[name][0]) for name in derived.COLUMNS}
+        facts = turn_words.turn(robot, {name: values[0] for name, values in table.items()}, _ended(history))
+        say(facts.answer)
+        print_sides(facts.sides)
+        for note in facts.notes:
+            say(f"- {note}")
+        result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
+        shows = page("turn", file, model=config.model, run=table, facts=facts, history=history, turns=turns)
+        return run.leave(folder, config, result, shows)
+
+
+def _ended(history: History | None) -> dict[str, float] | None:
+    """Time, distance from the start and angle turned by at the end of a run over time."""
+    if history is None:
+        return None
+    yaw = np.asarray(history.reading["yaw"])[0]
+    return {
+        "time_s": float(history.time[0, -1]),
+        "displacement_m": float(history.distance[0, -1]),
+        "turned_deg": float(np.degrees(yaw[-1] - yaw[0])),
+    }
+
+
+def check(robot: Robot) -> None:
+    """Refuse a robot that cannot turn.
+
+    Raises:
+        BadConfiguration: a load on a shaft, or one side.
+    """
+    if not robot.has_ground:
+        raise BadConfiguration("--left, --right: the robot's load is a shaft, which does not turn over the ground")
+    if float(robot.sides) < 2:
+        raise BadConfiguration(
+            f"--left, --right: got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
+        )
+    if robot.rig.imposed != "voltage":
+        raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
+
+
+def _cells(config: configuration.Simulate, given: dict[str, Any]) -> dict[str, Any]:
+    """Columns of the run: duties of the supply's voltage, which is the larger one where it is not stated."""
+    found: dict[str, Any] = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
+    if config.duty_left is not None:
+        return found | {"duty_left": config.duty_left, "duty_right": config.duty_right}
+    if config.left_V is None or config.right_V is None:
+        return found | {name: 1.0 for name in SIDES}
+    most = max(abs(config.left_V), abs(config.right_V))
+    supply = given[SUPPLY] if given.get(SUPPLY) is not None else most
+    if supply < most:
+        raise BadConfiguration(
+            f"--voltage: got {supply:g}; expected at least {most:g} V, what --left and --right ask"
+        )
+    share = 1 / supply if supply else 0.0
+    return found | {SUPPLY: supply, "duty_left": config.left_V * share, "duty_right": config.right_V * share}
+
+
+def _channels(robot: Robot, settled: bool) -> tuple[Channel, ...]:
+    """What is shown of a turn."""
+    every = channels.rows((*robot.rig.channels, *SHOWN))
+    return tuple(c for c in every if c.settled or not settled)
+
+
+def _with_others(robot: Robot, asked: Conditions) -> tuple[Run, Conditions]:
+    """The settled turn that is asked for, and those of other duties of the slower side; in one batch."""
+    left, right = (float(np.asarray(getattr(asked, name))[0]) for name in SIDES)
+    outer, shares = max(left, right, key=abs), len(SHARES)
+    others = outer * SHARES
+    slower = abs(left) <= abs(right)
+    duty_left = np.concatenate([[left], others if slower else np.full(shares, outer)])
+    duty_right = np.concatenate([[right], np.full(shares, outer) if slower else others])
+    rows = jax.tree.map(lambda x: np.repeat(np.asarray(x), shares + 1), asked)
+    rows = dataclasses.replace(rows, duty_left=jax.numpy.asarray(duty_left), duty_right=jax.numpy.asarray(duty_right))
+    rows = jax.tree.map(jax.numpy.asarray, rows)
+    return jax.device_get(fidelities.get(fidelities.NAMES[0]).run(robot, rows, {})), rows
+
+
+def _duties(conditions: Conditions) -> dict[str, np.ndarray]:
+    return {name: np.asarray(getattr(conditions, name)) for name in SIDES}
+
+
+def _columns(robot: Robot, shown: tuple[Channel, ...], conditions: Conditions, batch: Run) -> dict[str, np.ndarray]:
+    radii = np.array([float(c.radius) for c in robot.configurations.members])
+    reading = batch.result.reading
+    return {
+        **outputs.columns(batch.result, shown),
+        **derived.columns(robot, reading, radii[np.asarray(conditions.configuration)]),
+    }
+
+
+def history_table(history: History, shown: tuple[Channel, ...]) -> dict[str, np.ndarray]:
+    """A turn over time, a row a sample."""
+    read = {c.column: np.ravel(history.reading[c.name]) / c.factor for c in shown if c.over_time}
+    return {"time_s": np.ravel(history.time), **read, "displacement_m": np.ravel(history.distance)}
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def print_sides(sides: list[tuple[str, str, str]]) -> None:
+    """What either side does, for a person."""
+    shown = Table(box=None, pad_edge=False)
+    for heading in ("", "left", "right"):
+        shown.add_column(heading, justify="left" if not heading else "right")
+    for row in sides:
+        shown.add_row(*row)
+    say(shown)

@@ -1,0 +1,98 @@
+"""How a turn is told, in the terminal and on its page."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from mmrjax.channels import MM
+from mmrjax.robot import Robot
+from sweeps.pages import words
+
+FULL = 2 * math.pi  # rad a turn
+SIDES = ("left", "right")
+#: What either side does: words, column, format.
+ROWS = (
+    ("voltage [V]", "motor_voltage_{}_V", ".2f"),
+    ("current [A]", "motor_current_{}_A", ".3f"),
+    ("motor speed [rpm]", "motor_speed_{}_rpm", ".0f"),
+    ("electrical power [W]", "power_{}_W", ".1f"),
+    ("winding, long running [°C]", "winding_{}_C", ".0f"),
+)
+#: Motor speed below which a motor stands [rpm], speed below which a robot turns on the spot [mm/s].
+STANDS, SPOT = 1.0, 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Turn:
+    """How a turn is told: the answer in a sentence, rows of what left and right side do, and remarks."""
+
+    answer: str
+    sides: list[tuple[str, str, str]]
+    notes: list[str]
+
+
+def turn(robot: Robot, row: Mapping[str, Any], ended: Mapping[str, float] | None) -> Turn:
+    """A turn in words.
+
+    Args:
+        row: of the table of runs.
+        ended: of a run over time `time_s`, `displacement_m` and `turned_deg` at its end; None: a settled turn.
+    """
+    status = str(row["status"])
+    going = status in ("converged", "not_settled")
+    answer = _moves(row) if going else f"{status}: {words.STATUSES[status].why}"
+    if ended is not None and going:
+        answer = (
+            f"After {ended['time_s']:g} s: {ended['displacement_m']:.2f} m from the start, turned by "
+            f"{ended['turned_deg']:.0f}°. {answer if status == 'converged' else _now(row)}"
+        )
+    sides = [(label, *(format(float(row[c.format(side)]), form) for side in SIDES)) for label, c, form in ROWS]
+    return Turn(answer, [(a, b, c) for a, b, c in sides], _notes(robot, row) if going else [])
+
+
+def _way(row: Mapping[str, Any]) -> str:
+    return SIDES[0] if float(row["yaw_rate_rad_s"]) > 0 else SIDES[1]
+
+
+def _now(row: Mapping[str, Any]) -> str:
+    """A motion that still changes."""
+    rate, speed = float(row["yaw_rate_rad_s"]), float(row["speed_mm_s"])
+    return f"Not settled: {speed:.0f} mm/s ahead and {abs(rate):.2f} rad/s to the {_way(row)} then."
+
+
+def _moves(row: Mapping[str, Any]) -> str:
+    rate, radius, speed = (float(row[c]) for c in ("yaw_rate_rad_s", "turning_radius_mm", "speed_mm_s"))
+    if not math.isfinite(radius):
+        return f"Straight at {speed:.0f} mm/s."
+    if abs(speed) < SPOT:
+        minute = 60 / FULL * abs(rate)
+        return f"Turns on the spot to the {_way(row)} at {abs(rate):.2f} rad/s, {minute:.1f} turns a minute."
+    return (
+        f"Turns {'backward ' if speed < 0 else ''}to the {_way(row)}: a circle of {abs(radius):.0f} mm radius at "
+        f"{abs(speed):.0f} mm/s and {abs(rate):.2f} rad/s, one turn in {FULL / abs(rate):.1f} s."
+    )
+
+
+def _notes(robot: Robot, row: Mapping[str, Any]) -> list[str]:
+    notes = []
+    own = float(robot.configurations[str(row["configuration"])].turning.width) / MM
+    width = float(row["effective_width_mm"])
+    if math.isfinite(width):
+        notes.append(
+            f"effective track width {width:.0f} mm, {width / own:.2f} times the {own:.0f} mm between the sides: the "
+            "difference of the sides' speeds that a turn takes, over what it would take without sliding"
+        )
+    for side in SIDES:
+        power, current = float(row[f"power_{side}_W"]), float(row[f"motor_current_{side}_A"])
+        turning = float(row[f"motor_speed_{side}_rpm"])
+        if abs(turning) < STANDS:
+            notes.append(f"the {side} motor stands at {abs(current):.2f} A")
+        elif turning * current < 0:
+            back = f", {-power:.1f} W go back to the supply" if power < 0 else ""
+            notes.append(f"the {side} motor is driven by the turn: {abs(current):.2f} A brake it{back}")
+    if float(row["power_supply_W"]) < 0:
+        notes.append("the supply has to take power back")
+    return notes

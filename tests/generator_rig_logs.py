@@ -1,0 +1,409 @@
+"""Logs over time of random rigs with undeclared effects: one drive and a load on a shaft, from plain NumPy physics.
+
+The voltage, the current or the speed of the motor is imposed; four runs of 200 rows. Shares nothing with mmrjax. Many
+perturbed rigs go through the classical Runge-Kutta method at once, with steps of the winding's time constant.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+IMPOSED = ("voltage", "motor_current", "motor_speed")
+RUNS, ROWS = 4, 200
+STEP = 2.5e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
+RPM = np.pi / 30
+REST = 0.01  # of the output, within which friction is smoothed [rad/s]
+RELATIVE = {
+    "resistance": 0.05, "torque_constant": 0.03, "friction": 0.3, "viscous": 0.3, "efficiency": 0.04,
+    "rotor": 0.1, "inertia": 0.2, "dry": 0.3, "damping": 0.3,
+}  # fmt: skip
+#: Names of the constants in the rig's file.
+PUBLIC = {
+    "resistance": "motor.resistance", "torque_constant": "motor.torque_constant", "friction": "motor.friction_coulomb",
+    "viscous": "motor.friction_viscous", "rotor": "motor.inertia", "efficiency": "gearbox.efficiency_load",
+    "inertia": "bench.inertia", "dry": "bench.loss_coulomb", "damping": "bench.loss_viscous",
+}  # fmt: skip
+#: Column, SI value of its unit, and noise of a channel as a share of its rms.
+CHANNELS = {
+    "total_current": ("total_current_A", 1.0, 0.02),
+    "motor_speed": ("motor_speed_rpm", RPM, 0.01),
+    "output_angle": ("output_angle_deg", np.pi / 180, 0.003),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Law:
+    """One effect: balance, term per unit of amplitude, ordinary size, on which rigs, shapes to draw from."""
+
+    balance: str
+    of: Callable[[SimpleNamespace, Mapping[str, float]], Any]
+    size: Callable[[SimpleNamespace], float]
+    cls: str = ""
+    imposed: tuple[str, ...] = IMPOSED
+    shapes: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+
+_PHASE = {"phase": (-3.0, 3.0)}
+LIBRARY: dict[str, Law] = {
+    "series_resistance": Law("electrical", lambda s, q: s.I, lambda r: 0.15 * r.resistance, "series_resistance", ("voltage",)),
+    "torque_constant_saturation": Law("motor", lambda s, q: s.C * s.I**3, lambda r: 0.15 / r.rated**2, "torque_constant_saturation"),
+    "gear_quadratic_loss": Law("gearbox", lambda s, q: s.B**2 * s.sign, lambda r: 0.1 / r.torque, "gear_quadratic_loss"),
+    "churning": Law("track", lambda s, q: s.w_k**2 * s.sign, lambda r: 0.1 * r.torque / r.w_k**2, "churning"),
+    "stribeck_track": Law("track", lambda s, q: np.exp(-abs(s.w_k) / (q["fade"] * s.fast)) * s.sign, lambda r: 0.1 * r.torque, "stribeck_track", shapes={"fade": (0.1, 0.3)}),
+    "directional_friction": Law("track", lambda s, q: s.sign**2, lambda r: 0.07 * r.torque, "directional_friction"),
+    "directional_viscous": Law("track", lambda s, q: s.w_k * s.sign, lambda r: 0.07 * r.torque / r.w_k, "directional_viscous"),
+    "presliding": Law("track", lambda s, q: s.z - s.sign, lambda r: 0.1 * r.torque, "presliding"),
+    "angle_friction": Law("track", lambda s, q: np.sin(s.theta + q["phase"]) * s.sign, lambda r: 0.07 * r.torque, "angle_friction", shapes=_PHASE),
+}  # fmt: skip
+OUTSIDE: dict[str, Law] = {
+    # a bent shaft, a seal that lets go at a speed, grease that warms with the way travelled, cable drag by the angle
+    "order_two": Law("track", lambda s, q: np.sin(2 * s.theta + q["phase"]), lambda r: 0.07 * r.torque, shapes=_PHASE),
+    "friction_step": Law("track", lambda s, q: 0.5 * (1 + np.tanh((abs(s.w_k) / s.fast - q["at"]) / 0.03)) * s.sign, lambda r: 0.1 * r.torque, shapes={"at": (0.3, 0.6)}),
+    "warming": Law("track", lambda s, q: np.exp(-s.time / 0.5) * s.sign, lambda r: 0.1 * r.torque),
+    "supply_recovery": Law("electrical", lambda s, q: np.exp(-s.time / 0.3) * np.sign(s.I), lambda r: 0.05 * r.supply, imposed=("voltage",)),
+}  # fmt: skip
+LAWS = {**LIBRARY, **OUTSIDE}
+#: Turn over which the contacts of `presliding` yield [rad], the library's own.
+YIELDS = 0.02
+Term = tuple[Law, float, Mapping[str, float]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Rig:
+    """A rig with its truth, what its file states, and what is imposed.
+
+    Attributes:
+        p: true constants [SI]; stated: those of the file; ratio, supply [V], rated [A], torque [N·m], w_k [rad/s]: sizes.
+        every: sampling step [s]; inputs: of each run at each row [SI], shape (runs, rows); delay: of the readings [s].
+        sd: of each channel [unit of the column].
+    """
+
+    imposed: str
+    p: dict[str, float]
+    stated: dict[str, float]
+    ratio: float
+    supply: float
+    rated: float
+    torque: float
+    w_k: float
+    every: float
+    inputs: np.ndarray
+    delay: float
+    sd: dict[str, float]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        own = {"voltage": ("total_current", "motor_speed"), "motor_current": ("motor_speed", "output_angle")}
+        return own.get(self.imposed, ("total_current",))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Constants that act."""
+        electric = ("resistance",) if self.imposed == "voltage" else ()
+        return tuple(n for n in RELATIVE if n != "resistance" or n in electric)
+
+    @property
+    def scale(self) -> SimpleNamespace:
+        return SimpleNamespace(rated=self.rated, torque=self.torque, w_k=self.w_k, supply=self.supply, **self.p)
+
+
+def rig(rng: np.random.Generator, imposed: str) -> Rig:
+    """A random rig; its readings' noise is set by what they show without effects."""
+    supply, fast = float(rng.choice([6.0, 12.0, 24.0, 48.0])), rng.uniform(300.0, 800.0)
+    stall, ratio = (
+        np.exp(rng.uniform(np.log(3), np.log(30))),
+        float(np.round(np.exp(rng.uniform(np.log(15), np.log(60))))),
+    )
+    C, R, eta = supply / fast, supply / stall, rng.uniform(0.7, 0.92)
+    rated = 0.3 * stall
+    torque, w_k = ratio * eta * C * rated, fast / ratio
+    whole = rng.uniform(0.1, 0.3) * ratio**2 * C**2 / R  # inertia at the output by the mechanical time constant
+    share = rng.uniform(0.3, 0.7)
+    slow = imposed != "voltage"
+    p = {
+        "resistance": R, "torque_constant": C, "friction": C * stall * rng.uniform(0.005, 0.02),
+        "viscous": C * stall * rng.uniform(0.003, 0.015) / fast, "efficiency": eta, "rotor": share * whole / ratio**2,
+        "inertia": (1 - share) * whole, "dry": torque * rng.uniform(0.1, 0.3),
+        "damping": torque * rng.uniform(*((0.5, 1.0) if slow else (0.1, 0.3))) / w_k,
+    }  # fmt: skip
+    stated = {n: float(f"{x * np.exp(RELATIVE[n] * rng.standard_normal()):.4g}") for n, x in p.items()}
+    stated["efficiency"] = min(stated["efficiency"], 0.97)
+    every = float(rng.choice([0.005, 0.01, 0.02]))
+    inputs = np.stack([_inputs(rng, imposed, every, supply, rated, fast) for _ in range(RUNS)])
+    late = float(rng.choice([0.0, rng.uniform(0.0, 2.0)]))
+    # The current of an imposed speed jumps from row to row with its slope: late by whole rows it is not read in between.
+    delay = every * (round(late) if imposed == "motor_speed" else late)
+    made = Rig(imposed, p, stated, ratio, supply, rated, torque, w_k, every, inputs, delay, {})
+    shown = histories(made, [p])[0]
+    sd = {n: float(f"{CHANNELS[n][2] * np.sqrt(np.mean(shown[n] ** 2)):.2g}") for n in made.channels}
+    return dataclasses.replace(made, sd=sd)
+
+
+def _inputs(rng, imposed, every, supply, rated, fast) -> np.ndarray:
+    """What is imposed at each row of a run: stairs both ways, of a speed sums of waves from rest."""
+    t = np.arange(ROWS) * every
+    if imposed == "motor_speed":
+        waves = sum(
+            rng.uniform(0.2, 1.0) * np.sin(k * 2 * np.pi * t / t[-1] * rng.uniform(0.8, 1.2)) for k in (1, 2, 4)
+        )
+        return np.round(rng.uniform(0.5, 0.9) * fast * waves / np.abs(waves).max(), 4)
+    size = supply if imposed == "voltage" else 1.2 * rated
+    levels = rng.uniform(0.35, 1.0, 8) * np.where(rng.random(8) < 0.5, -1, 1) * size
+    at = np.sort(rng.choice(np.arange(10, ROWS - 5), 7, replace=False))
+    return np.round(levels[np.searchsorted(at, np.arange(ROWS), side="right")], 4)
+
+
+def histories(r: Rig, members: Sequence[Mapping[str, float]], terms: Sequence[Sequence[Term]] | None = None):
+    """Readings of each channel for each member, a dictionary each of shape (runs, rows) [units of the columns].
+
+    Args:
+        members: constants of each; terms: of each.
+    """
+    count, per = len(members), round(r.every / STEP)
+    p = {n: np.repeat([m[n] for m in members], RUNS) for n in r.p}
+    inputs = np.tile(r.inputs, (count, 1))
+    laws: list[tuple[Law, np.ndarray, Mapping[str, float]]] = []
+    for k, own in enumerate(terms or [()] * count):
+        laws += [(law, np.where(np.arange(count * RUNS) // RUNS == k, a, 0.0), q) for law, a, q in own]
+    J_w, J_d, C, R, i = p["inertia"], p["rotor"], p["torque_constant"], p["resistance"], r.ratio
+
+    def signals(time, y, given, slope):
+        s = SimpleNamespace(time=time, C=C, fast=r.w_k, I=y[0], w=y[1], theta=y[2], z=y[3])
+        if r.imposed == "motor_speed":
+            s.w = given
+        s.w_k = s.w / i
+        x = np.clip(s.w_k / REST, -1, 1)
+        s.sign = 0.5 * x * (3 - x * x)
+
+        def extra(balance):
+            return sum((a * law.of(s, q) for law, a, q in laws if law.balance == balance), 0.0)
+
+        load = p["dry"] * s.sign + p["damping"] * s.w_k + extra("track")
+        s.B = load
+        s.B = load + extra("gearbox")
+        idle = p["friction"] * s.sign + p["viscous"] * s.w
+        if r.imposed == "motor_speed":
+            turn = slope / i
+            for _ in range(6):  # the current by which the motors accelerate so
+                A = C * s.I - idle - extra("motor")
+                eta = _efficiency(A * J_w + i * J_d * s.B, s.sign, p["efficiency"])
+                s.I = ((turn * (J_w + J_d * i**2 * eta) + s.B) / (i * eta) + idle + extra("motor")) / C
+            s.turn = turn
+        else:
+            A = C * s.I - idle - extra("motor")
+            eta = _efficiency(A * J_w + i * J_d * s.B, s.sign, p["efficiency"])
+            s.turn = (i * eta * A - s.B) / (J_w + J_d * i**2 * eta)
+        if r.imposed == "voltage":
+            s.dI = (given - C * s.w - R * s.I - extra("electrical")) / (2e-4 * R)
+        else:
+            s.dI = (given - s.I) / 2e-4
+        return s
+
+    def rates(time, y, given, slope):
+        s = signals(time, y, given, slope)
+        z = (s.w_k - s.w_k * s.sign * s.z) / YIELDS
+        if r.imposed == "motor_speed":
+            return np.stack([0 * s.w, 0 * s.w, s.w_k, z])
+        return np.stack([s.dI, i * s.turn, s.w_k, z])
+
+    y = np.zeros((4, count * RUNS))
+    lines = r.imposed == "motor_speed"
+    h, late = r.every / per, round(r.delay / (r.every / per))
+    wanted = {max(row * per - late, 0) for row in range(ROWS)}
+    kept: dict[int, list[np.ndarray]] = {}
+    for row in range(ROWS):
+        now = inputs[:, row]
+        slope = (inputs[:, min(row + 1, ROWS - 1)] - now) / r.every if lines else 0.0
+        for n in range(per):
+            t, given = (row + n / per) * r.every, [now + slope * (n + x) * h for x in (0.0, 0.5, 1.0)]
+            if row * per + n in wanted:
+                s = signals(t, y, given[0], slope) if lines else SimpleNamespace(I=y[0], w=y[1])
+                kept[row * per + n] = [s.I, s.w, y[2]]
+            a = rates(t, y, given[0], slope)
+            b = rates(t + h / 2, y + h / 2 * a, given[1], slope)
+            d = rates(t + h / 2, y + h / 2 * b, given[1], slope)
+            e = rates(t + h, y + h * d, given[2], slope)
+            y = y + h / 6 * (a + 2 * b + 2 * d + e)
+    rows = np.array([kept[max(row * per - late, 0)] for row in range(ROWS)])  # (rows, 3, columns)
+    shown = np.moveaxis(rows, 0, -1).reshape(3, count, RUNS, ROWS)
+    order = {"total_current": 0, "motor_speed": 1, "output_angle": 2}
+    return [{n: shown[order[n], k] / CHANNELS[n][1] for n in r.channels} for k in range(count)]
+
+
+def _efficiency(flow, sign, eta):
+    return 1 + np.abs(sign) * (np.where(flow * sign >= 0, eta, 1 / eta) - 1)
+
+
+def whitened(r: Rig, shown: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Readings over their sds, shape (runs, readings)."""
+    return np.concatenate([shown[n] / r.sd[n] for n in r.channels], -1)
+
+
+def moved(p: Mapping[str, float], name: str, z: float) -> dict[str, float]:
+    """Constants with one so many sds of its tolerance larger."""
+    return {**p, name: p[name] * float(np.exp(RELATIVE[name] * z))}
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A rig, its log and its label."""
+
+    rig: Rig
+    measured: np.ndarray  # whitened, shape (runs, readings)
+    table: dict[str, np.ndarray]
+    label: dict[str, Any]
+
+    def write(self, folder: Path) -> None:
+        """`rig.toml`, `table.csv` and `label.json`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "rig.toml").write_text(toml(self.rig), encoding="utf-8")
+        with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
+            out = csv.writer(file)
+            out.writerow(self.table)
+            out.writerows(zip(*self.table.values(), strict=True))
+        (folder / "label.json").write_text(json.dumps(self.label, indent=1), encoding="utf-8")
+
+
+def slopes(r: Rig, p: Mapping[str, float], terms: Sequence[Term], also: Sequence[Sequence[Term]] = ()):
+    """Whitened readings, their change by one sd of each constant and by each of `also`'s further terms; each of shape
+    (runs, readings)."""
+    members = [p, *(moved(p, n, 1e-2) for n in r.names), *[p] * len(also)]
+    every = [
+        whitened(r, x) for x in histories(r, members, [terms] * (1 + len(r.names)) + [(*terms, *x) for x in also])
+    ]
+    n = len(r.names)
+    return every[0], [(x - every[0]) / 1e-2 for x in every[1 : 1 + n]], [x - every[0] for x in every[1 + n :]]
+
+
+def case(r: Rig, name: str, sigmas: float, seed: int) -> Case:
+    """A case; `name` empty is a clean one. Effects are sized so that a refit of the constants leaves `sigmas`."""
+    rng = np.random.default_rng([98, seed])
+    terms: tuple[Term, ...] = ()
+    effects = []
+    if name:
+        law = LAWS[name]
+        shapes = {k: float(rng.uniform(*b)) for k, b in law.shapes.items()}
+        amplitude = 0.05 * law.size(r.scale)
+        y, base, (change,) = slopes(r, r.p, (), [[(law, amplitude, shapes)]])
+        columns = np.stack([b.ravel() for b in base], 1)
+        left = _left(change.ravel(), columns)
+        for _ in range(4):  # what is left does not quite grow as the amplitude
+            amplitude *= float(np.clip(sigmas / max(left, 1e-9), 0.1, 30.0))
+            change = whitened(r, histories(r, [r.p], [[(law, amplitude, shapes)]])[0]) - y
+            left = _left(np.nan_to_num(change, nan=1e3).ravel(), columns)
+        terms = ((law, amplitude, shapes),)
+        effects.append({
+            "name": name, "class": law.cls, "balance": law.balance, "channel": "", "amplitude": amplitude,
+            "sizes": amplitude / law.size(r.scale), "shapes": shapes, "sigmas": left,
+        })  # fmt: skip
+    shown = histories(r, [r.p], [terms])[0]
+    measured = {n: x + r.sd[n] * rng.standard_normal(x.shape) for n, x in shown.items()}
+    column = {"voltage": "supply_voltage_V", "motor_current": "motor_current_A", "motor_speed": "motor_speed_rpm"}
+    t = np.round(np.arange(ROWS) * r.every, 6)
+    table: dict[str, np.ndarray] = {
+        "run_id": np.repeat([f"run{k}" for k in range(RUNS)], ROWS),
+        "time_s": np.tile(t, RUNS),
+        column[r.imposed]: (r.inputs / (RPM if r.imposed == "motor_speed" else 1.0)).ravel(),
+    }
+    for n in r.channels:
+        head, _, unit = CHANNELS[n][0].rpartition("_")
+        table[CHANNELS[n][0]] = np.array([float(f"{x:.9g}") for x in measured[n].ravel()])
+        table[f"{head}_sd_{unit}"] = np.full(RUNS * ROWS, r.sd[n])
+    label = {
+        "kind": "clean" if not name else "library" if LAWS[name].cls else "outside", "seed": seed, "imposed": r.imposed,
+        "every": r.every, "delay": r.delay, "effects": effects, "constants": r.p,
+        "finite": bool(all(np.isfinite(x).all() for x in shown.values())),
+    }  # fmt: skip
+    return Case(r, whitened(r, measured), table, label)
+
+
+def _left(change: np.ndarray, columns: np.ndarray) -> float:
+    wide = np.concatenate([columns, np.eye(columns.shape[1])])
+    long = np.concatenate([change, np.zeros(columns.shape[1])])
+    return float(np.linalg.norm(long - wide @ np.linalg.lstsq(wide, long, rcond=None)[0]))
+
+
+def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
+    """Rms of the whitened error of runs held out, one after the other, by least squares of one's own without and with
+    the true term, which then is one more unknown: Levenberg and Marquardt from what the file states, whose tolerances
+    are priors. The delay is known to it. All fits go through the simulation together.
+    """
+    r, effect = c.rig, c.label["effects"]
+    law, shapes = (LAWS[effect[0]["name"]], effect[0]["shapes"]) if effect else (None, {})
+    unit = 0.1 * law.size(r.scale) if law is not None else 0.0
+    count = len(r.names)
+    jobs = [(out, with_term) for with_term in ((False, True) if law is not None else (False,)) for out in range(RUNS)]
+
+    def constants(at: np.ndarray) -> dict[str, float]:
+        p = dict(r.stated)
+        for name, x in zip(r.names, at, strict=True):
+            p = moved(p, name, x)
+        return {**p, "efficiency": min(p["efficiency"], 1.0)}
+
+    def terms(size: float, with_term: bool) -> tuple[Term, ...]:
+        return ((law, unit * size, shapes),) if with_term and law is not None else ()
+
+    # Of each fit: unknowns (constants in their sds, the term in a tenth of its size), the best of them with what is left
+    # there, its derivatives and its error held out, and the damping.
+    at = {job: np.zeros(count + job[1]) for job in jobs}
+    best: dict[tuple[int, bool], tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
+    damping = dict.fromkeys(jobs, 1e-3)
+    for _ in range(steps):
+        members: list[Mapping[str, float]] = []
+        theirs: list[Sequence[Term]] = []
+        for job in jobs:
+            x = at[job]
+            size = x[count] if job[1] else 0.0
+            p, have = constants(x[:count]), terms(size, job[1])
+            members += [p, *(moved(p, n, 1e-2) for n in r.names), *[p] * job[1]]
+            theirs += [have] * (1 + count) + [terms(size + 1.0, True)] * job[1]
+        shown = [whitened(r, x) for x in histories(r, members, theirs)]
+        for job in jobs:
+            own, shown = shown[: 1 + count + job[1]], shown[1 + count + job[1] :]
+            x, inside = at[job], np.arange(RUNS) != job[0]
+            off = c.measured - own[0]
+            prior = np.eye(len(x))[:count]
+            left = np.concatenate([off[inside].ravel(), -x[:count]])
+            cost = float(left @ left) if np.isfinite(left).all() else np.inf
+            if job not in best or cost < best[job][0]:
+                slope = [(y - own[0])[inside].ravel() for y in own[1:]]
+                columns = np.stack([*(1e2 * y for y in slope[:count]), *slope[count:]], 1)
+                best[job] = cost, x, left, np.concatenate([columns, prior]), off[job[0]]
+                damping[job] *= 0.2
+            else:
+                damping[job] *= 10.0
+            _, x, left, columns, _ = best[job]
+            normal = columns.T @ columns
+            move = np.linalg.solve(normal + damping[job] * np.diag(np.diag(normal)), columns.T @ left)
+            at[job] = x + np.clip(move, -3, 3)
+    found = [
+        float(np.sqrt(np.mean(np.concatenate([best[j][4] for j in jobs if j[1] == with_term]) ** 2)))
+        for with_term in dict.fromkeys(j[1] for j in jobs)
+    ]
+    return found[0], found[-1]
+
+
+def toml(r: Rig) -> str:
+    """The rig's file as its owner writes it."""
+    tables: dict[str, list[str]] = {"motor": [], "gearbox": [f'ratio = "{r.ratio} ± 0"'], "bench": ['load = "shaft"']}
+    for name in RELATIVE:
+        if name == "resistance" and r.imposed != "voltage":
+            continue
+        table, _, key = PUBLIC[name].partition(".")
+        tables[table].append(f'{key} = "{r.stated[name]!r} ± {100 * RELATIVE[name]:g} %"')
+    start = "measured" if r.imposed == "motor_speed" else "rest"
+    lines = [
+        'schema = "mmrjax.robot/2"', 'base = "none"', f'imposed = "{r.imposed}"', f'start = "{start}"',
+        "channels = [" + ", ".join(f'"{n}"' for n in r.channels) + "]",
+    ]  # fmt: skip
+    for head, rows in tables.items():
+        lines += ["", f"[{head}]", *rows]
+    return "\n".join(lines) + "\n"

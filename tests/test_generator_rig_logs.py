@@ -1,0 +1,104 @@
+"""The generator of rigs' logs against the simulator's histories, and its labels."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import generator_rig_logs as gl
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.inference import noise, observers
+from mmrjax import params
+from mmrjax.effects import BY_NAME
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
+
+import rig_logs
+
+#: Of the sds of the readings, rms: both methods' own errors, and the windings', of which the file says nothing.
+ERROR = 0.3
+
+
+def shown(tmp_path, case, **amplitudes):
+    """Readings of the simulator with the truth of a case, in sds as the generator's, shape (runs, readings)."""
+    case.write(tmp_path)
+    robot = robot_file.read(tmp_path / "rig.toml")
+    runs = records.read(tmp_path / "table.csv", robot=robot)
+    truth = {gl.PUBLIC[n]: x for n, x in case.rig.p.items() if n in case.rig.names} | {"rig.delay": case.rig.delay}
+    if amplitudes:
+        robot = dataclasses.replace(robot, effects=tuple(BY_NAME[n]() for n in amplitudes))
+        for name in amplitudes:
+            shapes = case.label["effects"][0]["shapes"]
+            fade = {"speed_fade": shapes["fade"] * case.rig.w_k} if "fade" in shapes else shapes
+            truth |= {f"effects.{name}.{k}": x for k, x in fade.items()}
+            truth[f"effects.{name}.amplitude"] = amplitudes[name]
+    kind = observers.kind(runs)
+    robot = kind.with_initial_states(robot, runs, noise.of(runs, kind.sizes(runs)))
+    robot = params.replace(robot, {n: jnp.asarray(float(x)) for n, x in truth.items()})
+    made = kind.of(runs, robot)
+    reading = np.asarray(made(robot).reading) / [c.factor for c in robot.channels]
+    order = [[c.name for c in robot.channels].index(n) for n in case.rig.channels]
+    by_run = reading[:, order].T.reshape(len(order), gl.RUNS, gl.ROWS)
+    return np.concatenate([x / case.rig.sd[n] for n, x in zip(case.rig.channels, by_run, strict=True)], -1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("imposed", gl.IMPOSED)
+@pytest.mark.parametrize("name", ["", *gl.LIBRARY])
+def test_a_log_is_that_of_the_simulator_with_the_same_truth(tmp_path, imposed, name):
+    if name and imposed not in gl.LIBRARY[name].imposed:
+        pytest.skip("nothing shows it there")
+    case = gl.case(gl.rig(np.random.default_rng([3, gl.IMPOSED.index(imposed)]), imposed), name, 10.0, 1)
+    assert case.label["finite"]
+    sizes = {e["name"]: e["amplitude"] for e in case.label["effects"]}
+    ours = shown(tmp_path, case, **sizes)
+    clean = gl.whitened(case.rig, gl.histories(case.rig, [case.rig.p], [_terms(case)])[0])
+    assert np.sqrt(np.mean((ours - clean) ** 2)) < ERROR
+
+
+def _terms(case):
+    return tuple((gl.LAWS[e["name"]], e["amplitude"], e["shapes"]) for e in case.label["effects"])
+
+
+def test_a_log_is_reproducible_and_its_effect_has_its_strength():
+    rig = gl.rig(np.random.default_rng(7), "voltage")
+    one, two = (gl.case(rig, "series_resistance", 9.0, 4) for _ in range(2))
+    assert all((one.table[n] == two.table[n]).all() for n in one.table)
+    assert one.label["effects"][0]["class"] == "series_resistance" and len(one.table["time_s"]) == gl.RUNS * gl.ROWS
+    y, base, (change,) = gl.slopes(rig, rig.p, (), [_terms(one)])
+    assert gl._left(change.ravel(), np.stack([b.ravel() for b in base], 1)) == pytest.approx(9.0, rel=0.1)
+    assert np.sqrt(np.mean((one.measured - y - change) ** 2)) == pytest.approx(1.0, abs=0.05)
+
+
+def line(kind, seed, verdict="none", classes=(), **more):
+    held = {"refit": 1.2, "found": 1.05, "own": 1.3, "own_with_term": 1.0}
+    truth = [] if kind == "clean" else [{"name": "churning", "class": "churning", "balance": "track", "sigmas": 9.0}]
+    made = {"imposed": gl.IMPOSED[seed % 3], "every": 0.01, "delay": 0.0}
+    return {"kind": kind, "seed": seed, "verdict": verdict, "classes": [list(c) for c in classes], "where": None,
+            "truth": truth, "made": made, "seconds": 60.0, "read_again": True, "held_out": held, "written": True,
+            "delay": [0.0001, 0.0001], **more}  # fmt: skip
+
+
+def test_a_campaign_says_what_its_logs_came_to():
+    lines = [
+        line("clean", 0), line("library", 1, "named", [("churning",)]), line("library", 2, "unnamed"),
+        line("outside", 3, "named", [("churning",)], held_out={"refit": 1.0, "found": 1.2, "own": 1.0, "own_with_term": 1.0}),
+    ]  # fmt: skip
+    said = "\n".join(rig_logs.summary(lines))
+    assert "churning: right 1 of 2; {'unnamed': 1}" in said
+    shares = {text[:60].strip(): text[76:].split("%")[0].strip() for text in said.split("\n") if "%  [" in text}
+    assert shares["clean: a false finding (goal <= 5 %)"] == "0.0"
+    assert shares["outside: a wrong established name (goal <= 3 %)"] == "100.0"
+    assert [v for k, v in shares.items() if k.startswith("held out")] == ["75.0", "75.0"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", rig_logs.KINDS)
+def test_cases_are_of_their_kind(kind):
+    for seed in range(3):
+        case = rig_logs.attempt(kind, seed)
+        assert isinstance(case, str) or case.label["kind"] == kind

@@ -1,0 +1,139 @@
+"""The command `simulate` of a robot whose sides are driven apart."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from calibration.data import runs as records
+from calibration.data.errors import BadData
+from sweeps.pages import turn_words
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.slow
+def test_settled_turn_leaves_its_folder(tmp_path, mmrjax):
+    code, out, _ = mmrjax("simulate", "--left", "33", "--right", "15", "--out", str(tmp_path / "run"))
+    assert code == 0
+    assert "Turns to the right: a circle of 439 mm radius" in out
+    folder = tmp_path / "run"
+    (row,) = rows(folder / "runs.csv")
+    result = json.loads((folder / "result.json").read_text())
+    assert result["turn"]["turning_radius_mm"] == pytest.approx(float(row["turning_radius_mm"]))
+    left, right = (float(row[f"motor_voltage_{side}_V"]) for side in ("left", "right"))
+    assert (left, right) == (pytest.approx(33.0), pytest.approx(15.0))
+    power = sum(float(row[f"power_{side}_W"]) for side in ("left", "right"))
+    assert power == pytest.approx(float(row["power_supply_W"]))
+    turns = rows(folder / "turns.csv")
+    rates = np.array([float(t["yaw_rate_rad_s"]) for t in turns[1:]])
+    assert abs(rates[0]) < 1e-9 and (np.diff(np.abs(rates)) > 0).all()
+    assert "439 mm radius" in (folder / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_turn_over_time_leaves_its_path(tmp_path, mmrjax):
+    told = (
+        "--left",
+        "24",
+        "--right",
+        "-24",
+        "--slope",
+        "10",
+        "--heading",
+        "30",
+        "--model",
+        "drive",
+        "--duration",
+        "1",
+    )
+    assert mmrjax("simulate", *told, "--out", str(tmp_path / "run"))[0] == 0
+    first, *_, last = rows(tmp_path / "run" / "history.csv")
+    assert float(first["yaw_deg"]) == pytest.approx(30.0)
+    assert float(last["yaw_deg"]) < -60.0
+    assert float(last["x_mm"]) < 0  # it slips downhill
+    assert "yaw_rate_rad_s" in first and "motor_current_left_A" in first
+
+
+REFUSED = {
+    "one side": (("--left", "33"), "left_V acts with right_V only"),
+    "volts and duties": (
+        ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
+        "without duty_left",
+    ),
+    "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state duty_left and duty_right"),
+    "track": (("--left", "3", "--right", "1", "--model", "track"), "without model track"),
+    "profile": (("--left", "3", "--right", "1", "--profile", "patrol"), "without profile"),
+    "supply too low": (("--left", "33", "--right", "1", "--voltage", "20"), "expected at least 33 V"),
+    "slope": (("--left", "33", "--right", "1", "--slope", "5"), "its heading changes there all the time"),
+    "one motor": (("--left", "3", "--right", "1", "--robot", "ONE"), "expected sides = 2"),
+    "shaft": (("--left", "3", "--right", "1", "--robot", "SHAFT"), "the robot's load is a shaft"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+def test_bad_turns_are_refused_in_a_sentence(tmp_path, mmrjax, case):
+    told, sentence = REFUSED[case]
+    one = tmp_path / "one.toml"
+    one.write_text('base = "nominal"\nsides = 1\n')
+    shaft = tmp_path / "shaft.toml"
+    mmrjax("rig", "new", str(shaft), "--kind", "bench")
+    told = [{"ONE": str(one), "SHAFT": str(shaft)}.get(word, word) for word in told]
+    code, _, err = mmrjax("simulate", *told, "--out", str(tmp_path / "run"))
+    assert code == 2
+    assert sentence in " ".join(err.split())
+    assert not (tmp_path / "run").exists()
+
+
+HEADER = "configuration,supply_voltage_V,payload_kg,slope_deg,"
+
+
+def test_tables_take_the_duty_of_either_side(tmp_path):
+    path = tmp_path / "turns.csv"
+    path.write_text(f"{HEADER}duty_left,duty_right\n6T2A,33,0,0,1,-0.5\n")
+    runs = records.read(path, measured=False)
+    assert runs.turns
+    assert runs.axes[-2:] == ("duty_left", "duty_right")
+    path.write_text(f"{HEADER}duty_left\n6T2A,33,0,0,1\n")
+    with pytest.raises(BadData, match="column duty_right is missing beside duty_left"):
+        records.read(path, measured=False)
+    path.write_text(f"{HEADER}duty_left,duty_right,duty\n6T2A,33,0,0,1,1,1\n")
+    with pytest.raises(BadData, match="column duty beside duty_left"):
+        records.read(path, measured=False)
+
+
+def row(**changes):
+    sides = {f"{name}_{side}_{unit}": 1.0 for name, unit in (("motor_voltage", "V"), ("motor_current", "A"),
+                                                           ("motor_speed", "rpm")) for side in ("left", "right")}  # fmt: skip
+    usual = {
+        "configuration": "6T2A", "status": "converged", "yaw_rate_rad_s": 0.5, "turning_radius_mm": 400.0,
+        "speed_mm_s": 200.0, "effective_width_mm": 365.0, "power_left_W": 5.0, "power_right_W": 5.0,
+        "winding_left_C": 40.0, "winding_right_C": 40.0, "power_supply_W": 10.0,
+    }  # fmt: skip
+    return usual | sides | changes
+
+
+def test_turns_are_told_in_plain_words():
+    from mmrjax import robots
+
+    robot = robots.nominal()
+
+    def said(ended=None, **changes):
+        found = turn_words.turn(robot, row(**changes), ended)
+        return " ".join((found.answer, *found.notes))
+
+    assert "to the left: a circle of 400 mm radius" in said()
+    assert "on the spot to the right at 0.50 rad/s, 4.8 turns a minute" in said(yaw_rate_rad_s=-0.5, speed_mm_s=0.2)
+    assert "Straight at 200 mm/s" in said(turning_radius_mm=float("inf"), yaw_rate_rad_s=0.0)
+    assert "stalled" in said(status="stalled")
+    assert "the right motor stands at 1.00 A" in said(motor_speed_right_rpm=0.2)
+    back = said(motor_current_left_A=-0.4, motor_speed_left_rpm=900.0, power_left_W=-3.0)
+    assert "the left motor is driven by the turn: 0.40 A brake it, 3.0 W go back to the supply" in back
+    ended = {"time_s": 2.0, "displacement_m": 0.3, "turned_deg": -90.0}
+    assert said(ended, status="not_settled").startswith(
+        "After 2 s: 0.30 m from the start, turned by -90°. Not settled"
+    )

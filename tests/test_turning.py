@@ -1,0 +1,273 @@
+"""Robots whose sides are driven apart: against a second implementation in NumPy and SciPy, and closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from worlds import turning as world
+
+import mmrjax as mm
+from mmrjax import balances, energy, robots
+from mmrjax import turning as room
+from mmrjax.contact import Friction
+from mmrjax.fidelities import drive, turning
+from mmrjax.signals import STATUSES
+from mmrjax.turning import SIDES, Stance, pressure
+
+grip = jax.jit(room.grip)
+CONFIGURATIONS = ("6T2A", "4W2T")
+#: Duties of left and right: one side slower, one held, on the spot, one driven backward by the turn, slow.
+DUTIES = ((1.0, 0.5), (0.8, 0.0), (-1.0, 1.0), (0.3, -0.1), (0.25, 0.2))
+NAMES = ("motor_current_left", "motor_current_right", "motor_speed_left", "motor_speed_right", "yaw_rate")
+
+
+def of_world(robot, configuration, payload=0.0, **changes):
+    """The other implementation's robot, its stance that of ours."""
+    run = mm.Conditions(configuration, payload=payload).resolved(robot)
+    chassis = robot.configurations[configuration]
+    stands = balances.stance(robot, run, chassis, chassis.mass + payload)
+    own = {"height": float(stands.height), "inertia": float(chassis.turning.inertia)}
+    return world.paper_robot(wheeled=configuration == "4W2T", payload=payload, nodes=16, **(own | changes))
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return robots.nominal()
+
+
+@pytest.fixture(scope="module")
+def turns(robot):
+    """Settled turns at 33 V: as `DUTIES` say, mirrored, backward, and straight; of either configuration."""
+    left = [a for a, _ in DUTIES] + [b for _, b in DUTIES] + [-a for a, _ in DUTIES] + [0.7]
+    right = [b for _, b in DUTIES] + [a for a, _ in DUTIES] + [-b for _, b in DUTIES] + [0.7]
+    which = np.repeat(CONFIGURATIONS, len(left))
+    runs = mm.Conditions(which, voltage=33.0, duty_left=left * 2, duty_right=right * 2).resolved(robot)
+    _, motion, status = jax.jit(jax.vmap(lambda c: turning.circling(robot, c)))(runs)
+    return jax.device_get(motion), np.array(STATUSES)[np.asarray(status)]
+
+
+def of_configuration(turns, k):
+    motion, size = turns[0], 3 * len(DUTIES) + 1
+    readings = {
+        "motor_current_left": motion.current[:, 0], "motor_current_right": motion.current[:, 1],
+        "motor_speed_left": motion.speed_motor[:, 0], "motor_speed_right": motion.speed_motor[:, 1],
+        "yaw_rate": motion.yaw_rate, "speed": motion.speed, "lateral_speed": motion.speed_lateral,
+    }  # fmt: skip
+    return {name: x[k * size : (k + 1) * size] for name, x in readings.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [0, 1], ids=CONFIGURATIONS)
+def test_circling_is_that_of_a_second_implementation(robot, turns, k):
+    mine = of_configuration(turns, k)
+    other = of_world(robot, CONFIGURATIONS[k])
+    for n, (left, right) in enumerate(DUTIES):
+        found = world.circling(other, world.Inputs(left, right, kind="duty", supply=33.0))
+        expected = (*found.I, *found.w, found.omega, found.v_x, found.v_y)
+        got = [mine[name][n] for name in (*NAMES, "speed", "lateral_speed")]
+        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-9, err_msg=str((left, right)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [0, 1], ids=CONFIGURATIONS)
+def test_sides_swapped_mirror_and_both_reversed_reverse(turns, k):
+    mine, n = of_configuration(turns, k), len(DUTIES)
+    same, swapped, back = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
+    pairs = {"motor_current_left": "motor_current_right", "motor_speed_left": "motor_speed_right", "speed": "speed"}
+    for name, other in pairs.items():
+        np.testing.assert_allclose(mine[name][same], mine[other][swapped], rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(mine[name][same], -mine[name][back], rtol=1e-9, atol=1e-11)
+    for name in ("yaw_rate", "lateral_speed"):
+        np.testing.assert_allclose(mine[name][same], -mine[name][swapped], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(mine["yaw_rate"][same], -mine["yaw_rate"][back], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(mine["lateral_speed"][same], mine["lateral_speed"][back], rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.slow
+def test_sides_alike_travel_straight(robot, turns):
+    straight = mm.simulate(robot, mm.Conditions(list(CONFIGURATIONS), voltage=33.0, duty=0.7))
+    for name in ("motor_speed", "speed"):
+        mine = [of_configuration(turns, k)[name if name == "speed" else f"{name}_right"][-1] for k in (0, 1)]
+        np.testing.assert_allclose(mine, np.asarray(getattr(straight, name)), rtol=1e-9)
+    assert abs(of_configuration(turns, 0)["yaw_rate"][-1]) < 1e-12
+
+
+@pytest.mark.slow
+def test_every_turn_settles(turns):
+    assert set(turns[1]) == {"converged"}
+
+
+def flat(m):
+    y = jnp.concatenate([m.current, m.speed_motor, jnp.stack([jnp.asarray(getattr(m, n)) for n in PLANE])])
+    return y / jnp.asarray(turning._UNITS)
+
+
+PLANE = ("speed", "speed_lateral", "yaw_rate", "heading", "place_x", "place_y", "discharge")
+
+
+@pytest.mark.parametrize("configuration", CONFIGURATIONS)
+def test_energy_in_is_what_sinks_take_and_what_is_stored(robot, configuration):
+    run = mm.Conditions(
+        configuration, voltage=33.0, duty_left=0.9, duty_right=-0.2, slope_deg=12.0, heading_deg=40.0, payload=3.0
+    ).resolved(robot)
+    motion = turning.PlaneMotion(
+        *(jnp.asarray(x) for x in ([2.0, -0.7], [900.0, -150.0], 0.3, 0.05, -1.1, 0.7, 0.0, 0.0, 0.0))
+    )
+
+    def stored(m):
+        return energy.stored_turning(robot, balances.turning(robot, run, m), m)
+
+    @jax.jit
+    def powers(m):
+        rate = turning.motion_of(robot, turning.rates(robot, run, flat(m)))
+        # What is stored in shafts and windings changes with their rates; inductance and inertias do not.
+        _, change = jax.jvp(stored, (m,), (rate,))
+        travel = balances.turning(robot, run, m)
+        source = jnp.mean(jax.vmap(lambda c, s: energy.source(robot, c, s))(run.of_sides(), travel.signals))
+        return source, energy.sinks_turning(robot, run, travel), change
+
+    source, sinks, change = powers(motion)
+    assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
+    assert float(sinks["sliding"]) > 0
+
+
+@pytest.mark.parametrize("configuration", CONFIGURATIONS)
+def test_rates_are_those_of_a_second_implementation(robot, configuration):
+    other = of_world(robot, configuration, payload=3.0)
+    run = mm.Conditions(
+        configuration, voltage=24.0, duty_left=0.9, duty_right=-0.3, slope_deg=11.0, payload=3.0
+    ).resolved(robot)
+    inputs = world.Inputs(0.9, -0.3, kind="duty", slope=np.radians(11.0), supply=24.0)
+    law = jax.jit(lambda y: turning.rates(robot, run, y))
+    size, random = np.asarray(turning._UNITS), np.random.default_rng(5)
+    for _ in range(12):
+        y = random.normal(size=11) * np.array([0.2, 0.2, 0.8, 0.8, 0.4, 0.2, 0.15, 2.0, 1.0, 1.0, 0.0])
+        mine = np.asarray(law(jnp.asarray(y))) * size
+        place = [8, 9, 7, 4, 5, 6, 0, 1, 2, 3, 10]  # in the other's order
+        theirs = world.rates(other, inputs, 0.0, (y * size)[place])
+        np.testing.assert_allclose(mine[place][:10], theirs[:10], rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("configuration", CONFIGURATIONS)
+def test_settled_turns_of_a_second_implementation_are_settled(robot, configuration):
+    other = of_world(robot, configuration)
+    size = np.asarray(turning._UNITS)
+    law = jax.jit(
+        lambda left, right, y: turning.rates(
+            robot, mm.Conditions(CONFIGURATIONS.index(configuration), duty_left=left, duty_right=right), y
+        )
+    )
+    for left, right in DUTIES:
+        found = world.circling(other, world.Inputs(left, right, kind="duty", supply=33.0))
+        y = np.array([*found.I, *found.w, found.v_x, found.v_y, found.omega, 0, 0, 0, 0]) / size
+        assert np.abs(np.asarray(law(left, right, jnp.asarray(y)))[:7]).max() < 1e-5  # of some 1e4 /s that each is of
+
+
+@pytest.mark.slow
+def test_run_over_time_is_that_of_a_second_implementation(robot):
+    times = np.array([0.0, 0.05, 0.3, 0.8])
+    run = mm.Conditions(
+        ["6T2A"], voltage=24.0, duty_left=[1.0], duty_right=[0.4], slope_deg=8.0, heading_deg=60.0
+    ).resolved(robot)
+    mine = drive.drive_batch(robot, run, jnp.asarray(times), tolerance=1e-9)
+    inputs = world.Inputs(1.0, 0.4, kind="duty", slope=np.radians(8.0), supply=24.0)
+    begin = np.zeros(len(world.STATES))
+    begin[2] = np.radians(60.0)
+    other = world.simulate(of_world(robot, "6T2A"), inputs, times, begin)
+    signals = jax.tree.map(lambda x: np.asarray(x)[0], mine.signals)
+    expected = np.asarray(other.states)
+    for k, name in ((0, "place_x"), (1, "place_y"), (2, "heading"), (4, "speed_lateral"), (5, "yaw_rate")):
+        np.testing.assert_allclose(getattr(signals, name)[:, 0], expected[:, k], rtol=1e-6, atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(signals.current, expected[:, 6:8], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(signals.speed_motor, expected[:, 8:10], rtol=1e-6, atol=1e-4)
+
+
+def test_turning_numbers_are_those_of_the_paper(robot):
+    for name, (x, y) in {"6T2A": world.SURFACES["wood"][:2], "4W2T": world.SURFACES["wood"][2:]}.items():
+        own = robot.configurations[name].turning
+        assert float(own.lateral) == pytest.approx(y / x, rel=1e-12)
+        assert float(own.inertia) == world.INERTIA_YAW[name]
+        assert float(own.width) == world.WIDTH
+        run = mm.Conditions(name, payload=8.0).resolved(robot)
+        chassis = robot.configurations[name]
+        height = float(balances.stance(robot, run, chassis, chassis.mass + 8.0).height)
+        low, high = world.HEIGHT[name]
+        mass = float(chassis.mass)
+        assert height == pytest.approx((mass * low + 8 * high) / (mass + 8), abs=1e-3)
+
+
+def width_on_the_spot(wheeled, friction, lateral, speed, nodes=16):
+    """(r ω_k,right - r ω_k,left) / (ω B) at which no moment is left, the sides rolling at ± speed [m/s]."""
+    length, width, load = 0.3, 0.243, 100.0
+    stance = Stance(length, width, 0.0, 0.0, 0.0 if wheeled else 1.0, lateral, 1.0, nodes)
+
+    @jax.jit
+    def moment(rate):
+        sliding = speed * jnp.array([-1.0, 1.0]) + rate * width * SIDES
+        held = grip(stance, friction, 1.0, load, sliding, 0.0, rate, jnp.zeros(2))
+        return jnp.sum(held.moment - width * SIDES * held.ahead)
+
+    rate = brentq(lambda w: float(moment(w)), 1e-3 * speed / width, 2 * speed / width, xtol=1e-15)
+    return 2 * speed / rate / width
+
+
+@pytest.mark.parametrize(("wheeled", "share"), [(False, 1 / 3), (True, 1.0)], ids=["tracks", "wheels"])
+@pytest.mark.parametrize("lateral", [1.0, 1.1875])
+def test_spot_turn_in_creep_has_the_width_of_its_closed_form(wheeled, share, lateral):
+    friction = Friction(static=0.32, dynamic=0.25)
+    found = width_on_the_spot(wheeled, friction, lateral, 1e-6)
+    assert found == pytest.approx(1 + lateral * share * (0.3 / 0.243) ** 2, rel=1e-6)
+
+
+def test_spot_turn_under_coulomb_friction_has_the_width_of_its_closed_form():
+    coulomb = Friction(static=0.32, dynamic=0.32, speed_static=1e-7, speed_dynamic=1e-6)
+    assert width_on_the_spot(True, coulomb, 1.0, 1.0) == pytest.approx(1 + (0.3 / 0.243) ** 2, rel=1e-6)
+    a, b = 0.15, 0.1215
+    u = brentq(lambda u: (2 * b * u + u**2) * np.arcsinh(a / u) - a * np.hypot(a, u), 1e-3, 1.0)
+    assert 1 + u / b == pytest.approx(1.336, abs=5e-4)
+    # The nodes resolve an integrand with a pole 41 mm beside the line.
+    assert width_on_the_spot(False, coulomb, 1.0, 1.0, nodes=32) == pytest.approx(1 + u / b, rel=1e-6)
+    assert width_on_the_spot(False, coulomb, 1.0, 1.0) == pytest.approx(1 + u / b, rel=3e-5)
+
+
+@pytest.mark.parametrize(("wheeled", "share"), [(False, 1 / 4), (True, 1 / 2)], ids=["tracks", "wheels"])
+def test_lateral_sliding_has_the_moment_of_its_closed_form(wheeled, share):
+    coulomb = Friction(static=0.32, dynamic=0.32, speed_static=1e-9, speed_dynamic=1e-8)
+    stance = Stance(0.3, 0.243, 0.0, 0.0, 0.0 if wheeled else 1.0, 1.1875, 1.0, 1024)
+    held = grip(stance, coulomb, 1.0, 128.0, jnp.zeros(2), 0.0, 1.0, jnp.zeros(2))
+    assert -float(jnp.sum(held.moment)) == pytest.approx(0.38 * 128.0 * 0.3 * share, rel=1e-6)
+
+
+@pytest.mark.parametrize("rule", [1.0, 2.0])
+def test_friction_is_on_its_ellipse_and_takes_power(rule):
+    coulomb = Friction(static=0.3, dynamic=0.3, speed_static=1e-9, speed_dynamic=1e-8)
+    stance = Stance(1e-6, 1.0, 0.0, 0.0, 0.0, 1.4, rule)
+    for angle in np.linspace(0.0, 3.0, 7):
+        u, v = np.cos(angle), np.sin(angle)
+        held = grip(stance, coulomb, 1.0, 10.0, jnp.full(2, u), -v, 0.0, jnp.zeros(2))
+        ahead, aside = float(jnp.sum(held.ahead)), float(jnp.sum(held.aside))
+        assert (ahead / 3.0) ** 2 + (aside / 4.2) ** 2 == pytest.approx(1.0 if rule == 2 else u**2 + v**2, rel=1e-9)
+        assert ahead * u + aside * v > 0
+        assert float(jnp.sum(held.across)) == pytest.approx(aside * v, abs=1e-12)
+
+
+def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
+    stance = Stance(0.3, 0.243, 0.12, 0.01, 1.0, 1.2, 1.0)
+    friction, rolling = Friction(static=0.6, dynamic=0.5), jnp.array([0.05, 0.05])
+    held = jax.jit(lambda: grip(stance, friction, 1.0, 100.0, jnp.array([0.03, 0.05]), -0.05, 0.4, rolling))()
+    along = float(jnp.sum(held.ahead - rolling * held.normal))
+    assert float(held.moved) == pytest.approx(0.12 * float(jnp.sum(held.aside)) / 0.243, rel=1e-9)
+    assert float(held.centre) == pytest.approx(0.01 - 0.12 * along / 100.0, rel=1e-9)
+    assert float(held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.moved), rel=1e-9)
+
+
+@pytest.mark.parametrize("centre", [0.0, 0.03, -0.05, 0.08, -0.12])
+@pytest.mark.parametrize("on_tracks", [0.0, 1.0])
+def test_pressure_has_its_sum_and_its_centre(centre, on_tracks):
+    stance = Stance(0.3, 0.243, 0.0, 0.0, on_tracks, 1.0, 1.0)
+    place, share = pressure(stance, jnp.asarray(centre))
+    assert float(jnp.sum(share)) == pytest.approx(1.0, rel=1e-12)
+    assert float(jnp.sum(share * place)) == pytest.approx(centre, abs=1e-12)
+    assert float(jnp.min(share)) >= 0
+    assert float(jnp.max(jnp.abs(place))) <= 0.15 + 1e-12
