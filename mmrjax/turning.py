@@ -13,7 +13,6 @@ loads are those of a rigid robot in balance at every instant.
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -33,7 +32,6 @@ STILL = 1e-16
 LOAD_STEPS = 3
 
 
-@functools.cache
 def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places of nodes on -1..1 and their weights, Gauss and Legendre's; and the weights of two wheels at the ends,
     which have the first and the last of them."""
@@ -54,7 +52,7 @@ class Turning(eqx.Module):
         0.243,
         unit="m",
         meaning="distance B of the contact lines of left and right side",
-        bounds=(0.02, 5.0),
+        bounds=(0.0, 5.0),
         sd=0.012,
         source="middle of 208-278 mm, the widths between and over the tracks (Table 6: B_b, B_T)",
     )
@@ -78,7 +76,7 @@ class Turning(eqx.Module):
         0.2,
         unit="kg·m^2",
         meaning="moment of inertia in yaw J_ψ of the robot without payload",
-        bounds=(1e-5, 1e4),
+        bounds=(0.0, 1e4),
         relative_sd=0.2,
         source="sum of Table 7's parts in their places of Table 6",
     )

@@ -31,6 +31,7 @@ UNITS = {
     "mm_s": "mm/s", "m_s": "m/s", "A": "A", "mAh": "mAh", "V": "V", "W": "W", "Wh": "Wh", "J": "J", "N": "N",
     "Nm": "N·m", "kg": "kg", "rpm": "rpm", "deg": "deg", "C": "°C", "Hz": "Hz", "s": "s", "ms": "ms", "min": "min",
     "h": "h", "m": "m", "mm": "mm", "percent": "%", "EUR": "EUR", "mNm": "mN·m", "mV": "mV", "mA": "mA", "g": "g",
+    "rad_s": "rad/s",
 }  # fmt: skip
 #: An end that is a unit, the longest that fits.
 END = re.compile(rf"_({'|'.join(sorted(UNITS, key=len, reverse=True))})$")
@@ -45,6 +46,7 @@ MORE = {
     # conditions and options
     "time_s": "time since the run began; of a segment when it begins",
     "ambient_C": "ambient temperature",
+    "left_V": "at the left motor", "right_V": "at the right motor", "heading_deg": "from uphill, positive to the left",
     "discharge_mAh": "charge already taken from the battery",
     "voltages_V": "axis of supply_voltage_V", "payloads_kg": "axis of payload_kg",
     "slopes_deg": "axis of slope_deg", "motor_speeds_rpm": "axis of motor_speed_rpm",

@@ -638,11 +638,6 @@ CALLED: dict[tuple[str, str], str] = {
     ("loop_findings", "pose"): "further runs, read by fits that the loop made after its own preparation",
     ("calibrate", "pose"): "coverage about a known truth: problems without a table of their own",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
-    (
-        "05_your_rig",
-        "with_surface_configurations",
-    ): "an effect of the rig's size, shown by itself before it is calibrated as users do",
-    ("05_your_rig", "library_for"): "the same",
     ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }
 

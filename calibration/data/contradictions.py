@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -31,6 +33,8 @@ def check(runs: Runs, robot: Robot) -> None:
             angle that wraps or whose unit changes, or time that goes back now and then.
     """
     _mass(runs, robot)
+    if runs.turns and (why := cannot_turn(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
+        raise BadData(f"{runs.source}, duty_left, duty_right, heading_deg: {why}")
     if robot.rig.imposed == "motor_speed" and not runs.sampled:
         for column in (SUPPLY, "motor_voltage_V"):
             _voltage(runs, robot, column)
@@ -38,6 +42,24 @@ def check(runs: Runs, robot: Robot) -> None:
         _time(runs)
     if runs.sampled and runs.has("output_angle_deg"):
         _angle(runs)
+
+
+def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:
+    """Why a robot whose sides are driven apart cannot be computed in these configurations; None where it can."""
+    if not robot.has_ground:
+        return "the robot's load is a shaft, which does not turn over the ground"
+    if float(robot.sides) < 2:
+        return f"got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
+    if robot.rig.imposed == "motor_current":
+        return "the robot's file says that its motors' current is imposed, which says nothing of either side"
+    lacking = [
+        f"{name}.turning.{key} [{unit}]"
+        for name in names
+        if name in robot.configurations
+        for key, unit in (("width", "m"), ("inertia", "kg·m^2"))
+        if not float(getattr(robot.configurations[name].turning, key)) > 0
+    ]
+    return f"{', '.join(lacking)} missing in the robot's file, which a turn needs" if lacking else None
 
 
 def _mass(runs: Runs, robot: Robot) -> None:

@@ -59,6 +59,10 @@ VEHICLE: dict[str, tuple[float, str]] = {
     "track.guide_share": (0.0, "not stated: pulleys or wheels carry all of the weight"),
     "ground.friction.speed_static": (0.02, "not stated: assumed, a contact creeps up to this speed as it grips"),
     "ground.friction.speed_dynamic": (0.2, "not stated: assumed, ten times speed_static"),
+    "turning.width": (0.0, "not stated: only a robot that turns needs it"),
+    "turning.lateral": (1.0, "not stated: assumed, friction across the travel as along it"),
+    "turning.rule": (1.0, "not stated: assumed, friction against the sliding"),
+    "turning.inertia": (0.0, "not stated: only a robot that turns needs it"),
 }
 #: Those of VEHICLE that tracks have to state.
 _OF_TRACKS = ("track.loss_coulomb",)

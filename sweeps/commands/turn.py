@@ -11,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from calibration.data.columns import SIDES, SUPPLY
+from calibration.data.contradictions import cannot_turn
 from calibration.data.errors import BadConfiguration
 from mmrjax import channels, fidelities, outputs
 from mmrjax.channels import Channel
@@ -36,14 +37,14 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     """Simulate one run of options whose sides are driven apart; leave a run folder; returns the exit code.
 
     Raises:
-        BadConfiguration: runs of a file, a robot of one side, a turn without a steady state.
+        BadConfiguration: runs of a file, a robot that cannot turn, a turn without a steady state.
     """
     if isinstance(given, str):
         raise BadConfiguration("--runs: got a file beside --left, --right or --heading; state columns duty_left and "
                                "duty_right in it, or one run by options")  # fmt: skip
     file = load_robot(config)
     robot = file.robot
-    check(robot)
+    check(robot, given.get("configuration") or robot.configurations.names[0])
     runs = one_run(robot, {**given, **_cells(config, given)}, config.battery)
     settled = config.model == fidelities.NAMES[0]
     with open_folder("simulate", config, robot, out, force, runs) as folder:
@@ -86,18 +87,14 @@ def _ended(history: History | None) -> dict[str, float] | None:
     }
 
 
-def check(robot: Robot) -> None:
-    """Refuse a robot that cannot turn.
+def check(robot: Robot, named: str) -> None:
+    """Refuse a robot that cannot turn, in this configuration.
 
     Raises:
-        BadConfiguration: a load on a shaft, or one side.
+        BadConfiguration: why.
     """
-    if not robot.has_ground:
-        raise BadConfiguration("--left, --right: the robot's load is a shaft, which does not turn over the ground")
-    if float(robot.sides) < 2:
-        raise BadConfiguration(
-            f"--left, --right: got a robot of {float(robot.sides):g} side; expected sides = 2, one motor on each"
-        )
+    if why := cannot_turn(robot, (named,)):
+        raise BadConfiguration(f"--left, --right, --heading: {why}")
     if robot.rig.imposed != "voltage":
         raise BadConfiguration("--left, --right: the robot's file says that its motors are not driven by voltage")
 
