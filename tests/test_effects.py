@@ -57,15 +57,16 @@ SIGNAL_UNITS = {
     "C": "discharge",
     "kg": "mass payload",
     "N": "normal resistance gravity demand traction adhesion_limit",
-    "m/s": "speed speed_theoretical speed_slip_terms speed_sliding",
+    "m/s": "speed speed_theoretical speed_slip_terms speed_sliding speed_lateral",
+    "m": "place_x place_y",
     "m/s^2": "acceleration",
-    "1/s": "speed_motor speed_wheel speed_output",
+    "1/s": "speed_motor speed_wheel speed_output yaw_rate",
     "1/s^2": "acceleration_wheel",
     "N·m": "torque_electromagnetic torque_motor_loss torque_motor torque_track_loss torque_load torque_idle "
     "torque_input torque_gear torque_output torque_net",
     "H": "inductance",
     "kg·m^2": "inertia_added",
-    "rad": "angle",
+    "rad": "angle heading",
     "-": "duty on_tracks battery slope adhesion order direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}

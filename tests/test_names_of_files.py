@@ -19,9 +19,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import test_settle
 
 from calibration.data import columns
 from mmrjax import channels, derived, missions, outputs, requirements
+from mmrjax.derived import turn
 from mmrjax.fidelities.resonance import SIGNALS
 from sweeps import capabilities, cli, config
 from sweeps.points import export
@@ -87,6 +89,8 @@ def registries() -> dict[str, list[tuple[str, str]]]:
         found.setdefault(row.column, []).append((row.unit, row.label))
     for c in channels.EVERY:
         found.setdefault(c.sd_column, []).append((c.unit_shown, f"sd of a reading: {c.label}"))
+    for name, label in turn.COLUMNS.items():
+        found.setdefault(name, []).append((UNITS[END.search(name)[1]], label))
     for name in columns.CONDITIONS:
         found.setdefault(name, []).append((UNITS[END.search(name)[1]], f"condition {name}"))
     for q in requirements.QUANTITIES.values():
@@ -109,6 +113,8 @@ def known(name: str, names: set[str]) -> bool:
     if match := re.fullmatch(r"(.+?)_(mean_.+|ripple_percent|frequency_Hz)", name):
         kind = SIGNALS.get(match[1])
         return kind is not None and match[2] in (f"mean_{kind.unit}", "ripple_percent", "frequency_Hz")
+    if "_change_" in name:
+        return known(name.replace("_change_", "_"), names)
     if AFTER.search(name):
         return known(AFTER.sub("", name), names)
     return bool(BEFORE.match(name)) and known(BEFORE.sub("", name), names)
@@ -417,6 +423,8 @@ OTHERS = {
         "resonance", "--voltages", "16:32:2", "--payloads", "0", "--duration", "0.5", "--step", "0.0002", "--no-report",
     ),
     "battery": ("simulate", "--profile", "patrol", "--battery", "--no-report"),
+    "turn": ("simulate", "--left", "24", "--right", "12", "--model", "drive", "--duration", "1", "--no-report"),
+    "settle": ("settle", "log.csv", "--robot", "rig.toml"),
 }  # fmt: skip
 
 
@@ -424,12 +432,13 @@ OTHERS = {
 @pytest.mark.parametrize("name", OTHERS)
 def test_files_of_every_other_command_have_known_names(made, folder, name):
     (folder / "few.toml").write_text("speed_m_s = 0.3\nmass_kg = 30\n[envelope]\nslope_deg = [0, 5]\n")
+    test_settle.bench(folder, test_settle.stairs())
     sound(made(name, *OTHERS[name]))
 
 
 @pytest.mark.slow
 def test_every_command_that_leaves_a_folder_is_walked():
-    """Of `render`, `doctor` and `rig` there is no table; what `rig new` writes has names of parameters."""
+    """Of `render`, `doctor`, `explain` and `rig` there is no table; what `rig new` writes has names of parameters."""
     asked = {words[0] for words in OTHERS.values()} | {"sweep", "simulate", "compare", "calibrate"}
     commands = {(c.name or c.callback.__name__) for c in cli.app.registered_commands}
-    assert commands - asked == {"render", "doctor"}
+    assert commands - asked == {"render", "doctor", "explain"}

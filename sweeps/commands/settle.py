@@ -90,7 +90,7 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
     table: dict[str, np.ndarray] = {
         "run_id": np.array([s.run for s in every]),
         "from_s": np.array([s.begin for s in every]),
-        "to_s": np.array([s.end for s in every]),
+        "until_s": np.array([s.end for s in every]),
         "first_row": np.array([s.rows[0] + 1 for s in every]),
         "last_row": np.array([s.rows[-1] + 1 for s in every]),
         "imposed": np.array([s.imposed for s in every]),
@@ -98,7 +98,7 @@ def stretches(found: Settled) -> dict[str, np.ndarray]:
     }
     for signal in found.signals:
         channel = signal.channel
-        of = {channel.column: "mean", channel.sd_column: "sd", f"{channel.name}_change_{channel.unit}": "drift"}
+        of = {channel.column: "mean", channel.sd_column: "sd", channel.sd_column.replace("_sd_", "_change_"): "drift"}
         for column, field in of.items():
             table[column] = np.array([getattr(s, field).get(channel.name, np.nan) for s in every])
     return table
