@@ -109,7 +109,7 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
         return np.array([reading["speed"][0], 0.5 * width * reading["yaw_rate"][0]]) - wanted
 
     alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
-    supply = float(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike)[0])
+    supply = float(np.ravel(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike))[0])
     belts = wanted[0] + WIDER * wanted[1] * np.array([-1.0, 1.0])
     turning = belts / float(chassis.radius) * float(robot.gearbox.ratio) * float(robot.motor.torque_constant)
     for share in LOADED:
