@@ -106,7 +106,8 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
 
     def off(volts: np.ndarray) -> np.ndarray:
         reading = _with_others(robot, driven(volts))[0].result.reading
-        return np.array([reading["speed"][0], 0.5 * width * reading["yaw_rate"][0]]) - wanted
+        speed, turn = (np.asarray(reading[name])[0] for name in ("speed", "yaw_rate"))
+        return np.array([speed, 0.5 * width * turn]) - wanted
 
     alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
     supply = float(np.ravel(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike))[0])
