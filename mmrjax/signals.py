@@ -32,7 +32,7 @@ DONE = (CONVERGED, REVERSES)
 FLAGS = (
     "motor_overspeed", "gearbox_overspeed", "winding_hot", "slips", "jumps", "overvoltage", "cut_off",
     "battery_overcurrent", "current_limited", "gearbox_overload", "too_hot", "demand_missed",
-    "voltage_rising",
+    "voltage_rising", "current_returned",
 )  # fmt: skip
 
 
