@@ -163,7 +163,7 @@ class Layout:
     @property
     def crosses_zero(self) -> bool:
         """Whether readings may cross zero, so that errors are percent of a channel's size and not of the reading."""
-        return not self.table8
+        return not self.table8 or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
     @property
     def idle(self) -> tuple[str, ...]:

@@ -60,6 +60,11 @@ class Runs:
         return any(self.has(name) for name in (*SIDES, *HEADING))
 
     @property
+    def of_sides(self) -> np.ndarray:
+        """What drives the left and the right side, in one unit, shape (2, rows); of a table with `turns`."""
+        return np.stack([self.columns.get(name, np.ones(len(self))) for name in SIDES])
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """That its readings are of, in the order of arrays."""
         return self.layout.channels

@@ -46,6 +46,9 @@ SETTLING = 7
 #: Of the search for a settled turn: implicit Euler's first step, its shortest and longest [s]; by what the next is
 #: longer, and shorter where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units.
 FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.01, 1e-6, 1e9, 2.0, 0.25, 1.05, 0.05
+#: Most steps of a first search, whose unknowns may change by more at once [units]: it finds most turns, and the
+#: others are searched for anew.
+QUICK, FAR_QUICK = 30, 0.4
 #: It has ended at a change so small where the rates are small too [1/s] or the step is long [s]; and failed after so
 #: many.
 SMALL, SMALL_RATE, LONG, TURNS = 1e-9, 1e-7, 10.0, 200
@@ -159,13 +162,20 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 11"],
 
     held = jax.lax.stop_gradient((robot, conditions))
 
+    # The first step goes nowhere: it only looks round.
+    begun = _Search(guess, jnp.zeros_like(guess), still, jnp.asarray(FIRST), jnp.asarray(0), jnp.asarray(False))
+
     def turn(search: _Search) -> _Search:
+        begins, far = search.turns % QUICK == 0, jnp.where(search.turns < QUICK, FAR_QUICK, FAR)
+        begins &= search.turns <= QUICK
+        fresh = dataclasses.replace(begun, turns=search.turns)
+        search = jax.tree.map(lambda new, old: jnp.where(begins, new, old), fresh, search)
         step = inverse(jnp.eye(SETTLING) / search.step - search.jacobian)(search.rates)
         there = search.y + step
         slope, found = jax.jacfwd(lambda y: (of(y, *held),) * 2, has_aux=True)(there)
         slope = jnp.where(moves[:, None], slope, still)  # what does not move has no equation of its own
         before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
-        worse = (~(after <= WORSE * before + SMALL) | (jnp.max(jnp.abs(step)) > FAR)) & (search.turns > 0)
+        worse = (~(after <= WORSE * before + SMALL) | (jnp.max(jnp.abs(step)) > far)) & ~begins
         ended = ~worse & (jnp.max(jnp.abs(step)) < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
         y, found, slope = (
             jnp.where(worse, old, new)
@@ -174,8 +184,6 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 11"],
         length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
         return _Search(y, found, slope, length, search.turns + 1, ended)
 
-    # The first step goes nowhere: it only looks round.
-    begun = _Search(guess, jnp.zeros_like(guess), still, jnp.asarray(FIRST), jnp.asarray(0), jnp.asarray(False))
     end = jax.lax.while_loop(lambda search: (search.turns < TURNS) & ~search.solved, turn, begun)
     end = jax.lax.stop_gradient(end)
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
