@@ -233,7 +233,7 @@ def prepared(
     if not kind.traced:
         raise BadData(
             f"{runs.source}: the loop looks for effects in straight travel alone, and these runs turn; `calibrate` "
-            "fits them, and rows whose sides are driven alike can go through the loop without the columns of either side"
+            "fits them, and rows whose sides are driven alike can go through it without the columns of either side"
         )
     ready = preparation.prepare(distinct, robot, noise, stated)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
