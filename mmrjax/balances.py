@@ -451,6 +451,7 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
     signals = _fill(
         signals,
         total_current=both(jnp.mean(signals.total_current)),
+        side=jnp.sign(SIDES),
         slope=both(jnp.arcsin(sine_slope * cosine(motion.heading))),
         **{
             name: both(getattr(motion, name))
