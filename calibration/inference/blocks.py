@@ -84,7 +84,8 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
         return {}
     labels = np.where(changes, np.char.add("run ", runs_of(runs).astype(str)), labels)
     names = list(dict.fromkeys(labels))
-    return {name: labels == name for name in names} if len(names) > 1 else {}
+    single = by == "run" and len(names) == len(runs)  # rows that have nothing in common with others
+    return {name: labels == name for name in names} if len(names) > 1 and not single else {}
 
 
 def distinct(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:

@@ -27,7 +27,7 @@ class SettledTurns(SettledRuns):
     """
 
     word: ClassVar[str] = "turns"
-    blocks: ClassVar[tuple[str, ...]] = (TURN, "run", "voltage", "payload", "configuration")
+    blocks: ClassVar[tuple[str, ...]] = ("run", TURN, "voltage", "payload", "configuration")
     traced: ClassVar[bool] = False
     searches: ClassVar[int | None] = 4  # a turn takes some hundred times as long to find as straight travel
     profiled: ClassVar[bool] = False
