@@ -429,7 +429,7 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
     )
     fix: tuple[str, ...] = about((), "Parameters to hold, comma-separated")
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = about(
-        None, "Searches", usual="64; histories 8; rows with drive or track 1"
+        None, "Searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
     )
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = about(
         None,
@@ -440,7 +440,7 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = about(
         None, "Of the population, at most", usual="30", solver=True
     )
-    profiles: bool | None = about(None, "Profile likelihood of each", usual="steady only")
+    profiles: bool | None = about(None, "Profile likelihood of each", usual="steady only, but of turns")
     hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
 
 
