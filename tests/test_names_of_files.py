@@ -77,7 +77,15 @@ MORE = {
     "radius_m": "of the driving wheel",
 }  # fmt: skip
 #: Names of several tables on purpose: one quantity of a run, of a mission, or a limit on it.
-SHARED = {"peak_current_A", "speed_m_s", "slope_deg", "payload_kg", "motor_speed_rpm", "energy_per_metre_Wh"}
+SHARED = {
+    "turning_radius_mm",
+    "peak_current_A",
+    "speed_m_s",
+    "slope_deg",
+    "payload_kg",
+    "motor_speed_rpm",
+    "energy_per_metre_Wh",
+}
 #: Keys of files below which keys are no names of ours: of parameters, users' settings, packages and hashes.
 FOREIGN = {"parameters", "set", "versions", "hashes", "prior", "blocks", "statuses", "tied"}
 

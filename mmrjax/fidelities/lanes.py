@@ -27,7 +27,8 @@ def until(
     the mean, beside what the last `LANES` members take.
 
     Args:
-        begun: state of arrays, of `own`; turn: the next state, of `own` and a state; ended: of a state.
+        begun: state of arrays, of `own`; turn: the next state, of `own` and a state; ended: of a state. They close
+            over no traced number.
         own: what a member has of its own; numbers in it may be batched.
     """
     numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)

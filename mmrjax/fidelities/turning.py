@@ -150,7 +150,7 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 11"],
     last of those carries the derivatives, which are the implicit ones.
     """
     moves = np.arange(SETTLING) >= (0 if conditions.of_sides().motor_speed is None else 4)
-    still = -jnp.eye(SETTLING)
+    still = -np.eye(SETTLING)
 
     def others(conditions: Conditions) -> Array:
         return jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
@@ -162,7 +162,7 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 11"],
         """Its first step goes nowhere: it only looks round."""
         guess = _guess(*held)[:SETTLING]
         none = jnp.zeros_like(guess)
-        return _Search(guess, none, still, jnp.asarray(FIRST), jnp.asarray(0), jnp.asarray(False))
+        return _Search(guess, none, jnp.asarray(still), jnp.asarray(FIRST), jnp.asarray(0), jnp.asarray(False))
 
     def turn(held: tuple[Robot, Conditions], search: _Search) -> _Search:
         step = inverse(jnp.eye(SETTLING) / search.step - search.jacobian)(search.rates)
