@@ -5,8 +5,7 @@
     python benchmarks/husky_table.py --result FOLDER      the same of a calibration, by surface
 
 Means over windows of 2 s in which no wheel's speed has a standard deviation above 16 mm/s, two steps of its
-instrument, and one of them rolls at more than 50 mm/s. Of each run those that spread its yaw rates
-evenly, at most 12.
+instrument, and one of them rolls at more than 50 mm/s. Of each run those that spread its yaw rates, at most 12.
 """
 
 from __future__ import annotations
