@@ -74,6 +74,8 @@ LAWS = {**LIBRARY, **OUTSIDE}
 #: Turn over which the contacts of `presliding` yield [rad], the library's own.
 YIELDS = 0.02
 Term = tuple[Law, float, Mapping[str, float]]
+#: Of a sum of squares, what one more step of one's own least squares may still gain.
+CONVERGED = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -355,31 +357,36 @@ def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
     # there, its derivatives and its error held out, and the damping.
     at = {job: np.zeros(count + job[1]) for job in jobs}
     best: dict[tuple[int, bool], tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
-    damping = dict.fromkeys(jobs, 1e-3)
+    damping, going = dict.fromkeys(jobs, 1e-3), list(jobs)
     for _ in range(steps):
+        if not going:
+            break
         members: list[Mapping[str, float]] = []
         theirs: list[Sequence[Term]] = []
-        for job in jobs:
+        for job in going:
             x = at[job]
             size = x[count] if job[1] else 0.0
             p, have = constants(x[:count]), terms(size, job[1])
             members += [p, *(moved(p, n, 1e-2) for n in r.names), *[p] * job[1]]
             theirs += [have] * (1 + count) + [terms(size + 1.0, True)] * job[1]
         shown = [whitened(r, x) for x in histories(r, members, theirs)]
-        for job in jobs:
+        for job in tuple(going):
             own, shown = shown[: 1 + count + job[1]], shown[1 + count + job[1] :]
             x, inside = at[job], np.arange(RUNS) != job[0]
             off = c.measured - own[0]
             prior = np.eye(len(x))[:count]
             left = np.concatenate([off[inside].ravel(), -x[:count]])
             cost = float(left @ left) if np.isfinite(left).all() else np.inf
-            if job not in best or cost < best[job][0]:
+            gained = best[job][0] - cost if job in best else np.inf
+            if gained > 0:
                 slope = [(y - own[0])[inside].ravel() for y in own[1:]]
                 columns = np.stack([*(1e2 * y for y in slope[:count]), *slope[count:]], 1)
                 best[job] = cost, x, left, np.concatenate([columns, prior]), off[job[0]]
                 damping[job] *= 0.2
             else:
                 damping[job] *= 10.0
+            if abs(gained) < CONVERGED:
+                going.remove(job)
             _, x, left, columns, _ = best[job]
             normal = columns.T @ columns
             move = np.linalg.solve(normal + damping[job] * np.diag(np.diag(normal)), columns.T @ left)
