@@ -18,6 +18,7 @@ import numpy as np
 
 IMPOSED = ("voltage", "motor_current", "motor_speed")
 RUNS, ROWS = 4, 200
+EVERY = (0.005, 0.01, 0.02)  # [s]
 STEP = 2.5e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
 RPM = np.pi / 30
 REST = 0.01  # of the output, within which friction is smoothed [rad/s]
@@ -117,8 +118,12 @@ class Rig:
         return SimpleNamespace(rated=self.rated, torque=self.torque, w_k=self.w_k, supply=self.supply, **self.p)
 
 
-def rig(rng: np.random.Generator, imposed: str) -> Rig:
-    """A random rig; its readings' noise is set by what they show without effects."""
+def rig(rng: np.random.Generator, imposed: str, every: float | None = None) -> Rig:
+    """A random rig; its readings' noise is set by what they show without effects.
+
+    Args:
+        every: sampling step [s]; None: a random one.
+    """
     supply, fast = float(rng.choice([6.0, 12.0, 24.0, 48.0])), rng.uniform(300.0, 800.0)
     stall, ratio = (
         np.exp(rng.uniform(np.log(3), np.log(30))),
@@ -138,7 +143,8 @@ def rig(rng: np.random.Generator, imposed: str) -> Rig:
     }  # fmt: skip
     stated = {n: float(f"{x * np.exp(RELATIVE[n] * rng.standard_normal()):.4g}") for n, x in p.items()}
     stated["efficiency"] = min(stated["efficiency"], 0.97)
-    every = float(rng.choice([0.005, 0.01, 0.02]))
+    drawn = float(rng.choice(EVERY))
+    every = drawn if every is None else every
     inputs = np.stack([_inputs(rng, imposed, every, supply, rated, fast) for _ in range(RUNS)])
     late = float(rng.choice([0.0, rng.uniform(0.0, 2.0)]))
     # The current of an imposed speed jumps from row to row with its slope: late by whole rows it is not read in between.

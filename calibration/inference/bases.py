@@ -344,6 +344,9 @@ def waves(
             words.append(word)
     if not words:
         return ()
+    # The first again for orders that these samples do not resolve: logs of one size share what is compiled.
+    possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
+    bases, words = (x + x[:1] * (possible - len(x)) for x in (bases, words))
     every = [(b, w) for b in balances_of(robot) for w in words]
     return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
 
