@@ -73,7 +73,7 @@ INRUSH = 2e-3
 LASTING = 0.25
 #: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
 #: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
-GATHERS = 0.2
+STILL = 0.2
 #: Most levels of a condition that are told apart where it changes within runs.
 LEVELS = 6
 #: By how much a stated mass may change within a run beside the payload [kg].
@@ -277,18 +277,18 @@ class Histories(Observer):
         )
 
     @classmethod
-    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
+    def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
         """The medians of the later half of each run, which have settled where the run is long enough; of one whose
-        conditions change, of the longest stretch in which it is driven forwards, where that lasts at all. Runs whose
-        speed still changes as it does below half of steady travel are left out."""
+        conditions change, of the longest stretch in which it is driven forwards, where that lasts at all."""
         time, measured = runs["time_s"], runs.measured()
         each = [
             max((s for s in run if s.driven or s.whole), key=lambda s: s.lasts, default=run[0])
             for run in stretches(runs)
         ]
         each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
-        speeds = [k for k, c in enumerate(runs.channels) if c.zero_at_rest and c.directed]
-        each = [s for s in each if not _gathers(measured[:, speeds], s.after(time, 0.5), s.after(time, 0.75))]
+        if steady:
+            speeds = measured[:, [c.zero_at_rest and c.directed for c in runs.channels]]
+            each = [s for s in each if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
             shown = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
@@ -805,8 +805,8 @@ def _knots(rows: np.ndarray, most: int) -> np.ndarray:
     return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
 
 
-def _gathers(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
-    """Whether a speed still changes by more than `GATHERS` in the later half of a stretch.
+def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
+    """Whether a speed still changes by more than `STILL` in the later half of a stretch.
 
     Args:
         speeds: shape (rows, channels); half, quarter: rows of the later half and of the last quarter.
@@ -814,7 +814,7 @@ def _gathers(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
         before, after = np.nanmedian(speeds[np.setdiff1d(half, quarter)], 0), np.nanmedian(speeds[quarter], 0)
-    return bool(np.any(np.abs(after - before) > GATHERS * np.abs(before + after) / 2))
+    return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
 
 
 def _common(instants: int) -> int:
