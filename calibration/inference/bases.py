@@ -346,7 +346,8 @@ def waves(
         return ()
     # The first again for orders that these samples do not resolve: logs of one size share what is compiled.
     possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
-    bases, words = (x + x[:1] * (possible - len(x)) for x in (bases, words))
+    bases += bases[:1] * (possible - len(bases))
+    words += words[:1] * (possible - len(words))
     every = [(b, w) for b in balances_of(robot) for w in words]
     return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
 

@@ -71,6 +71,8 @@ ON_LINES = ("voltage", "motor_current", "duty")
 INRUSH = 2e-3
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
+#: Fewest steps from sample to sample of a run that is driven both ways.
+FINE = 8
 #: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
 #: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
 STILL = 0.2
@@ -179,7 +181,10 @@ class Histories(Observer):
         mine = [np.flatnonzero(run == k) for k in range(len(names))]
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
         sudden = _changes(runs, mine, robot.rig)
-        grids = [grid(runs["time_s"][m], changes) for m, changes in zip(mine, sudden, strict=True)]
+        exact = robot.rig.imposed == "motor_speed"
+        driven = np.zeros(len(run)) if exact else applied(runs)
+        steps = [_longest(runs["time_s"][m], driven[m]) for m in mine]
+        grids = [grid(runs["time_s"][m], changes, h) for m, changes, h in zip(mine, sudden, steps, strict=True)]
         longest, samples = _common(max(map(len, grids))), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
@@ -815,6 +820,17 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
         warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
         before, after = np.nanmedian(speeds[np.setdiff1d(half, quarter)], 0), np.nanmedian(speeds[quarter], 0)
     return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
+
+
+def _longest(time: np.ndarray, driven: np.ndarray) -> float:
+    """Longest step of a run [s]. Where what drives it changes its sign, friction jumps within a step: the error is of
+    the order of the step, and has to be small beside what changes from sample to sample.
+
+    Args:
+        time: of its samples [s]; driven: what drives it there.
+    """
+    turns = driven.min() < 0 < driven.max() and len(time) > 1
+    return min(LONGEST, float(np.median(np.diff(time))) / FINE) if turns else LONGEST
 
 
 def _common(instants: int) -> int:
