@@ -823,8 +823,8 @@ def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) ->
 
 
 def _longest(time: np.ndarray, driven: np.ndarray) -> float:
-    """Longest step of a run [s]. Where what drives it changes its sign, friction jumps within a step: the error is of
-    the order of the step, and has to be small beside what changes from sample to sample.
+    """Longest step of a run [s]. Where what drives it changes its sign, friction jumps as the speed passes through
+    zero, within a step, which has to be short beside the time from sample to sample.
 
     Args:
         time: of its samples [s]; driven: what drives it there.
