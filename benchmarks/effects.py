@@ -17,7 +17,7 @@ import numpy as np
 from calibration.words import effects as words
 from mmrjax import balances, channels, params, robots
 from mmrjax.conditions import Conditions
-from mmrjax.effects import ALL, Effect
+from mmrjax.effects import ALL, OF_TURNS, Effect
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.robot import Robot
@@ -48,6 +48,7 @@ ALIKE = 0.95
 ABSORBED = 1e-9
 STARTS = np.concatenate([[0.0], np.geomspace(1e-4, 0.05, 40), np.linspace(0.06, 2.0, 98)])  # [s]
 
+EVERY = (*ALL, *OF_TURNS.values())
 SETTLED = tuple(e for e in ALL if not e.transient and not e.needs_battery)
 PASSING = tuple(e for e in ALL if e not in SETTLED)
 
@@ -148,6 +149,25 @@ def _about(effect: type[Effect]) -> tuple[str, ...]:
     return tuple(text.replace("|", "∣") for text in words.about(effect))
 
 
+def _row(effect: type[Effect]) -> str:
+    """What an effect declares, as a row of the first table."""
+    spec = amplitude(effect)
+    shapes = "; ".join(
+        f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk(effect()) if not p.spec.amplitude
+    )
+    where = effect.balance + (f": {effect.channel}" if effect.channel else "")
+    low, high = spec.bounds
+    declared = ", ".join(words.declared(effect)) or "-"
+    return (
+        f"| `{effect.name}` | {where} | {effect.family()} | {_about(effect)[0]} | {spec.unit} | "
+        f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {declared} |"
+    )
+
+
+def _meaning(effect: type[Effect]) -> str:
+    return "- `{}`: {} {}".format(effect.name, *_about(effect)[1:])
+
+
 def page() -> str:
     """The page as it should be."""
     example, grid, base = sensitivities()
@@ -169,23 +189,13 @@ def page() -> str:
         'that one acts on: `[effects.churning] configurations = ["4W2T"]`.',
         "",
         "Effects of one equation that change with one and the same thing are a family: forms of a law that data may",
-        "not tell apart. Where no single name is sure, the loop names the family.",
+        "not tell apart. Where no single name is sure, the loop names the family. Those that act in turns alone are",
+        "freed by `calibrate --free effects.NAME.amplitude` of a robot file that states `[effects.NAME]`.",
         "",
         "| effect | balance | family | equation | unit | plausible: sd, bounds | shape parameters | declares |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for effect in ALL:
-        spec = amplitude(effect)
-        shapes = "; ".join(
-            f"{p.name} {float(p.value):g} {p.spec.unit}" for p in params.walk(effect()) if not p.spec.amplitude
-        )
-        where = effect.balance + (f": {effect.channel}" if effect.channel else "")
-        low, high = spec.bounds
-        declared = ", ".join(words.declared(effect)) or "-"
-        lines.append(
-            f"| `{effect.name}` | {where} | {effect.family()} | {_about(effect)[0]} | {spec.unit} | "
-            f"{spec.prior_sd(0.0):g}, {low:g} to {high:g} | {shapes or '-'} | {declared} |"
-        )
+    lines += [_row(effect) for effect in EVERY]
     lines += [
         "",
         "## What one standard deviation does, and what looks alike",
@@ -218,7 +228,7 @@ def page() -> str:
     for k, effect in enumerate(PASSING):
         lines.append(f"| `{effect.name}` | " + " | ".join(_number(x).lstrip("+") for x in start[k].ravel()) + " |")
     lines += ["", "## What they stand for, and sources", ""]
-    lines += ["- `{}`: {} {}".format(effect.name, *_about(effect)[1:]) for effect in ALL]
+    lines += [_meaning(effect) for effect in EVERY]
     return "\n".join(lines) + "\n"
 
 

@@ -36,11 +36,11 @@ _NODES = np.polynomial.legendre.leggauss(10)
 TRACK = _NODES[0] / 2, _NODES[1] / 2
 
 
-def read(path: Path) -> Table:
-    """Columns of a table; text where it is no number."""
+def read(path: Path, words: tuple[str, ...] = ("surface", "run_id")) -> Table:
+    """Columns of a table; text in those that hold words."""
     with path.open() as lines:
         rows = list(csv.DictReader(lines))
-    return {c: np.array([r[c] if c in ("surface", "run_id") else float(r[c]) for r in rows]) for c in rows[0]}
+    return {c: np.array([r[c] if c in words else float(r[c]) for r in rows]) for c in rows[0]}
 
 
 def percent(error: np.ndarray, size: np.ndarray) -> float:

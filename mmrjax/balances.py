@@ -194,6 +194,10 @@ def track(robot: Robot, chassis: Load, signals: Signals, guide: Scalar | None = 
     return _fill(signals, torque_track_loss=loss)
 
 
+#: Of what turns with a wheel [kg·m²]: a rig's file need not state any.
+LEAST_INERTIA = 1e-12
+
+
 def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None = None) -> Signals:
     """Torques at both shafts and the acceleration of the driving wheel, the armature taking its share.
 
@@ -209,7 +213,8 @@ def gearbox(robot: Robot, chassis: Load, signals: Signals, mover: Scalar | None 
     load = signals.torque_track_loss + mover + own
     drive = signals.torque_motor - idle
     inertia_added = added(robot, signals, "inertia")
-    inertia_wheel = chassis.inertia + inertia_added
+    # Of shafts without inertia, the side from which power flows and what they transmit are those of next to none.
+    inertia_wheel = jnp.maximum(chassis.inertia + inertia_added, LEAST_INERTIA)
     side = drive * inertia_wheel + gear.ratio * inertia_motor * load
     efficiency = gear.efficiency_flow(side, signals.direction)
     net = gear.ratio * efficiency * drive - load
@@ -446,6 +451,7 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
     signals = _fill(
         signals,
         total_current=both(jnp.mean(signals.total_current)),
+        side=jnp.sign(SIDES),
         slope=both(jnp.arcsin(sine_slope * cosine(motion.heading))),
         **{
             name: both(getattr(motion, name))

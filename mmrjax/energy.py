@@ -7,7 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from mmrjax.balances import Travel
+from mmrjax.balances import Travel, added
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
@@ -77,6 +77,9 @@ def sinks_turning(robot: Robot, conditions: Conditions, travel: Travel) -> dict[
     weight = jnp.mean(jnp.asarray(signals.mass)) * GRAVITY * sine(conditions.slope)
     across = jnp.mean(jnp.asarray(signals.speed_lateral)) * sine(jnp.mean(jnp.asarray(signals.heading)))
     found["sliding"] = found["sliding"] + jnp.sum(travel.grip.across)
+    for balance, rate in (("lateral", signals.speed_lateral), ("yaw", signals.yaw_rate)):
+        taken = jax.vmap(lambda s, balance=balance: added(robot, s, balance) * jnp.ones(()))(signals)
+        found["sliding"] = found["sliding"] + robot.sides / 2 * jnp.sum(taken * jnp.asarray(rate))
     found["lift"] = found["lift"] - weight * across
     return found
 

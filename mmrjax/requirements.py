@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import energy
-from mmrjax.channels import RPM
+from mmrjax import balances, energy
+from mmrjax.channels import MM, RPM
 from mmrjax.conditions import Conditions
 from mmrjax.derived import steepest_slope
 from mmrjax.fidelities.steady import operating
+from mmrjax.fidelities.turning import circling
 from mmrjax.motor import ALPHA, TEMPERATURE_REFERENCE
 from mmrjax.params import Index, Scalar
 from mmrjax.robot import Robot
@@ -26,6 +27,8 @@ from mmrjax.tables import CONDITION_LIMITS
 #: Of an envelope: what a point of it states.
 AXES = ("payload_kg", "slope_deg", "charge", "ambient_C")
 PAYLOAD, SLOPE, CHARGE, AMBIENT = AXES
+#: What turning on level ground depends on.
+LEVEL = (PAYLOAD, CHARGE, AMBIENT)
 
 WATT_HOUR, MINUTE = 3600.0, 60.0
 
@@ -67,6 +70,9 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity("motor_speed_rpm", "rpm", RPM, False, "speed of the motors", "travel"),
         Quantity("current_A", "A", 1.0, False, "current of all motors", "travel"),
         Quantity("energy_per_metre_Wh", "Wh/m", WATT_HOUR, False, "energy per metre", "travel"),
+        Quantity("turn_in_place_rad_s", "rad/s", 1.0, True, "yaw rate on the spot", "turn", LEVEL),
+        Quantity("turning_radius_mm", "mm", MM, False, "turning radius beside a braked side", "turn", LEVEL),
+        Quantity("side_slope_deg", "deg", 1.0, True, "steepest slope travelled across", "across", (PAYLOAD,)),
     )
 }
 
@@ -99,7 +105,8 @@ class Point(eqx.Module):
     """A point of the envelope; every field differentiable and batchable.
 
     Attributes:
-        configuration: index; adhesion: of the surface as a ratio to the robot's own [-]; battery: 1 on the battery.
+        configuration: index; battery: 1 on the battery.
+        adhesion, adhesion_lateral: of the surface as a ratio to the robot's own [-].
         charge: state of charge [-], of an external supply its voltage [V]; charge_end: to which the battery is used.
         share: of the time that the robot drives, for its endurance; 0 standing still [-].
         slope_deg: [deg]; payload: [kg]; ambient: [°C].
@@ -107,6 +114,7 @@ class Point(eqx.Module):
 
     configuration: Index
     adhesion: Scalar
+    adhesion_lateral: Scalar
     battery: Scalar
     charge: Scalar
     charge_end: Scalar
@@ -302,8 +310,45 @@ def _mass(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
     return Found(mass, jnp.full(mass.shape, CONVERGED))
 
 
+#: Duty of the left side, the right one's being full.
+DUTY_LEFT = {"turn_in_place_rad_s": -1.0, "turning_radius_mm": 0.0}
+
+
+def _turn(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+    """A settled turn on level ground, at full voltage: both sides apart on the spot, or beside a side that brakes."""
+    here, conditions = _at(robot, point, of)
+    conditions = dataclasses.replace(
+        conditions, slope_deg=jnp.zeros(()), adhesion_lateral=jnp.asarray(point.adhesion_lateral),
+        duty_left=jnp.asarray(DUTY_LEFT[name]), duty_right=jnp.asarray(1.0),
+    )  # fmt: skip
+    found, motion, status = circling(here, conditions)
+    low = jnp.any(jnp.asarray(_cell(of, found.signals, point)) < 0)
+    turns = jnp.where(jnp.abs(motion.yaw_rate) > 1e-6, motion.yaw_rate, 1e-6)
+    value = motion.yaw_rate if name == "turn_in_place_rad_s" else jnp.abs(motion.speed / turns)
+    return Found(jnp.asarray(value), jnp.where((status == CONVERGED) & low, CUT_OFF, status))
+
+
+def _across(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+    """The side slope [deg] from which a robot that travels across slides, or tips.
+
+    Rolling resistance takes a share f/φ_x of the friction ellipse: tan α = φ_y √(1 - (f/φ_x)²). It tips at
+    tan α = B / (2 h). Of a rigid robot whose load has not moved.
+    """
+    here, conditions = _at(robot, point, of)
+    conditions = dataclasses.replace(conditions, adhesion_lateral=jnp.asarray(point.adhesion_lateral))
+    chassis = here.chassis(conditions.configuration)
+    stands = balances.stance(here, conditions, chassis, chassis.mass + point.payload)
+    friction = chassis.ground.friction.static * point.adhesion
+    taken = jnp.minimum(chassis.ground.rolling_resistance / friction, 1.0)
+    # A root of nothing left has no derivative.
+    slides = friction * stands.lateral * jnp.sqrt(jnp.maximum(1 - taken**2, 1e-12))
+    tips = stands.width / (2 * stands.height)
+    return Found(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
+
+
 #: How a group of quantities is computed: (robot, point, ratings, name) -> Found.
-GROUPS = {"travel": _travel, "slope": _slope, "payload": _payload, "endurance": _endurance, "mass": _mass}
+GROUPS = {"travel": _travel, "slope": _slope, "payload": _payload, "endurance": _endurance, "mass": _mass,
+          "turn": _turn, "across": _across}  # fmt: skip
 
 
 def evaluate(robot: Robot, point: Point, of: Ratings, name: str) -> Found:

@@ -32,7 +32,7 @@ DONE = (CONVERGED, REVERSES)
 FLAGS = (
     "motor_overspeed", "gearbox_overspeed", "winding_hot", "slips", "jumps", "overvoltage", "cut_off",
     "battery_overcurrent", "current_limited", "gearbox_overload", "too_hot", "demand_missed",
-    "voltage_rising",
+    "voltage_rising", "current_returned",
 )  # fmt: skip
 
 
@@ -108,6 +108,7 @@ class Signals(eqx.Module):
     speed: Scalar = UNSET  # V of the robot [m/s]
     temperature: Scalar | None = None  # of the winding, where it is followed [°C]
     # of the robot in the plane of the ground; of one that travels straight nothing
+    side: Scalar = 0.0  # 1 of the left side, -1 of the right one [-]
     speed_lateral: Scalar = 0.0  # v_y to the left [m/s]
     yaw_rate: Scalar = 0.0  # ω, positive to the left [rad/s]
     heading: Scalar = 0.0  # ψ from uphill, positive to the left [rad]

@@ -271,9 +271,20 @@ class TurnPart(Part):
     right_V: Voltage | None = about(None, "Voltage of the right motor (V)")
     duty_left: Duty | None = about(None, "Share of the supply's voltage at the left motor, in place of --left")
     duty_right: Duty | None = about(None, "Share of the supply's voltage at the right motor")
+    speed_m_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = about(
+        None, "Speed of the settled turn (m/s), in place of --left and --right, which are found; with --yaw-rate"
+    )
+    yaw_rate_rad_s: Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)] | None = about(
+        None, "Yaw rate of the settled turn (rad/s), positive to the left; with --speed"
+    )
     heading_deg: Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)] | None = about(
         None, "Heading at the start, from uphill, positive to the left"
     )
+
+    @property
+    def demands(self) -> bool:
+        """Whether it is stated how the robot turns, and not what drives its sides."""
+        return self.speed_m_s is not None
 
     @property
     def turns(self) -> bool:
@@ -282,12 +293,16 @@ class TurnPart(Part):
 
     @model_validator(mode="after")
     def _of_both_sides(self) -> Self:
-        for left, right in (("left_V", "right_V"), ("duty_left", "duty_right")):
+        pairs = ("left_V", "right_V"), ("duty_left", "duty_right"), ("speed_m_s", "yaw_rate_rad_s")
+        for left, right in pairs:
             if (getattr(self, left) is None) != (getattr(self, right) is None):
                 one, other = (left, right) if getattr(self, right) is None else (right, left)
-                raise PydanticCustomError("idle", f"{one} acts with {other} only; state both sides")
-        if self.left_V is not None and self.duty_left is not None:
-            raise PydanticCustomError("idle", "left_V acts without duty_left only; state voltages or duties")
+                raise PydanticCustomError("idle", f"{one} acts with {other} only; state both")
+        stated = [one for one, _ in pairs if getattr(self, one) is not None]
+        if len(stated) > 1:
+            raise PydanticCustomError(
+                "idle", f"{stated[0]} acts without {stated[1]} only; state voltages, duties, or speed and yaw rate"
+            )
         return self
 
 
@@ -414,7 +429,7 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
     )
     fix: tuple[str, ...] = about((), "Parameters to hold, comma-separated")
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = about(
-        None, "Searches", usual="64; histories 8; rows with drive or track 1"
+        None, "Searches", usual="64; histories 8; settled turns 4; rows with drive or track 1"
     )
     population: Annotated[int, Field(ge=0, le=1_000_000)] | None = about(
         None,
@@ -425,7 +440,7 @@ class Calibrate(RobotPart, ModelPart, InferencePart, OutputPart):
     generations: Annotated[int, Field(ge=1, le=10_000)] | None = about(
         None, "Of the population, at most", usual="30", solver=True
     )
-    profiles: bool | None = about(None, "Profile likelihood of each", usual="steady only")
+    profiles: bool | None = about(None, "Profile likelihood of each", usual="steady only, but of turns")
     hold_out: bool | None = about(None, "Fit again without each block", usual="steady only")
 
 

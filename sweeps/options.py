@@ -13,8 +13,8 @@ import typer
 from sweeps import config
 from sweeps.config import Part
 
-#: Units that names of fields end with.
-UNITS = ("s", "V", "rpm", "kg", "deg", "mAh")
+#: Units that names of fields end with, the longest first, and as they are written.
+UNITS = {"rad_s": "rad/s", "m_s": "m/s", "s": "s", "V": "V", "rpm": "rpm", "kg": "kg", "deg": "deg", "mAh": "mAh"}
 _TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
 _LISTS = {"number": str, "string": list[str]}  # an axis is one text
 
@@ -33,8 +33,15 @@ def facts(kind: type[Part]) -> dict[str, dict[str, Any]]:
 
 def flag(name: str, fact: Mapping[str, Any]) -> str:
     """The option of a field: `--discharge` of `discharge_mAh`."""
-    stem, _, unit = name.rpartition("_")
-    return str(fact.get("flag") or "--" + (stem if unit in UNITS else name).replace("_", "-"))
+    stem, _ = of_unit(name)
+    return str(fact.get("flag") or "--" + stem.replace("_", "-"))
+
+
+def of_unit(name: str) -> tuple[str, str]:
+    """A field's name without its unit, and that, empty where it has none."""
+    return next(
+        ((name.removesuffix(f"_{end}"), unit) for end, unit in UNITS.items() if name.endswith(f"_{end}")), (name, "")
+    )
 
 
 def flags(kind: type[Part]) -> dict[str, str]:
@@ -44,9 +51,9 @@ def flags(kind: type[Part]) -> dict[str, str]:
 
 def described(name: str, fact: Mapping[str, Any]) -> str:
     """Meaning, unit, choices, bounds and default of a field, as a help text has them."""
-    unit = name.rpartition("_")[2]
+    _, unit = of_unit(name)
     texts = [str(fact.get("description", name)).rstrip(".")]
-    if unit in UNITS and f"({unit})" not in texts[0]:
+    if unit and f"({unit})" not in texts[0]:
         texts[0] += f" ({unit})"
     if "enum" in fact:
         texts[0] += f": {', '.join(map(str, fact['enum']))}"

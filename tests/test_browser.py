@@ -40,6 +40,8 @@ PAGES = {
     "size": "size",
     "store": f"sweep {Path(__file__).parent / 'record' / 'commands' / 'plan.toml'}",
     "track": "simulate --model track --slope 5",
+    "turn": "simulate --left 33 --right 15",
+    "path": "simulate --left 24 --right -12 --slope 10 --heading 30 --model drive --duration 2",
 }
 FAULTY = """<html><body style="margin:0"><p style="white-space:nowrap">{long}</p>
 <p style="color:#bbb">faint</p><p style="font-size:7px">tiny</p>

@@ -156,7 +156,7 @@ def test_change_follows_the_derivative(result):
 
 def point(**given):
     usual = {
-        "configuration": 0, "adhesion": 1.0, "battery": 1.0, "charge": 1.0, "charge_end": 0.0, "share": 0.0,
+        "configuration": 0, "adhesion": 1.0, "adhesion_lateral": 1.0, "battery": 1.0, "charge": 1.0, "charge_end": 0.0, "share": 0.0,
         "slope_deg": 0.0, "payload": 0.0, "ambient": 25.0,
     }  # fmt: skip
     return Point(**{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()})
@@ -166,9 +166,17 @@ def point(**given):
     "name",
     [
         "speed_m_s",
+        "side_slope_deg",
         *(
             pytest.param(n, marks=pytest.mark.slow)
-            for n in ("slope_deg", "payload_kg", "endurance_min", "energy_per_metre_Wh")
+            for n in (
+                "slope_deg",
+                "payload_kg",
+                "endurance_min",
+                "energy_per_metre_Wh",
+                "turn_in_place_rad_s",
+                "turning_radius_mm",
+            )
         ),
     ],
 )
@@ -195,6 +203,32 @@ def test_derivatives_are_differences(robot, name):
         assert exact[k] * float(theta[k]) == pytest.approx(
             difference * float(theta[k]), rel=1e-4, abs=1e-5 * float(value(theta))
         )
+
+
+def test_a_robot_slides_or_tips_across_a_slope(robot):
+    def side(robot, **given):
+        return float(evaluate(robot, point(**given), ratings(robot), "side_slope_deg").value)
+
+    chassis = robot.configurations["6T2A"]
+    friction, rolling = float(chassis.ground.friction.static), float(chassis.ground.rolling_resistance)
+    across = friction * float(chassis.turning.lateral) * math.sqrt(1 - (rolling / friction) ** 2)
+    assert side(robot) == pytest.approx(math.degrees(math.atan(across)), rel=1e-12)
+    assert side(robot, adhesion_lateral=0.5) == pytest.approx(math.degrees(math.atan(across / 2)), rel=0.02)
+    narrow = params.replace(robot, {"6T2A.turning.width": 0.03})
+    tall = side(narrow, payload=8.0)
+    assert tall < side(robot)  # it tips before it slides
+    assert tall == pytest.approx(side(params.replace(narrow, {"6T2A.turning.lateral": 9.0}), payload=8.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "left"), [("turn_in_place_rad_s", -1.0), ("turning_radius_mm", 0.0)])
+def test_turns_that_are_asked_for_are_those_that_settle(robot, name, left):
+    found = evaluate(robot, point(battery=0.0, charge=24.0, payload=3.0), ratings(robot), name)
+    runs = Conditions([0], voltage=24.0, payload=3.0, duty_left=left, duty_right=1.0).resolved(robot)
+    reading = steady_batch(robot, runs).reading
+    rate, speed = float(reading["yaw_rate"][0]), float(reading["speed"][0])
+    assert float(found.value) == pytest.approx(rate if left else abs(speed / rate), rel=1e-6)
+    assert int(found.outcome) == CONVERGED
 
 
 def test_cells_as_a_number_are_the_batterys_cells(robot):

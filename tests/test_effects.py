@@ -67,7 +67,7 @@ SIGNAL_UNITS = {
     "H": "inductance",
     "kg·m^2": "inertia_added",
     "rad": "angle heading",
-    "-": "duty on_tracks battery slope adhesion order direction direction_travel efficiency_load",
+    "-": "side duty on_tracks battery slope adhesion order direction direction_travel efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}
@@ -668,7 +668,7 @@ def test_every_effect_stands_in_the_file_of_its_balance():
     for effect in ALL:
         assert effect.__module__ == f"mmrjax.effects.{effect.balance}"
     found = {e for name in MODULES for e in effects.defined_in(importlib.import_module(name))}
-    assert found == set(ALL)
+    assert found == {*ALL, *effects.OF_TURNS.values()}
 
 
 def test_name_follows_from_the_class_unless_stated():

@@ -59,8 +59,10 @@ def test_generator_imports_nothing_of_the_package():
 
 def test_generator_holds_every_effect_that_steady_runs_show():
     # battery_sag acts on the battery alone, thermal_drift settles to winding_heating; forward directional_friction is
-    # loss_coulomb, and up a slope no load drives a motor
-    other = {"battery_sag", "thermal_drift", "directional_friction", "backdriving_loss"}
+    # loss_coulomb, and up a slope no load drives a motor; forward a torque_offset is loss_coulomb too, and
+    # directional_viscous loss_viscous
+    forward = {"directional_friction", "torque_offset", "directional_viscous"}
+    other = {"battery_sag", "thermal_drift", "backdriving_loss", *forward}
     shown = {e.name for e in ALL if not e.transient} - other
     assert set(g.LIBRARY) == shown
     assert all(f.cls == name for name, f in g.LIBRARY.items())

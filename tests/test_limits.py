@@ -43,6 +43,8 @@ def rated(robot):
         ({"discharge": 12_800.0}, set()),  # the parabola turns at 12 857 C
         ({"discharge": 12_900.0}, {"voltage_rising"}),
         ({"discharge": 12_900.0, "battery": 0.0}, set()),
+        ({"total_current": -0.1, "battery": 0.0}, {"current_returned"}),
+        ({"total_current": 0.1, "battery": 0.0}, set()),
     ],
 )
 def test_limits_that_an_instant_exceeds(rated, changed, flags):

@@ -62,8 +62,8 @@ def test_every_field_that_can_be_chosen_is_an_option_that_says_what_the_schema_s
                 continue
             shown = parameters[command][name]
             assert fact["description"].rstrip(".").partition(" (")[0] in shown.help, name
-            unit = name.rpartition("_")[2]
-            assert unit not in options.UNITS or f"({unit})" in shown.help, name
+            _, unit = options.of_unit(name)
+            assert not unit or f"({unit})" in shown.help, name
             assert all(choice in shown.help for choice in fact.get("enum", ()))
             assert shown.default is None, name  # what is not given is the configuration's affair
     assert {"config_file", "no_cache"} <= set(parameters[command])

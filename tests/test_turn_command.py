@@ -59,11 +59,32 @@ def test_turn_over_time_leaves_its_path(tmp_path, mmrjax):
     assert "yaw_rate_rad_s" in first and "motor_current_left_A" in first
 
 
+@pytest.mark.slow
+def test_a_demanded_turn_is_that_of_the_voltages_found(tmp_path, mmrjax):
+    told = "--speed", "0.3", "--yaw-rate", "1", "--voltage", "24", "--no-report"
+    assert mmrjax("simulate", *told, "--out", str(tmp_path / "asked"))[0] == 0
+    (asked,) = rows(tmp_path / "asked" / "runs.csv")
+    assert float(asked["speed_mm_s"]) == pytest.approx(300.0, rel=1e-6)
+    assert float(asked["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
+    sides = [word for side in ("left", "right") for word in (f"--{side}", asked[f"motor_voltage_{side}_V"])]
+    assert mmrjax("simulate", *sides, "--no-report", "--out", str(tmp_path / "driven"))[0] == 0
+    (driven,) = rows(tmp_path / "driven" / "runs.csv")
+    assert float(driven["yaw_rate_rad_s"]) == pytest.approx(1.0, rel=1e-6)
+    code, _, err = mmrjax("simulate", *told[:4], "--voltage", "12", "--out", str(tmp_path / "weak"))
+    assert code == 2
+    assert "take 18.1 V at one motor; the supply has 12 V" in " ".join(err.split())
+
+
 REFUSED = {
     "one side": (("--left", "33"), "left_V acts with right_V only"),
     "volts and duties": (
         ("--left", "3", "--right", "1", "--duty-left", "1", "--duty-right", "1"),
         "without duty_left",
+    ),
+    "speed alone": (("--speed", "0.3"), "speed_m_s acts with yaw_rate_rad_s only"),
+    "volts and a demand": (
+        ("--left", "3", "--right", "1", "--speed", "0.3", "--yaw-rate", "1"),
+        "left_V acts without speed_m_s",
     ),
     "volts on the battery": (("--left", "3", "--right", "1", "--battery"), "state duty_left and duty_right"),
     "track": (("--left", "3", "--right", "1", "--model", "track"), "without model track"),

@@ -33,6 +33,8 @@ DRIVING = ("duty", "mode")
 #: What a table may state of a robot whose sides are driven apart: the shares of the supply's voltage that the motors
 #: of either side get; and where it heads at the start, from uphill, positive to the left.
 SIDES: dict[str, tuple[float, float]] = {"duty_left": (-1.0, 1.0), "duty_right": (-1.0, 1.0)}
+#: The same where speeds are imposed.
+SPEEDS = tuple(channels.of(f"motor_speed_{side}").column for side in ("left", "right"))
 HEADING: dict[str, tuple[float, float]] = {"heading_deg": (-360.0, 360.0)}
 #: Place of a row in the sequence in which runs were made; without it that of the row in the file.
 ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
@@ -163,7 +165,7 @@ class Layout:
     @property
     def crosses_zero(self) -> bool:
         """Whether readings may cross zero, so that errors are percent of a channel's size and not of the reading."""
-        return not self.table8
+        return not self.table8 or not set(channels.OF_TURNS).isdisjoint(self.channels)
 
     @property
     def idle(self) -> tuple[str, ...]:
@@ -174,6 +176,12 @@ class Layout:
     def imposed_column(self) -> str:
         """Column of what is imposed."""
         return IMPOSED[self.imposed][0]
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """Columns that say what drives the left and the right side of a robot that turns; none of one that cannot."""
+        imposed = {"voltage": tuple(SIDES), "motor_speed": SPEEDS}.get(self.imposed, ())
+        return imposed if self.has_ground else ()
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -201,8 +209,8 @@ class Layout:
     def known(self) -> tuple[str, ...]:
         """Every column that means something."""
         driven: tuple[str, ...] = DRIVING if self.imposed == "voltage" else ()
-        if driven and self.has_ground:
-            driven = (*driven, *SIDES, *HEADING)
+        if self.sides:
+            driven = (*driven, *self.sides, *HEADING)
         named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns, "surface")
         return tuple(dict.fromkeys(c for c in (*named, "run_id", "time_s", *driven, *ORDER) if c not in self.idle))
 
@@ -218,7 +226,7 @@ class Layout:
         """What each number column holds, by its name."""
         found: dict[str, Quantity] = {**_OF_CONDITIONS}
         for channel in channels.EVERY:
-            if channel in self.channels or channel.column == self.imposed_column:
+            if channel in self.channels or channel.column in (self.imposed_column, *self.sides):
                 found |= _of_channel(channel)
         known = (*self.known(), *ON_GROUND)
         return {column: quantity for column, quantity in found.items() if column in known}

@@ -7,7 +7,8 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from calibration.data.columns import RPM, SPEED, SUPPLY
+from calibration.data import sides
+from calibration.data.columns import HEADING, RPM, SPEED, SUPPLY
 from calibration.data.errors import BadData, number
 from calibration.data.table import Runs
 from mmrjax.robot import Robot
@@ -29,13 +30,16 @@ def check(runs: Runs, robot: Robot) -> None:
     """Refuse a table that contradicts itself or its robot.
 
     Raises:
-        BadData: a vehicle without mass, an imposed speed that the stated voltage cannot turn the motors at, or an
-            angle that wraps or whose unit changes, or time that goes back now and then.
+        BadData: a vehicle without mass, a turn of a robot that cannot turn or whose sides are exchanged, an imposed
+            speed that the stated voltage cannot turn the motors at, or an angle that wraps or whose unit changes, or
+            time that goes back now and then.
     """
     _mass(runs, robot)
     if runs.turns and (why := cannot_turn(robot, sorted({str(n) for n in runs.configurations_named(robot)}))):
-        raise BadData(f"{runs.source}, duty_left, duty_right, heading_deg: {why}")
-    if robot.rig.imposed == "motor_speed" and not runs.sampled:
+        raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
+    if runs.turns:
+        sides.check(runs)
+    if robot.rig.imposed == "motor_speed" and not runs.sampled and not runs.turns:
         for column in (SUPPLY, "motor_voltage_V"):
             _voltage(runs, robot, column)
     if runs.sampled:

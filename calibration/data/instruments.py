@@ -65,6 +65,10 @@ def infer_instruments(
 
 def with_inferred_instruments(robot: Robot, runs: Runs) -> Robot:
     """`robot` with the instruments that its table shows."""
-    if not any(i.free for i in robot.rig.instruments):
+    mine = robot.rig.instruments
+    found = runs.layout.instruments if any(i.free for i in mine) else mine
+    named = {i.channel for i in found}
+    found = (*found, *(i for i in runs.layout.instruments if i.channel not in named))
+    if found == mine:
         return robot
-    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=runs.layout.instruments))
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, instruments=found))

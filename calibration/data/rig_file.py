@@ -161,9 +161,9 @@ def rig(content: dict[str, Any], where: str, loads: Sequence[str], *, travels: b
     between = _one_of(content.pop("between_rows", BETWEEN[0]), BETWEEN, f"{where}, between_rows")
     usual = [name for name in channels.USUAL if travels or name != "speed"]
     names = _channels(content.pop("channels", [n for n in usual if n != imposed]), f"{where}, channels")
-    if imposed in names:
+    if shown := {imposed, f"{imposed}_left", f"{imposed}_right"} & set(names):
         raise BadConfiguration(
-            f"{where}, channels: {imposed} is imposed, so it is no reading; remove it, or state imposed = "
+            f"{where}, channels: {min(shown)} is imposed, so it is no reading; remove it, or state imposed = "
             f'"{next(word for word in IMPOSED if word != imposed)}"'
         )
     return Rig(

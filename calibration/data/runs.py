@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.data import contradictions, delimited, instruments, surfaces, units
+from calibration.data import contradictions, delimited, instruments, sides, surfaces, units
 from calibration.data.columns import (
     CONDITIONS,
     DEFAULTS,
     DRIVEN,
     DUTY,
-    SIDES,
+    SPEED,
+    SPEEDS,
     SUPPLY,
     TIME,
     WHEN,
@@ -121,16 +122,19 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
             columns[meaning.column] = np.array(values)
     if bad:
         raise BadData(_listed(name, [said for _, _, said in sorted(bad)]))
-    layout = dataclasses.replace(layout, instruments=instruments.infer_instruments(layout.instruments, columns))
+    told = instruments.infer_instruments(layout.instruments, columns)
+    stated = {i.channel for i in told}
+    unsigned = tuple(i for i in sides.magnitudes(columns, layout.sides) if measured and i.channel not in stated)
+    layout = dataclasses.replace(layout, instruments=(*told, *unsigned))
     _fill(name, columns, len(rows) - 1, layout)
     _check_driving(name, columns)
-    _check_sides(name, columns)
+    _check_sides(name, columns, layout)
     _check_mass(name, columns)
     _check_deviations(name, columns, layout.channels)
     if battery and layout.imposed == "voltage":
         columns[SUPPLY] = np.full(len(rows) - 1, np.nan)
     elif (
-        measured and not set(TIME) <= set(columns) and not set(SIDES) & set(columns)
+        measured and not set(TIME) <= set(columns) and not set(layout.sides) & set(columns)
     ):  # a history may stop, and go on forwards against its motors
         _check_signs(name, columns, layout)
     if not any(column in columns for column in WHEN):
@@ -138,6 +142,11 @@ def _read(path: Path, name: str, measured: bool, battery: bool, layout: Layout, 
     unknown = tuple(c for c, meaning in zip(header, meanings, strict=True) if meaning is None)
     extras = {c: _extra([row[header.index(c)] for row in rows[1:]]) for c in unknown}
     notes = (*notes, *capitals, *(_lacks(name, columns, layout) if measured else ()))
+    notes += tuple(
+        f"{name}: {channels.of(i.channel).column} is positive where its side is driven backward; it is taken to show "
+        "magnitude alone, and magnitudes are compared"
+        for i in unsigned
+    )
     return Runs(name, columns, unknown, hashlib.sha256(content).hexdigest(), extras, layout, notes)
 
 
@@ -243,6 +252,8 @@ def _fill(name: str, columns: dict[str, np.ndarray], rows: int, layout: Layout) 
         return
     if "configuration" not in columns and layout.configurations:
         columns["configuration"] = np.full(rows, _only(name, columns, layout))
+    if layout.imposed_column == SPEED and set(SPEEDS) <= set(columns):
+        columns[SPEED] = np.mean([columns[c] for c in SPEEDS], 0)
     for column, value in DEFAULTS.items():
         columns.setdefault(column, np.full(rows, value))
 
@@ -326,7 +337,12 @@ def _check_header(
     strange = [c for c, m in zip(header, meanings, strict=True) if m is None]
     if not layout.complete:  # other channels' columns are not misspelt
         strange = [c for c in strange if c not in {x for k in channels.EVERY for x in (k.column, k.sd_column)}]
+    _check_names_of_sides(name, strange, stated, layout)
     required = layout.required(measured=measured, battery=battery)
+    if layout.imposed_column == SPEED and stated & set(layout.sides):  # theirs is imposed
+        required = tuple(c for c in required if c != SPEED)
+        if SPEED in stated:
+            raise BadData(f"{name}: column {SPEED} beside {', '.join(layout.sides)}; keep one of them")
     if not layout.complete and "surface" in stated:  # which says the configuration too, where it has those of one
         required = tuple(c for c in required if c != "configuration")
     for column in (c for c in (*required, *layout.measured_columns) if c not in stated):
@@ -343,6 +359,26 @@ def _check_header(
         close = difflib.get_close_matches(column, [c for c in layout.known() if c not in stated], 1, 0.85)
         if close:
             raise BadData(f"{name}: unknown column {column}; did you mean {close[0]}? rename or remove it")
+
+
+#: How people call the sides.
+_SIDE = {"l": "left", "lh": "left", "lft": "left", "port": "left", "r": "right", "rh": "right", "starboard": "right"}
+
+
+def _check_names_of_sides(name: str, strange: list[str], stated: set[str], layout: Layout) -> None:
+    """Refuse columns that name a side in other words, or elsewhere in the column's name."""
+
+    def words(column: str) -> list[str]:
+        return sorted(_SIDE.get(word.casefold(), word.casefold()) for word in column.split("_"))
+
+    known = {tuple(words(c)): c for c in layout.known() if {"left", "right"} & set(words(c))}
+    for column in strange:
+        meant = known.get(tuple(words(column)))
+        if meant is not None and meant not in stated:
+            raise BadData(
+                f"{name}: column {column}: the sides are called left and right; name it {meant}, or state [columns] "
+                f'{meant} = "{column}" in the robot\'s file'
+            )
 
 
 def _cell(where: str, meaning: Meaning, cell: str, layout: Layout, kind: type[InputError] = BadData) -> Any:
@@ -436,11 +472,11 @@ def _check_driving(name: str, columns: dict[str, np.ndarray]) -> None:
     columns["duty"] = np.nan_to_num(columns["duty"])
 
 
-def _check_sides(name: str, columns: dict[str, np.ndarray]) -> None:
-    stated = [c for c in SIDES if c in columns]
+def _check_sides(name: str, columns: dict[str, np.ndarray], layout: Layout) -> None:
+    stated = [c for c in layout.sides if c in columns]
     if len(stated) == 1:
-        (other,) = set(SIDES) - set(stated)
-        raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state the duty of both sides")
+        (other,) = set(layout.sides) - set(stated)
+        raise BadData(f"{name}: column {other} is missing beside {stated[0]}; state what drives both sides")
     if stated and set(columns) & {"duty", "mode"}:
         beside = min(set(columns) & {"duty", "mode"})
         raise BadData(f"{name}: column {beside} beside {stated[0]}, which says how either side is driven; keep one")

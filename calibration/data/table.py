@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.data import surfaces
-from calibration.data.columns import DRIVEN, DUTY, HEADING, IMPOSED, SIDES, SUPPLY, TIME, Layout
+from calibration.data.columns import DRIVEN, DUTY, HEADING, IMPOSED, SUPPLY, TIME, Layout
 from calibration.data.errors import BadData, choices
 from mmrjax import channels
 from mmrjax.channels import Channel
@@ -57,7 +57,13 @@ class Runs:
     @property
     def turns(self) -> bool:
         """Whether its robot is free to turn: its sides are driven apart, or it heads elsewhere than uphill."""
-        return any(self.has(name) for name in (*SIDES, *HEADING))
+        return any(self.has(name) for name in (*self.layout.sides, *HEADING))
+
+    @property
+    def of_sides(self) -> np.ndarray:
+        """What drives the left and the right side, in the unit of `Layout.sides`, shape (2, rows); of a table with
+        `turns`."""
+        return np.stack([self.columns.get(name, np.ones(len(self))) for name in self.layout.sides])
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -78,7 +84,7 @@ class Runs:
                 f"{self.source}, {lost[0]}: left out as the table was read, but the robot has this channel; read the "
                 "table with robot=, the robot that it is of"
             )
-        mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0]}
+        mine |= {self.layout.imposed_column, IMPOSED[robot.rig.imposed][0], *self.layout.sides}
         others = {column for c in channels.EVERY for column in (c.column, c.sd_column)} - mine
         left = {name: values for name, values in self.columns.items() if name in others}
         return dataclasses.replace(
@@ -93,7 +99,7 @@ class Runs:
     def axes(self) -> tuple[str, ...]:
         """Columns of the conditions that its runs have, what is imposed first."""
         duty = () if self.sampled else DUTY
-        return tuple(c for c in (*self.layout.axes, *duty, *SIDES, *HEADING) if self.has(c))
+        return tuple(c for c in (*self.layout.axes, *duty, *self.layout.sides, *HEADING) if self.has(c))
 
     @property
     def sampled(self) -> bool:
@@ -186,9 +192,12 @@ class Runs:
             lateral[scaled] = [
                 lateral_ratio(s, t) for s, t in zip(self["surface"][scaled], on_tracks[scaled], strict=True)
             ]
-        sides = {name: self[name] for name in (*SIDES, *HEADING) if self.has(name)}
         column, factor = IMPOSED[robot.rig.imposed]
         imposed = robot.rig.imposed != "voltage"
+        sides = {name: self[name] for name in HEADING if self.has(name)}
+        for side, name in zip(("left", "right"), self.layout.sides, strict=False):
+            if self.has(name):
+                sides[f"{robot.rig.imposed if imposed else 'duty'}_{side}"] = factor * self[name]
         if imposed and not self.has(column):
             raise BadData(f"{self.source}: no {column}, which the robot's file says is imposed; give it in a table")
         return Conditions(

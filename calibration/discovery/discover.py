@@ -230,6 +230,11 @@ def prepared(
             f"{runs.source}: {len(distinct)} {kind.word} cannot show what a model lacks; at least {kind.fewest} are "
             "needed"
         )
+    if not kind.traced:
+        raise BadData(
+            f"{runs.source}: the loop looks for effects in straight travel alone, and these runs turn; `calibrate` "
+            "fits them, and rows whose sides are driven alike can go through it without the columns of either side"
+        )
     ready = preparation.prepare(distinct, robot, noise, stated)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
     turned = scales.turned_in(distinct, ready.robot)

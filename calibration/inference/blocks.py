@@ -25,6 +25,8 @@ BLOCKS: dict[str, tuple[str, ...]] = {
     "voltage_configuration": ("configuration", "supply_voltage_V"),
     "run": ("run_id",),
 }
+#: And after how sharp a turn is.
+TURN = "turn"
 
 
 def in_words(by: str, joint: str = " and ") -> str:
@@ -53,11 +55,23 @@ def levels(x: np.ndarray) -> np.ndarray:
     return found
 
 
+def sharpness(runs: Runs) -> dict[str, np.ndarray]:
+    """Label → mask of its rows, of `PARTS` parts from turns on the spot to straight travel: what drives the slower
+    side over what drives the faster one, -1 to 1."""
+    slow, fast = np.sort(np.abs(runs.of_sides), 0)
+    share = np.round(slow / np.maximum(fast, 1e-12) * np.sign(np.prod(runs.of_sides, 0)), 6)
+    part = np.searchsorted(np.sort(share), share) * PARTS // len(share)
+    rows = [part == k for k in np.unique(part)]
+    return {f"{share[mine].min():.2g} to {share[mine].max():.2g}": mine for mine in rows} if len(rows) > 1 else {}
+
+
 def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
     """Label → mask of its rows, for each block of `by`; empty where the data do not vary in it.
 
     A run of a history in which it changes is a block of its own; empty where that is all that there is.
     """
+    if by == TURN:
+        return sharpness(runs) if runs.turns else {}
     columns = [c for c in BLOCKS[by] if runs.has(c) and (c in NO_CONDITIONS or c in runs.axes)]
     if len(columns) < len(BLOCKS[by]):
         return {}
@@ -70,7 +84,8 @@ def blocks(runs: Runs, by: str) -> dict[str, np.ndarray]:
         return {}
     labels = np.where(changes, np.char.add("run ", runs_of(runs).astype(str)), labels)
     names = list(dict.fromkeys(labels))
-    return {name: labels == name for name in names} if len(names) > 1 else {}
+    single = by == "run" and len(names) == len(runs)  # rows that have nothing in common with others
+    return {name: labels == name for name in names} if len(names) > 1 and not single else {}
 
 
 def distinct(runs: Runs, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:

@@ -99,7 +99,7 @@ def calibrate(
     facts = observers.facts(model)
     effort = facts.effort
     starts = (observe.searches or effort.starts) if starts is None else starts
-    profiles = effort.profiles if profiles is None else profiles
+    profiles = effort.profiles and observe.profiled if profiles is None else profiles
     blocks = effort.blocks if blocks is None else blocks
     kinds = (observe.blocks if blocks else ()) if isinstance(blocks, bool) else tuple(blocks)
 
@@ -113,16 +113,16 @@ def calibrate(
         for sentence in former:  # before a name is refused that nobody has typed
             tell(sentence)
         present = {robot.configurations.names[k] for k in runs.configurations(robot)}
-        default = priors.default_names(present, robot, computed=facts.computes)
+        default = priors.default_names(present, robot, computed=facts.computes, turns=runs.turns)
         owned = priors.stated_names(robot, present, () if observe.axis else priors.OVER_TIME)
-        held = {*default, *fidelities.unread(model, owned)}
+        held = {*default, *fidelities.unread(model, owned, runs.turns)}
         default = (*default, *(n for n in owned if n not in held and not n.endswith(facts.computes)))
         default = (*default, *priors.delays(robot, observe.free()[0]))
         names = priors.choose(robot, default, *words)
-        if unread := fidelities.unread(model, names):
+        if unread := fidelities.unread(model, names, runs.turns):
             if fidelities.OF_TURNS in unread[0]:
                 raise BadConfiguration(f"--free {unread[0]}: these runs are straight, which do not show it")
-            reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread))
+            reads = ", ".join(other for other in fidelities.NAMES if not fidelities.unread(other, unread, runs.turns))
             raise BadConfiguration(f"--free {unread[0]}: --model {model} does not read it; allowed: --model {reads}")
         return names
 
@@ -142,7 +142,7 @@ def calibrate(
     posed = observers.pose(runs, base, coordinates, known.sd, model)
 
     if population is None:
-        population = POPULATION if fidelities.unread("steady", names) else 0
+        population = POPULATION if fidelities.unread("steady", names, runs.turns) else 0
     if (members is not None or generations is not None) and not population:
         raise BadConfiguration("--generations, --members: there is no population; state --population")
     if population and not posed.observe.eased:

@@ -70,7 +70,8 @@ def foresee(runs: Runs, robot: Robot, noise: str | None = None) -> Foresight:
     observe, robot, known = ready.observe, ready.robot, ready.noise
     present = {robot.configurations.names[k] for k in runs.configurations(robot)}
     names = priors.free_names(robot, present, *observe.free())
-    names = tuple(n for n in names if n not in fidelities.unread("steady", names)) if not observe.axis else names
+    if not observe.axis:
+        names = tuple(n for n in names if n not in fidelities.unread("steady", names, runs.turns))
     if not names:
         raise BadConfiguration("nothing to determine: every loss is zero, so it is held; state yours with a ±")
     coordinates = priors.coordinates(robot, names, any_surface=robot.rig.inherits)

@@ -23,7 +23,8 @@ GRIPPING = 20.0
 def operating_readings(
     robot: Robot, conditions: Conditions, names: tuple[str, ...] | None = None
 ) -> Float[np.ndarray, "runs channels"]:
-    """Readings of steady travel on a surface that grips [SI]; NaN where the robot does not get under way.
+    """Readings of steady travel on a surface that grips, and of turns on their own [SI]; NaN where the robot does not
+    get under way.
 
     Args:
         conditions: shape (runs,).
@@ -36,6 +37,8 @@ def operating_readings(
         own = np.asarray([float(c.mass) for c in robot.configurations.members])
         mass = own[np.asarray(conditions.configuration)] + np.asarray(conditions.payload)
     gripping, own_mass = jax.device_put((np.full(runs, GRIPPING), np.asarray(mass)))
+    if conditions.turns:  # what a turn takes is friction's
+        gripping = conditions.adhesion
     posed = dataclasses.replace(conditions, adhesion=gripping, total_mass=own_mass)
     padded = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[index]), posed)
     found = steady_batch(params.strong(robot), padded)

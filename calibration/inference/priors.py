@@ -38,6 +38,9 @@ OVER_TIME = (".inertia", ".inductance", ".backlash")
 GUIDE_SHARE, GUIDE_FRICTION = "track.guide_share", "track.guide_friction"
 #: Share of the weight that the guides carry in the track model, where it is an output (docs/track-model.md).
 GUIDED = 0.98
+#: Of configurations whose sides are driven apart; the rule of direction trades with the ratio of frictions, and the
+#: moment of inertia shows over time alone.
+OF_TURNS = ("turning.width", "turning.lateral")
 #: Parameters of a chassis whose source states a ratio to another one, which they keep while they are not freed
 #: themselves: follower, leader.
 TIED = (
@@ -193,15 +196,20 @@ def delays(robot: Robot, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(n for n in names if n == DELAY and n in robot.rig.stated - robot.rig.exact)
 
 
-def default_names(configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = ()) -> tuple[str, ...]:
+def default_names(
+    configurations: Iterable[str], robot: Robot, *, computed: Sequence[str] = (), turns: bool = False
+) -> tuple[str, ...]:
     """The default set of free parameters for data of these configurations.
 
     Args:
         computed: parameters of a configuration that the fidelity puts out, see `fidelities.Facts`; for the guides'
             share the guide friction μ_t stands then.
+        turns: whether the data are of turns.
     """
     present = set(configurations)
     names = [n for c in robot.configurations if c in present for n in friction(robot, c)]
+    if turns:
+        names += _uncertain(robot, (f"{c}.{n}" for c in robot.configurations if c in present for n in OF_TURNS))
     names = [n for n in names if _leader(robot, n) is None]
     if GUIDE_SHARE in computed:
         names = [n.replace(GUIDE_SHARE, GUIDE_FRICTION) for n in names]

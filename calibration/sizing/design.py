@@ -17,7 +17,9 @@ from calibration.sizing import sheet
 from calibration.sizing.options import Options
 from mmrjax import params
 from mmrjax.requirements import CHARGE, NODES, QUANTITIES, SLOPE, Point, Ratings, heat_left, travel
+from mmrjax.requirements import evaluate as requirement
 from mmrjax.robot import Robot
+from mmrjax.signals import CONVERGED
 
 #: Continuous numbers of a design, of which the search takes logarithms: total ratio, rolling radius [m], cells in
 #: parallel.
@@ -227,7 +229,12 @@ def _margin(of: Task, d: Demand, design: Design, robot: Robot, ratings: Ratings,
         return _endurance(r, robot, ratings, at)
     if r.limit is None:  # as the parts are rated, which is asked of every design
         return jnp.minimum(travels, above)
-    value = at[r.name] / r.quantity.factor
+    if r.name not in at:  # not of straight travel
+        found_here = jax.vmap(lambda p: requirement(robot, p, ratings, r.name))(points)
+        counts = jnp.where(found_here.outcome == CONVERGED, 1.0, -1.0)
+        value, travels = found_here.value / r.quantity.factor, jnp.min(counts)
+    else:
+        value = at[r.name] / r.quantity.factor
     share = jnp.min(value / _limit(r) - 1) if r.least else jnp.min(1 - value / _limit(r))
     if r.name == "winding_C":
         share = jnp.min(_heat(robot, points, at["current"], jnp.asarray(_limit(r))))

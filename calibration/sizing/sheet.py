@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from calibration.data.contradictions import cannot_turn
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.requirements import Envelope, Requirement, Requirements
 from mmrjax import params
@@ -19,7 +20,7 @@ from mmrjax.compiling import compiled
 from mmrjax.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, STATUSES
-from mmrjax.tables import adhesion_ratio
+from mmrjax.tables import adhesion_ratio, lateral_ratio
 
 #: Values along each axis of an envelope: its ends, and between them where an output may turn.
 VALUES = {PAYLOAD: 3, SLOPE: 5, CHARGE: 5, AMBIENT: 2}
@@ -30,7 +31,8 @@ CHANGEABLE = (
     "motor.resistance_thermal_winding", "motor.resistance_thermal_housing", "battery.capacity", "battery.resistance",
     "battery.current_other",
 )  # fmt: skip
-OF_CONFIGURATION = ("mass", "radius", "ground.friction.static", "ground.rolling_resistance", "track.loss_coulomb")
+OF_CONFIGURATION = ("mass", "radius", "ground.friction.static", "ground.rolling_resistance", "track.loss_coulomb",
+                    "turning.width")  # fmt: skip
 #: Bounds within which a change is looked for, beside those of the field: least and greatest multiple of what it is.
 REACH = (0.1, 10.0)
 #: Values of a parameter in one call, calls along a ladder, and digits that a stated change has.
@@ -123,8 +125,8 @@ def refuse(robot: Robot, asked: Requirements) -> None:
     """Refuse requirements that no robot of these configurations could be held against.
 
     Raises:
-        BadConfiguration: a configuration that the robot does not have; an envelope with a slope that the surface does
-            not hold, whatever drives the robot: tan α above μ_s.
+        BadConfiguration: a configuration that the robot does not have; a turn that it cannot make; an
+            envelope with a slope that the surface does not hold, whatever drives the robot: tan α above μ_s.
     """
     for r in asked.each:
         e = r.envelope
@@ -134,6 +136,9 @@ def refuse(robot: Robot, asked: Requirements) -> None:
                 f"{where}: the robot has no configuration {e.configuration}; "
                 f"{choices(e.configuration, robot.configurations)}"
             )
+        turns = r.quantity.group in ("turn", "across")
+        if turns and (why := cannot_turn(robot, (_configuration(robot, e),))):
+            raise BadConfiguration(f"{where}: {why}")
         chassis = robot.configurations[_configuration(robot, e)]
         friction = float(chassis.ground.friction.static) * adhesion_ratio(e.surface, float(chassis.on_tracks) > 0.5)
         steepest = math.degrees(math.atan(friction))
@@ -167,7 +172,8 @@ def points(robot: Robot, requirement: Requirement) -> Point:
 
     return Point(
         configuration=jnp.full(len(payload), robot.configurations.index(name)),
-        adhesion=same(adhesion_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
+        adhesion=same(adhesion_ratio(e.surface, on_tracks)),
+        adhesion_lateral=same(lateral_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
         charge=jnp.asarray(charge), charge_end=same(e.charge_end), share=same(requirement.share),
         slope_deg=jnp.asarray(slope), payload=jnp.asarray(payload), ambient=jnp.asarray(warm),
     )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from calibration.words.experiments import ACTS, DOING
-from mmrjax.effects import Effect
+from mmrjax.effects import OF_TURNS, Effect
 
 #: What isolates a balance: rows of `experiments.DOING`, `weigh`, and of a channel of `sensor` rows of `ACTS`.
 ISOLATED_BY = {
@@ -38,6 +38,7 @@ def declared(effect: type[Effect]) -> Iterator[str]:
     words = [
         "dissipative" * effect.dissipative,
         "in histories alone" * effect.transient,
+        "in turns alone" * (effect.name in OF_TURNS),
         f"settles to `{effect.settles_to}`" * bool(effect.settles_to),
         "on the battery alone" * effect.needs_battery,
         "in runs both ways alone" * effect.needs_reverse,

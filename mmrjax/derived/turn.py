@@ -17,8 +17,9 @@ COLUMNS: dict[str, str] = {
     "centre_x_mm": "instantaneous centre of rotation ahead of the centre of mass",
     "centre_y_mm": "instantaneous centre of rotation to the left of the centre of mass",
     "effective_width_mm": "effective track width (V_teor,right - V_teor,left) / yaw rate",
-    "power_left_W": "electrical power of the left motor", "power_right_W": "of the right motor",
-    "winding_left_C": "winding of the left motor after long running", "winding_right_C": "of the right motor",
+    "power_left_W": "electrical power of the left motor", "power_right_W": "electrical power of the right motor",
+    "winding_left_C": "winding of the left motor after long running",
+    "winding_right_C": "winding of the right motor after long running",
 }  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from mmrjax.effects import (
     slip,
     supply,
     track,
+    turning,
 )
 from mmrjax.effects.base import Effect, amplitude, defined_in
 from mmrjax.effects.curve import CURVES, WAVES
@@ -27,4 +28,7 @@ BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 #: Discrepancies without a name, which robot files know and no library holds.
 UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES}
 
-__all__ = ["ALL", "BY_NAME", "CURVES", "UNNAMED", "WAVES", "Effect", "amplitude", "defined_in"]
+#: Of a robot that turns, which robot files know and the loop over straight travel cannot show.
+OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_in(turning)}
+
+__all__ = ["ALL", "BY_NAME", "CURVES", "OF_TURNS", "UNNAMED", "WAVES", "Effect", "amplitude", "defined_in"]

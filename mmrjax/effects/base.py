@@ -23,6 +23,7 @@ EQUATION = {
     **dict.fromkeys(("supply", "electrical"), "voltage drop"),
     **dict.fromkeys(("motor", "gearbox", "track"), "loss torque"),
     "ground": "resistance to travel",
+    **dict.fromkeys(("lateral", "yaw"), "resistance to turning"),
     "slip": "slip",
     "mass": "mass",
     "inertia": "inertia",

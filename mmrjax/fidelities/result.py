@@ -14,6 +14,9 @@ from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import CONVERGED, FLAGS, REVERSES, ROLLS_BACK, Result, Signals, quotient
 
+#: Current into a supply that is none [A]: what rounding and a settled search leave.
+CURRENT_SMALL = 1e-3
+
 
 def result(robot: Robot, signals: Signals, status: Int[Array, "..."]) -> Result:
     """Readings, power chain of Fig. 4 and exceeded limits of one instant."""
@@ -66,6 +69,7 @@ def exceeded(robot: Robot, signals: Signals) -> dict[str, Scalar]:
         "current_limited": robot.driver.limits(signals.current),
         "gearbox_overload": torque > (robot.gearbox.torque_limit or jnp.inf),
         "voltage_rising": on_battery & battery.rises(signals.discharge),
+        "current_returned": ~on_battery & (signals.total_current < -CURRENT_SMALL),
     }
 
 

@@ -18,7 +18,7 @@ from mmrjax import balances, channels, ground
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.effects.base import Effect
-from mmrjax.fidelities import rest
+from mmrjax.fidelities import lanes, rest
 from mmrjax.fidelities.rest import SHARE, TIME, voltage_at_rest
 from mmrjax.fidelities.result import efficiency, result, withhold
 from mmrjax.fidelities.rosenbrock import inverse
@@ -45,7 +45,7 @@ SETTLING = 7
 
 #: Of the search for a settled turn: implicit Euler's first step, its shortest and longest [s]; by what the next is
 #: longer, and shorter where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units.
-FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.01, 1e-6, 1e9, 2.0, 0.25, 1.05, 0.05
+FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.05, 1e-6, 1e9, 3.0, 0.25, 1.05, 0.1
 #: It has ended at a change so small where the rates are small too [1/s] or the step is long [s]; and failed after so
 #: many.
 SMALL, SMALL_RATE, LONG, TURNS = 1e-9, 1e-7, 10.0, 200
@@ -149,17 +149,22 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 11"],
     Implicit Euler's steps, longer and longer, follow a run to where it settles; in the end they are Newton's, and the
     last of those carries the derivatives, which are the implicit ones.
     """
-    guess = jax.lax.stop_gradient(_guess(robot, conditions))[:SETTLING]
-    others = jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
     moves = np.arange(SETTLING) >= (0 if conditions.of_sides().motor_speed is None else 4)
     still = -jnp.eye(SETTLING)
 
+    def others(conditions: Conditions) -> Array:
+        return jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
+
     def of(y: Array, robot: Robot, conditions: Conditions) -> Array:
-        return rates(robot, conditions, jnp.concatenate([y, others]))[:SETTLING]
+        return rates(robot, conditions, jnp.concatenate([y, others(conditions)]))[:SETTLING]
 
-    held = jax.lax.stop_gradient((robot, conditions))
+    def begun(held: tuple[Robot, Conditions]) -> _Search:
+        """Its first step goes nowhere: it only looks round."""
+        guess = _guess(*held)[:SETTLING]
+        none = jnp.zeros_like(guess)
+        return _Search(guess, none, still, jnp.asarray(FIRST), jnp.asarray(0), jnp.asarray(False))
 
-    def turn(search: _Search) -> _Search:
+    def turn(held: tuple[Robot, Conditions], search: _Search) -> _Search:
         step = inverse(jnp.eye(SETTLING) / search.step - search.jacobian)(search.rates)
         there = search.y + step
         slope, found = jax.jacfwd(lambda y: (of(y, *held),) * 2, has_aux=True)(there)
@@ -174,14 +179,11 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 11"],
         length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
         return _Search(y, found, slope, length, search.turns + 1, ended)
 
-    # The first step goes nowhere: it only looks round.
-    begun = _Search(guess, jnp.zeros_like(guess), still, jnp.asarray(FIRST), jnp.asarray(0), jnp.asarray(False))
-    end = jax.lax.while_loop(lambda search: (search.turns < TURNS) & ~search.solved, turn, begun)
-    end = jax.lax.stop_gradient(end)
+    end = lanes.until(begun, turn, lambda search: (search.turns >= TURNS) | search.solved, (robot, conditions))
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
     slope = jnp.where(sound, end.jacobian, still)
     last = inverse(-slope)(jnp.where(sound, of(end.y, robot, conditions), 0.0))
-    return jnp.concatenate([end.y + last, others]), sound
+    return jnp.concatenate([end.y + last, others(conditions)]), sound
 
 
 def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:

@@ -8,16 +8,19 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy.optimize
 from rich.table import Table
 
 from calibration.data.columns import SIDES, SUPPLY
 from calibration.data.contradictions import cannot_turn
 from calibration.data.errors import BadConfiguration
+from calibration.data.table import Runs
 from mmrjax import channels, fidelities, outputs
 from mmrjax.channels import Channel
 from mmrjax.conditions import Conditions
 from mmrjax.derived import turn as derived
 from mmrjax.fidelities.base import History, Run
+from mmrjax.fidelities.rest import voltage_at_rest
 from mmrjax.robot import Robot
 from sweeps import config as configuration
 from sweeps.console import say
@@ -51,6 +54,8 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         asked = run.commanded(robot, runs, config)
         run.refuse(robot, asked, config)
         shown = _channels(robot, settled)
+        if config.demands:
+            asked, runs = _demanded(robot, asked, runs, config)
         if settled:
             batch, swept = _with_others(robot, asked)
             turns = {**_duties(swept), **_columns(robot, shown, swept, batch)}
@@ -73,6 +78,60 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
         shows = page("turn", file, model=config.model, run=table, facts=facts, history=history, turns=turns)
         return run.leave(folder, config, result, shows)
+
+
+#: Of a demanded turn: as how much wider a robot slides than it is, to begin with; what its load takes, in shares of
+#: the faster side's voltage, one after the other until one is near enough; how near is there [m/s]; and the voltages
+#: tried from each at most.
+WIDER, LOADED, NEAR, TRIED = 2.0, (0.1, 0.05, 0.2, 0.4), 1e-7, 100
+
+
+def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration.Simulate) -> tuple[Conditions, Runs]:
+    """The run with those duties whose settled turn has the demanded speed and yaw rate.
+
+    Raises:
+        BadConfiguration: no duties have it, or they ask more than the supply has.
+    """
+    chassis = robot.configurations[str(runs.configurations_named(robot)[0])]
+    width = float(chassis.turning.width)
+    assert config.speed_m_s is not None and config.yaw_rate_rad_s is not None  # one comes with the other
+    wanted = np.array([config.speed_m_s, 0.5 * width * config.yaw_rate_rad_s])  # of the turn [m/s]
+
+    def driven(volts: np.ndarray) -> Conditions:
+        """Of an external supply that has as much; a battery has what it has."""
+        most = max(supply, float(np.abs(volts).max()))
+        left, right, source = (jax.numpy.full(asked.shape, x) for x in (*volts / most, most))
+        voltage = asked.voltage if config.battery else source
+        return dataclasses.replace(asked, voltage=voltage, duty_left=left, duty_right=right)
+
+    def off(volts: np.ndarray) -> np.ndarray:
+        reading = _with_others(robot, driven(volts))[0].result.reading
+        speed, turn = (np.asarray(reading[name])[0] for name in ("speed", "yaw_rate"))
+        return np.array([speed, 0.5 * width * turn]) - wanted
+
+    alike = dataclasses.replace(asked, duty_left=None, duty_right=None)
+    supply = float(np.ravel(jax.vmap(lambda c: voltage_at_rest(robot, c))(alike))[0])
+    belts = wanted[0] + WIDER * wanted[1] * np.array([-1.0, 1.0])
+    turning = belts / float(chassis.radius) * float(robot.gearbox.ratio) * float(robot.motor.torque_constant)
+    for share in LOADED:
+        begun = turning + share * np.abs(turning).max() * np.sign(belts)
+        volts = scipy.optimize.root(off, begun, options={"maxfev": TRIED}).x
+        if np.abs(off(volts)).max() < NEAR:  # not NaN
+            break
+    else:
+        raise BadConfiguration(
+            f"--speed, --yaw-rate: no settled turn of {config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s "
+            f"was found{' on the battery' if config.battery else ''}; friction that falls with sliding may have none "
+            "there"
+        )
+    if np.abs(volts).max() > supply:
+        raise BadConfiguration(
+            f"--speed, --yaw-rate: {config.speed_m_s:g} m/s and {config.yaw_rate_rad_s:g} rad/s take "
+            f"{np.abs(volts).max():.3g} V at one motor; the supply has {supply:.3g} V"
+        )
+    duties = volts / supply
+    columns = {**runs.columns, **dict(zip(SIDES, duties[:, None], strict=True))}
+    return driven(volts), dataclasses.replace(runs, columns=columns)
 
 
 def _ended(history: History | None) -> dict[str, float] | None:
@@ -104,7 +163,7 @@ def _cells(config: configuration.Simulate, given: dict[str, Any]) -> dict[str, A
     found: dict[str, Any] = {} if config.heading_deg is None else {"heading_deg": config.heading_deg}
     if config.duty_left is not None:
         return found | {"duty_left": config.duty_left, "duty_right": config.duty_right}
-    if config.left_V is None or config.right_V is None:
+    if config.left_V is None or config.right_V is None:  # those of a demand are found later
         return found | {name: 1.0 for name in SIDES}
     most = max(abs(config.left_V), abs(config.right_V))
     supply = given[SUPPLY] if given.get(SUPPLY) is not None else most

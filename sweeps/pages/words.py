@@ -129,6 +129,7 @@ FLAGS = {
     "too_hot": "winding hotter than permitted",
     "demand_missed": "a demanded speed was not reached",
     "voltage_rising": "a cell's voltage that rises as it discharges: the parabola of its curve has turned up",
+    "current_returned": "current flows back into the external supply, which few bench supplies take",
 }
 
 

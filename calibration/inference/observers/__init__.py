@@ -12,20 +12,21 @@ from calibration.data.runs import Runs
 from calibration.inference.observers.base import Observer
 from calibration.inference.observers.histories import Histories
 from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.observers.turns import SettledTurns
 from calibration.inference.priors import Coordinates
 from calibration.inference.problem import Problem, data_of
 from mmrjax import fidelities, params
 from mmrjax.fidelities import Facts
 from mmrjax.robot import Robot
 
-__all__ = ["Histories", "Observer", "SettledRuns", "facts", "kind", "pose"]
+__all__ = ["Histories", "Observer", "SettledRuns", "SettledTurns", "facts", "kind", "pose"]
 
 #: In the order in which they are asked whether a table is theirs.
-KINDS: tuple[type[Observer], ...] = (Histories, SettledRuns)
+KINDS: tuple[type[Observer], ...] = (Histories, SettledTurns, SettledRuns)
 
 
 def kind(runs: Runs) -> type[Observer]:
-    """The observer of a table: time histories where it has `time_s`, else settled runs."""
+    """The observer of a table: time histories where it has `time_s`, else settled turns or straight runs."""
     return next(k for k in KINDS if k.observes(runs))
 
 

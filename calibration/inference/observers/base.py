@@ -58,7 +58,9 @@ class Observer(eqx.Module):
         policy: how fits are searched for.
         rows_tell: whether a single row shows a defect by itself.
         evidence: kinds of evidence that something is missing.
-        searches: of a calibration; None takes the fidelity's.
+        traced: whether the loop can tell missing effects from such data.
+        searches: of a calibration; None takes the fidelity's; profiled: whether its parameters are profiled too,
+            where the fidelity's are.
     """
 
     conditions: eqx.AbstractVar[Conditions]
@@ -71,7 +73,9 @@ class Observer(eqx.Module):
     policy: ClassVar[SearchPolicy]
     rows_tell: ClassVar[bool]
     evidence: ClassVar[tuple[str, ...]]
+    traced: ClassVar[bool] = True
     searches: ClassVar[int | None] = None
+    profiled: ClassVar[bool] = True
 
     # --- of a table, before anything is simulated
 

@@ -177,6 +177,11 @@ class Histories(Observer):
         """Rows may come in any order; what does not change within a run is that of its first row."""
         if fidelity is not None and fidelities.get(fidelity).name != "drive":
             raise BadConfiguration(f"--model {fidelity}: {runs.source} holds time histories; they need --model drive")
+        if runs.turns:
+            raise BadConfiguration(
+                f"{runs.source}: time histories of a robot that turns are simulated, and not fitted; give its "
+                "settled turns, one a row, without time_s"
+            )
         names, first, run = np.unique(_names(runs), return_index=True, return_inverse=True)
         mine = [np.flatnonzero(run == k) for k in range(len(names))]
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]

@@ -102,12 +102,13 @@ class SettledRuns(Observer):
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
         columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
         measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
+        least = cls.sizes(runs) if runs.turns else np.zeros(measured.shape)  # readings of turns cross zero
         for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
             alike.setdefault(key, []).append(row)
         for rows in map(np.array, alike.values()):
             here, sds = measured[rows], noise.sd[rows]
             apart = np.abs(here[:, None] - here)
-            mean = np.abs(here[:, None] + here) / 2
+            mean = np.maximum(np.abs(here[:, None] + here) / 2, least[rows])
             sd = np.hypot(sds[:, None], sds)
             allowed = np.where(noise.estimated, CONTRADICTION_SHARE * mean, CONTRADICTION * sd)
             for at in np.argwhere(apart > allowed)[:1]:

@@ -1,0 +1,110 @@
+"""Effects of a robot that turns: sides that are not alike, and resistance to the turn. Straight travel shows none.
+
+They are no part of the library that the loop looks through, which takes runs of straight travel; robot files know
+them, and `calibrate` frees their amplitudes.
+"""
+
+from __future__ import annotations
+
+from mmrjax.effects.base import Effect, amplitude
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import Signals
+
+
+class SideFriction(Effect):
+    """ΔM_df = a s sign ω_m, s = 1 on the left and -1 on the right: a dry loss of M + a left and of M - a right.
+
+    Brushes, bearings and belts of one side that rub more than those of the other.
+
+    Source: Coulomb's friction of each side. Currents of a robot's sides differ in straight travel, by 1.4 A of 4 A in
+    LaRocque et al., arXiv 2403.16877 (docs/lab/turning-data.md).
+    """
+
+    balance = "motor"
+    driver = "direction"
+
+    amplitude: Scalar = amplitude(
+        unit="N·m",
+        meaning="half the difference of the sides' dry friction at the motor, positive where the left rubs more",
+        bounds=(-1.0, 1.0),
+        sd=1.5e-3,
+        source="half of the dry friction of Table 2",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.side * signals.direction
+
+
+class SideTorque(Effect):
+    """ΔM_d = a s C_m I, s = 1 on the left and -1 on the right: C_m (1 - a) on the left and C_m (1 + a) on the right.
+
+    Motors and ammeters of two makers' tolerances, or one that has lost part of its magnets' strength.
+
+    Source: eq. (17) with a constant of its own for each side.
+    """
+
+    balance = "motor"
+    driver = "load"
+    rests_on = ("motor.torque_constant",)
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="half the relative difference of the sides' torque constants, positive where the left is weaker",
+        bounds=(-0.5, 0.5),
+        sd=0.05,
+        source="makers' tolerances of 5 to 10 %",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.side * robot.motor.torque_electromagnetic(signals.current)
+
+
+class SideVoltage(Effect):
+    """ΔU = a s (E + I R), s = 1 left and -1 right: settled motors get U / (1 + a) on the left, U / (1 - a) on
+    the right.
+
+    A driver or leads of one side that give its motors less: the robot turns at equal commands.
+
+    Source: eq. (15) with a voltage of its own for each side.
+    """
+
+    balance = "electrical"
+    driver = "speed"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="half the relative difference of the sides' voltages, positive where the left gets less",
+        bounds=(-0.5, 0.5),
+        sd=0.03,
+        source="drivers' gains and dead times: a few percent",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        winding = robot.motor.voltage_winding(signals.current, signals.temperature)
+        return self.amplitude * signals.side * (robot.motor.voltage_back(signals.speed_motor) + winding)
+
+
+class TurningResistance(Effect):
+    """ΔM_ψ = a N ω for the load N of each side, against the turn: a moment in proportion to load and yaw rate.
+
+    Soil, carpet or tyres that are dragged round and yield the faster the more they resist.
+
+    Source: viscous drag beside Coulomb's friction; Wong and Chiang, A general theory for skid steering of tracked
+    vehicles on firm ground, Proc. IMechE D 215 (2001), for a turning moment that is no constant.
+    """
+
+    balance = "yaw"
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="m·s",
+        meaning="moment against the turn over load and yaw rate",
+        bounds=(-0.01, 0.5),
+        sd=1e-3,
+        source="a tenth of the friction's moment φ_y L/4 at 4 rad/s (Table 5: 0.03 m)",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.normal * signals.yaw_rate

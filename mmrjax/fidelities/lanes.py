@@ -1,0 +1,79 @@
+"""A loop whose turns differ much in number over a batch: a member that has ended makes room for the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool
+
+T = TypeVar("T")
+
+#: Members of a batch that are at work at once: enough to fill vectors and caches, few enough that seldom many have
+#: ended at its end.
+LANES = 256
+
+
+def until(
+    begun: Callable[[Any], T], turn: Callable[[Any, T], T], ended: Callable[[T], Bool[Array, ""]], own: Any
+) -> T:
+    """The state at which `ended`, by `turn` from `begun`, without derivatives.
+
+    A batch of `jax.lax.while_loop` takes for each of its members as many turns as the longest of them. Here it takes
+    the mean, beside what the last `LANES` members take.
+
+    Args:
+        begun: state of arrays, of `own`; turn: the next state, of `own` and a state; ended: of a state.
+        own: what a member has of its own; numbers in it may be batched.
+    """
+    numbers, rest = eqx.partition(jax.lax.stop_gradient(own), eqx.is_array)
+
+    def of(numbers: Any) -> Any:
+        return eqx.combine(numbers, rest)
+
+    @custom_vmap
+    def alone(numbers: Any) -> T:
+        return jax.lax.while_loop(lambda s: ~ended(s), lambda s: turn(of(numbers), s), begun(of(numbers)))
+
+    @alone.def_vmap
+    def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:
+        (batched,) = batched
+        lanes = min(size, LANES)
+        axes = jax.tree.map(lambda b: 0 if b else None, batched)
+
+        def chosen(which: Array, one: T, other: T) -> T:
+            return jax.tree.map(
+                lambda x, y: jnp.where(jnp.reshape(which, which.shape + (1,) * (x.ndim - 1)), x, y), one, other
+            )
+
+        def at(index: Array) -> Any:
+            return jax.tree.map(lambda x, b: x[index] if b else x, numbers, batched)
+
+        begin = jax.vmap(lambda x: begun(of(x)), in_axes=(axes,))
+        go = jax.vmap(lambda x, s: turn(of(x), s), in_axes=(axes, 0))
+        over = jax.vmap(ended)
+
+        def busy(carry: tuple) -> Array:
+            return jnp.any(carry[1] < size)
+
+        def step(carry: tuple) -> tuple:
+            found, index, following, state = carry
+            state = chosen(over(state), state, go(at(index), state))
+            free = over(state) & (index < size)
+            found = jax.tree.map(
+                lambda all_, x: all_.at[jnp.where(free, index, size)].set(x, mode="drop"), found, state
+            )
+            index = jnp.where(free, jnp.minimum(following + jnp.cumsum(free) - 1, size), index)
+            return found, index, following + jnp.sum(free), chosen(free, begin(at(index)), state)
+
+        first = jnp.arange(lanes)
+        state = begin(at(first))
+        found = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), state)
+        found = jax.lax.while_loop(busy, step, (found, first, jnp.asarray(lanes), state))[0]
+        return found, jax.tree.map(lambda _: True, found)
+
+    return alone(numbers)

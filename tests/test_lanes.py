@@ -1,0 +1,52 @@
+"""Loops whose members take different numbers of turns: each ends as by itself, in as many turns as the mean asks."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mmrjax.fidelities import lanes
+
+
+def halves(own):
+    """How often a number is halved until it is below one, and what is left; `own` is the number and the divisor."""
+    begun = lambda own: (own[0], jnp.asarray(0))  # noqa: E731
+    return lanes.until(begun, lambda own, s: (s[0] / own[1], s[1] + 1), lambda s: s[0] < 1.0, own)
+
+
+@pytest.mark.parametrize("size", [1, 3, 8, 50])
+def test_members_of_a_batch_end_as_each_by_itself(monkeypatch, size):
+    monkeypatch.setattr(lanes, "LANES", 8)
+    numbers = jnp.asarray(2.0 ** np.random.default_rng(0).integers(-1, 40, size) * 1.5)
+    left, turns = jax.jit(jax.vmap(lambda x: halves((x, 2.0))))(numbers)
+    alone = [halves((x, 2.0)) for x in numbers]
+    np.testing.assert_array_equal(turns, [int(a[1]) for a in alone])
+    np.testing.assert_array_equal(left, [float(a[0]) for a in alone])
+    both = jax.vmap(jax.vmap(lambda x, y: halves((x, y)), (0, None)), (None, 0))(numbers, jnp.asarray([2.0, 4.0]))
+    np.testing.assert_array_equal(both[1][0], turns)
+
+
+def test_a_batch_takes_as_many_turns_as_its_lanes_need(monkeypatch):
+    """One member of a hundred that takes a thousand turns does not make a thousand of the others'."""
+    monkeypatch.setattr(lanes, "LANES", 4)
+    taken = []
+
+    def turn(own, state):
+        jax.debug.callback(lambda: taken.append(1))
+        return state + 1
+
+    own = jnp.asarray([30.0] + [3.0] * 40)
+    count = jax.vmap(
+        lambda x: lanes.until(
+            lambda own: (own, own * 0), lambda own, s: (s[0], turn(own, s[1])), lambda s: s[1] >= s[0], x
+        )
+    )
+    np.testing.assert_array_equal(jax.block_until_ready(count(own))[1], own)
+    jax.effects_barrier()
+    assert len(taken) < 4 * 50 < 41 * 30
+
+
+def test_no_derivative_passes_through():
+    assert float(jax.grad(lambda x: halves((x, 2.0))[0])(12.0)) == 0.0

@@ -1,0 +1,177 @@
+"""Calibration of a robot whose sides are driven apart: tables of settled turns whose truth is known."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from worlds import turning as world
+
+import mmrjax as mm
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.discovery.discover import discover
+from calibration.inference import blocks, identifiability, observers, priors
+from calibration.inference.calibrate import calibrate
+from calibration.inference.observers.turns import SettledTurns
+from mmrjax import balances, channels, params, robots
+
+CURRENTS = ("motor_current_left", "motor_current_right")
+MOTION = ("motor_speed_left", "motor_speed_right", "yaw_rate")
+SHOWN = (*CURRENTS, *MOTION)
+#: Sds of the instruments, in the units of the columns.
+SDS = dict(zip(SHOWN, (0.02, 0.02, 8.0, 8.0, 0.01), strict=True))
+NOISE = ",".join(f"{name}={sd}{channels.of(name).unit}" for name, sd in SDS.items())
+#: Duties of left and right side.
+DUTIES = (
+    (1.0, 1.0), (1.0, 0.7), (1.0, 0.3), (1.0, 0.0), (1.0, -0.5), (1.0, -1.0), (0.6, 0.5), (0.3, 0.7), (0.1, 0.8),
+    (-0.4, 0.9), (-0.6, 0.6), (0.5, -0.2),
+)  # fmt: skip
+LATERAL, WIDTH = "turning.lateral", "turning.width"
+
+
+def written(path, configuration, mass, readings):
+    """A table of those duties at 33 V with noisy readings by channel [SI]."""
+    random = np.random.default_rng(3)
+    columns = {"configuration": [configuration] * len(DUTIES), "supply_voltage_V": [33] * len(DUTIES)}
+    columns |= {
+        "total_mass_kg": [mass] * len(DUTIES),
+        "payload_kg": [0] * len(DUTIES),
+        "slope_deg": [0] * len(DUTIES),
+    }
+    columns |= {f"duty_{side}": [d[k] for d in DUTIES] for k, side in enumerate(("left", "right"))}
+    for name, values in readings.items():
+        channel = channels.of(name)
+        columns[channel.column] = np.asarray(values) / channel.factor + SDS[name] * random.normal(size=len(DUTIES))
+    lines = [",".join(str(v) for v in row) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join([",".join(columns), *lines]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robot") / "robot.toml"
+    path.write_text(f'base = "nominal"\nchannels = [{", ".join(map(repr, SHOWN))}]\n')
+    return mm.read_robot(str(path))
+
+
+@pytest.fixture(scope="module")
+def of_world(robot, tmp_path_factory):
+    """Runs of the second implementation, narrower and with more lateral friction than the nominal robot."""
+    run = mm.Conditions("6T2A").resolved(robot)
+    chassis = robot.configurations["6T2A"]
+    height = float(balances.stance(robot, run, chassis, chassis.mass).height)
+    true = {"ratio": TRUE[LATERAL], "width": TRUE[WIDTH], "inertia": 0.23, "height": height, "nodes": 16}
+    other = world.paper_robot(**true)
+    found = [world.circling(other, world.Inputs(*duty, kind="duty", supply=33.0)) for duty in DUTIES]
+    seen = np.array([[*f.I, *f.w, f.omega] for f in found]).T
+    path = written(
+        tmp_path_factory.mktemp("world") / "turns.csv", "6T2A", other.mass, dict(zip(SHOWN, seen, strict=True))
+    )
+    return records.read(path, robot=robot)
+
+
+TRUE = {LATERAL: 1.45, WIDTH: 0.236}
+
+
+def test_settled_turns_are_observed_as_turns(robot, of_world):
+    assert observers.kind(of_world) is SettledTurns
+    names = tuple(f"6T2A.{n}" for n in (LATERAL, WIDTH))
+    sd = np.broadcast_to([channels.of(n).factor * SDS[n] for n in SHOWN], of_world.measured().shape)
+    truth = {name: (TRUE[name.partition(".")[2]], 0.05) for name in names}
+    posed = observers.pose(of_world, robot, priors.coordinates(robot, names, truth), sd)
+    seen = posed.observation(jnp.zeros(2))
+    whitened = (np.asarray(seen.reading) - of_world.measured()) / sd
+    assert np.sqrt((whitened**2).mean()) == pytest.approx(1.0, abs=0.2)  # noise alone
+    assert not np.asarray(seen.adhesion_used).any()
+
+
+def test_turns_free_what_turns_show(robot):
+    straight = priors.default_names(["6T2A"], robot)
+    turns = priors.default_names(["6T2A"], robot, turns=True)
+    assert set(turns) - set(straight) == {f"6T2A.{LATERAL}", f"6T2A.{WIDTH}"}
+
+
+def test_turns_are_held_out_by_how_sharp_they_are(of_world):
+    found = blocks.blocks(of_world, blocks.TURN)
+    assert list(found) == ["-1 to -0.5", "-0.44 to 0", "0.12 to 0.43", "0.7 to 1"]
+    assert np.sum(list(found.values()), 0).tolist() == [1] * len(DUTIES)
+
+
+@pytest.mark.parametrize("model", ["drive", "track"])
+def test_settled_turns_are_fitted_by_steady_alone(robot, of_world, model):
+    with pytest.raises(BadConfiguration, match="settled turns are fitted with --model steady"):
+        SettledTurns.of(of_world, robot, model)
+
+
+def test_histories_of_turns_are_refused(robot, of_world, tmp_path):
+    path = tmp_path / "history.csv"
+    lines = [
+        "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,duty_left,duty_right,time_s,yaw_rate_rad_s"
+    ]
+    lines += [f"6T2A,33,13.1,0,0,1,0.5,{0.1 * k},{-0.05 * k}" for k in range(12)]
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(BadConfiguration, match=r"history.csv: time histories of a robot that turns"):
+        calibrate(records.read(path, robot=robot), robot, model="drive", free=[f"6T2A.{LATERAL}"], noise=NOISE)
+
+
+def test_loop_over_turns_is_refused(robot, of_world):
+    with pytest.raises(BadData, match="the loop looks for effects in straight travel alone, and these runs turn"):
+        discover(of_world, robot)
+
+
+@pytest.mark.slow
+def test_truth_of_a_second_implementation_is_found(robot, of_world):
+    found = calibrate(of_world, robot, noise=NOISE)
+    assert found.converged and found.adequacy.p_value > 0.01
+    for name, true in TRUE.items():
+        estimate = found.parameters[f"6T2A.{name}"]
+        assert abs(estimate.value - true) < 3 * estimate.sd and not estimate.held_by_prior
+    held = found.held_out["turn"].errors
+    assert all(0 < held[name].rms_sigma < 2 for name in SHOWN)
+    assert held["yaw_rate"].rms_percent < 2 < found.errors_before["yaw_rate"].rms_percent
+
+
+@pytest.mark.slow
+def test_truth_of_a_simulated_table_is_found_from_the_command_line(tmp_path, mmrjax):
+    friction = {f"4W2T.ground.friction.{k}": v for k, v in (("static", 0.45), ("dynamic", 0.36))}
+    true = params.replace(robots.nominal(), {f"4W2T.{LATERAL}": 0.9, **friction})
+    duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
+    runs = mm.Conditions(["4W2T"] * len(DUTIES), voltage=33.0, **duties)
+    seen = mm.simulate(true, runs).reading
+    mass = float(true.configurations["4W2T"].mass)
+    table = written(tmp_path / "turns.csv", "4W2T", mass, {name: seen[name] for name in SHOWN})
+    (tmp_path / "robot.toml").write_text(f'base = "nominal"\nchannels = [{", ".join(map(repr, SHOWN))}]\n')
+    free = ",".join(f"4W2T.{n}" for n in (LATERAL, WIDTH, "ground.friction.static"))
+    told = ("--robot", str(tmp_path / "robot.toml"), "--free", free, "--noise", NOISE)
+    code, out, err = mmrjax("calibrate", str(table), *told, "--out", str(tmp_path / "run"))
+    assert code == 0, err
+    assert "held out" in out
+    held = json.loads((tmp_path / "run" / "result.json").read_text())["held_out_by"]["turn"]
+    assert held["all"]["yaw_rate"]["rows"] == len(DUTIES)
+    fitted = mm.read_robot(str(tmp_path / "run" / "robot.toml"))
+    assert float(fitted.configurations["4W2T"].turning.lateral) == pytest.approx(0.9, rel=0.03)
+
+
+@pytest.mark.slow
+def test_wheels_that_creep_tell_the_effective_width_alone(tmp_path):
+    """Without currents only B + φ_y/φ_x L²/B shows, which the correlation of both says."""
+    path = tmp_path / "robot.toml"
+    path.write_text(f'base = "nominal"\nchannels = [{", ".join(map(repr, MOTION))}]\n')
+    robot = mm.read_robot(str(path))
+    duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
+    seen = mm.simulate(robot, mm.Conditions(["4W2T"] * len(DUTIES), voltage=33.0, **duties)).reading
+    mass = float(robot.configurations["4W2T"].mass)
+    table = written(tmp_path / "turns.csv", "4W2T", mass, {name: seen[name] for name in MOTION})
+    runs = records.read(table, robot=robot)
+    names = tuple(f"4W2T.{n}" for n in (LATERAL, WIDTH))
+    sd = np.broadcast_to([channels.of(n).factor * SDS[n] for n in MOTION], runs.measured().shape)
+    about = identifiability.analyse(
+        observers.pose(runs, robot, priors.coordinates(robot, names), sd), jnp.zeros(len(names))
+    )
+    ((one, other, correlation),) = about.correlated()
+    assert {one, other} == set(names)
+    length, width, ratio = 0.3, 0.243, float(robot.configurations["4W2T"].turning.lateral)
+    # At a given effective width: d(ratio)/dB = -(1 - ratio (L/B)²) (B/L)², so here both grow together.
+    slope = -(1 - ratio * (length / width) ** 2) * (width / length) ** 2
+    assert np.sign(correlation) == np.sign(slope)

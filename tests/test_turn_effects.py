@@ -1,0 +1,155 @@
+"""Effects of a robot that turns: their equations, that left and right mirror, and that straight travel has none."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_turn_calibration import DUTIES, NOISE, SHOWN, written
+from test_turning import flat, of_world
+from worlds import turning as world
+
+import mmrjax as mm
+from calibration.data import robot_file
+from calibration.data import runs as records
+from calibration.inference.calibrate import calibrate
+from mmrjax import balances, effects, energy, params, robots
+from mmrjax.fidelities import turning
+from mmrjax.signals import PlaneMotion, State
+
+OF_SIDES = ("side_friction", "side_torque", "side_voltage")
+#: In units of the prior sd.
+SIZE = 2.0
+MOTION = PlaneMotion(*(jnp.asarray(x) for x in ([2.0, -0.7], [900.0, -150.0], 0.3, 0.05, -1.1, 0.0, 0.0, 0.0, 0.0)))
+
+
+def amplitude(name):
+    return SIZE * next(p.spec for p in params.walk(effects.OF_TURNS[name]()) if p.spec.amplitude).prior_sd(0.0)
+
+
+def with_amplitudes(robot, values):
+    present = tuple(effects.OF_TURNS[n](amplitude=v) for n, v in values.items())
+    return dataclasses.replace(robot, effects=present)
+
+
+RUN = mm.Conditions("6T2A", voltage=33.0, duty_left=0.9, duty_right=-0.2).resolved(robots.nominal())
+MIRRORED = mm.Conditions("6T2A", voltage=33.0, duty_left=-0.2, duty_right=0.9).resolved(robots.nominal())
+
+
+@jax.jit
+def rates(values, run, y):
+    return turning.rates(with_amplitudes(robots.nominal(), values), run, y)
+
+
+def amplitudes(**some):
+    return {name: jnp.asarray(some.get(name, 0.0)) for name in effects.OF_TURNS}
+
+
+@pytest.mark.parametrize("name", effects.OF_TURNS)
+def test_effect_moves_the_turn_and_mirrors(name):
+    y = flat(MOTION)
+    plain = turning.rates(robots.nominal(), RUN, y)
+    np.testing.assert_allclose(rates(amplitudes(), RUN, y), plain, rtol=1e-12, atol=1e-12)
+    size = amplitude(name)
+    moved = np.asarray(rates(amplitudes(**{name: size}), RUN, y))
+    assert (np.abs(moved - plain) > 0.01 * np.abs(plain)).any()
+    swap = np.array([1, 0, 3, 2, 4, 5, 6, 7, 8, 9, 10])
+    sign = np.array([1, 1, 1, 1, 1, -1, -1, -1, 1, -1, 1])
+    other = -size if name in OF_SIDES else size
+    mirrored = np.asarray(rates(amplitudes(**{name: other}), MIRRORED, (y * sign)[swap]))
+    np.testing.assert_allclose(mirrored, (moved * sign)[swap], rtol=1e-9, atol=1e-9)
+
+
+def test_friction_of_a_side_is_that_of_a_second_implementation():
+    robot, more = robots.nominal(), 0.002
+    dry = float(robot.motor.friction_coulomb)
+    constants = [{"motor.friction_coulomb": dry + more}, {"motor.friction_coulomb": dry - more}]
+    other = of_world(robot, "6T2A", left=constants[0], right=constants[1])
+    y = np.asarray(flat(MOTION))
+    theirs = world.rates(
+        other, world.Inputs(0.9, -0.2, kind="duty", supply=33.0), 0.0, (y * np.asarray(turning._UNITS))[PLACES]
+    )
+    mine = np.asarray(rates(amplitudes(side_friction=more), RUN, jnp.asarray(y))) * np.asarray(turning._UNITS)
+    np.testing.assert_allclose(mine[PLACES][:10], theirs[:10], rtol=1e-8, atol=1e-8)
+
+
+#: Of the second implementation's state in ours.
+PLACES = [8, 9, 7, 4, 5, 6, 0, 1, 2, 3, 10]
+
+
+def test_terms_are_their_equations():
+    robot, values = robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS}
+    signals = balances.turning(robot, RUN, MOTION).signals
+    terms = {}
+    for name, a in values.items():
+        effect = effects.OF_TURNS[name](amplitude=a)
+        terms[name] = np.asarray(jax.vmap(lambda s, effect=effect: effect.term(robot, s))(signals))
+    side, current, turned = np.array([1.0, -1.0]), np.array([2.0, -0.7]), np.array([900.0, -150.0])
+    constant, resistance = float(robot.motor.torque_constant), float(robot.motor.resistance)
+    np.testing.assert_allclose(terms["side_friction"], values["side_friction"] * side * np.sign(turned), rtol=1e-9)
+    np.testing.assert_allclose(terms["side_torque"], values["side_torque"] * side * constant * current, rtol=1e-9)
+    given = constant * turned + resistance * current
+    np.testing.assert_allclose(terms["side_voltage"], values["side_voltage"] * side * given, rtol=1e-9)
+    resisted = values["turning_resistance"] * np.asarray(signals.normal) * -1.1
+    np.testing.assert_allclose(terms["turning_resistance"], resisted, rtol=1e-9)
+
+
+def test_energy_is_kept_and_resistance_to_turning_takes_it():
+    robot = with_amplitudes(robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS})
+
+    def stored(m):
+        return energy.stored_turning(robot, balances.turning(robot, RUN, m), m)
+
+    @jax.jit
+    def powers(m):
+        rate = turning.motion_of(robot, turning.rates(robot, RUN, flat(m)))
+        travel = balances.turning(robot, RUN, m)
+        source = jnp.mean(jax.vmap(lambda c, s: energy.source(robot, c, s))(RUN.of_sides(), travel.signals))
+        return source, energy.sinks_turning(robot, RUN, travel), jax.jvp(stored, (m,), (rate,))[1]
+
+    source, sinks, change = powers(MOTION)
+    assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
+    plain = energy.sinks_turning(robots.nominal(), RUN, balances.turning(robots.nominal(), RUN, MOTION))
+    load = float(jnp.sum(balances.turning(robot, RUN, MOTION).signals.normal))
+    taken = amplitude("turning_resistance") * load * 1.1**2
+    assert float(sinks["sliding"] - plain["sliding"]) == pytest.approx(taken, rel=1e-6)
+
+
+def test_straight_travel_shows_none_of_them():
+    robot = robots.nominal()
+    run = mm.Conditions("6T2A", slope_deg=3.0).resolved(robot)
+    state = State(*(jnp.asarray(x) for x in (2.0, 900.0, 0.7, 0.0)))
+    plain = balances.settled(robot, run, state, 1.0)[0]
+    moved = balances.settled(with_amplitudes(robot, {n: amplitude(n) for n in effects.OF_TURNS}), run, state, 1.0)[0]
+    for mine, theirs in zip(jax.tree.leaves(plain), jax.tree.leaves(moved), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_robot_files_know_them_and_the_library_of_straight_travel_does_not(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text('base = "nominal"\n[effects.side_torque]\namplitude = 0.1\n')
+    robot = robot_file.read(path)
+    assert [e.name for e in robot.effects] == ["side_torque"] and float(robot.effects[0].amplitude) == 0.1
+    assert not set(effects.OF_TURNS) & set(effects.BY_NAME)
+    for kind in effects.OF_TURNS.values():
+        assert "Source:" in (kind.__doc__ or "") and kind.balance in balances.BALANCES
+
+
+@pytest.mark.slow
+def test_sides_that_are_not_alike_are_found(tmp_path):
+    """A table of a robot whose left side rubs more, calibrated with that effect's amplitude free."""
+    true = with_amplitudes(robots.nominal(), {"side_friction": jnp.asarray(0.0025)})
+    duties = dict(zip(("duty_left", "duty_right"), np.array(DUTIES).T, strict=True))
+    seen = mm.simulate(true, mm.Conditions(["6T2A"] * len(DUTIES), voltage=33.0, **duties)).reading
+    path = tmp_path / "robot.toml"
+    shown = f"channels = [{', '.join(map(repr, SHOWN))}]\n"
+    path.write_text(f'base = "nominal"\n{shown}[effects.side_friction]\n[effects.side_torque]\n')
+    robot = mm.read_robot(str(path))
+    mass = float(robot.configurations["6T2A"].mass)
+    table = written(tmp_path / "turns.csv", "6T2A", mass, {name: seen[name] for name in SHOWN})
+    free = [f"effects.{name}.amplitude" for name in ("side_friction", "side_torque")] + ["6T2A.turning.lateral"]
+    found = calibrate(records.read(table, robot=robot), robot, free=free, noise=NOISE, starts=1, blocks=())
+    friction, torque = (found.parameters[name] for name in free[:2])
+    assert abs(friction.value - 0.0025) < 3 * friction.sd < 0.001
+    assert abs(torque.value) < 3 * torque.sd

@@ -1,0 +1,221 @@
+"""Tables of turns: what they may state of either side, and every way in which that can be wrong."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mmrjax as mm
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from calibration.data.instruments import with_inferred_instruments
+from calibration.inference.calibrate import calibrate
+from calibration.inference.ranges import check_ranges
+from mmrjax import balances
+from mmrjax.channels import RPM
+from mmrjax.signals import State
+
+#: A robot on four wheels whose sides' speeds are imposed; the numbers are nobody's.
+KINEMATIC = """
+base = "none"
+sides = 2
+imposed = "motor_speed"
+channels = ["motor_current_left", "motor_current_right", "yaw_rate"]
+[motor]
+torque_constant = "0.044 ± 5 %"
+friction_coulomb = "0.05 ± 50 %"
+[gearbox]
+ratio = 78.0
+efficiency_load = "0.7 ± 20 %"
+[rover]
+load = "vehicle"
+movers = "wheels"
+mass = 50.0
+radius = 0.165
+[rover.ground]
+rolling_resistance = "0.03 ± 50 %"
+[rover.ground.friction]
+static = "0.6 ± 50 %"
+speed_static = "0.04 ± 100 %"
+[rover.turning]
+width = "0.555 ± 5 %"
+lateral = "0.7 ± 50 %"
+inertia = 3.0
+[running_gear]
+wheelbase = 0.512
+"""
+#: The same, its voltage imposed and its motors' speeds read.
+DRIVEN = (
+    KINEMATIC.replace('imposed = "motor_speed"\n', "")
+    .replace('channels = ["motor_current', 'channels = ["motor_speed_left", "motor_speed_right", "motor_current')
+    .replace("[motor]", "[motor]\nresistance = 0.5")
+)
+SPEEDS = "motor_speed_left_rpm,motor_speed_right_rpm"
+READ = "motor_current_left_A,motor_current_right_A,yaw_rate_rad_s"
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """Reads a robot's file, then a table of its runs."""
+
+    def written(content):
+        path = tmp_path / "rover.toml"
+        path.write_text(content)
+        return mm.read_robot(str(path))
+
+    return written
+
+
+@pytest.fixture
+def table(tmp_path):
+    def written(header, *rows, robot):
+        path = tmp_path / "turns.csv"
+        path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+        return records.read(path, robot=robot)
+
+    return written
+
+
+#: Speeds of left and right, currents and yaw rate that can be true of one robot.
+SOUND = (
+    (1000, 2000, -3.0, 9.0, 0.3), (2000, 1000, 9.0, -3.0, -0.3), (1500, 1500, 2.0, 2.0, 0.0),
+    (-1500, 1500, -8.0, 8.0, 0.9), (1500, -1500, 8.0, -8.0, -0.9), (0, 1500, -2.0, 8.0, 0.4),
+)  # fmt: skip
+
+
+def test_speeds_of_both_sides_are_conditions(rig, table):
+    robot = rig(KINEMATIC)
+    runs = table(f"{SPEEDS},{READ}", *SOUND, robot=robot)
+    assert runs.turns and runs.axes[:1] == ("motor_speed_rpm",) and set(SPEEDS.split(",")) < set(runs.axes)
+    conditions = runs.conditions(robot)
+    np.testing.assert_allclose(conditions.motor_speed_left, RPM * np.array([row[0] for row in SOUND]))
+    np.testing.assert_allclose(conditions.motor_speed_right, RPM * np.array([row[1] for row in SOUND]))
+    assert conditions.turns and conditions.duty_left is None
+
+
+def test_yaw_rate_in_degrees_is_converted(rig, table):
+    robot = rig(KINEMATIC)
+    runs = table(f"{SPEEDS},yaw_rate_deg_s", *[(a, b, np.degrees(w)) for a, b, _, _, w in SOUND], robot=robot)
+    np.testing.assert_allclose(runs["yaw_rate_rad_s"], [row[-1] for row in SOUND])
+
+
+def test_yaw_rate_to_the_right_is_turned_in_the_file(rig, table):
+    robot = rig(KINEMATIC.replace("[motor]", '[columns]\nyaw_rate_rad_s = {column = "w", factor = -1}\n[motor]', 1))
+    runs = table(f"{SPEEDS},w", *[(a, b, -w) for a, b, _, _, w in SOUND], robot=robot)
+    np.testing.assert_allclose(runs["yaw_rate_rad_s"], [row[-1] for row in SOUND])
+
+
+@pytest.mark.slow
+def test_yaw_rate_in_degrees_under_another_name_is_refused(rig, table):
+    robot = rig(KINEMATIC)
+    rows = [(a, b, np.degrees((b - a) * RPM / 78 * 0.165 / 0.9)) for a, b, *_ in SOUND]
+    with pytest.raises(BadData, match=r"yaw_rate_rad_s: .*deg/s"):
+        check_ranges(table(f"{SPEEDS},yaw_rate_rad_s", *rows, robot=robot), robot)
+
+
+def test_currents_without_sign_are_compared_as_magnitudes(rig, table):
+    robot = rig(KINEMATIC)
+    runs = table(f"{SPEEDS},{READ}", *[(a, b, abs(i), abs(k), w) for a, b, i, k, w in SOUND * 2], robot=robot)
+    assert not robot.rig.instruments
+    assert {i.channel: i.signed for i in with_inferred_instruments(robot, runs).rig.instruments} == {
+        "motor_current_left": False, "motor_current_right": False,
+    }  # fmt: skip
+    assert any("magnitudes are compared" in note for note in runs.notes)
+    signed = table(f"{SPEEDS},{READ}", *SOUND, robot=robot)
+    assert with_inferred_instruments(robot, signed) is robot
+
+
+def row_of(*changes):
+    """Rows with columns in another order, or of another sign."""
+    return [tuple(sign * row[k] for k, sign in changes) for row in SOUND]
+
+
+KEEP = tuple((k, 1) for k in range(5))
+REFUSED = {
+    "one side": (KINEMATIC, f"motor_speed_left_rpm,{READ}", row_of(KEEP[0], *KEEP[2:]),
+                 "column motor_speed_right_rpm is missing beside motor_speed_left_rpm"),
+    "one duty": (DRIVEN, f"supply_voltage_V,duty_left,{READ}", [(24, 1, *row[2:]) for row in SOUND],
+                 "column duty_right is missing beside duty_left"),
+    "both ways": (KINEMATIC, f"motor_speed_rpm,{SPEEDS},{READ}", [(1, *row) for row in SOUND],
+                  "column motor_speed_rpm beside motor_speed_left_rpm, motor_speed_right_rpm; keep one"),
+    "letters": (KINEMATIC, f"{SPEEDS},motor_current_l_A,motor_current_r_A,yaw_rate_rad_s", SOUND,
+                "column motor_current_l_A: the sides are called left and right; name it motor_current_left_A"),
+    "in front": (KINEMATIC, f"{SPEEDS},left_motor_current_A,right_motor_current_A,yaw_rate_rad_s", SOUND,
+                 r"name it motor_current_left_A, or state \[columns\]"),
+    "duties by letters": (DRIVEN, f"supply_voltage_V,duty_L,duty_R,{READ}", [(24, 1, 1, *r[2:]) for r in SOUND],
+                          "column duty_L: the sides are called left and right; name it duty_left"),
+    "yaw to the right": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:4], (4, -1)),
+                         r"row 4, yaw_rate_rad_s: got -0.9 where .* are -1500 and 1500, and so in 5 of 5 rows; "
+                         "expected a positive one where the right side is the faster"),
+    "currents exchanged": (KINEMATIC, f"{SPEEDS},{READ}", row_of(*KEEP[:2], (3, 1), (2, 1), KEEP[4]),
+                           r"row 4, motor_current_left_A and motor_current_right_A: got 8 and -8 .* exchanged"),
+    "duties exchanged": (DRIVEN, f"supply_voltage_V,duty_left,duty_right,{SPEEDS}",
+                         [(24, b / 2000, a / 2000, a, b) for a, b, *_ in SOUND],
+                         "motor_speed_left_rpm and motor_speed_right_rpm: .* the sides of one pair of columns are"),
+    "no width": (KINEMATIC.replace('width = "0.555 ± 5 %"\n', ""), f"{SPEEDS},{READ}", SOUND,
+                 r"rover.turning.width \[m\] missing in the robot's file, which a turn needs"),
+    "one motor": (KINEMATIC.replace("sides = 2", "sides = 1"), f"{SPEEDS},{READ}", SOUND,
+                  "got a robot of 1 side; expected sides = 2"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED, ids=list(REFUSED))
+def test_bad_tables_of_turns_are_refused_in_a_sentence(rig, table, case):
+    content, header, rows, sentence = REFUSED[case]
+    robot = rig(content)
+    with pytest.raises(BadData, match=sentence):
+        table(header, *rows, robot=robot)
+
+
+def test_sound_tables_of_turns_are_not_refused(rig, table):
+    assert len(table(f"{SPEEDS},{READ}", *SOUND, robot=rig(KINEMATIC))) == len(SOUND)
+    rows = [(24, row[0] / 2000, row[1] / 2000, *row) for row in SOUND]
+    assert len(table(f"supply_voltage_V,duty_left,duty_right,{SPEEDS},{READ}", *rows, robot=rig(DRIVEN))) == len(
+        SOUND
+    )
+
+
+def test_what_is_wrong_with_a_robot_that_turns_is_said(rig):
+    with pytest.raises(BadConfiguration, match=r"rover.turning.width: got 555; expected 0 to 5"):
+        rig(KINEMATIC.replace('"0.555 ± 5 %"', "555"))
+    with pytest.raises(BadConfiguration, match="motor_speed_left is imposed, so it is no reading"):
+        rig(KINEMATIC.replace('["motor_current_left"', '["motor_speed_left"'))
+
+
+@pytest.mark.slow
+def test_width_or_ratio_of_a_kinematic_robot_is_calibrated(rig, table):
+    robot = rig(KINEMATIC)
+    speeds = [
+        (1000, 2000),
+        (2000, 1200),
+        (1500, 1500),
+        (-1200, 1500),
+        (1500, -800),
+        (200, 1500),
+        (1800, 1500),
+        (900, 0),
+    ]
+    left, right = RPM * np.array(speeds).T
+    true = mm.params.replace(robot, {"rover.turning.lateral": jnp.asarray(0.9)})
+    seen = mm.simulate(
+        true, mm.Conditions(["rover"] * len(speeds), motor_speed=0.0, motor_speed_left=left, motor_speed_right=right)
+    ).reading
+    random, sds = np.random.default_rng(5), (0.05, 0.05, 0.005)
+    noisy = [
+        np.asarray(seen[n]) + sd * random.normal(size=len(speeds))
+        for n, sd in zip(robot.rig.channels, sds, strict=True)
+    ]
+    runs = table(f"{SPEEDS},{READ}", *zip(*np.array(speeds).T, *noisy, strict=True), robot=robot)
+    noise = "motor_current_left=0.05A,motor_current_right=0.05A,yaw_rate=0.005rad/s"
+    found = calibrate(runs, robot, free=["rover.turning.lateral", "rover.ground.friction.static"], noise=noise)
+    ratio = found.parameters["rover.turning.lateral"]
+    assert found.converged and abs(ratio.value - 0.9) < 3 * ratio.sd < 0.1
+    assert found.held_out["turn"].errors["yaw_rate"].rms_sigma < 3
+
+
+def test_gearbox_loses_though_no_inertia_is_stated(rig):
+    robot = rig(KINEMATIC)
+    run = mm.Conditions("rover", motor_speed=100.0).resolved(robot)
+    state = State(*(jnp.asarray(x) for x in (1.6, 100.0, 0.2, 0.0)))
+    signals, _ = balances.settled(robot, run, state, 1.0)
+    assert float(signals.efficiency_load) == pytest.approx(0.7)
+    assert np.isfinite(float(signals.torque_output))
