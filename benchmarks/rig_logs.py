@@ -39,17 +39,23 @@ TRIES = 6
 TENTH = 0.1
 
 
+def inputs(seed: int) -> tuple[str, float]:
+    """What is imposed and how often it is sampled [s], by turns; with each effect each step comes up."""
+    turn = seed // len(gl.IMPOSED)
+    return gl.IMPOSED[seed % len(gl.IMPOSED)], gl.EVERY[(turn + turn // 9) % len(gl.EVERY)]
+
+
 @functools.lru_cache(maxsize=2)
 def attempt(kind: str, seed: int) -> gl.Case | str:
     """The case of a kind and a seed, or why there is none."""
     rng = np.random.default_rng([41, KINDS.index(kind), seed])
-    imposed = gl.IMPOSED[seed % len(gl.IMPOSED)]
+    imposed, every = inputs(seed)
     if kind == "clean":
-        return gl.case(gl.rig(rng, imposed), "", 0.0, seed)
+        return gl.case(gl.rig(rng, imposed, every), "", 0.0, seed)
     pool = [n for n, x in (gl.LIBRARY if kind == "library" else gl.OUTSIDE).items() if imposed in x.imposed]
     name, why = pool[(seed // len(gl.IMPOSED)) % len(pool)], "no rig can have it"
     for _ in range(TRIES):
-        case = gl.case(gl.rig(rng, imposed), name, float(rng.uniform(*SIGMAS[kind])), seed)
+        case = gl.case(gl.rig(rng, imposed, every), name, float(rng.uniform(*SIGMAS[kind])), seed)
         effect = case.label["effects"][0]
         if case.label["finite"] and effect["sizes"] < SIZES and effect["sigmas"] > 0.9 * SIGMAS[kind][0]:
             return case
@@ -122,9 +128,9 @@ def held_out(whole, case: gl.Case) -> dict:
     }
 
 
-def program(task: Task) -> tuple[str]:
-    """What logs have in common that share what is compiled: what is imposed."""
-    return (gl.IMPOSED[task.seed % len(gl.IMPOSED)],)
+def program(task: Task) -> tuple[str, float]:
+    """What logs have in common that share what is compiled: what is imposed, and how often it is sampled."""
+    return inputs(task.seed)
 
 
 def summary(lines: list[dict]) -> list[str]:

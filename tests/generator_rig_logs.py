@@ -18,6 +18,7 @@ import numpy as np
 
 IMPOSED = ("voltage", "motor_current", "motor_speed")
 RUNS, ROWS = 4, 200
+EVERY = (0.005, 0.01, 0.02)  # [s]
 STEP = 2.5e-4  # [s]; the winding's time constant is 2e-4 s, and the method is stable to 2.7 of them
 RPM = np.pi / 30
 REST = 0.01  # of the output, within which friction is smoothed [rad/s]
@@ -74,6 +75,8 @@ LAWS = {**LIBRARY, **OUTSIDE}
 #: Turn over which the contacts of `presliding` yield [rad], the library's own.
 YIELDS = 0.02
 Term = tuple[Law, float, Mapping[str, float]]
+#: Of a sum of squares, what one more step of one's own least squares may still gain.
+CONVERGED = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +118,12 @@ class Rig:
         return SimpleNamespace(rated=self.rated, torque=self.torque, w_k=self.w_k, supply=self.supply, **self.p)
 
 
-def rig(rng: np.random.Generator, imposed: str) -> Rig:
-    """A random rig; its readings' noise is set by what they show without effects."""
+def rig(rng: np.random.Generator, imposed: str, every: float | None = None) -> Rig:
+    """A random rig; its readings' noise is set by what they show without effects.
+
+    Args:
+        every: sampling step [s]; None: a random one.
+    """
     supply, fast = float(rng.choice([6.0, 12.0, 24.0, 48.0])), rng.uniform(300.0, 800.0)
     stall, ratio = (
         np.exp(rng.uniform(np.log(3), np.log(30))),
@@ -136,7 +143,8 @@ def rig(rng: np.random.Generator, imposed: str) -> Rig:
     }  # fmt: skip
     stated = {n: float(f"{x * np.exp(RELATIVE[n] * rng.standard_normal()):.4g}") for n, x in p.items()}
     stated["efficiency"] = min(stated["efficiency"], 0.97)
-    every = float(rng.choice([0.005, 0.01, 0.02]))
+    drawn = float(rng.choice(EVERY))
+    every = drawn if every is None else every
     inputs = np.stack([_inputs(rng, imposed, every, supply, rated, fast) for _ in range(RUNS)])
     late = float(rng.choice([0.0, rng.uniform(0.0, 2.0)]))
     # The current of an imposed speed jumps from row to row with its slope: late by whole rows it is not read in between.
@@ -355,31 +363,36 @@ def least_squares(c: Case, steps: int = 12) -> tuple[float, float]:
     # there, its derivatives and its error held out, and the damping.
     at = {job: np.zeros(count + job[1]) for job in jobs}
     best: dict[tuple[int, bool], tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
-    damping = dict.fromkeys(jobs, 1e-3)
+    damping, going = dict.fromkeys(jobs, 1e-3), list(jobs)
     for _ in range(steps):
+        if not going:
+            break
         members: list[Mapping[str, float]] = []
         theirs: list[Sequence[Term]] = []
-        for job in jobs:
+        for job in going:
             x = at[job]
             size = x[count] if job[1] else 0.0
             p, have = constants(x[:count]), terms(size, job[1])
             members += [p, *(moved(p, n, 1e-2) for n in r.names), *[p] * job[1]]
             theirs += [have] * (1 + count) + [terms(size + 1.0, True)] * job[1]
         shown = [whitened(r, x) for x in histories(r, members, theirs)]
-        for job in jobs:
+        for job in tuple(going):
             own, shown = shown[: 1 + count + job[1]], shown[1 + count + job[1] :]
             x, inside = at[job], np.arange(RUNS) != job[0]
             off = c.measured - own[0]
             prior = np.eye(len(x))[:count]
             left = np.concatenate([off[inside].ravel(), -x[:count]])
             cost = float(left @ left) if np.isfinite(left).all() else np.inf
-            if job not in best or cost < best[job][0]:
+            gained = best[job][0] - cost if job in best else np.inf
+            if gained > 0:
                 slope = [(y - own[0])[inside].ravel() for y in own[1:]]
                 columns = np.stack([*(1e2 * y for y in slope[:count]), *slope[count:]], 1)
                 best[job] = cost, x, left, np.concatenate([columns, prior]), off[job[0]]
                 damping[job] *= 0.2
             else:
                 damping[job] *= 10.0
+            if abs(gained) < CONVERGED:
+                going.remove(job)
             _, x, left, columns, _ = best[job]
             normal = columns.T @ columns
             move = np.linalg.solve(normal + damping[job] * np.diag(np.diag(normal)), columns.T @ left)

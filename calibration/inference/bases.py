@@ -344,6 +344,10 @@ def waves(
             words.append(word)
     if not words:
         return ()
+    # The first again for orders that these samples do not resolve: logs of one size share what is compiled.
+    possible = sum(1 for _, belted in ORDERS.values() if np.any(on_tracks) or not belted)
+    bases += bases[:1] * (possible - len(bases))
+    words += words[:1] * (possible - len(words))
     every = [(b, w) for b in balances_of(robot) for w in words]
     return (Basis.of(np.stack(bases * len(balances_of(robot))), every),)
 

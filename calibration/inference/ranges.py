@@ -38,7 +38,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     """Refuse readings that no robot like this one shows under these conditions; return what should be said of others.
 
     Each channel's readings are compared with steady travel of the robot as its file states it, and with a tenth and
-    four times its friction: the median factor by which they lie outside.
+    four times its friction: the median factor by which they lie outside. Of histories, those that have settled.
 
     Raises:
         BadData: a factor beyond `REFUSED`; of histories, which need not get under way, only where a known confusion
@@ -46,7 +46,7 @@ def check_ranges(runs: Runs, robot: Robot) -> list[Note]:
     """
     runs = runs.of(robot)
     kind = observers.kind(runs)
-    runs, measured, lasts = kind.settled(runs)
+    runs, measured, lasts = kind.settled(runs, steady=True)
     if not len(runs):
         return []
     _check_masses(runs, robot)

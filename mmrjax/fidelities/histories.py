@@ -43,17 +43,20 @@ def growth(duration: float, changes: int) -> float:
     return max(GROWTH, changes * float(np.log(max(LONGEST, duration / STEPS) / FIRST)) / most)
 
 
-def grid(times: Float[np.ndarray, " times"], changes: Sequence[float] | np.ndarray = ()) -> np.ndarray:
+def grid(
+    times: Float[np.ndarray, " times"], changes: Sequence[float] | np.ndarray = (), longest: float = LONGEST
+) -> np.ndarray:
     """Instants from 0 to the last of `times` [s], `times` and `changes` among them.
 
     Args:
         changes: instants at which the motors' supply changes [s]; steps are as short after each as after the start.
+        longest: step, where `STEPS` allow it [s].
     """
     last = float(np.max(times, initial=0.0))
     changes = np.asarray(changes, float)
     begins = np.unique(np.concatenate([[0.0], changes[(changes > 0) & (changes < last)]]))
     times = np.unique(np.concatenate([begins, np.asarray(times, float)]))
-    longest = max(LONGEST, last / STEPS)
+    longest = max(longest, last / STEPS)
     grows = growth(last, len(begins))
     knee = max((longest - FIRST) / grows, 0.0)
 

@@ -133,8 +133,12 @@ class Observer(eqx.Module):
 
     @classmethod
     @abc.abstractmethod
-    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
-        """One row a run, what it shows in the end [SI], shape (runs, channels), and how long it lasts [s]."""
+    def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
+        """One row a run, what it shows in the end [SI], shape (runs, channels), and how long it lasts [s].
+
+        Args:
+            steady: whether runs are left out whose speed still changes as it does below half of steady travel.
+        """
 
     @classmethod
     @abc.abstractmethod

@@ -71,6 +71,11 @@ ON_LINES = ("voltage", "motor_current", "duty")
 INRUSH = 2e-3
 #: A stretch of unchanged conditions so long may show steady travel [s].
 LASTING = 0.25
+#: Fewest steps from sample to sample of a run that is driven both ways.
+FINE = 8
+#: Change of a speed from the third to the last quarter of a stretch, as a share, from which on it has not settled.
+#: From rest a speed that nears steady travel exponentially and has reached half of it still changes by 0.23.
+STILL = 0.2
 #: Most levels of a condition that are told apart where it changes within runs.
 LEVELS = 6
 #: By how much a stated mass may change within a run beside the payload [kg].
@@ -181,8 +186,11 @@ class Histories(Observer):
         mine = [np.flatnonzero(run == k) for k in range(len(names))]
         mine = [m[np.argsort(runs["time_s"][m], kind="stable")] for m in mine]
         sudden = _changes(runs, mine, robot.rig)
-        grids = [grid(runs["time_s"][m], changes) for m, changes in zip(mine, sudden, strict=True)]
-        longest, samples = max(map(len, grids)), max(map(len, mine))
+        exact = robot.rig.imposed == "motor_speed"
+        driven = np.zeros(len(run)) if exact else applied(runs)
+        steps = [_longest(runs["time_s"][m], driven[m]) for m in mine]
+        grids = [grid(runs["time_s"][m], changes, h) for m, changes, h in zip(mine, sudden, steps, strict=True)]
+        longest, samples = _common(max(map(len, grids))), max(map(len, mine))
         times = np.stack([np.concatenate([g, np.repeat(g[-1], longest - len(g))]) for g in grids])
         instant = np.array([np.searchsorted(grids[r], t) for r, t in zip(run, runs["time_s"], strict=True)])
         rows = np.stack([np.concatenate([m, np.full(samples - len(m), -1)]) for m in mine])
@@ -279,7 +287,7 @@ class Histories(Observer):
         )
 
     @classmethod
-    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
+    def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
         """The medians of the later half of each run, which have settled where the run is long enough; of one whose
         conditions change, of the longest stretch in which it is driven forwards, where that lasts at all."""
         time, measured = runs["time_s"], runs.measured()
@@ -288,6 +296,9 @@ class Histories(Observer):
             for run in stretches(runs)
         ]
         each = [s for s in each if s.driven and (s.whole or s.lasts >= LASTING)]
+        if steady:
+            speeds = measured[:, [c.zero_at_rest and c.directed for c in runs.channels]]
+            each = [s for s in each if not _changes_still(speeds, s.after(time, 0.5), s.after(time, 0.75))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
             shown = [np.nanmedian(measured[s.after(time, 0.5)], 0) for s in each]
@@ -802,6 +813,36 @@ def _knots(rows: np.ndarray, most: int) -> np.ndarray:
     """At most so many of a run's rows, evenly chosen, its first and last among them; the last again for the rest."""
     chosen = rows[np.unique(np.round(np.linspace(0, len(rows) - 1, most)).astype(int))]
     return np.concatenate([chosen, np.repeat(chosen[-1], most - len(chosen))])
+
+
+def _changes_still(speeds: np.ndarray, half: np.ndarray, quarter: np.ndarray) -> bool:
+    """Whether a speed still changes by more than `STILL` in the later half of a stretch.
+
+    Args:
+        speeds: shape (rows, channels); half, quarter: rows of the later half and of the last quarter.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a channel without readings
+        before, after = np.nanmedian(speeds[np.setdiff1d(half, quarter)], 0), np.nanmedian(speeds[quarter], 0)
+    return bool(np.any(np.abs(after - before) > STILL * np.abs(before + after) / 2))
+
+
+def _longest(time: np.ndarray, driven: np.ndarray) -> float:
+    """Longest step of a run [s]. Where what drives it changes its sign, friction jumps as the speed passes through
+    zero, within a step, which has to be short beside the time from sample to sample.
+
+    Args:
+        time: of its samples [s]; driven: what drives it there.
+    """
+    turns = driven.min() < 0 < driven.max() and len(time) > 1
+    return min(LONGEST, float(np.median(np.diff(time))) / FINE) if turns else LONGEST
+
+
+def _common(instants: int) -> int:
+    """The next of the lengths that grids have, an eighth of a power of two apart: logs of about one length share what
+    is compiled, for steps of no length, at most an eighth more."""
+    part = max(2 ** (instants.bit_length() - 1) // 8, 1)
+    return -(-instants // part) * part
 
 
 def _readings(robot: Robot, signals: Signals) -> Float[Array, " channels"]:

@@ -133,7 +133,7 @@ class SettledRuns(Observer):
         return
 
     @classmethod
-    def settled(cls, runs: Runs) -> tuple[Runs, np.ndarray, np.ndarray]:
+    def settled(cls, runs: Runs, steady: bool = False) -> tuple[Runs, np.ndarray, np.ndarray]:
         return runs, runs.measured(), np.full(len(runs), np.inf)
 
     @classmethod
