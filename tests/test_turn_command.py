@@ -8,7 +8,9 @@ import pytest
 
 from calibration.data import runs as records
 from calibration.data.errors import BadData
+from mmrjax import robots
 from sweeps.pages import turn_words
+from sweeps.points.job import showing_turns
 
 
 def rows(path):
@@ -158,3 +160,23 @@ def test_turns_are_told_in_plain_words():
     assert said(ended, status="not_settled").startswith(
         "After 2 s: 0.30 m from the start, turned by -90°. Not settled"
     )
+
+
+PLAN = '[conditions]\nconfiguration = "6T2A"\nvoltage = 24\nduty_right = 1\n[axes]\nduty_left = [-1, 1]\n'
+
+
+def test_a_sweep_over_duties_of_sides_shows_both_and_one_of_straight_travel_as_before():
+    robot = robots.nominal()
+    assert showing_turns(robot, {"voltage", "slope_deg"}) is robot
+    shown = showing_turns(robot, {"voltage", "duty_left"}).channels
+    assert {"yaw_rate", "motor_current_left", "speed"} <= {c.name for c in shown}
+
+
+@pytest.mark.slow
+def test_a_sweep_over_duties_leaves_yaw_rates(tmp_path, mmrjax):
+    (tmp_path / "plan.toml").write_text(PLAN)
+    told = "sweep", str(tmp_path / "plan.toml"), "--export", "csv", "--no-report", "--out", str(tmp_path / "run")
+    assert mmrjax(*told)[0] == 0
+    spot, straight = rows(tmp_path / "run" / "runs.csv")
+    assert float(spot["yaw_rate_rad_s"]) > 3 and float(spot["speed_mm_s"]) == pytest.approx(0.0, abs=1e-6)
+    assert float(straight["yaw_rate_rad_s"]) == pytest.approx(0.0, abs=1e-9)

@@ -28,7 +28,7 @@ from sweeps.pages import words
 from sweeps.points import axes, grid, run, scale, uncertainty
 from sweeps.points.design import Blocks
 from sweeps.points.identity import Identity, identity
-from sweeps.points.job import laid_out, prepare, usual
+from sweeps.points.job import laid_out, prepare, showing_turns, usual
 from sweeps.points.zarr_store import STORE, Done, Layout, SweepStore
 from sweeps.skeleton import page
 from sweeps.store import DONE, SOLVER_FAILED, default_path, open_folder
@@ -85,6 +85,7 @@ def _into_table(config: Sweep, file: RobotFile, out: Path | None, force: bool) -
 def _into_store(config: Campaign, file: RobotFile, where: str, out: Path | None, force: bool, options: How) -> int:
     robot = file.robot
     plan = axes.plan(config, robot, where)
+    robot = showing_turns(robot, {*plan.axes, *plan.conditions})
     pool = None
     if options.scheduler is not None and not options.dry_run:
         from sweeps.points import cluster

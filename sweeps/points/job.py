@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+from collections.abc import Collection
 from typing import Any
 
 import jax
@@ -25,6 +27,27 @@ from sweeps.points.zarr_store import ABSENT, Layout, Variable
 
 #: Points at which a fidelity is asked, before the first is simulated, whether it could bear them.
 ASKED = 48
+
+
+#: Conditions that free a robot to turn.
+TURNING = {
+    "duty_left",
+    "duty_right",
+    "open_left",
+    "open_right",
+    "motor_speed_left",
+    "motor_speed_right",
+    "heading_deg",
+}
+
+
+def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
+    """The robot, with instruments of both sides and of its yaw where conditions of these names free it to turn."""
+    if not TURNING & set(conditions):
+        return robot
+    own = robot.rig.channels
+    more = [c.name for c in channels.OF_TURNS if c.settled and c.name not in own]
+    return dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, channels=(*own, *more)))
 
 
 def usual(config: Campaign, robot: Robot) -> tuple[str, ...]:
