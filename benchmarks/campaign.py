@@ -48,14 +48,20 @@ class Task:
 
 
 @functools.cache
-def robot_of(name: str) -> Any:
-    """A robot by its name or from its file; what its loops compile is kept on disk for the other workers."""
+def ready() -> None:
+    """Double precision; and what loops compile is kept on disk for the other workers."""
     import jax
 
     from sweeps import compilation_cache
 
     compilation_cache.enable()
     jax.config.update("jax_enable_x64", True)
+
+
+@functools.cache
+def robot_of(name: str) -> Any:
+    """A robot by its name or from its file."""
+    ready()
     from calibration.data import robot_file
 
     return robot_file.load(name)

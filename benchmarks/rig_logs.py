@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import generator_rig_logs as gl
 import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign
+from campaign import Task, campaign, ready
 from loop import verdict
 
 KINDS = ("clean", "library", "outside")
@@ -65,22 +65,12 @@ def attempt(kind: str, seed: int) -> gl.Case | str:
     return why
 
 
-@functools.cache
-def _ready() -> None:
-    import jax
-
-    from sweeps import compilation_cache
-
-    compilation_cache.enable()
-    jax.config.update("jax_enable_x64", True)
-
-
 def work(task: Task) -> dict:
     """A log made, looped over and scored against its label."""
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
-    _ready()
+    ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
     from calibration.discovery.discover import assemble_result, prepared

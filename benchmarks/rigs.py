@@ -26,7 +26,7 @@ import generator_rigs as gr
 import generator_rigs_laws as laws
 import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign
+from campaign import Task, campaign, ready
 from loop import verdict
 
 KINDS = ("clean", "library", "outside")
@@ -101,22 +101,12 @@ def _refused(case: gr.Case, low: float) -> str:
 # --- verdicts -----------------------------------------------------------------------------------------
 
 
-@functools.cache
-def _ready() -> None:
-    import jax
-
-    from sweeps import compilation_cache
-
-    compilation_cache.enable()
-    jax.config.update("jax_enable_x64", True)
-
-
 def work(task: Task) -> dict:
     """A rig made, looped over and scored against its label."""
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
-    _ready()
+    ready()
     from calibration.data import robot_file
     from calibration.data import runs as records
     from calibration.discovery.discover import prepared

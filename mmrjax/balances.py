@@ -70,6 +70,10 @@ def _fill(signals: Signals, **values: Any) -> Signals:
     return dataclasses.replace(signals, **values)
 
 
+#: What a robot that turns does in the plane of the ground; of straight travel it is nothing.
+IN_PLANE = ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
+
+
 def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar | None = None) -> Signals:
     """Kinematics and mass of the instant; `direction` None takes it from the speeds, smooth through rest."""
     chassis = robot.chassis(conditions.configuration)
@@ -77,9 +81,7 @@ def begin(robot: Robot, conditions: Conditions, state: State, direction: Scalar 
     speed_theoretical = chassis.radius * speed_wheel
     rest = chassis.speed_still
     duty = robot.driver.duty_limited(conditions.duty, state.current)
-    straight = dict.fromkeys(
-        ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y"), jnp.zeros_like(state.speed)
-    )
+    straight = dict.fromkeys(IN_PLANE, jnp.zeros_like(state.speed))
     signals = Signals(
         **straight,
         configuration=conditions.configuration,
@@ -453,10 +455,7 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
         total_current=both(jnp.mean(signals.total_current)),
         side=jnp.sign(SIDES),
         slope=both(jnp.arcsin(sine_slope * cosine(motion.heading))),
-        **{
-            name: both(getattr(motion, name))
-            for name in ("speed_lateral", "yaw_rate", "heading", "place_x", "place_y")
-        },
+        **{name: both(getattr(motion, name)) for name in IN_PLANE},
     )
     even = jax.vmap(lambda c, s: _to_slip(robot, c, chassis, s))(own, signals)
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)

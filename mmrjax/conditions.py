@@ -19,6 +19,8 @@ Number = float | Sequence[float] | np.ndarray | Array
 
 #: Conditions that are stated of either side.
 OF_SIDES = ("duty_left", "duty_right", "open_left", "open_right", "motor_speed_left", "motor_speed_right")
+#: Conditions that free a robot to turn where they are stated.
+OF_TURNS = (*OF_SIDES, "heading_deg")
 
 
 class Conditions(eqx.Module):
@@ -147,7 +149,7 @@ class Conditions(eqx.Module):
     @property
     def turns(self) -> bool:
         """Whether the sides are driven apart, or the robot heads elsewhere than uphill: it is then free to turn."""
-        return any(getattr(self, name) is not None for name in (*OF_SIDES, "heading_deg"))
+        return any(getattr(self, name) is not None for name in OF_TURNS)
 
     def of_sides(self) -> Conditions:
         """Those of left and right side, a leading axis of 2."""

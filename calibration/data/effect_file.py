@@ -52,7 +52,7 @@ def library(paths: Sequence[Path | str] = ()) -> Library:
     known = dict(effects.BY_NAME)
     own = [(path, effect) for path in map(Path, paths) for effect in read(path)]
     for path, effect in own:
-        if effect.name in {**effects.UNNAMED, **effects.OF_TURNS, **known}:
+        if effect.name in {**effects.BESIDE, **known}:
             raise BadConfiguration(f"{_where(path, effect)}, name: {effect.name} is taken; choose another")
         known[effect.name] = effect
     for path, effect in own:

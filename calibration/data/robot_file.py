@@ -162,7 +162,7 @@ def parse(path: Path, library: Library = effects.BY_NAME, notes: list[str] | Non
     if not isinstance(present, dict):
         raise BadConfiguration(f"{path.name}, effects: got {present}; expected tables such as [effects.churning]")
     for name in present:
-        if name not in {**effects.UNNAMED, **effects.OF_TURNS, **library}:
+        if name not in {**effects.BESIDE, **library}:
             raise BadConfiguration(f"{path.name}, effects.{name}: no such effect; {choices(name, library)}")
     tables = {name: table for name, table in present.items() if isinstance(table, dict)}
     acting = {name: table.pop("configurations") for name, table in tables.items() if "configurations" in table}
@@ -241,7 +241,7 @@ def with_effects(
     Raises:
         BadConfiguration: configurations of an effect that are no list of names, or that the robot does not have.
     """
-    known = {**effects.UNNAMED, **effects.OF_TURNS, **library}
+    known = {**effects.BESIDE, **library}
     present = []
     for name in names:
         effect = known[name]()

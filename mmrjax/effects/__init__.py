@@ -31,4 +31,7 @@ UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES}
 #: Of a robot that turns, which robot files know and the loop over straight travel cannot show.
 OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_in(turning)}
 
-__all__ = ["ALL", "BY_NAME", "CURVES", "OF_TURNS", "UNNAMED", "WAVES", "Effect", "amplitude", "defined_in"]
+#: What robot files know beside the library.
+BESIDE: dict[str, type[Effect]] = {**UNNAMED, **OF_TURNS}
+
+__all__ = ["ALL", "BESIDE", "BY_NAME", "CURVES", "OF_TURNS", "UNNAMED", "WAVES", "Effect", "amplitude", "defined_in"]

@@ -34,7 +34,7 @@ def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
     Raises:
         BadConfiguration: nothing has that name; what is near is said.
     """
-    library = {**effect_file.library(files), **effects.OF_TURNS, **effects.UNNAMED}
+    library = {**effect_file.library(files), **effects.BESIDE}
     known = names(library)
     if name is None:
         for kind, those in known.items():

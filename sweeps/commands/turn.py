@@ -115,8 +115,9 @@ def _demanded(robot: Robot, asked: Conditions, runs: Runs, config: configuration
     turning = belts / float(chassis.radius) * float(robot.gearbox.ratio) * float(robot.motor.torque_constant)
     for share in LOADED:
         begun = turning + share * np.abs(turning).max() * np.sign(belts)
-        volts = scipy.optimize.root(off, begun, options={"maxfev": TRIED}).x
-        if np.abs(off(volts)).max() < NEAR:  # not NaN
+        found = scipy.optimize.root(off, begun, options={"maxfev": TRIED})
+        volts = found.x
+        if np.abs(found.fun).max() < NEAR:  # not NaN
             break
     else:
         raise BadConfiguration(

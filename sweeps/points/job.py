@@ -14,6 +14,7 @@ import numpy as np
 from calibration.data import profiles
 from calibration.data.errors import BadConfiguration
 from mmrjax import __version__, channels, fidelities, outputs
+from mmrjax.conditions import OF_TURNS
 from mmrjax.errors import UsageError
 from mmrjax.profile import Profile
 from mmrjax.robot import Robot
@@ -29,21 +30,9 @@ from sweeps.points.zarr_store import ABSENT, Layout, Variable
 ASKED = 48
 
 
-#: Conditions that free a robot to turn.
-TURNING = {
-    "duty_left",
-    "duty_right",
-    "open_left",
-    "open_right",
-    "motor_speed_left",
-    "motor_speed_right",
-    "heading_deg",
-}
-
-
 def showing_turns(robot: Robot, conditions: Collection[str]) -> Robot:
     """The robot, with instruments of both sides and of its yaw where conditions of these names free it to turn."""
-    if not TURNING & set(conditions):
+    if set(OF_TURNS).isdisjoint(conditions):
         return robot
     own = robot.rig.channels
     more = [c.name for c in channels.OF_TURNS if c.settled and c.name not in own]

@@ -99,10 +99,15 @@ class SettledRuns(Observer):
         return np.maximum(measured, 0.01 * np.max(np.nan_to_num(measured), 0))
 
     @classmethod
+    def least(cls, runs: Runs) -> np.ndarray:
+        """Sizes below which no reading counts when repeated ones are compared [SI], shape (rows, channels)."""
+        return np.zeros(runs.measured().shape)
+
+    @classmethod
     def check(cls, runs: Runs, noise: Noise) -> list[Note | str]:
         columns = [c for c in ("configuration", *runs.axes, "surface") if runs.has(c)]
         measured, alike = runs.measured(), dict[tuple[str, ...], list[int]]()
-        least = cls.sizes(runs) if runs.turns else np.zeros(measured.shape)  # readings of turns cross zero
+        least = cls.least(runs)
         for row, key in enumerate(zip(*(runs[c].astype(str).tolist() for c in columns), strict=True)):
             alike.setdefault(key, []).append(row)
         for rows in map(np.array, alike.values()):

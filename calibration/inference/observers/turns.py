@@ -49,6 +49,10 @@ class SettledTurns(SettledRuns):
         """The channel's root mean square: readings of turns either way cross zero."""
         return Histories.sizes(runs)
 
+    @classmethod
+    def least(cls, runs: Runs) -> np.ndarray:
+        return cls.sizes(runs)
+
     def __call__(self, robot: Robot) -> Observation:
         seen = super().__call__(robot)
         return dataclasses.replace(seen, adhesion_used=jnp.zeros_like(seen.adhesion_used))
