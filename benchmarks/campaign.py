@@ -67,6 +67,19 @@ def robot_of(name: str) -> Any:
     return robot_file.load(name)
 
 
+def rig_input(case: Any, folder: Path, task: Task) -> Any:
+    """What the loop begins with, read from the files of a rig and its table as a user's are."""
+    ready()
+    from calibration.data import robot_file
+    from calibration.data import runs as records
+    from calibration.discovery.discover import prepared
+
+    case.write(folder)
+    robot = robot_file.read(folder / "rig.toml")
+    runs = records.read(folder / "table.csv", robot=robot)
+    return prepared(runs, robot, replicates=task.replicates, seed=task.seed)
+
+
 def plain(x: Any) -> Any:
     """Anything that a result holds, as JSON can."""
     if dataclasses.is_dataclass(x) and not isinstance(x, type):

@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 import generator_rig_logs as gl
 import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, ready
+from campaign import Task, campaign, rig_input
 from loop import verdict
 
 KINDS = ("clean", "library", "outside")
@@ -70,20 +70,15 @@ def work(task: Task) -> dict:
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
-    ready()
-    from calibration.data import robot_file
-    from calibration.data import runs as records
-    from calibration.discovery.discover import assemble_result, prepared
-
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        case.write(Path(folder))
-        robot = robot_file.read(Path(folder) / "rig.toml")
-        runs = records.read(Path(folder) / "table.csv", robot=robot)
-        given = prepared(runs, robot, replicates=task.replicates, seed=task.seed)
+        given = rig_input(case, Path(folder), task)
         found = given.trace()
         line = {**verdict(found), **loop_findings.findings(given, found), "seconds": time.perf_counter() - began}
         if not task.brief:
+            from calibration.data import robot_file
+            from calibration.discovery.discover import assemble_result
+
             whole = assemble_result(
                 found, given.runs, given.numbers, given.settings, given.library, lambda note: None
             )

@@ -26,7 +26,7 @@ import generator_rigs as gr
 import generator_rigs_laws as laws
 import loop_findings
 import loop_scores as scores
-from campaign import Task, campaign, ready
+from campaign import Task, campaign, rig_input
 from loop import verdict
 
 KINDS = ("clean", "library", "outside")
@@ -106,17 +106,9 @@ def work(task: Task) -> dict:
     case = attempt(task.kind, task.seed)
     if isinstance(case, str):
         return {"skipped": case}
-    ready()
-    from calibration.data import robot_file
-    from calibration.data import runs as records
-    from calibration.discovery.discover import prepared
-
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        case.write(Path(folder))
-        robot = robot_file.read(Path(folder) / "rig.toml")
-        runs = records.read(Path(folder) / "table.csv", robot=robot)
-        given = prepared(runs, robot, replicates=task.replicates, seed=task.seed)
+        given = rig_input(case, Path(folder), task)
         found = given.trace()
         said = {**verdict(found), **loop_findings.findings(given, found)}
         parameters = identified(found, case)
