@@ -664,7 +664,14 @@ def test_campaigns_and_notebooks_take_the_way_of_users():
     }
     assert found == set(CALLED)
     way, shared = "calibration.discovery.discover.prepared", "campaign.rig_input"  # which takes that way
-    ways = {"campaign": way, "loop": way, "loop_series": way, "loop_baselines": way, "rigs": shared, "rig_logs": shared}
+    ways = {
+        "campaign": way,
+        "loop": way,
+        "loop_series": way,
+        "loop_baselines": way,
+        "rigs": shared,
+        "rig_logs": shared,
+    }
     for campaign, name in ways.items():
         tree = ast.parse((ROOT / f"benchmarks/{campaign}.py").read_text(encoding="utf-8"))
         assert name in {imported for imported, _ in names_imported(tree, "")}, campaign
