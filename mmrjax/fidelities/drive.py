@@ -37,6 +37,7 @@ from mmrjax.signals import (
 # Units of the unknowns (current, motor speed, speed, distance, discharge), all then of the order of one.
 # The memories of those effects that have one follow, each in its own unit.
 _UNITS = (10.0, 1000.0, 1.0, 1.0, 10.0)
+MOTOR, GROUND = 1, 2
 _GAP = 0.01  # of the gap within a backlash, the last unknown where there is one [rad]
 
 #: Time after which a run is read as settled [s].
@@ -67,6 +68,11 @@ class Trajectory(eqx.Module):
 
 def _units(robot: Robot) -> tuple[float, ...]:
     return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering) + (_GAP,) * robot.loose
+
+
+def units_of(robot: Robot) -> Float[Array, " unknowns"]:
+    """What the unknowns are measured in."""
+    return jnp.asarray(_units(robot))
 
 
 def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:

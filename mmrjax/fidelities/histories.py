@@ -15,10 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.drive import moving, rates, start, state_of
+from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units_of
+from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -86,15 +87,15 @@ def _at_start(robot: Robot, conditions: Conditions) -> Float[Array, " unknowns"]
     return start(robot, eqx.combine(jax.tree.map(lambda x: x[0], changing), constant))
 
 
-def _matrix(robot: Robot, conditions: Conditions, y: Array, h: Array) -> tuple[Array, Array]:
-    """I - γ h ∂f/∂y, and f."""
+def _matrix(robot: Robot, conditions: Conditions, y: Array, span: Array) -> tuple[Array, Array]:
+    """I - span ∂f/∂y, and f."""
 
     def f(y: Array) -> tuple[Array, Array]:
         value = rates(robot, conditions, y)
         return value, value
 
     jacobian, value = jax.jacfwd(f, has_aux=True)(y)
-    return jnp.eye(y.shape[0], dtype=y.dtype) - _GAMMA * h * jacobian, value
+    return jnp.eye(y.shape[0], dtype=y.dtype) - span * jacobian, value
 
 
 def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: Array) -> Array:
@@ -105,7 +106,7 @@ def _stage(robot: Robot, conditions: Conditions, known: Array, guess: Array, h: 
 
     def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, y, _ = state
-        matrix, value = _matrix(robot, conditions, y, h)
+        matrix, value = _matrix(robot, conditions, y, _GAMMA * h)
         step = jnp.linalg.solve(matrix, y - known - _GAMMA * h * value)
         # Over a kink of the friction law full steps can swing to and fro for ever.
         whole, part = y - step, y - 0.3 * step
@@ -177,21 +178,84 @@ def respond(
     """
 
     changing, constant = _in_time(conditions)
+    of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
+    at = jnp.concatenate([_at_start(robot, conditions)[None], stages[1]])
+    through = _through_rest(robot, of_first, at)
+    h = jnp.diff(times)
+    # Through rest: Euler's implicit steps to and from it, by the equations as they are off it.
+    spans = (
+        jnp.where(through.any, through.before * h, _GAMMA * h),
+        jnp.where(through.any, (1 - through.before) * h, _GAMMA * h),
+    )
+    clock = times[:-1] + jnp.where(through.any, through.before, _GAMMA) * h
+    off_rest = jnp.where((through.before > 0)[:, None], at[:-1], at[1:]), jnp.where(
+        (through.before < 1)[:, None], at[1:], at[:-1]
+    )
+    places = tuple(jnp.where(through.any[:, None], a, b) for a, b in zip(off_rest, stages, strict=True))
 
     def step(dy: Array, inputs: tuple) -> tuple[Array, tuple[Array, Array]]:
-        t, h, one, two, now, then = inputs
+        (t, end), (one, two), (to, beyond), (passes, turns), now, then = inputs
         held = eqx.combine(now, constant)
-        first = jnp.linalg.inv(_matrix(robot, held, one, h)[0])
-        second = jnp.linalg.inv(_matrix(robot, held, two, h)[0])
-        d1 = jnp.tensordot(first, dy + _GAMMA * h * source(t + _GAMMA * h, one, held), 1)
-        known = dy + (1 - _GAMMA) / _GAMMA * (d1 - dy)
-        d2 = jnp.tensordot(second, known + _GAMMA * h * source(t + h, two, held), 1)
+        first = jnp.linalg.inv(_matrix(robot, held, one, to)[0])
+        second = jnp.linalg.inv(_matrix(robot, held, two, beyond)[0])
+        d1 = jnp.tensordot(first, dy + to * source(t, one, held), 1)
+        jump = turns * _jump(robot, held, two)
+        known = jnp.where(
+            passes, d1 + jump.reshape(-1, *[1] * (d1.ndim - 1)) * d1[1], dy + (1 - _GAMMA) / _GAMMA * (d1 - dy)
+        )
+        d2 = jnp.tensordot(second, known + beyond * source(end, two, held), 1)
         return d2, (seen(one, d1, held), seen(two, d2, eqx.combine(then, constant)))
 
     begins, ends = (jax.tree.map(lambda x, s=s: x[s], changing) for s in (slice(-1), slice(1, None)))
-    of_first = eqx.combine(jax.tree.map(lambda x: x[0], changing), constant)
     still = jnp.zeros_like(source(times[0], stages[0][0], of_first)) if begin is None else begin
-    return jax.lax.scan(step, still, (times[:-1], jnp.diff(times), *stages, begins, ends))[1]
+    given = (clock, times[1:]), places, spans, (through.any, through.turns), begins, ends
+    return jax.lax.scan(step, still, given)[1]
+
+
+class _Through(eqx.Module):
+    """Steps in which a shaft turns through rest, where friction jumps: what a step remembers of the one before it is
+    not in what its own stages show, however short it is.
+
+    Attributes:
+        any: whether it does in a step; turns: whether its direction changes within it.
+        before: share of the step before it is at rest.
+    """
+
+    any: Bool[Array, " steps"]
+    turns: Float[Array, " steps"]
+    before: Float[Array, " steps"]
+
+
+def _edge(robot: Robot, conditions: Conditions) -> tuple[Scalar, Array]:
+    """Motor speed from which on a direction is one, in the unit of the unknowns; and by what the unknowns change with
+    it where shafts and robot move as one."""
+    load, units = robot.chassis(conditions.configuration), units_of(robot)
+    per_speed = load.radius / robot.gearbox.ratio
+    along = jnp.zeros_like(units).at[MOTOR].set(1.0).at[GROUND].set(per_speed * units[MOTOR] / units[GROUND])
+    return load.speed_still / (per_speed * units[MOTOR]), along
+
+
+def _through_rest(robot: Robot, conditions: Conditions, at: Float[Array, "instants unknowns"]) -> _Through:
+    """Of a run's states: a step from one direction to the other, or two of them with one state at rest between."""
+    edge, _ = _edge(robot, conditions)
+    speed = at[:, MOTOR]
+    way = jnp.where(jnp.abs(speed) < edge, 0.0, jnp.sign(speed)) * (0.0 if robot.loose else 1.0)
+    a, b = way[:-1], way[1:]
+    before, after = jnp.concatenate([a[:1], a[:-1]]), jnp.concatenate([b[1:], b[-1:]])
+    across, into, out = a * b < 0, (a != 0) & (b == 0) & (a * after < 0), (a == 0) & (b != 0) & (before * b < 0)
+    shares = jnp.abs(speed[:-1]) / jnp.maximum(jnp.abs(speed[:-1]) + jnp.abs(speed[1:]), 1e-300)
+    share = jnp.where(across, shares, jnp.where(into, 1.0, 0.0))
+    return _Through(across | into | out, (across | out).astype(at.dtype), share)
+
+
+def _jump(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
+    """By what the unknowns change with the motor speed before it passes through rest: (f⁺ - f⁻) / f⁻, as the moment
+    of rest moves by -1 / f⁻ (Filippov systems; Leine and Nijmeijer 2004, Section 7.3); 0 where it does not pass."""
+    edge, along = _edge(robot, conditions)
+    way = jnp.sign(y[MOTOR])
+    before, after = (rates(robot, conditions, y + (side * edge - y[MOTOR]) * along) for side in (-way, way))
+    passes = before[MOTOR] * after[MOTOR] > 0
+    return jnp.where(passes, (after - before) / jnp.where(passes, before[MOTOR], 1.0), 0.0)
 
 
 def histories(robot: Robot, conditions: Conditions, times: Float[Array, " times"]) -> Signals:
