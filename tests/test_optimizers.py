@@ -504,20 +504,21 @@ def test_rival_searches_end_where_three_agree_unless_one_is_lower():
         creeps = jnp.stack([jnp.sqrt(4000.0), 0.5 * jnp.sqrt(1 + (z[0] - 50) ** 2)])
         return jnp.concatenate([jnp.where(k < 3, basin, jnp.where(k < 5, valley, creeps)), jnp.zeros(2), 1e-3 * z])
 
-    @jax.jit
-    def evaluate(z):
-        members = jnp.arange(len(z))
+    def evaluate(z, members):
+        evaluated.append(len(members))
         r, jacobian = jax.vmap(residual)(members, z), jax.vmap(jax.jacfwd(residual, 1))(members, z)
-        return r, jacobian, members
+        return jax.device_get((r, jacobian, members))
 
-    one = jnp.ones((1, 3))
+    evaluated, one = [], jnp.ones((1, 3))
     data = problem.Data(0 * one, one, one, jnp.zeros(2), jnp.asarray(1.0))
     begin = jnp.asarray([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0], [-1.2, 1.0], [-1.9, 2.0], [0.0, 0.0]])
     weights = jnp.ones((6, 1, 3))
-    found, _ = fit.searches_long(evaluate, begin, data, weights, 40, rivals=True)
+    found, _ = fit.searches_long(evaluate, begin, data, weights, 40, 2, rivals=True)
     np.testing.assert_allclose(found.cost[:5], [30, 30, 30, 0, 0], atol=1e-3)
     assert found.converged[:5].all() and found.steps[3] > found.steps[0]
-    alone, _ = fit.searches_long(evaluate, begin, data, weights, 40)
+    evaluated.clear()
+    alone, _ = fit.searches_long(evaluate, begin, data, weights, 40, 2)
+    assert max(evaluated) == 2 and sum(evaluated) == alone.steps.sum()  # what has ended leaves its place
     assert found.steps[5] < alone.steps[5]
-    same, _ = fit.searches_long(evaluate, begin[:3], data, weights[:3], 40, rivals=True)
+    same, _ = fit.searches_long(evaluate, begin[:3], data, weights[:3], 40, 2, rivals=True)
     assert (same.steps <= found.steps[:3]).all()

@@ -41,7 +41,7 @@ HOPELESS = 10.0
 #: How many of them have to end in one place, to within so much of the objective, for it to be the optimum.
 AGREE, SAME = 3, 0.01
 #: Cores on which many searches run, at most.
-CORES = min(4, os.cpu_count() or 1)
+CORES = min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 Z = Float[Array, " parameters"]
 #: An array of JAX or NumPy.
@@ -540,67 +540,86 @@ def search_long(
     return best, first, last
 
 
-Evaluate = Callable[[Array], tuple[Array, Array, Observation]]
+#: Of so many members, by their indices, at their z: residuals, penalties with their signs, their Jacobian and the
+#: observation, as NumPy's arrays; leading axis these members.
+Evaluate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, Observation]]
 
 
 @functools.partial(jax.jit, static_argnames=("held_from", "held_to"))
-def _steps(at: Progress, found: tuple[Array, Array, Any], held_from: int, held_to: int) -> Progress:
+def _steps(
+    at: Progress, found: tuple[Array, Array, Any], data: Data, weights: Array, held_from: int, held_to: int
+) -> tuple[Progress, Optimum]:
+    """The next step of every search, and what its best point is as an optimum."""
     held = slice(held_from, held_to)
-    return jax.vmap(lambda at, found: step(at, found, held, TOLERANCE_LONG))(at, found)
 
+    def one(at: Progress, found: tuple[Array, Array, Any], weight: Array) -> tuple[Progress, Optimum]:
+        new = step(at, found, held, TOLERANCE_LONG)
+        (r, jacobian, _), there = new.found, dataclasses.replace(data, weight=weight)
+        return new, _optimum(jacobian, r, new.y, there, no_pin(new.y.shape[0]), new.steps)
 
-@eqx.filter_jit
-def _optima(jacobian: Array, r: Array, z: Array, data: Data, weights: Array, steps: Array) -> Optimum:
-    def one(jacobian: Array, r: Array, z: Array, weight: Array, steps: Array) -> Optimum:
-        there = dataclasses.replace(data, weight=weight)
-        return _optimum(jacobian, r, z, there, no_pin(z.shape[0]), steps)
-
-    return jax.vmap(one)(jacobian, r, z, weights, steps)
+    return jax.vmap(one)(at, found, weights)
 
 
 def searches_long(
-    evaluate: Evaluate, starts: Array, data: Data, weights: Array, max_steps: int, *, rivals: bool = False
+    evaluate: Evaluate,
+    starts: Numbers,
+    data: Data,
+    weights: Numbers,
+    max_steps: int,
+    places: int,
+    *,
+    rivals: bool = False,
 ) -> tuple[Optimum, Observation]:
-    """A batch of `levenberg_marquardt` with the steps taken from outside, so that rollouts are compiled once in all.
+    """`levenberg_marquardt` of any number of members with the steps taken from outside, so that rollouts are compiled
+    once in all; what has ended is not evaluated again and leaves its place to one that waits.
 
     Args:
-        evaluate: residuals, penalties with their signs, their Jacobian and the observation of every member at its z,
-            compiled; leading axis the batch.
         starts: shape (members, coordinates); weights: of each member's readings, shape (members, rows, channels).
+        places: searches side by side.
         rivals: whether all search the same optimum, so that all end once `AGREE` have ended in one place and none is
             lower, and those that cannot come down to it (by `HOPELESS` times what their step predicts) before.
 
     Returns:
         Where each search ended, and what the model says there.
     """
-    starts = jnp.asarray(starts)
-    found, held = evaluate(starts), penalties(data)
-    at = jax.vmap(begin_at)(starts, jax.tree.map(jnp.zeros_like, found))
-    over, taken = np.zeros(len(starts), bool), np.zeros(len(starts), int)
-    for steps in range(1, max_steps + 1):
+    starts, weights, held = np.asarray(starts), np.asarray(weights), penalties(data)
+    waiting, holds = list(range(len(starts)))[::-1], np.full(max(places, len(starts) * rivals), -1)
+    cost, ended = np.full(len(starts), np.inf), dict[int, tuple[Optimum, Observation]]()
+    at: Progress | None = None
+    while waiting or (holds >= 0).any():
+        fresh = np.flatnonzero(holds < 0)[: len(waiting)]
+        holds[fresh] = [waiting.pop() for _ in fresh]
+        member, going = np.maximum(holds, 0), np.flatnonzero(holds >= 0)
         # A step judges what was found where the last one led; what is accepted becomes y.
-        new = _steps(at, found, held.start, held.stop)
-        moved, done = np.asarray(new.rejected == 0), np.asarray(new.over)
-        at = _where(over, at, new)
-        taken = np.where(over, taken, steps)
-        r, jacobian, seen = at.found
-        ends = _optima(jacobian, r, at.y, data, weights, jnp.asarray(taken))
+        ahead = starts[member] if at is None else np.asarray(at.ahead)
+        ahead = _put(ahead, fresh, starts[member[fresh]])
+        there = evaluate(ahead[going], holds[going])
+        found = jax.tree.map(lambda x: _put(np.zeros((len(holds), *x.shape[1:]), x.dtype), going, x), there)  # noqa: B023
+        if at is None:
+            at = jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found))
+        elif len(fresh):
+            begun = jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found))
+            at = jax.tree.map(lambda old, new: _put(np.asarray(old), fresh, np.asarray(new)[fresh]), at, begun)  # noqa: B023
+        at, ends = jax.device_get(_steps(at, found, data, weights[member], held.start, held.stop))
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
-        over = over | done | np.asarray(moved & (ends.decrement < small))
+        over = at.over | (at.steps >= max_steps) | ((at.rejected == 0) & (ends.decrement < small))
+        cost[holds[going]] = ends.cost[going]
         if rivals:
-            cost, reach = np.asarray(ends.cost), HOPELESS * np.asarray(ends.decrement)
-            lowest = np.min(cost[over], initial=np.inf)
-            agree = np.sum(over & (cost < lowest + SAME)) >= AGREE and not np.any(~over & (cost < lowest - SAME))
-            over = over | (cost - reach > lowest) | agree
-        if over.all():
-            break
-        found = evaluate(jnp.where(over[:, None], at.y, at.ahead))
-    return ends, seen
+            done = np.r_[[*ended], holds[over & (holds >= 0)]].astype(int)
+            lowest = np.min(cost[done], initial=np.inf)
+            still = ~over & (holds >= 0)
+            agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not np.any(still & (ends.cost < lowest - SAME))
+            over = over | (ends.cost - HOPELESS * ends.decrement > lowest) | agree
+        for place in np.flatnonzero(over & (holds >= 0)):
+            ended[int(holds[place])] = jax.tree.map(lambda x: x[place], (ends, at.found[2]))  # noqa: B023
+            holds[place] = -1
+    return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(len(starts))))
 
 
-@jax.jit
-def _where(which: Array, new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+def _put(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:
+    x = np.array(x)
+    x[places] = values
+    return x
 
 
 @compiled

@@ -188,8 +188,9 @@ def respond(
         jnp.where(through.any, (1 - through.before) * h, _GAMMA * h),
     )
     clock = times[:-1] + jnp.where(through.any, through.before, _GAMMA) * h
-    off_rest = jnp.where((through.before > 0)[:, None], at[:-1], at[1:]), jnp.where(
-        (through.before < 1)[:, None], at[1:], at[:-1]
+    off_rest = (
+        jnp.where((through.before > 0)[:, None], at[:-1], at[1:]),
+        jnp.where((through.before < 1)[:, None], at[1:], at[:-1]),
     )
     places = tuple(jnp.where(through.any[:, None], a, b) for a, b in zip(off_rest, stages, strict=True))
 

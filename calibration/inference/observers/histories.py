@@ -6,9 +6,11 @@ imposed where the rig's file says that it goes on straight lines (`Rig.between_r
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
 import operator
 import re
+import threading
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
@@ -33,7 +35,15 @@ from calibration.inference.normal_equations import backward, cholesky, forward
 from calibration.inference.notes import CoarseSteps, ManyChanges, Note, StopsOnSlope
 from calibration.inference.observers import settled_ends
 from calibration.inference.observers.base import Observer, SearchPolicy
-from calibration.inference.optimizers import Numbers, Optimum, linearised, linearised_signed, searches_long
+from calibration.inference.optimizers import (
+    CORES,
+    Evaluate,
+    Numbers,
+    Optimum,
+    linearised,
+    linearised_signed,
+    searches_long,
+)
 from calibration.inference.priors import DELAY
 from calibration.inference.problem import MISSING, Data, Observation, Problem
 from mmrjax import balances, channels, fidelities, params
@@ -63,6 +73,8 @@ SLIDING = ("ground.friction.dynamic", "ground.friction.speed_dynamic")
 COARSE = 15
 #: A first sample so early shows a robot at rest [s]; how much of its largest speed, and how many sds, it may show.
 EARLY, RESTING, RESTING_SD = 0.005, 0.2, 5.0
+#: Members of a search that one call of its program evaluates.
+TOGETHER = 2
 #: Fields of `Conditions` that may change within a run; and of those what makes for an inrush, with how much of the
 #: largest applied voltage a change has to be for steps to be short after it.
 CHANGING = ("voltage", "motor_current", "slope_deg", "payload", "adhesion", "total_mass", "duty", "open")
@@ -521,14 +533,9 @@ class Histories(Observer):
         """As the protocol says; see `settled_ends`."""
 
         def search(blunt: Problem, starts: np.ndarray, steps: int) -> Optimum:
-            weights = jnp.repeat(blunt.data.weight[None], self.policy.batch, 0)
-            evaluate = lambda z: _evaluate(blunt, z, weights, None)  # noqa: E731
-            batches = starts[: len(starts) // self.policy.batch * self.policy.batch]
-            parts = [
-                searches_long(evaluate, jnp.asarray(z), blunt.data, weights, steps)[0]
-                for z in batches.reshape(-1, self.policy.batch, starts.shape[1])
-            ]
-            return jax.tree.map(lambda *x: np.concatenate(x), *jax.device_get(parts))
+            weights = np.repeat(np.asarray(blunt.data.weight)[None], len(starts), 0)
+            evaluate = _evaluator(blunt, weights, None)
+            return searches_long(evaluate, starts, blunt.data, weights, steps, self.policy.batch)[0]
 
         if not problem.base.has_ground or problem.base.rig.imposed != "voltage":  # no grip that makes for valleys
             return scans.placed(problem, super().starts(problem, random, count))
@@ -569,27 +576,16 @@ class Histories(Observer):
         *,
         rivals: bool = False,
     ) -> tuple[Optimum, Observation]:
-        """As the protocol says; the runs are compiled once for all steps, and fits go in batches of one size."""
+        """As the protocol says; the runs are compiled once for all steps."""
+        data, steps = problem.data, self.policy.steps
 
-        def batch(starts: Numbers, weights: Numbers, active: Numbers | None) -> tuple[Optimum, Observation]:
-            return searches_long(
-                lambda z: _evaluate(problem, z, weights, active),
-                starts,
-                problem.data,
-                weights,
-                self.policy.steps,
-                rivals=rivals,
-            )
+        def searched(starts: Numbers) -> tuple[Optimum, Observation]:
+            evaluate = _evaluator(problem, weights, active)
+            return searches_long(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
 
+        found = searched(starts)
         if not rivals:
-            parts, size, count = [], self.policy.batch, len(starts)
-            for first in range(0, count, size):
-                chosen = np.r_[first : min(first + size, count)]
-                filled = np.append(chosen, [first] * (size - len(chosen))).astype(int)
-                found = batch(*jax.tree.map(lambda x: jnp.asarray(x)[filled], (starts, weights, active)))  # noqa: B023
-                parts.append(jax.tree.map(lambda x: x[: len(chosen)], jax.device_get(found)))  # noqa: B023
-            return jax.tree.map(lambda *x: np.concatenate(x), *parts)
-        found = batch(starts, weights, active)
+            return found
         if not scans.scanned(problem):
             return found
         k = int(np.nanargmin(found[0].cost))
@@ -599,7 +595,7 @@ class Histories(Observer):
             problem,
             one(found),
             data,
-            lambda z: one(batch(jnp.tile(z, (len(starts), 1)), weights, active)),
+            lambda z: one(searched(np.tile(z, (len(starts), 1)))),
             lambda _: None,
         )
         return jax.tree.map(lambda every, mine: jnp.asarray(every).at[k].set(mine), found, best)
@@ -890,8 +886,34 @@ def _moved(residual: Array, jacobian: Array, z: Array, held: Array) -> tuple[Arr
     return 0.5 * jnp.sum((residual + free @ step) ** 2), z + step
 
 
+def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Evaluate:
+    """Evaluates members of a search, `TOGETHER` in one call of one program, calls side by side on the cores.
+
+    Args:
+        weights, active: of every member, see `Histories.search`.
+    """
+
+    made = threading.Event()
+
+    def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+        filled = np.resize(np.arange(len(members)), TOGETHER)
+        of = None if active is None else np.asarray(active)[members[filled]]
+        return jax.device_get(_evaluate(problem, z[filled], np.asarray(weights)[members[filled]], of))
+
+    def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
+        parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
+        with concurrent.futures.ThreadPoolExecutor(CORES if made.is_set() else 1) as cores:
+            found = list(cores.map(lambda part: some(*part), parts))
+        made.set()  # by its first call the program is compiled
+        return jax.tree.map(lambda *x: np.concatenate(x)[: len(members)], *found)
+
+    return evaluate
+
+
 @compiled
-def _evaluate(problem: Problem, z: Array, weights: Array, active: Array | None) -> tuple[Array, Array, Observation]:
+def _evaluate(
+    problem: Problem, z: Numbers, weights: Numbers, active: Numbers | None
+) -> tuple[Array, Array, Observation]:
     def one(z: Array, weight: Array, which: Array | None) -> tuple[Array, Array, Observation]:
         here = problem
         if which is not None:
