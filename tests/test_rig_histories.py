@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from calibration.data.errors import BadConfiguration
 from calibration.inference import noise, observers, priors
 from calibration.inference.calibrate import calibrate
 from mmrjax import channels, params
+from mmrjax.conditions import Conditions
 from mmrjax.fidelities import histories as integrator
 from mmrjax.rig import Begin, Begins, Rig
 
@@ -283,3 +285,31 @@ def test_between_rows_is_one_of_two_words_and_is_written(tmp_path):
     robot = robot_file.load(str(path))
     robot_file.write(robot, tmp_path / "robot.toml")
     assert robot_file.load(str(tmp_path / "robot.toml")).rig.between_rows == robot.rig.between_rows == "linear"
+
+
+@pytest.mark.parametrize("name", ["bench.inertia", "bench.loss_coulomb", "motor.friction_coulomb"])
+def test_derivatives_through_rest_are_those_of_steps_without_end(tmp_path, name):
+    """Where a direction turns friction jumps, by what no stage of a step shows: the derivative of what the stages
+    compute forgets that the moment of rest moves."""
+    path = tmp_path / "robot.toml"
+    path.write_text(DRIVE.format(imposed="voltage", channels='"motor_current", "motor_speed"', start="rest") + BENCH)
+    robot = robot_file.read(path)
+    every = np.arange(0, 1.2, 0.02)
+    value = {p.name: float(p.value) for p in params.walk(robot)}[name]
+
+    def speeds(longest):
+        times = integrator.grid(every, (), longest)
+        volts = 6.0 * np.where(np.sin(2 * np.pi * (1.3 * times + 0.4 * times**2)) >= 0, 1.0, -1.0)
+        held = dataclasses.replace(Conditions(voltage=8.0), voltage=jnp.asarray(volts))
+
+        @jax.jit
+        def of(share):
+            there = params.replace(robot, {name: value * (1 + share)})
+            return integrator.histories(there, held, jnp.asarray(times)).speed_motor[np.searchsorted(times, every)]
+
+        return of
+
+    fine, usual = speeds(4e-5), speeds(6e-4)
+    assert (np.diff(np.sign(fine(0.0))) != 0).sum() >= 4
+    wide = (fine(0.02) - fine(-0.02)) / 0.04
+    assert np.linalg.norm(jax.jacfwd(usual)(0.0) - wide) < 0.05 * np.linalg.norm(wide)
