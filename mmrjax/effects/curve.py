@@ -21,7 +21,10 @@ BALANCES = {
     "track": ("N·m", 0.2, "direction"),
     "ground": ("N", 4.0, "direction_travel"),
     "slip": ("m/s", 0.05, "direction"),
+    "yaw": ("N·m", 0.5, "direction_turn"),
 }
+#: Those of straight travel, whose waves are looked for.
+OF_STRAIGHT = ("electrical", "track", "ground", "slip")
 #: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
 READINGS = {c.name: (c.unit_si or c.unit, 0.01 * c.range[1] * c.factor, "direction") for c in channels.usual()}
 PLACES = {**BALANCES, **READINGS}
@@ -36,7 +39,11 @@ VARIABLES = {
     "speed": ("m/s", 0.1, 1.0),
     "time": ("s", 0.0, 2.0),
     "order": ("-", 0.0, 100.0),
+    "yaw_rate": ("rad/s", 0.0, 4.0),
+    "side": ("-", -1.0, 1.0),
 }
+#: Variables that have a sign by themselves; the others count along the motion: of the shafts, or of the turn.
+SIGNED = ("payload", "order", "side")
 ORDINATES = tuple(f"y{k}" for k in range(6))
 #: Share of the range over which a curve levels out beyond each of its ends.
 LEVEL = 0.05
@@ -91,6 +98,7 @@ def _curve(place: str, over: str) -> type[Effect]:
     shown = place in READINGS
     unit, size, along = PLACES[place]
     unit_x, first, last = VARIABLES[over]
+    ahead = "direction_turn" if over == "yaw_rate" else "direction" if place == "yaw" else along
 
     class Curve(Effect):
         name = f"curve_{place}_{over}"
@@ -130,7 +138,7 @@ def _curve(place: str, over: str) -> type[Effect]:
             if over == "time":
                 x = self.recall(robot, signals)
             else:
-                x = getattr(signals, over) if over in ("payload", "order") else getattr(signals, over) * way
+                x = getattr(signals, over) * (1.0 if over in SIGNED else getattr(signals, ahead))
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
             return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
 
@@ -196,7 +204,7 @@ def _wave(place: str) -> type[Effect]:
 
 
 #: The wave of every balance that carries curves: what a series shows as an order.
-WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, BALANCES)}
+WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, OF_STRAIGHT)}
 
 #: Every curve by its name. Robot files know them; they are no part of the library that is scored.
 CURVES: dict[str, type[Effect]] = {

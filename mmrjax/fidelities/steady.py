@@ -102,7 +102,10 @@ def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
 
 
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
-    """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
+    """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`); of a
+    robot that turns those of each side, along an axis of 2."""
+    if conditions.turns:
+        return turning.circling(robot, conditions)[0].signals
     state, _ = _root(robot, conditions)
     _, sound = _sound(robot, conditions)
     return _balanced(robot, sound, state, direction(robot, sound))[0]
