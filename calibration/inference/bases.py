@@ -121,7 +121,7 @@ Bases = tuple[Basis, ...]
 
 def in_readings(place: str) -> bool:
     """Whether a place of curves is a channel, whose readings are off; else it is a balance."""
-    return place in channels.names(channels.EVERY)
+    return place not in (*BALANCES, *OF_TURNS) and place in channels.names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:

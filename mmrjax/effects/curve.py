@@ -21,13 +21,12 @@ BALANCES = {
     "track": ("N·m", 0.2, "direction"),
     "ground": ("N", 4.0, "direction_travel"),
     "slip": ("m/s", 0.05, "direction"),
-    "yaw": ("N·m", 0.5, "direction_turn"),
 }
-#: Those of straight travel, whose waves are looked for.
-OF_STRAIGHT = ("electrical", "track", "ground", "slip")
+#: The same of a robot that turns alone.
+ROUND = {"yaw": ("N·m", 0.5, "direction_turn")}
 #: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
 READINGS = {c.name: (c.unit_si or c.unit, 0.01 * c.range[1] * c.factor, "direction") for c in channels.usual()}
-PLACES = {**BALANCES, **READINGS}
+PLACES = {**BALANCES, **ROUND, **READINGS}
 #: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the
 #: place of a run in the sequence: unit and ordinary range.
 VARIABLES = {
@@ -39,9 +38,10 @@ VARIABLES = {
     "speed": ("m/s", 0.1, 1.0),
     "time": ("s", 0.0, 2.0),
     "order": ("-", 0.0, 100.0),
-    "yaw_rate": ("rad/s", 0.0, 4.0),
-    "side": ("-", -1.0, 1.0),
 }
+#: The same of a robot that turns alone; and which of the others its turns have.
+VARIABLES_ROUND = {"yaw_rate": ("rad/s", 0.0, 4.0), "side": ("-", -1.0, 1.0)}
+IN_TURNS = ("voltage", "current", "speed_motor", "payload", "speed", "order")
 #: Variables that have a sign by themselves; the others count along the motion: of the shafts, or of the turn.
 SIGNED = ("payload", "order", "side")
 ORDINATES = tuple(f"y{k}" for k in range(6))
@@ -97,8 +97,8 @@ def _curve(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance, or in the readings of one channel."""
     shown = place in READINGS
     unit, size, along = PLACES[place]
-    unit_x, first, last = VARIABLES[over]
-    ahead = "direction_turn" if over == "yaw_rate" else "direction" if place == "yaw" else along
+    unit_x, first, last = (VARIABLES | VARIABLES_ROUND)[over]
+    ahead = "direction_turn" if over == "yaw_rate" else "direction" if place in ROUND else along
 
     class Curve(Effect):
         name = f"curve_{place}_{over}"
@@ -204,9 +204,17 @@ def _wave(place: str) -> type[Effect]:
 
 
 #: The wave of every balance that carries curves: what a series shows as an order.
-WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, OF_STRAIGHT)}
+WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, BALANCES)}
 
 #: Every curve by its name. Robot files know them; they are no part of the library that is scored.
 CURVES: dict[str, type[Effect]] = {
     effect.name: effect for effect in (_curve(place, over) for place in PLACES for over in VARIABLES)
+}
+#: Those of a robot that turns alone.
+CURVES_ROUND: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        *(_curve(place, over) for place in (*BALANCES, *ROUND) for over in VARIABLES_ROUND),
+        *(_curve(place, over) for place in ROUND for over in IN_TURNS),
+    )
 }
