@@ -14,12 +14,12 @@ import mmrjax as mm
 from calibration.data import runs as records
 from calibration.discovery.discover import pose, prepared
 from calibration.inference import bases as bases_room
-from calibration.inference.observers.turns import TurnLinearization, along
+from calibration.inference.observers.turns import TurnLinearization
 from mmrjax import effects, params
-from mmrjax.fidelities.steady import operating_signals
+from mmrjax.effects.curve import weights
 
 #: Of the library, one of each balance that a turn shows, beside those of turns.
-SOME = ("supply_sag", "iron_loss", "gear_load_loss", "mass_offset")
+SOME = ("supply_sag", "iron_loss")
 COUNT = 8
 
 
@@ -31,7 +31,7 @@ def posed(tmp_path_factory):
     library = {name: kind for name, kind in effects.BY_NAME.items() if name in SOME}
     ready = prepared(records.read(table, robot=robot), robot, noise=planted.NOISE, library=library)
     space = pose(ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library)
-    return dataclasses.replace(space.bare, observe=space.bare.observe), space
+    return space.bare, space
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +89,7 @@ def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
     assert x.shape == (linear.points,)
     ordinates = {"y0": 1.0, "y1": 0.4, "y2": 0.1, "y3": 0.0, "y4": -0.3, "y5": -0.2}
     ends = {"low": float(x.min()), "high": float(x.max())}
-    effect = params.replace(
-        effects.UNNAMED[name](), {n: jnp.asarray(v) for n, v in (ordinates | ends).items()}
-    )
-    from mmrjax.effects.curve import weights
+    effect = params.replace(effects.UNNAMED[name](), {n: jnp.asarray(v) for n, v in (ordinates | ends).items()})
 
     shapes = np.asarray(weights(jnp.asarray(x), ends["low"], ends["high"]))
     columns = bases_room.signature(linear, balance, shapes) @ np.array(list(ordinates.values()))
@@ -103,7 +100,7 @@ def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
 
 
 def test_points_are_each_side_of_each_row(posed, linear):
-    problem, space = posed
+    _, space = posed
     assert isinstance(linear, TurnLinearization) and linear.points == 2 * linear.rows
     mask = np.zeros(linear.points, bool)
     mask[linear.rows + 3] = True  # the right side of the fourth row
@@ -111,8 +108,7 @@ def test_points_are_each_side_of_each_row(posed, linear):
     assert linear.at_points(space.included).sum() == 2 * COUNT
     side = linear.variable("side")
     assert (side[: linear.rows] == 1).all() and (side[linear.rows :] == -1).all()
-    signals = jax.vmap(lambda c: operating_signals(problem.robot(jnp.zeros(space.free)), c))(problem.observe.conditions)
-    assert (np.asarray(along(signals, "speed_motor")) > 0).all()  # counted along the motion of its side
+    assert (linear.variable("speed_motor") > 0).all()  # counted along the motion of its side
 
 
 def test_what_a_channel_of_one_side_shows_is_off_by_that_side_alone(linear):
