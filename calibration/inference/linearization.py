@@ -39,8 +39,8 @@ def probe(of: str) -> Effect:
         )
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
-            own = self.amplitude
-            return jnp.where(signals.side > 0, own[0], own[1]) if jnp.ndim(own) else own
+            own = jnp.asarray(self.amplitude)
+            return jnp.where(signals.side > 0, own[0], own[1]) if own.ndim else own
 
     return Probe()
 

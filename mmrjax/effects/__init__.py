@@ -28,7 +28,7 @@ BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 #: Discrepancies without a name, which robot files know and no library holds.
 UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES, **CURVES_ROUND}
 
-#: Of a robot that turns, which robot files know and the loop over straight travel cannot show.
+#: Of a robot that turns: robot files know them, and the loop looks for them in tables of turns.
 OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_in(turning)}
 
 #: What robot files know beside the library.

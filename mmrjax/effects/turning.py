@@ -1,7 +1,7 @@
 """Effects of a robot that turns: sides that are not alike, and resistance to the turn. Straight travel shows none.
 
-They are no part of the library that the loop looks through, which takes runs of straight travel; robot files know
-them, and `calibrate` frees their amplitudes.
+They are no part of the library that the loop looks through in straight travel; in tables of turns it looks for them
+beside that library. Robot files know them, and `calibrate` frees their amplitudes.
 """
 
 from __future__ import annotations

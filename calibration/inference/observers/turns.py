@@ -65,7 +65,7 @@ class TurnLinearization(SettledLinearization):
         return np.tile(rows, self.defects.shape[1])
 
     def of_rows(self, points: np.ndarray) -> np.ndarray:
-        return points.reshape(-1, self.rows).any(0)
+        return np.any(points.reshape(-1, self.rows), axis=0)
 
     def variable(self, name: str) -> np.ndarray:
         return np.asarray(along(self.signals, name), float)
