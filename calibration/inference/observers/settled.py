@@ -19,7 +19,7 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
-from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
+from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Note
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -48,13 +48,17 @@ EQUATIONS = ("electrical", "track", "slip")
 
 
 class SettledLinearization(Linearization):
-    """Of settled rows: `defects` has shape (balances, sides, rows, channels), a defect of each row of its own; sides
-    that are alike are one."""
+    """Of settled rows: `defects` has shape (balances, rows, channels), a defect of each row of its own, or (balances,
+    sides, rows, channels) where sides are driven apart."""
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
         of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
-        moved = self.defects[balance][:, :, :, None] * of_sides[:, :, None, :]
+        moved = self.of_sides(balance)[:, :, :, None] * of_sides[:, :, None, :]
         return moved.sum(0).reshape(-1, shapes.shape[1])
+
+    def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
+        """What a defect of a balance changes, of each side; sides that are alike are one."""
+        return self.defects[balance].reshape(-1, *self.scale.shape)
 
     def places(self) -> np.ndarray:
         return np.arange(self.rows)
@@ -235,7 +239,7 @@ class SettledRuns(Observer):
             return moved.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
-        defects = defects * kind.sense(signals)
+        defects = (defects * kind.sense(signals)).reshape(len(probes), *self.shape_sides, rows, count)
         return kind(residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown)
 
     def draws(
@@ -297,7 +301,9 @@ class SettledRuns(Observer):
 
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
     rows = len(included)
-    sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)].sum(0)[:rows] for b in EQUATIONS], 2)
+    assert isinstance(linear, SettledLinearization)
+    along = (np.asarray(linear.of_sides(linear.probed.index(b)).sum(0))[:rows] for b in EQUATIONS)
+    sensitivity = np.stack(list(along), 2)
     residual = np.asarray(linear.by_row())[:rows]
     found = np.full((rows, len(EQUATIONS)), np.nan)
     for k in np.flatnonzero(included):
