@@ -132,7 +132,7 @@ FOUND = {"clean": (), "friction": ("side_friction",), "voltage": ("side_voltage"
 @pytest.mark.parametrize("case", FOUND)
 def test_what_a_second_implementation_planted_is_found(tmp_path, mmrjax, case):
     table, robot = planted.write(tmp_path, case)
-    told = ("--robot", str(robot), "--noise", planted.NOISE, "--replicates", "249")
+    told = ("--robot", str(robot), "--noise", planted.NOISE, "--replicates", "250")
     code, out, err = mmrjax("loop", str(table), *told, "--out", str(tmp_path / "run"))
     assert code == 0, err
     found = json.loads((tmp_path / "run" / "result.json").read_text())
