@@ -208,7 +208,7 @@ WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, B
 
 #: Every curve by its name. Robot files know them; they are no part of the library that is scored.
 CURVES: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (_curve(place, over) for place in PLACES for over in VARIABLES)
+    effect.name: effect for effect in (_curve(place, over) for place in (*BALANCES, *READINGS) for over in VARIABLES)
 }
 #: Those of a robot that turns alone.
 CURVES_ROUND: dict[str, type[Effect]] = {
