@@ -454,6 +454,7 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
         signals,
         total_current=both(jnp.mean(signals.total_current)),
         side=jnp.sign(SIDES),
+        direction_turn=both(contact.direction(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
         slope=both(jnp.arcsin(sine_slope * cosine(motion.heading))),
         **{name: both(getattr(motion, name)) for name in IN_PLANE},
     )

@@ -111,6 +111,7 @@ class Signals(eqx.Module):
     side: Scalar = 0.0  # 1 of the left side, -1 of the right one [-]
     speed_lateral: Scalar = 0.0  # v_y to the left [m/s]
     yaw_rate: Scalar = 0.0  # ω, positive to the left [rad/s]
+    direction_turn: Scalar = 0.0  # way round, -1..1, positive to the left [-]
     heading: Scalar = 0.0  # ψ from uphill, positive to the left [rad]
     place_x: Scalar = 0.0  # uphill of where the run started [m]
     place_y: Scalar = 0.0  # to the left of that [m]

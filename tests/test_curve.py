@@ -147,7 +147,8 @@ def test_curves_are_no_part_of_the_library():
 
 
 def test_curves_are_those_that_the_trace_looks_for():
-    assert tuple(curve.BALANCES) == curves.BALANCES and tuple(curve.VARIABLES) == tuple(curves.VARIABLES)
+    assert tuple(curve.BALANCES) == curves.BALANCES and tuple(curve.ROUND) == curves.OF_TURNS
+    assert (*curve.VARIABLES, *curve.VARIABLES_ROUND) == tuple(curves.VARIABLES)
     assert {b: u for b, (u, *_) in curve.BALANCES.items()} == {b: balances.BALANCES[b][0] for b in curve.BALANCES}
     assert tuple(curve.READINGS) == channels.USUAL
 

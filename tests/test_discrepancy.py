@@ -199,7 +199,7 @@ def test_formula_reads_as_text():
 
 
 def test_every_balance_of_a_curve_has_a_symbol():
-    assert set(formula.SYMBOL) == {*bases.BALANCES, *channels.USUAL}
+    assert set(formula.SYMBOL) == {*bases.BALANCES, *bases.OF_TURNS, *channels.USUAL}
 
 
 def test_no_formula_is_proposed_where_nothing_shows(found):

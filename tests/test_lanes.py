@@ -50,3 +50,22 @@ def test_a_batch_takes_as_many_turns_as_its_lanes_need(monkeypatch):
 
 def test_no_derivative_passes_through():
     assert float(jax.grad(lambda x: halves((x, 2.0))[0])(12.0)) == 0.0
+
+
+def test_batches_of_batches_share_their_lanes(monkeypatch):
+    """A long member of one batch does not make the members of the others wait."""
+    monkeypatch.setattr(lanes, "LANES", 4)
+    taken = []
+
+    def turn(own, state):
+        jax.debug.callback(lambda: taken.append(1))
+        return state + 1
+
+    def count(x):
+        begun = lambda own: (own, own * 0)  # noqa: E731
+        return lanes.until(begun, lambda own, s: (s[0], turn(own, s[1])), lambda s: s[1] >= s[0], x)[1]
+
+    own = jnp.full((8, 8), 3.0).at[0, 0].set(40.0)
+    np.testing.assert_array_equal(jax.block_until_ready(jax.vmap(jax.vmap(count))(own)), own)
+    jax.effects_barrier()
+    assert len(taken) < 4 * 80 < 8 * 8 * 40

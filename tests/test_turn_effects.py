@@ -18,7 +18,7 @@ from mmrjax import balances, effects, energy, params, robots
 from mmrjax.fidelities import turning
 from mmrjax.signals import PlaneMotion, State
 
-OF_SIDES = ("side_friction", "side_torque", "side_voltage")
+OF_SIDES = ("side_friction", "side_torque", "side_voltage", "side_radius")
 #: In units of the prior sd.
 SIZE = 2.0
 MOTION = PlaneMotion(*(jnp.asarray(x) for x in ([2.0, -0.7], [900.0, -150.0], 0.3, 0.05, -1.1, 0.0, 0.0, 0.0, 0.0)))
@@ -91,6 +91,8 @@ def test_terms_are_their_equations():
     np.testing.assert_allclose(terms["side_torque"], values["side_torque"] * side * constant * current, rtol=1e-9)
     given = constant * turned + resistance * current
     np.testing.assert_allclose(terms["side_voltage"], values["side_voltage"] * side * given, rtol=1e-9)
+    rolled = float(robot.configurations["6T2A"].radius) * turned / float(robot.gearbox.ratio)
+    np.testing.assert_allclose(terms["side_radius"], values["side_radius"] * side * rolled, rtol=1e-9)
     resisted = values["turning_resistance"] * np.asarray(signals.normal) * -1.1
     np.testing.assert_allclose(terms["turning_resistance"], resisted, rtol=1e-9)
 
@@ -110,7 +112,8 @@ def test_energy_is_kept_and_resistance_to_turning_takes_it():
 
     source, sinks, change = powers(MOTION)
     assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
-    plain = energy.sinks_turning(robots.nominal(), RUN, balances.turning(robots.nominal(), RUN, MOTION))
+    rolls = with_amplitudes(robots.nominal(), {"side_radius": amplitude("side_radius")})  # slides as much
+    plain = energy.sinks_turning(rolls, RUN, balances.turning(rolls, RUN, MOTION))
     load = float(jnp.sum(balances.turning(robot, RUN, MOTION).signals.normal))
     taken = amplitude("turning_resistance") * load * 1.1**2
     assert float(sinks["sliding"] - plain["sliding"]) == pytest.approx(taken, rel=1e-6)

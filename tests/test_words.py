@@ -554,12 +554,6 @@ def test_what_the_track_model_is_asked_about(about, said):
             "so something is missing and the parameters may absorb it; mmrjax loop finds what",
         ),
         (
-            Adequacy(False, 812.3, 600.0, 1e-9, Shown(what="stated"), True, traced=False),
-            "Not adequate: the residuals exceed the stated noise (χ² 812.3 on 600 degrees of freedom, p < 1e-6), so "
-            "something is missing and the parameters may absorb it; the loop takes straight travel alone, so look at "
-            "the residuals by run",
-        ),
-        (
             Adequacy(True, 61.0, 60.0, 0.4, Shown(what="repeats"), True),
             "Adequate: the residuals are what the stated noise leaves (χ² 61 on 60 degrees of freedom, p = 0.4)",
         ),

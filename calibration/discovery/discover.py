@@ -24,7 +24,7 @@ from calibration.discovery.adequacy import AdequacyTest, Diagnosis
 from calibration.discovery.candidates import BaseFit, Candidate, empty, filled, fit_base, fit_candidates, start
 from calibration.discovery.classes import Classes, classes, cosines
 from calibration.discovery.discrepancy import diagnosis_beside, fit_discrepancy, locate
-from calibration.discovery.experiments import Proposal, denser, separating
+from calibration.discovery.experiments import Proposal, denser, no_menu, separating
 from calibration.discovery.hidden import hidden
 from calibration.discovery.kept import Keep
 from calibration.discovery.location import DiscrepancyLocation
@@ -230,14 +230,10 @@ def prepared(
             f"{runs.source}: {len(distinct)} {kind.word} cannot show what a model lacks; at least {kind.fewest} are "
             "needed"
         )
-    if not kind.traced:
-        raise BadData(
-            f"{runs.source}: the loop looks for effects in straight travel alone, and these runs turn; `calibrate` "
-            "fits them, and rows whose sides are driven alike can go through it without the columns of either side"
-        )
     ready = preparation.prepare(distinct, robot, noise, stated)
     said: Notes = (*notes, *ready.former, *ready.checked, *ready.begins, *ready.weighed, *ready.foreign)
     turned = scales.turned_in(distinct, ready.robot)
+    library = {**library, **kind.library}
     library = scales.library_for(ready.robot, distinct.conditions(ready.robot), library, turned)
     settings = dataclasses.replace(settings_for(kind, replicates, seed, prefer), forbidden=tuple(forbidden))
     return LoopInput(
@@ -343,7 +339,8 @@ class LoopStages:
         happens = bases_room.window(variable)
         if happens is None:
             return ()
-        inside = self.screened.base.space.included & happens.holds(self.left.linear.variable(happens.axis))
+        linear = self.left.linear
+        inside = self.screened.base.space.included & linear.of_rows(happens.holds(linear.variable(happens.axis)))
         rows = [int(k) + 1 for k in np.flatnonzero(inside)]
         return ({"axis": happens.axis, "window": (happens.low, happens.high), "rows": rows},)
 
@@ -713,7 +710,7 @@ def assemble_result(
         remains = None if where is None or traced.verdict == "unnamed" else where
     concealed: tuple[HiddenEffect, ...] = ()
     if traced.alike is not None and traced.verdict != "unnamed":
-        ask = not observe.long
+        ask = observe.menu and not observe.long
         concealed = findings.hidden_effects(
             space, hidden(space, best, traced.alike, left, traced.ends, settings, ask=ask)
         )
@@ -809,6 +806,8 @@ def _residuals(
 
 def _proposal(space: CandidateSpace, traced: LoopStages, settings: Settings) -> Proposal | None:
     """What to do next; None where nothing is left to tell apart."""
+    if not space.bare.observe.menu:
+        return no_menu(space) if traced.verdict != "none" else None
     if traced.verdict == "unnamed" and traced.where is not None:
         return denser(space, traced.where, settings)
     return None if traced.alike is None else separating(space, traced.best, traced.alike, settings)

@@ -115,7 +115,7 @@ def refined(linear: Linearization, place: str, axis: str, included: np.ndarray) 
     Args:
         included: whether a row counts, shape (rows,).
     """
-    x = linear.variable(axis)
+    x, included = linear.variable(axis), linear.at_points(included)
     at, counts = np.unique(x[included], return_counts=True)
     merged = -(-len(at) // INSTANTS)
     edges = at[::merged]

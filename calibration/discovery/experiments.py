@@ -28,7 +28,15 @@ from calibration.discovery.active_set import CandidateSpace
 from calibration.discovery.candidates import Candidate
 from calibration.discovery.classes import Classes
 from calibration.discovery.location import DiscrepancyLocation
-from calibration.discovery.notes import CarryOut, Instruction, MoreRuns, NothingPossible, NothingTells, TooWeak
+from calibration.discovery.notes import (
+    CarryOut,
+    Instruction,
+    MoreRuns,
+    NoMenu,
+    NothingPossible,
+    NothingTells,
+    TooWeak,
+)
 from calibration.discovery.reach import Reach, reach_of
 from calibration.discovery.settings import Settings
 from calibration.inference import bases, priors
@@ -329,6 +337,11 @@ def denser(space: CandidateSpace, where: DiscrepancyLocation, settings: Settings
     name = name if bases.window(variable) is None else "the same runs again"
     curve = f"curve of the {bases.in_words(where.place)} over {variable}"
     return Proposal((name,), more_runs(where.place, variable, within), (curve,), sigma, False, ())
+
+
+def no_menu(space: CandidateSpace) -> Proposal:
+    """Nothing: the menu holds no runs of the kind that the table does."""
+    return Proposal((NONE,), NoMenu(space.bare.observe.word), (), 0.0, False, ())
 
 
 def separating(space: CandidateSpace, best: Candidate, found: Classes, settings: Settings) -> Proposal | None:

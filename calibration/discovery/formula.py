@@ -13,10 +13,9 @@ from calibration.inference.bases import ORDERS, signature
 from calibration.inference.linearization import Linearization
 from mmrjax import channels
 from mmrjax.effects.curve import PLACES
-from mmrjax.signals import Signals
 
 #: What a formula is called, in the symbols of the paper.
-SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV"} | {
+SYMBOL = {"electrical": "ΔU", "track": "ΔM_t", "ground": "ΔF_f", "slip": "ΔV", "yaw": "ΔM_ψ"} | {
     c.name: f"Δ({c.label})" for c in channels.usual()
 }
 #: Variables over which things fade: symbol, and unit of its constant.
@@ -44,8 +43,8 @@ class Ratio:
     of: str
     over: float
 
-    def __call__(self, signals: Signals, rows: int) -> np.ndarray:
-        x = np.broadcast_to(np.asarray(getattr(signals, self.of), float), (rows,))
+    def __call__(self, linear: Linearization) -> np.ndarray:
+        x = linear.variable(self.of)
         return (np.sin(x) if self.of == "slope" else x) / self.over
 
 
@@ -55,6 +54,7 @@ RATIOS = (
     Ratio("U", "24 V", "voltage", 24.0),
     Ratio("sin α", "0.1", "slope", 0.1),
     Ratio("m_c", "5 kg", "payload", 5.0),
+    Ratio("ω", "1 rad/s", "yaw_rate", 1.0),
 )
 #: Rise of the BIC for each variable but the one that the curve is over: one of so many is looked for.
 FOREIGN = 2 * float(np.log(len(RATIOS)))
@@ -155,13 +155,13 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
         return _while(balance, curve)
     if curve.variable in FADING:
         return _decay(linear, balance, counts, curve)
-    rows = len(counts)
-    ratios = np.stack([r(linear.signals, rows) for r in RATIOS], 1)
+    counts = linear.at_points(counts)
+    ratios = np.stack([r(linear) for r in RATIOS], 1)
     known = dictionary(ratios[counts])
     terms = list(known)
     if not terms:  # all runs alike
         return Proposal("", (), (), (), (), 0.0, 0.0, 0)
-    shapes = np.zeros((rows, len(terms)))
+    shapes = np.zeros((linear.points, len(terms)))
     for k, value in enumerate(known.values()):
         shapes[counts, k] = value
     a, b = Projection(linear)(signature(linear, balance, shapes))
@@ -231,7 +231,7 @@ def _while(balance: str, curve: Smooth) -> Proposal:
 def _decay(linear: Linearization, balance: str, counts: np.ndarray, curve: Smooth) -> Proposal:
     """What fades with the time since the start or from run to run: an exponential, its constant from a grid over the
     length of the runs or of the table. A level beside it is left to the base."""
-    t = linear.variable(curve.variable)
+    t, counts = linear.variable(curve.variable), linear.at_points(counts)
     symbol, unit = FADING[curve.variable]
     constants = np.geomspace(0.02, 2.0, 40) * max(float(t[counts].max()), 1e-9)
     best: tuple[float, tuple] = (np.inf, ())

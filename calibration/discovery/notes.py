@@ -372,6 +372,13 @@ class NothingPossible:
 
 
 @dataclasses.dataclass(frozen=True)
+class NoMenu:
+    """The menu holds no runs of the kind of the table's; what its rows are."""
+
+    word: str
+
+
+@dataclasses.dataclass(frozen=True)
 class NothingTells:
     """No experiment of the menu tells alternatives apart by so much [σ]."""
 
@@ -417,7 +424,7 @@ class TooWeak:
     sigma: float
 
 
-Instruction = NothingPossible | NothingTells | CarryOut | MoreRuns | TooWeak
+Instruction = NothingPossible | NoMenu | NothingTells | CarryOut | MoreRuns | TooWeak
 
 
 @dataclasses.dataclass(frozen=True)

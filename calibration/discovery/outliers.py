@@ -63,7 +63,7 @@ def ahead(
             search_each(space.equipped, [nothing], [space.weight], [space.library.indices(none)])
 
     def foresee(base: BaseFit) -> None:
-        if not space.bare.observe.long:
+        if space.bare.observe.menu and not space.bare.observe.long:
             jobs.append(others.submit(predict, base.space, {"": base.candidate}, settings))
 
     with concurrent.futures.ThreadPoolExecutor(2) as others:

@@ -27,7 +27,7 @@ from mmrjax.balances import BALANCES, absent, added
 from mmrjax.conditions import Conditions
 from mmrjax.effects import Effect
 from mmrjax.effects.scaled import amplitude_of, scaled, shape_of
-from mmrjax.fidelities.steady import operating
+from mmrjax.fidelities.steady import operating_signals
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 
@@ -40,6 +40,8 @@ WHOLE: dict[str, Callable[[Robot, Signals], object]] = {
     "track": lambda robot, s: s.torque_load,
     "ground": lambda robot, s: s.demand,
     "slip": lambda robot, s: s.speed_theoretical,
+    "lateral": lambda robot, s: s.normal,
+    "yaw": lambda robot, s: robot.running_gear.wheelbase / 4 * s.normal,  # the moment of friction of one, sliding
     "mass": lambda robot, s: s.mass,
     "inertia": lambda robot, s: (
         robot.configurations.members[0].inertia + robot.motor.inertia * robot.gearbox.ratio**2
@@ -129,7 +131,7 @@ def _steady(robot: Robot, conditions: Conditions) -> Conditions:
 
 
 def _signals(robot: Robot, conditions: Conditions) -> Signals:
-    return jax.vmap(lambda c: operating(robot, c)[0])(conditions)
+    return jax.vmap(lambda c: operating_signals(robot, c))(conditions)
 
 
 @functools.cache

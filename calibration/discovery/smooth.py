@@ -99,7 +99,7 @@ def smooth(linear: Linearization, balance: str, variable: str, counts: np.ndarra
     """
     happens = window(variable)
     axis = variable if happens is None else happens.axis
-    x = linear.variable(axis)
+    x, counts = linear.variable(axis), linear.at_points(counts)
     low, high = (0.0, 2 * np.pi) if variable in ORDERS else (float(x[counts].min()), float(x[counts].max()))
     if happens is not None:
         beside = BESIDE * max(happens.high - happens.low, NARROW * (high - low))
@@ -162,12 +162,12 @@ def surface(
     Args:
         counts: whether a row counts, shape (rows,).
     """
-    weight = counts.astype(float)
+    weight = linear.at_points(counts).astype(float)
     sides = [
         legendre.legvander(scaled(linear.variable(v), weight), PRODUCT - 1) * np.exp(-FALL * np.arange(PRODUCT))
         for v in variables
     ]
-    shapes = (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.rows, -1)
+    shapes = (sides[0][:, :, None] * sides[1][:, None, :]).reshape(linear.points, -1)
     columns = signature(linear, balance, shapes)
     a, b = project(columns)
     size = 1 / np.sqrt(max(np.diag(a).max(), 1e-300))

@@ -167,7 +167,7 @@ def _over(place: str, variable: str) -> CurveOver:
 
 
 def _varies(linear: Linearization, variable: str, included: np.ndarray) -> bool:
-    x = linear.variable(variable)[included]
+    x = linear.variable(variable)[linear.at_points(included)]
     return bool(np.all(np.isfinite(x)) and np.ptp(x) > 1e-9 * max(np.max(np.abs(x)), 1e-9))
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from numpy.polynomial import legendre
 
 from calibration.data.columns import CURRENT, SPEED, Layout
-from calibration.inference.linearization import PROBED, Linearization
+from calibration.inference.linearization import Linearization
 from mmrjax import channels
 from mmrjax.balances import absent
 from mmrjax.channels import Channel
@@ -37,7 +37,11 @@ VARIABLES = {
     "speed": "speed_mm_s",
     "time": "time_s",
     "order": "order",
+    "yaw_rate": "yaw_rate",
+    "side": "side",
 }
+#: Balances of turns that carry curves, beside those of straight travel.
+OF_TURNS = ("yaw",)
 #: Terms of a curve of one variable (Legendre polynomials), and degree of the polynomial in all conditions.
 TERMS, DEGREE = 5, 2
 CONDITIONS = "conditions"
@@ -108,7 +112,7 @@ class Basis(eqx.Module):
     def signatures(self, linear: Linearization) -> Float[Array, "families readings terms"]:
         """Change of the whitened readings by every family's columns."""
         of_channels = in_readings(self.places[0])
-        known, change = (linear.channels, linear.shown) if of_channels else (PROBED, linear.columns)
+        known, change = (linear.channels, linear.shown) if of_channels else (linear.probed, linear.columns)
         return jax.vmap(change)(jnp.asarray([known.index(place) for place in self.places]), self.columns)
 
 
@@ -117,7 +121,7 @@ Bases = tuple[Basis, ...]
 
 def in_readings(place: str) -> bool:
     """Whether a place of curves is a channel, whose readings are off; else it is a balance."""
-    return place in channels.names(channels.EVERY)
+    return place not in (*BALANCES, *OF_TURNS) and place in channels.names(channels.EVERY)
 
 
 def balance_of(place: str) -> str:
@@ -134,7 +138,7 @@ def signature(linear: Linearization, place: str, shapes: np.ndarray) -> np.ndarr
     """Change of the readings by terms of a place, shape (readings, terms), of shapes (rows, terms)."""
     if in_readings(place):
         return np.asarray(linear.shown(linear.channels.index(place), shapes))
-    return np.asarray(linear.columns(PROBED.index(place), shapes))
+    return np.asarray(linear.columns(linear.probed.index(place), shapes))
 
 
 def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -162,20 +166,29 @@ def axes_of(robot: Robot | None) -> tuple[str, ...]:
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
 
-def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> Bases:
+def families(
+    columns: Mapping[str, np.ndarray],
+    weight: np.ndarray,
+    robot: Robot | None = None,
+    balances: Sequence[str] | None = None,
+    axes: Sequence[str] | None = None,
+) -> Bases:
     """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
     of what the readings of a channel are off by, over the reading and over what time or order brings.
 
     Args:
-        columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,).
-        robot: whose balances can lack something.
+        columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,), or of points
+            (see `Linearization`).
+        robot: whose balances can lack something; balances: which of them, and axes: columns of the conditions, where
+            it is not all that straight travel has.
     """
-    balances = balances_of(robot)
+    balances = balances_of(robot) if balances is None else balances
+    conditions = axes_of(robot) if axes is None else axes
     over: dict[str, tuple[str, np.ndarray]] = {}
     for variable, column in VARIABLES.items():
-        if column not in columns or (column in EVERY_AXIS and column not in axes_of(robot)):
+        if column not in columns or (column in EVERY_AXIS and column not in conditions):
             continue
-        if variable == "order" and collinearity(columns, weight, robot) > COLLINEAR:
+        if variable == "order" and collinearity(columns, weight, robot, conditions) > COLLINEAR:
             # Another variable again in its place: tables of one size share what is compiled.
             over[variable] = next(iter(over.values()))
             continue
@@ -192,10 +205,10 @@ def families(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot
     new = [n for n in shown if over[n[1]][0] == n[1]]
     # As above: what is left out makes room for another of its channel, or of the first that has one.
     read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
-    axes = [scaled(columns[c], weight) for c in axes_of(robot)]
-    powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(axes)) if sum(p) <= DEGREE]
+    spans = [scaled(columns[c], weight) for c in conditions]
+    powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
-        np.prod([a**k for a, k in zip(axes, p, strict=True)], 0) * (columns["configuration"] == name)
+        np.prod([a**k for a, k in zip(spans, p, strict=True)], 0) * (columns["configuration"] == name)
         for name in np.unique(columns["configuration"])
         for p in powers
     ]
@@ -237,22 +250,30 @@ def window(variable: str) -> Window | None:
     return None if found is None else Window(found[1], float(found[2]), float(found[3]))
 
 
-def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> Bases:
+def windows(
+    columns: Mapping[str, np.ndarray],
+    weight: np.ndarray,
+    robot: Robot | None = None,
+    balances: Sequence[str] | None = None,
+    axes: Sequence[str] | None = None,
+) -> Bases:
     """Windows in time (at the same instants of all runs) or in the order of runs, and levels of conditions, in every
     balance and channel; in the order only where the conditions do not tell it.
 
     Args:
         columns: of the table; weight: 0 for rows that do not count, shape (rows,).
-        robot: whose balances can lack something.
+        robot: whose balances can lack something; balances, axes: as of `families`.
     """
     counts = weight > 0
+    balances = balances_of(robot) if balances is None else balances
+    conditions = axes_of(robot) if axes is None else axes
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
     if axis is not None:
         x = np.asarray(columns[VARIABLES[axis]], float)
         low, high = x[counts].min(), x[counts].max()
         # Some runs one after the other are then runs at some conditions, which have windows of their own.
-        sorted_runs = axis == "order" and collinearity(columns, weight, robot) > COLLINEAR
+        sorted_runs = axis == "order" and collinearity(columns, weight, robot, conditions) > COLLINEAR
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
@@ -260,7 +281,7 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot 
                 inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
                 offered.append((axis, x, counts & inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
-        if VARIABLES[condition] not in axes_of(robot):
+        if VARIABLES[condition] not in conditions:
             continue
         x = factor * np.asarray(columns[VARIABLES[condition]], float)
         levels = np.unique(x[counts])
@@ -282,12 +303,17 @@ def windows(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot 
             np.stack([s for s, _ in shapes] * len(places))[:, :, None],
             [(place, name) for place in places for _, name in shapes],
         )
-        for places in (balances_of(robot), read)
+        for places in (balances, read)
         if places
     )
 
 
-def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None) -> float:
+def collinearity(
+    columns: Mapping[str, np.ndarray],
+    weight: np.ndarray,
+    robot: Robot | None = None,
+    axes: Sequence[str] | None = None,
+) -> float:
     """Share of the variance of the order of runs that their conditions explain (R²): at 1 a drift from run to run
     cannot be told from what the conditions do.
 
@@ -299,11 +325,12 @@ def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: R
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
     _, which = np.unique(np.asarray(columns["configuration"])[there], return_inverse=True)
-    others = [c for c in axes_of(robot) if c != VARIABLES["slope"]]
+    conditions = axes_of(robot) if axes is None else axes
+    others = [c for c in conditions if c != VARIABLES["slope"]]
     cells = np.stack([which, *(np.asarray(columns[c], float)[there] for c in others)], 1)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     few = cell.max() + 1 <= FEW_CELLS * len(x)
-    smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in axes_of(robot)) if few else axes_of(robot)
+    smooth = [VARIABLES["slope"]] * (VARIABLES["slope"] in conditions) if few else conditions
     terms = list(np.eye(len(x))[cell.ravel() if few else which.ravel()].T)
     for column in smooth:
         terms += list(legendre.legvander(scaled(columns[column], weight)[there], DEGREE)[:, 1:].T)

@@ -215,7 +215,7 @@ def calibrate(
         starts=found.starts,
         searched=searched,
         chi_square=estimates.chi_square(seen, measured, sd, about, known),
-        adequacy=lack_of_fit.adequacy(left, known=not known.estimated.any(), traced=observe.traced),
+        adequacy=lack_of_fit.adequacy(left, known=not known.estimated.any()),
         residual_clusters=residual_clusters(left, seed),
         identifiability=about,
         posterior=of_coordinates(posed.coordinates, z, about.covariance),

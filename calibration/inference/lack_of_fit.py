@@ -42,7 +42,6 @@ class Adequacy:
         p_value: family-wise, of all tests made; None where none could be.
         shown_by: the most telling test.
         noise_known: whether χ² was among the tests.
-        traced: whether the loop takes such runs, and so may find what is missing.
     """
 
     adequate: bool | None
@@ -51,7 +50,6 @@ class Adequacy:
     p_value: float | None
     shown_by: Shown
     noise_known: bool
-    traced: bool = True
 
     @property
     def statement(self) -> str:
@@ -60,9 +58,7 @@ class Adequacy:
 
     def to_json(self) -> dict[str, object]:
         """As in `adequate` of result.json."""
-        told = {**dataclasses.asdict(self), "shown_by": fits.shown_by(self.shown_by), "statement": self.statement}
-        del told["traced"]  # the statement says it
-        return told
+        return {**dataclasses.asdict(self), "shown_by": fits.shown_by(self.shown_by), "statement": self.statement}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,22 +106,21 @@ class Residuals:
         return dataclasses.replace(self, whitened=whitened, jacobian=jacobian)
 
 
-def adequacy(fit: Residuals, *, known: bool, traced: bool = True) -> Adequacy:
+def adequacy(fit: Residuals, *, known: bool) -> Adequacy:
     """Test a fit.
 
     Args:
         known: whether the noise of every channel is, and was not estimated from the misfit.
-        traced: whether the loop takes such runs.
     """
     chi2, freedom = float(fit.chi2.sum()), float(fit.freedom.sum())
     found = structure(fit, known=known)
     if known and freedom > 0:
         found.append((float(chdtrc(freedom, chi2)), Shown(what="stated")))
     if not found:
-        return Adequacy(None, chi2, freedom, None, Shown(), known, traced)
+        return Adequacy(None, chi2, freedom, None, Shown(), known)
     p, shown = min(found)
     p = min(1.0, p * len(found))
-    return Adequacy(p > LEVEL, chi2, freedom, p, shown, known, traced)
+    return Adequacy(p > LEVEL, chi2, freedom, p, shown, known)
 
 
 def structure(fit: Residuals, *, known: bool) -> list[tuple[float, Shown]]:

@@ -28,7 +28,7 @@ PROBED = ("mass", "supply", "electrical", "motor", "gearbox", "track", "ground",
 
 
 def probe(of: str) -> Effect:
-    """An effect that adds its amplitude to a balance."""
+    """An effect that adds its amplitude to a balance: of every side, or of each its own, shape (2,): left, right."""
 
     class Probe(Effect):
         name: ClassVar[str] = f"probe_{of}"
@@ -39,7 +39,8 @@ def probe(of: str) -> Effect:
         )
 
         def term(self, robot: Robot, signals: Signals) -> Scalar:
-            return self.amplitude
+            own = jnp.asarray(self.amplitude)
+            return jnp.where(signals.side > 0, own[0], own[1]) if own.ndim else own
 
     return Probe()
 
@@ -131,11 +132,17 @@ class Linearization(eqx.Module):
             adhesion (1 a row), priors.
         jacobian: by the free coordinates, shape (residuals, coordinates).
         signatures: by each instance's amplitude in prior sds, shape (readings, instances).
-        defects: by a defect of each balance of PROBED [its unit]; what further axes are is the observer's.
+        defects: by a defect of each balance of `probed` [its unit]; what further axes are is the observer's.
         scale: of what is added to a reading [1/SI], 0 where it does not count, shape (rows, channels).
         signals: of every row, at the fit.
         channels: names of those that readings are of, in order.
+        probed: balances whose defects are known.
+
+    A defect of a balance may be at every point: of each row, and of a robot whose sides are driven apart of each side
+    of it, the left side of all rows first.
     """
+
+    probed: ClassVar[tuple[str, ...]] = PROBED
 
     residual: Float[Array, " residuals"]
     jacobian: Float[Array, "residuals coordinates"]
@@ -163,19 +170,32 @@ class Linearization(eqx.Module):
         """The same at other residuals."""
         return dataclasses.replace(self, residual=residual)
 
+    @property
+    def points(self) -> int:
+        """How many points there are at which a balance may lack something."""
+        return self.rows
+
+    def at_points(self, rows: np.ndarray) -> np.ndarray:
+        """What is known by row, at every point; shape (points,)."""
+        return rows
+
+    def of_rows(self, points: np.ndarray) -> np.ndarray:
+        """Whether any of a row's points is among those of a mask; shape (rows,)."""
+        return points
+
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by defects of a balance, each a column over the rows.
+        """Change of the whitened readings by defects of a balance, each a column over the points.
 
         Args:
-            balance: index into PROBED; shapes: shape (rows, terms).
+            balance: index into `probed`; shapes: shape (points, terms).
         """
         raise NotImplementedError
 
     def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        """Change of the whitened readings by what is added to those of a channel [SI], each a column over the rows.
+        """Change of the whitened readings by what is added to those of a channel [SI], each a column over the points.
 
         Args:
-            channel: position in the table of channels; shapes: shape (rows, terms).
+            channel: position in the table of channels; shapes: shape (points, terms).
         """
         mine = self.scale * (np.arange(self.scale.shape[1]) == channel)
         return (mine[:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
@@ -185,7 +205,7 @@ class Linearization(eqx.Module):
         raise NotImplementedError
 
     def variable(self, name: str) -> np.ndarray:
-        """What a curve may be over, by row [SI]: a signal, or what else the observer knows."""
+        """What a curve may be over, by point [SI]: a signal, or what else the observer knows."""
         return np.broadcast_to(np.asarray(getattr(self.signals, name), float), (self.rows,))
 
     def runs(self) -> list[np.ndarray]:

@@ -10,6 +10,7 @@ from calibration.discovery.notes import (
     CarryOut,
     Instruction,
     MoreRuns,
+    NoMenu,
     NothingPossible,
     NothingTells,
     Overspeed,
@@ -144,6 +145,8 @@ def instruction(what: Instruction) -> str:
     """What to do and what to read."""
     if isinstance(what, NothingPossible):
         return "Every experiment of the menu is forbidden or beyond reach"
+    if isinstance(what, NoMenu):
+        return f"The menu of experiments is of straight travel and has no {what.word}"
     if isinstance(what, NothingTells):
         return f"No experiment of the menu tells {' and '.join(what.names)} apart by {what.sigma:g} sigma"
     if isinstance(what, CarryOut):

@@ -256,11 +256,6 @@ def shown_by(test: Shown) -> str:
     }[test.what]
 
 
-#: What looks for the missing, and what is left to do where nothing does.
-_LOOP = "mmrjax loop finds what"
-_NO_LOOP = "the loop takes straight travel alone, so look at the residuals by run"
-
-
 def adequacy(found: Adequacy) -> str:
     """Whether a fit is adequate; opens a calibration's output."""
     chi2 = f"χ² {found.chi2:.4g} on {found.degrees_of_freedom:.4g} degrees of freedom"
@@ -274,7 +269,7 @@ def adequacy(found: Adequacy) -> str:
         why = f"{chi2}, {p}" if found.noise_known else f"{p}, the noise estimated from them"
         return (
             f"Not adequate: {shown_by(found.shown_by)} ({why}), so something is missing and the parameters may "
-            f"absorb it; {_LOOP if found.traced else _NO_LOOP}"
+            "absorb it; mmrjax loop finds what"
         )
     if found.noise_known:
         return f"Adequate: the residuals are what the stated noise leaves ({chi2}, {p})"

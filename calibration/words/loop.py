@@ -141,6 +141,8 @@ def _without_name(where: DiscrepancyLocation, p: float, no_effect: str) -> str:
 def shown_over(variable: str) -> str:
     """Where a discrepancy shows."""
     happens = bases.window(variable)
+    if variable == "side":
+        return "unlike on the two sides"
     if happens is None:
         return f"best shown over {variable.replace('_', ' ')}" if variable != "order" else "drifting from run to run"
     if happens.axis == "time":

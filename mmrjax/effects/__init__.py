@@ -15,7 +15,7 @@ from mmrjax.effects import (
     turning,
 )
 from mmrjax.effects.base import Effect, amplitude, defined_in
-from mmrjax.effects.curve import CURVES, WAVES
+from mmrjax.effects.curve import CURVES, CURVES_ROUND, WAVES
 
 _FILES = (mass, inertia, supply, electrical, inductance, motor, gearbox, track, ground, slip, sensor)
 
@@ -26,9 +26,9 @@ ALL: tuple[type[Effect], ...] = tuple(effect for file in _FILES for effect in de
 BY_NAME: dict[str, type[Effect]] = {effect.name: effect for effect in ALL}
 
 #: Discrepancies without a name, which robot files know and no library holds.
-UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES}
+UNNAMED: dict[str, type[Effect]] = {**CURVES, **WAVES, **CURVES_ROUND}
 
-#: Of a robot that turns, which robot files know and the loop over straight travel cannot show.
+#: Of a robot that turns: robot files know them, and the loop looks for them in tables of turns.
 OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_in(turning)}
 
 #: What robot files know beside the library.

@@ -22,9 +22,11 @@ BALANCES = {
     "ground": ("N", 4.0, "direction_travel"),
     "slip": ("m/s", 0.05, "direction"),
 }
+#: The same of a robot that turns alone.
+ROUND = {"yaw": ("N·m", 0.5, "direction_turn")}
 #: Channels to whose readings a curve may be added, likewise; an instrument's error of 1 % of its range is plausible.
 READINGS = {c.name: (c.unit_si or c.unit, 0.01 * c.range[1] * c.factor, "direction") for c in channels.usual()}
-PLACES = {**BALANCES, **READINGS}
+PLACES = {**BALANCES, **ROUND, **READINGS}
 #: Variables of a curve, signals that every one of these balances knows, the time since the start of the run and the
 #: place of a run in the sequence: unit and ordinary range.
 VARIABLES = {
@@ -37,6 +39,11 @@ VARIABLES = {
     "time": ("s", 0.0, 2.0),
     "order": ("-", 0.0, 100.0),
 }
+#: The same of a robot that turns alone; and which of the others its turns have.
+VARIABLES_ROUND = {"yaw_rate": ("rad/s", 0.0, 4.0), "side": ("-", -1.0, 1.0)}
+IN_TURNS = ("voltage", "current", "speed_motor", "payload", "speed", "order")
+#: Variables that have a sign by themselves; the others count along the motion: of the shafts, or of the turn.
+SIGNED = ("payload", "order", "side")
 ORDINATES = tuple(f"y{k}" for k in range(6))
 #: Share of the range over which a curve levels out beyond each of its ends.
 LEVEL = 0.05
@@ -90,7 +97,8 @@ def _curve(place: str, over: str) -> type[Effect]:
     """The curve of one variable in one balance, or in the readings of one channel."""
     shown = place in READINGS
     unit, size, along = PLACES[place]
-    unit_x, first, last = VARIABLES[over]
+    unit_x, first, last = (VARIABLES | VARIABLES_ROUND)[over]
+    ahead = "direction_turn" if over == "yaw_rate" else "direction" if place in ROUND else along
 
     class Curve(Effect):
         name = f"curve_{place}_{over}"
@@ -130,7 +138,7 @@ def _curve(place: str, over: str) -> type[Effect]:
             if over == "time":
                 x = self.recall(robot, signals)
             else:
-                x = getattr(signals, over) if over in ("payload", "order") else getattr(signals, over) * way
+                x = getattr(signals, over) * (1.0 if over in SIGNED else getattr(signals, ahead))
             y = jnp.stack(jnp.broadcast_arrays(*(getattr(self, n) for n in ORDINATES)), -1)
             return self.amplitude * jnp.sum(weights(x, self.low, self.high) * y, -1) * way
 
@@ -200,5 +208,13 @@ WAVES: dict[str, type[Effect]] = {effect.name: effect for effect in map(_wave, B
 
 #: Every curve by its name. Robot files know them; they are no part of the library that is scored.
 CURVES: dict[str, type[Effect]] = {
-    effect.name: effect for effect in (_curve(place, over) for place in PLACES for over in VARIABLES)
+    effect.name: effect for effect in (_curve(place, over) for place in (*BALANCES, *READINGS) for over in VARIABLES)
+}
+#: Those of a robot that turns alone.
+CURVES_ROUND: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        *(_curve(place, over) for place in (*BALANCES, *ROUND) for over in VARIABLES_ROUND),
+        *(_curve(place, over) for place in ROUND for over in IN_TURNS),
+    )
 }

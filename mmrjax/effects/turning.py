@@ -1,7 +1,7 @@
 """Effects of a robot that turns: sides that are not alike, and resistance to the turn. Straight travel shows none.
 
-They are no part of the library that the loop looks through, which takes runs of straight travel; robot files know
-them, and `calibrate` frees their amplitudes.
+They are no part of the library that the loop looks through in straight travel; in tables of turns it looks for them
+beside that library. Robot files know them, and `calibrate` frees their amplitudes.
 """
 
 from __future__ import annotations
@@ -108,3 +108,29 @@ class TurningResistance(Effect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.normal * signals.yaw_rate
+
+
+class SideRadius(Effect):
+    """ΔV = a s r_k ω_k, s = 1 left and -1 right: the left side rolls on (1 - a) r_k, the right one on (1 + a) r_k.
+
+    A worn belt, a tyre of less pressure or another size on one side: the robot turns at equal shaft speeds. The lever
+    arm of the traction stays, as of `rolling_radius`.
+
+    Source: eq. (32) with a radius of its own for each side; unequal wheel diameters are the first of odometry's
+    systematic errors in Borenstein and Feng, Measurement and correction of systematic odometry errors in mobile
+    robots, IEEE Trans. Robotics and Automation 12 (1996) 869.
+    """
+
+    balance = "slip"
+    driver = "side"
+
+    amplitude: Scalar = amplitude(
+        unit="-",
+        meaning="half the relative difference of the sides' rolling radii, positive where the left's is smaller",
+        bounds=(-0.2, 0.2),
+        sd=0.01,
+        source="wear and pressure: a percent or two",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return self.amplitude * signals.side * signals.speed_theoretical

@@ -36,13 +36,32 @@ def until(
     def of(numbers: Any) -> Any:
         return eqx.combine(numbers, rest)
 
-    @custom_vmap
-    def alone(numbers: Any) -> T:
-        return jax.lax.while_loop(lambda s: ~ended(s), lambda s: turn(of(numbers), s), begun(of(numbers)))
+    def many(numbers: Any, batched: Any, size: int) -> T:
+        """The end of each of `size` members; where these are a batch again, all members go through the same lanes."""
 
-    @alone.def_vmap
-    def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:
-        (batched,) = batched
+        @custom_vmap
+        def each(numbers: Any) -> T:
+            return refilled(numbers, batched, size)
+
+        @each.def_vmap
+        def flat(outer: int, of_outer: Any, numbers: Any) -> tuple[T, Any]:
+            (of_outer,) = of_outer
+
+            def member(x: Array, inner: bool, out: bool) -> Array:
+                if inner and not out:
+                    return jnp.concatenate([x] * outer)
+                if out and not inner:
+                    return jnp.repeat(x, size, axis=0)
+                return x.reshape(outer * size, *x.shape[2:]) if inner else x
+
+            whole = jax.tree.map(member, numbers, batched, of_outer)
+            either = jax.tree.map(lambda inner, out: inner or out, batched, of_outer)
+            found = jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), many(whole, either, outer * size))
+            return found, jax.tree.map(lambda _: True, found)
+
+        return each(numbers)
+
+    def refilled(numbers: Any, batched: Any, size: int) -> T:
         lanes = min(size, LANES)
         axes = jax.tree.map(lambda b: 0 if b else None, batched)
 
@@ -74,7 +93,15 @@ def until(
         first = jnp.arange(lanes)
         state = begin(at(first))
         found = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), state)
-        found = jax.lax.while_loop(busy, step, (found, first, jnp.asarray(lanes), state))[0]
+        return jax.lax.while_loop(busy, step, (found, first, jnp.asarray(lanes), state))[0]
+
+    @custom_vmap
+    def alone(numbers: Any) -> T:
+        return jax.lax.while_loop(lambda s: ~ended(s), lambda s: turn(of(numbers), s), begun(of(numbers)))
+
+    @alone.def_vmap
+    def together(size: int, batched: Any, numbers: Any) -> tuple[T, Any]:
+        found = many(numbers, batched[0], size)
         return found, jax.tree.map(lambda _: True, found)
 
     return alone(numbers)

@@ -101,8 +101,16 @@ def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
     return _state(unknowns, sound.discharge), solved
 
 
+@compiled
+def _circled(robot: Robot, conditions: Conditions) -> Signals:
+    return turning.circling(robot, conditions)[0].signals
+
+
 def operating_signals(robot: Robot, conditions: Conditions) -> Signals:
-    """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`)."""
+    """Every signal of one run at its operating point, with numbers whatever the status (see `operating_point`); of a
+    robot that turns those of each side, along an axis of 2."""
+    if conditions.turns:
+        return _circled(robot, conditions)
     state, _ = _root(robot, conditions)
     _, sound = _sound(robot, conditions)
     return _balanced(robot, sound, state, direction(robot, sound))[0]

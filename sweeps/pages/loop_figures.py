@@ -368,5 +368,7 @@ VARIABLE_WORDS = {
     "speed": ("speed_mm_s", 1.0, "speed [mm/s]"),
     "time": ("time_s", 1.0, "time since the start [s]"),
     "order": ("order", 1.0, "order of the runs"),
+    "yaw_rate": ("yaw_rate_rad_s", 1.0, "yaw rate [rad/s]"),
+    "side": ("", 1.0, "side: 1 left, -1 right"),
 }
 SHOWN = {"speed_motor": 1 / RPM, "slope": 180 / np.pi, "speed": 1 / MM}

@@ -58,7 +58,8 @@ class Observer(eqx.Module):
         policy: how fits are searched for.
         rows_tell: whether a single row shows a defect by itself.
         evidence: kinds of evidence that something is missing.
-        traced: whether the loop can tell missing effects from such data.
+        library: effects that such data show beside the library's.
+        menu: whether the menu of experiments is of runs of this kind.
         searches: of a calibration; None takes the fidelity's; profiled: whether its parameters are profiled too,
             where the fidelity's are.
     """
@@ -73,7 +74,8 @@ class Observer(eqx.Module):
     policy: ClassVar[SearchPolicy]
     rows_tell: ClassVar[bool]
     evidence: ClassVar[tuple[str, ...]]
-    traced: ClassVar[bool] = True
+    library: ClassVar[Mapping[str, type[Effect]]] = {}
+    menu: ClassVar[bool] = True
     searches: ClassVar[int | None] = None
     profiled: ClassVar[bool] = True
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
@@ -18,7 +19,7 @@ from calibration.data.runs import Runs
 from calibration.inference import bases as bases_room
 from calibration.inference.bases import Bases
 from calibration.inference.details import EquationDefects
-from calibration.inference.linearization import PROBED, Linearization, ScoredEffect, finite, probe
+from calibration.inference.linearization import Linearization, ScoredEffect, finite, probe
 from calibration.inference.noise import Noise
 from calibration.inference.notes import Note
 from calibration.inference.observers.base import Observer, SearchPolicy
@@ -31,7 +32,7 @@ from mmrjax.effects import Effect
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import FAILED, SLIDES, TIPS
+from mmrjax.signals import FAILED, SLIDES, TIPS, Signals
 
 if TYPE_CHECKING:
     from calibration.discovery.adequacy import Diagnosis
@@ -47,13 +48,31 @@ EQUATIONS = ("electrical", "track", "slip")
 
 
 class SettledLinearization(Linearization):
-    """Of settled rows: `defects` has shape (balances, rows, channels), a defect of each row of its own."""
+    """Of settled rows: `defects` has shape (balances, rows, channels), a defect of each row of its own, or (balances,
+    sides, rows, channels) where sides are driven apart."""
 
     def columns(self, balance: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
-        return (self.defects[balance][:, :, None] * shapes[:, None, :]).reshape(-1, shapes.shape[1])
+        of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
+        moved = self.of_sides(balance)[:, :, :, None] * of_sides[:, :, None, :]
+        return moved.sum(0).reshape(-1, shapes.shape[1])
+
+    def of_sides(self, balance: Scalar | int) -> Float[Array, "sides rows channels"]:
+        """What a defect of a balance changes, of each side; sides that are alike are one."""
+        return self.defects[balance].reshape(-1, *self.scale.shape)
 
     def places(self) -> np.ndarray:
         return np.arange(self.rows)
+
+    @classmethod
+    def sense(cls, signals: Signals) -> Array | float:
+        """Along what a defect of each balance is counted, by side and row; 1 in travel, which is forward."""
+        return 1.0
+
+
+def shares(channel: str, sides: int) -> np.ndarray:
+    """What a channel shows of each side [-]: of one of a side that alone, else their mean."""
+    of = channels.of(channel).side
+    return np.full(sides, 1 / sides) if of is None or sides == 1 else np.eye(sides)[of]
 
 
 class SettledRuns(Observer):
@@ -72,6 +91,8 @@ class SettledRuns(Observer):
     policy: ClassVar[SearchPolicy] = SearchPolicy()
     rows_tell: ClassVar[bool] = True
     evidence: ClassVar[tuple[str, ...]] = ("single", "curve", "pair", "chi2")
+    linearization: ClassVar[type[SettledLinearization]] = SettledLinearization
+    shape_sides: ClassVar[tuple[int, ...]] = ()  # of what each side has of its own
 
     conditions: Conditions
     fidelity: str = eqx.field(static=True)
@@ -184,40 +205,42 @@ class SettledRuns(Observer):
     ) -> SettledLinearization:
         """As the protocol says. A signature is the sensitivity of the readings to a defect of the effect's balance,
         times its term: exact, as an effect enters one balance and is linear in its amplitude."""
-        probes = tuple(probe(b) for b in PROBED)
+        kind = self.linearization
+        probes = tuple(probe(b) for b in kind.probed)
         robot, size, shown = problem.robot(z), z.size, channels.names(problem.channels)
 
         def whitened(x: Array) -> Array:
-            z, delta = x[:size], x[size:]
+            z, delta = x[:size], x[size:].reshape(len(probes), *self.shape_sides)
             there = problem.robot(z)
             put = tuple(eqx.tree_at(lambda e: e.amplitude, p, d) for p, d in zip(probes, delta, strict=True))
             there = dataclasses.replace(there, effects=(*there.effects, *put))
             return jnp.concatenate([problem.whitened(self(there), data), z - data.centre])
 
         jacobian, residual = jax.jacfwd(lambda x: (whitened(x),) * 2, has_aux=True)(
-            jnp.concatenate([z, jnp.zeros(len(probes))])
+            jnp.concatenate([z, jnp.zeros(len(probes) * math.prod(self.shape_sides))])
         )
         rows, count = data.measured.shape
-        defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes)).transpose(2, 0, 1)
+        defects = jacobian[: rows * count, size:].reshape(rows, count, len(probes), -1).transpose(2, 3, 0, 1)
         signals = jax.vmap(lambda c: operating_signals(robot, c))(self.conditions)
+        each = jax.tree.map(lambda x: x.reshape(-1), signals)
         scale = data.weight / data.sd
 
         def signature(effect: Effect) -> Array:
             alone = dataclasses.replace(robot, effects=(effect,))
-            term = jax.vmap(lambda s: balances.added(alone, s, effect.balance, effect.channel))(signals)
-            term = jnp.broadcast_to(term, (rows,))
+            term = jax.vmap(lambda s: balances.added(alone, s, effect.balance, effect.channel))(each)
+            term = jnp.broadcast_to(term, each.speed.shape).reshape(rows, -1)
             if effect.balance == "sensor":
+                term = term @ shares(effect.channel, term.shape[1])
                 moved = term[:, None] * (jnp.arange(count) == shown.index(effect.channel)) * scale
-            elif effect.balance in PROBED:
-                moved = term[:, None] * defects[PROBED.index(effect.balance)]
+            elif effect.balance in kind.probed:
+                moved = (term.T[:, :, None] * defects[kind.probed.index(effect.balance)]).sum(0)
             else:
                 moved = jnp.zeros((rows, count))
             return moved.ravel()
 
         signatures = jnp.concatenate([e.each(signature) for e in effects]).T
-        return SettledLinearization(
-            residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown
-        )
+        defects = (defects * kind.sense(signals)).reshape(len(probes), *self.shape_sides, rows, count)
+        return kind(residual, jacobian[:, :size], finite(signatures), defects, scale, signals, channels=shown)
 
     def draws(
         self, problem: Problem, z: Array, linear: Linearization, keys: Array, factors: np.ndarray
@@ -278,7 +301,9 @@ class SettledRuns(Observer):
 
 def _defects(linear: Linearization, included: np.ndarray) -> dict[str, np.ndarray]:
     rows = len(included)
-    sensitivity = np.stack([np.asarray(linear.defects)[PROBED.index(b)][:rows] for b in EQUATIONS], 2)
+    assert isinstance(linear, SettledLinearization)
+    along = (np.asarray(linear.of_sides(linear.probed.index(b)).sum(0))[:rows] for b in EQUATIONS)
+    sensitivity = np.stack(list(along), 2)
     residual = np.asarray(linear.by_row())[:rows]
     found = np.full((rows, len(EQUATIONS)), np.nan)
     for k in np.flatnonzero(included):

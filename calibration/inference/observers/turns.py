@@ -3,20 +3,83 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from calibration.data.errors import BadConfiguration
 from calibration.data.runs import Runs
+from calibration.inference import bases as bases_room
+from calibration.inference import priors
+from calibration.inference.bases import Bases
 from calibration.inference.blocks import TURN
+from calibration.inference.linearization import PROBED
+from calibration.inference.observers.base import SearchPolicy
 from calibration.inference.observers.histories import Histories
-from calibration.inference.observers.settled import SettledRuns
+from calibration.inference.observers.settled import SettledLinearization, SettledRuns, shares
 from calibration.inference.problem import Observation
-from mmrjax import fidelities
+from mmrjax import balances, effects, fidelities
+from mmrjax.compiling import compiled
+from mmrjax.effects import Effect
+from mmrjax.effects.curve import SIGNED
+from mmrjax.fidelities.steady import operating_signals
+from mmrjax.params import Scalar
 from mmrjax.robot import Robot
-from mmrjax.signals import NOT_SETTLED
+from mmrjax.signals import NOT_SETTLED, Signals
+
+#: Variables of curves in turns; a slope they have none, and time neither.
+VARIABLES = ("voltage", "current", "speed_motor", "payload", "speed", "yaw_rate", "side")
+#: Balances that act round the turn; the others along the motion of the shafts of a side.
+ROUND = ("lateral", "yaw")
+
+
+def along(signals: Signals, name: str) -> Float[Array, " points"]:
+    """A signal at every point [SI], counted along the motion: of the shafts, or of the turn.
+
+    Args:
+        signals: shape (rows, sides).
+    """
+    x = jnp.asarray(getattr(signals, name))
+    if name == "yaw_rate":
+        x = x * signals.direction_turn
+    elif name not in SIGNED:
+        x = x * signals.direction
+    return x.T.ravel()
+
+
+class TurnLinearization(SettledLinearization):
+    """Of settled turns: each side of each row is a point, and what each side has of `signals` is along their last
+    axis."""
+
+    probed: ClassVar[tuple[str, ...]] = (*PROBED, *ROUND)
+
+    @property
+    def points(self) -> int:
+        return self.rows * self.defects.shape[1]
+
+    def at_points(self, rows: np.ndarray) -> np.ndarray:
+        return np.tile(rows, self.defects.shape[1])
+
+    def of_rows(self, points: np.ndarray) -> np.ndarray:
+        return np.any(points.reshape(-1, self.rows), axis=0)
+
+    def variable(self, name: str) -> np.ndarray:
+        return np.asarray(along(self.signals, name), float)
+
+    def shown(self, channel: Scalar | int, shapes: Array | np.ndarray) -> Float[Array, "readings terms"]:
+        of_sides = shapes.reshape(-1, self.rows, shapes.shape[1])
+        each = np.stack([shares(name, len(of_sides)) for name in self.channels])
+        return super().shown(channel, jnp.tensordot(jnp.asarray(each)[channel], of_sides, 1))
+
+    @classmethod
+    def sense(cls, signals: Signals) -> Array | float:
+        shafts, turn = (jnp.asarray(x).T for x in (signals.direction, signals.direction_turn))
+        of = {"mass": jnp.ones_like(shafts)} | dict.fromkeys(ROUND, turn)
+        return jnp.stack([of.get(balance, shafts) for balance in cls.probed])[..., None]
 
 
 class SettledTurns(SettledRuns):
@@ -28,9 +91,14 @@ class SettledTurns(SettledRuns):
 
     word: ClassVar[str] = "turns"
     blocks: ClassVar[tuple[str, ...]] = ("run", TURN, "voltage", "payload", "configuration")
-    traced: ClassVar[bool] = False
+    rows_tell: ClassVar[bool] = False  # a row has a defect on either side
+    library: ClassVar[Mapping[str, type[Effect]]] = effects.OF_TURNS
+    menu: ClassVar[bool] = False
+    policy: ClassVar[SearchPolicy] = SearchPolicy(searches=4)
     searches: ClassVar[int | None] = 4  # a turn takes some hundred times as long to find as straight travel
     profiled: ClassVar[bool] = False
+    linearization: ClassVar[type[SettledLinearization]] = TurnLinearization
+    shape_sides: ClassVar[tuple[int, ...]] = (2,)
 
     @classmethod
     def observes(cls, runs: Runs) -> bool:
@@ -53,9 +121,34 @@ class SettledTurns(SettledRuns):
     def least(cls, runs: Runs) -> np.ndarray:
         return cls.sizes(runs)
 
+    @classmethod
+    def free(cls) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        return (), priors.OF_TURNS
+
     def __call__(self, robot: Robot) -> Observation:
         seen = super().__call__(robot)
         return dataclasses.replace(seen, adhesion_used=jnp.zeros_like(seen.adhesion_used))
 
     def unreachable(self, status: np.ndarray) -> np.ndarray:
         return super().unreachable(status) | (status == NOT_SETTLED)
+
+    def bases(self, columns: Mapping[str, np.ndarray], included: np.ndarray, robot: Robot) -> Bases:
+        """As the protocol says: in the balances of both sides alike, and round the turn, over what each side does,
+        how fast the robot turns, and which side it is."""
+        names = [v for v in VARIABLES if v != "voltage" or robot.rig.shows_voltage]
+        seen = _variables(self, robot, tuple(names))
+        points = {bases_room.VARIABLES[v]: np.asarray(seen[v]) for v in names}
+        points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
+        weight = np.tile(included.astype(float), 2)
+        lacking = tuple(b for b in (*bases_room.BALANCES, *bases_room.OF_TURNS) if b not in balances.absent(robot))
+        imposed = bases_room.axes_of(robot)[0]
+        axes = (imposed, bases_room.VARIABLES["payload"], "yaw_rate", "side")
+        told = points, weight, robot, lacking, axes
+        return (*bases_room.families(*told), *bases_room.windows(*told))
+
+
+@compiled
+def _variables(observe: SettledTurns, robot: Robot, names: tuple[str, ...]) -> dict[str, Array]:
+    """Variables of curves at every point of a fit."""
+    signals = jax.vmap(lambda c: operating_signals(robot, c))(observe.conditions)
+    return {name: along(signals, name) for name in names}

@@ -1,0 +1,143 @@
+"""The loop on tables of settled turns: what effects and defects of each side do to the readings, and what is found."""
+
+import dataclasses
+import json
+
+import equinox as eqx
+import generator_turns as planted
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mmrjax as mm
+from calibration.data import runs as records
+from calibration.discovery.discover import pose, prepared
+from calibration.inference import bases as bases_room
+from calibration.inference.observers.turns import TurnLinearization
+from mmrjax import effects, params
+from mmrjax.effects.curve import weights
+
+#: Of the library, one of each balance that a turn shows, beside those of turns.
+SOME = ("supply_sag", "iron_loss")
+COUNT = 8
+
+
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory):
+    """A small table of turns whose left side rubs more, as the loop poses it."""
+    table, file = planted.write(tmp_path_factory.mktemp("turns"), "friction", COUNT)
+    robot = mm.read_robot(str(file))
+    library = {name: kind for name, kind in effects.BY_NAME.items() if name in SOME}
+    ready = prepared(records.read(table, robot=robot), robot, noise=planted.NOISE, library=library)
+    space = pose(ready.runs, ready.robot, ready.noise.sd, ready.settings, ready.stated, ready.library)
+    return space.bare, space
+
+
+@pytest.fixture(scope="module")
+def linear(posed):
+    problem, space = posed
+    z = jnp.zeros(space.free)
+    found = jax.jit(lambda z: problem.observe.linearise(problem, z, problem.data, space.library.scored))(z)
+    return jax.device_get(found)
+
+
+@pytest.fixture(scope="module")
+def shown(posed):
+    """Change of the whitened readings as effects of a robot go from nothing to an amplitude, by central difference."""
+    problem, space = posed
+    robot = problem.robot(jnp.zeros(space.free))
+
+    @eqx.filter_jit
+    def of(effect, amplitude):
+        there = dataclasses.replace(robot, effects=(eqx.tree_at(lambda e: e.amplitude, effect, amplitude),))
+        return problem.whitened(problem.observe(there), problem.data)[: problem.data.measured.size]
+
+    def change(effect, step):
+        return np.asarray(of(effect, jnp.asarray(step)) - of(effect, jnp.asarray(-step))) / (2 * step)
+
+    return change
+
+
+def test_loop_looks_for_effects_of_turns_beside_the_library(posed):
+    _, space = posed
+    assert set(effects.OF_TURNS) < set(space.library.names) and set(SOME) & set(space.library.names)
+    assert {"6T2A.turning.width", "6T2A.turning.lateral"} < set(space.coordinates.base.names)
+
+
+@pytest.mark.parametrize("name", ["side_voltage", "side_torque", "turning_resistance", "iron_loss"])
+def test_signature_is_what_the_effect_does(posed, linear, shown, name):
+    _, space = posed
+    k = space.library.names.index(name)
+    effect = space.library.scored[k].effect
+    size = float(effect.amplitude)
+    mine = np.asarray(linear.signatures)[:, np.flatnonzero(space.library.of == k)]
+    values = space.library.scored[k].values
+    at = len(values) // 2
+    if len(values):
+        effect = params.replace(effect, {space.library.scored[k].shape: values[at]})
+    wanted = size * shown(effect, 1e-3 * size)
+    assert np.abs(wanted).max() > 0.1
+    np.testing.assert_allclose(mine[:, at], wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("name", ["curve_track_side", "curve_yaw_yaw_rate", "curve_slip_yaw_rate"])
+def test_column_of_a_curve_is_what_the_curve_does(linear, shown, name):
+    """A curve that the loop fits is the one whose columns it scored."""
+    _, balance, variable = name.split("_", 2)
+    x = linear.variable(variable)
+    assert x.shape == (linear.points,)
+    ordinates = {"y0": 1.0, "y1": 0.4, "y2": 0.1, "y3": 0.0, "y4": -0.3, "y5": -0.2}
+    ends = {"low": float(x.min()), "high": float(x.max())}
+    effect = params.replace(effects.UNNAMED[name](), {n: jnp.asarray(v) for n, v in (ordinates | ends).items()})
+
+    shapes = np.asarray(weights(jnp.asarray(x), ends["low"], ends["high"]))
+    columns = bases_room.signature(linear, balance, shapes) @ np.array(list(ordinates.values()))
+    size = 1e-4 * float(effect.amplitude or 1.0)
+    wanted = shown(effect, size)
+    assert np.abs(wanted).max() > 1.0
+    np.testing.assert_allclose(columns, wanted, rtol=2e-3, atol=1e-3 * np.abs(wanted).max())
+
+
+def test_points_are_each_side_of_each_row(posed, linear):
+    _, space = posed
+    assert isinstance(linear, TurnLinearization) and linear.points == 2 * linear.rows
+    mask = np.zeros(linear.points, bool)
+    mask[linear.rows + 3] = True  # the right side of the fourth row
+    assert np.flatnonzero(linear.of_rows(mask)).tolist() == [3]
+    assert linear.at_points(space.included).sum() == 2 * COUNT
+    side = linear.variable("side")
+    assert (side[: linear.rows] == 1).all() and (side[linear.rows :] == -1).all()
+    assert (linear.variable("speed_motor") > 0).all()  # counted along the motion of its side
+
+
+def test_what_a_channel_of_one_side_shows_is_off_by_that_side_alone(linear):
+    shapes = np.ones((linear.points, 1))
+    shapes[: linear.rows] = 0.0  # the right side alone
+    by = [np.asarray(linear.shown(k, shapes)).reshape(linear.rows, -1) for k in range(len(linear.channels))]
+    moved = [float(np.abs(x).max()) for x in by]
+    sides = {"left": 0.0, "right": 1.0}
+    for k, name in enumerate(linear.channels):
+        share = sides.get(name.rpartition("_")[2], 0.5)
+        assert moved[k] == pytest.approx(share * float(linear.scale[:, k].max()))
+        assert not np.delete(by[k], k, 1).any()
+
+
+#: Table → equation that the answer has to be in, and effects of which one has to be established; none: nothing is
+#: missing.
+FOUND = {"clean": (), "friction": ("side_friction",), "voltage": ("side_voltage",), "moment": ("turning_resistance",)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", FOUND)
+def test_what_a_second_implementation_planted_is_found(tmp_path, mmrjax, case):
+    table, robot = planted.write(tmp_path, case)
+    told = ("--robot", str(robot), "--noise", planted.NOISE, "--replicates", "250")
+    code, out, err = mmrjax("loop", str(table), *told, "--out", str(tmp_path / "run"))
+    assert code == 0, err
+    found = json.loads((tmp_path / "run" / "result.json").read_text())
+    if not FOUND[case]:
+        assert found["verdict"] == "none" and "nothing" in out.lower()
+        return
+    members = {name for effect in found["effects"] for name in effect["class"]}
+    assert found["verdict"] in ("named", "class") and set(FOUND[case]) <= members
