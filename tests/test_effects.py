@@ -67,7 +67,7 @@ SIGNAL_UNITS = {
     "H": "inductance",
     "kg·m^2": "inertia_added",
     "rad": "angle heading",
-    "-": "side duty on_tracks battery slope adhesion order direction direction_travel efficiency_load",
+    "-": "side duty on_tracks battery slope adhesion order direction direction_travel direction_turn efficiency_load",
 }
 UNIT_OF = {name: unit for unit, fields in SIGNAL_UNITS.items() for name in fields.split()}
 SENSOR_UNITS = {"total_current": "A", "motor_speed": "1/s", "speed": "m/s"}

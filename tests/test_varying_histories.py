@@ -403,6 +403,16 @@ def test_speeds_without_a_sign_are_refused_where_a_run_is_driven_backward(runs):
         Histories.check(changed(runs, motor_speed_rpm=np.abs(runs["motor_speed_rpm"])), nothing)
 
 
+def test_a_rig_may_turn_on_forward_while_it_is_driven_backward(runs):
+    """Its inertia carries it through one stretch; another shows that its speeds have a sign."""
+    nothing = Noise(*(None for _ in dataclasses.fields(Noise)))
+    back = np.flatnonzero(runs["supply_voltage_V"] * (runs["mode"] == "voltage") < 0)
+    speed = runs["motor_speed_rpm"].copy()
+    assert len(back) > 20 and speed[back].min() < -0.5 * speed.max()
+    speed[back[5:]] = np.abs(speed[back[5:]])
+    Histories.check(changed(runs, motor_speed_rpm=speed), nothing)
+
+
 def test_payload_that_changes_acts_from_its_sample_on(runs):
     payload = runs["payload_kg"] + 6.0 * (runs["time_s"] >= 1.25)
     heavier = Histories.of(changed(runs, payload_kg=payload), robots.nominal())

@@ -237,10 +237,14 @@ def _edge(robot: Robot, conditions: Conditions) -> tuple[Scalar, Array]:
 
 
 def _through_rest(robot: Robot, conditions: Conditions, at: Float[Array, "instants unknowns"]) -> _Through:
-    """Of a run's states: a step from one direction to the other, or two of them with one state at rest between."""
+    """Of a run's states: a step from one direction to the other, or two of them with one state at rest between.
+
+    None where shafts and robot do not move as one, with a backlash or a ground to slip on: their moments of rest are
+    apart.
+    """
     edge, _ = _edge(robot, conditions)
     speed = at[:, MOTOR]
-    way = jnp.where(jnp.abs(speed) < edge, 0.0, jnp.sign(speed)) * (0.0 if robot.loose else 1.0)
+    way = jnp.where(jnp.abs(speed) < edge, 0.0, jnp.sign(speed)) * (0.0 if robot.loose or robot.has_ground else 1.0)
     a, b = way[:-1], way[1:]
     before, after = jnp.concatenate([a[:1], a[:-1]]), jnp.concatenate([b[1:], b[-1:]])
     across, into, out = a * b < 0, (a != 0) & (b == 0) & (a * after < 0), (a == 0) & (b != 0) & (before * b < 0)

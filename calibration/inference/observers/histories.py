@@ -780,7 +780,8 @@ def _few(x: np.ndarray) -> np.ndarray:
 
 
 def _check_signs(runs: Runs) -> None:
-    """Refuse speeds without a sign of runs that are driven backward."""
+    """Refuse speeds without a sign of runs that are driven backward: a rig's inertia may carry it forward for as long
+    as a stretch lasts, but not in all of a table."""
     volts, measured = applied(runs), runs.measured()
     time = runs["time_s"]
     for run in stretches(runs):
@@ -789,7 +790,10 @@ def _check_signs(runs: Runs) -> None:
             for k, channel in enumerate(runs.channels):
                 shown = measured[rows, k][np.isfinite(measured[rows, k])]
                 size = np.nanmax(np.abs(measured[:, k]), initial=0.0)
-                if channel.zero_at_rest and channel.directed and shown.size and np.median(shown) > RESTING * size:
+                if not (channel.zero_at_rest and channel.directed and shown.size):
+                    continue
+                signed = np.nanmin(measured[:, k], initial=0.0) < -RESTING * size
+                if np.median(shown) > RESTING * size and not signed:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
                         f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} V; "
