@@ -5,9 +5,8 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import functools
-import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -398,6 +397,49 @@ _go_on_often = compiled(_go_on, options=SMALL)
 _go_on_seldom = compiled(_go_on, options=SELDOM)
 
 
+class Places:
+    """Members that go on side by side; one that has ended leaves its place to one that waits.
+
+    Attributes:
+        holds: member in each place, -1 for none; ended: what each member that has ended found.
+    """
+
+    def __init__(self, members: Iterable[int], count: int) -> None:
+        """So many places, empty; members that wait for them."""
+        self._waiting, self.holds = list(members)[::-1], np.full(count, -1)
+        self.ended: dict[int, Any] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting) or bool(self.taken.any())
+
+    @property
+    def waiting(self) -> bool:
+        """Whether members wait."""
+        return bool(self._waiting)
+
+    @property
+    def taken(self) -> np.ndarray:
+        """Whether each place holds a member."""
+        return self.holds >= 0
+
+    @property
+    def member(self) -> np.ndarray:
+        """The member in each place, any where there is none."""
+        return np.maximum(self.holds, 0)
+
+    def fill(self) -> np.ndarray:
+        """Let members in; the places that they take."""
+        fresh = np.flatnonzero(~self.taken)[: len(self._waiting)]
+        self.holds[fresh] = [self._waiting.pop() for _ in fresh]
+        return fresh
+
+    def leave(self, over: np.ndarray, found: Any) -> None:
+        """Members whose search is over go, with what they found; leading axis the places."""
+        for place in np.flatnonzero(over & self.taken):
+            self.ended[int(self.holds[place])] = jax.tree.map(lambda x: x[place], found)  # noqa: B023
+            self.holds[place] = -1
+
+
 def searches_refilled(problem: Problem, members: Member, max_steps: int, places: int) -> tuple[Optimum, Observation]:
     """`levenberg_marquardt` of any number of members, so many at a time: one that has ended leaves its place to one
     that waits, where a batch would wait for the slowest of it. One program serves any number.
@@ -421,28 +463,21 @@ def _refilled(problem: Problem, members: Member, max_steps: int, places: int) ->
     idle = _vacant(problem, first)
     go_on = _go_on_seldom if getattr(problem.coordinates, "fitted_once", False) else _go_on_often
 
-    def some(core: int) -> list[tuple[int, Any]]:
-        waiting, ended = list(range(core, count, cores))[::-1], []
-        holds = np.full(places, -1)
-        at = idle
-        while waiting or (holds >= 0).any():
-            fresh = np.zeros(places, bool)
-            for place in np.flatnonzero(holds < 0)[: len(waiting)]:
-                holds[place], fresh[place] = waiting.pop(), True
-            own = jax.tree.map(lambda x: x[np.maximum(holds, 0)], members)
-            running = int((holds >= 0).sum())
-            enough = places - running + (max(1, places // 4) if waiting else running)
+    def some(core: int) -> dict[int, Any]:
+        mine, at = Places(range(core, count, cores), places), idle
+        while mine:
+            fresh = np.isin(np.arange(places), mine.fill())
+            own = jax.tree.map(lambda x: x[mine.member], members)
+            running = int(mine.taken.sum())
+            enough = places - running + (max(1, places // 4) if mine.waiting else running)
             at, found = go_on(problem, own, fresh, at, np.asarray(enough), most)
-            over, found = jax.device_get((at.over, (found, at.found)))
-            for place in np.flatnonzero(over & (holds >= 0)):
-                ended.append((holds[place], jax.tree.map(lambda x: x[place], found)))  # noqa: B023
-                holds[place] = -1
-        return ended
+            mine.leave(*jax.device_get((at.over, (found, at.found))))
+        return mine.ended
 
     if cores > 1:  # the program is made once, by a call that takes no step
         go_on(problem, first, np.zeros(places, bool), idle, np.asarray(0), most)
     with concurrent.futures.ThreadPoolExecutor(cores) as pool:
-        ended = dict(itertools.chain(*pool.map(some, range(cores))))
+        ended = {k: found for part in pool.map(some, range(cores)) for k, found in part.items()}
     return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(count)))
 
 
@@ -583,37 +618,31 @@ def searches_long(
         Where each search ended, and what the model says there.
     """
     starts, weights, held = np.asarray(starts), np.asarray(weights), penalties(data)
-    waiting, holds = list(range(len(starts)))[::-1], np.full(max(places, len(starts) * rivals), -1)
-    cost, ended = np.full(len(starts), np.inf), dict[int, tuple[Optimum, Observation]]()
+    mine = Places(range(len(starts)), max(places, len(starts) * rivals))
+    cost, ahead = np.full(len(starts), np.inf), starts[mine.member]
     at: Progress | None = None
-    while waiting or (holds >= 0).any():
-        fresh = np.flatnonzero(holds < 0)[: len(waiting)]
-        holds[fresh] = [waiting.pop() for _ in fresh]
-        member, going = np.maximum(holds, 0), np.flatnonzero(holds >= 0)
+    while mine:
+        fresh, going = mine.fill(), np.flatnonzero(mine.taken)
         # A step judges what was found where the last one led; what is accepted becomes y.
-        ahead = starts[member] if at is None else np.asarray(at.ahead)
-        ahead = _put(ahead, fresh, starts[member[fresh]])
-        there = evaluate(ahead[going], holds[going])
-        found = jax.tree.map(lambda x: _put(np.zeros((len(holds), *x.shape[1:]), x.dtype), going, x), there)  # noqa: B023
-        if at is None:
-            at = jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found))
-        elif len(fresh):
-            begun = jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found))
-            at = jax.tree.map(lambda old, new: _put(np.asarray(old), fresh, np.asarray(new)[fresh]), at, begun)  # noqa: B023
-        at, ends = jax.device_get(_steps(at, found, data, weights[member], held.start, held.stop))
+        ahead = _put(ahead, fresh, starts[mine.holds[fresh]])
+        there = evaluate(ahead[going], mine.holds[going])
+        found = jax.tree.map(lambda x: _put(np.zeros((len(ahead), *x.shape[1:]), x.dtype), going, x), there)  # noqa: B023
+        if len(fresh):
+            begun = jax.device_get(jax.vmap(begin_at)(jnp.asarray(ahead), jax.tree.map(np.zeros_like, found)))
+            at = begun if at is None else jax.tree.map(lambda old, new: _put(old, fresh, new[fresh]), at, begun)  # noqa: B023
+        at, ends = jax.device_get(_steps(at, found, data, weights[mine.member], held.start, held.stop))
+        ahead, seen = at.ahead, at.found[2]
         small = 0.1 * (DECREMENT + DECREMENT_SHARE * ends.cost)
         over = at.over | (at.steps >= max_steps) | ((at.rejected == 0) & (ends.decrement < small))
-        cost[holds[going]] = ends.cost[going]
+        cost[mine.holds[going]] = ends.cost[going]
         if rivals:
-            done = np.r_[[*ended], holds[over & (holds >= 0)]].astype(int)
+            done = np.r_[[*mine.ended], mine.holds[over & mine.taken]].astype(int)
             lowest = np.min(cost[done], initial=np.inf)
-            still = ~over & (holds >= 0)
-            agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not np.any(still & (ends.cost < lowest - SAME))
+            lower = mine.taken & ~over & (ends.cost < lowest - SAME)
+            agree = np.sum(cost[done] < lowest + SAME) >= AGREE and not lower.any()
             over = over | (ends.cost - HOPELESS * ends.decrement > lowest) | agree
-        for place in np.flatnonzero(over & (holds >= 0)):
-            ended[int(holds[place])] = jax.tree.map(lambda x: x[place], (ends, at.found[2]))  # noqa: B023
-            holds[place] = -1
-    return jax.tree.map(lambda *x: np.stack(x), *(ended[k] for k in range(len(starts))))
+        mine.leave(over, (ends, seen))
+    return jax.tree.map(lambda *x: np.stack(x), *(mine.ended[k] for k in range(len(starts))))
 
 
 def _put(x: np.ndarray, places: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -584,9 +584,7 @@ class Histories(Observer):
             return searches_long(evaluate, starts, data, weights, steps, self.policy.batch, rivals=rivals)
 
         found = searched(starts)
-        if not rivals:
-            return found
-        if not scans.scanned(problem):
+        if not rivals or not scans.scanned(problem):
             return found
         k = int(np.nanargmin(found[0].cost))
         one = lambda x: jax.tree.map(lambda leaf: leaf[k], x)  # noqa: E731
@@ -783,17 +781,15 @@ def _check_signs(runs: Runs) -> None:
     """Refuse speeds without a sign of runs that are driven backward: a rig's inertia may carry it forward for as long
     as a stretch lasts, but not in all of a table."""
     volts, measured = applied(runs), runs.measured()
-    time = runs["time_s"]
+    time, size = runs["time_s"], np.nanmax(np.abs(measured), 0, initial=0.0)
+    unsigned = np.nanmin(measured, 0, initial=0.0) >= -RESTING * size
+    unsigned &= [c.zero_at_rest and c.directed for c in runs.channels]
     for run in stretches(runs):
         for s in (s for s in run if volts[s.rows[0]] < 0 and s.lasts >= LASTING):
             rows = s.after(time, 0.5)
-            for k, channel in enumerate(runs.channels):
-                shown = measured[rows, k][np.isfinite(measured[rows, k])]
-                size = np.nanmax(np.abs(measured[:, k]), initial=0.0)
-                if not (channel.zero_at_rest and channel.directed and shown.size):
-                    continue
-                signed = np.nanmin(measured[:, k], initial=0.0) < -RESTING * size
-                if np.median(shown) > RESTING * size and not signed:
+            for k in np.flatnonzero(unsigned):
+                channel, shown = runs.channels[k], measured[rows, k][np.isfinite(measured[rows, k])]
+                if shown.size and np.median(shown) > RESTING * size[k]:
                     raise BadData(
                         f"{runs.source} row {rows[0] + 1}, {channel.column}: got "
                         f"{number(runs[channel.column][rows[0]])} {channel.unit} at {number(volts[rows[0]])} V; "
@@ -897,12 +893,12 @@ def _evaluator(problem: Problem, weights: Numbers, active: Numbers | None) -> Ev
         weights, active: of every member, see `Histories.search`.
     """
 
-    made = threading.Event()
+    weights, made = np.asarray(weights), threading.Event()
 
     def some(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         filled = np.resize(np.arange(len(members)), TOGETHER)
         of = None if active is None else np.asarray(active)[members[filled]]
-        return jax.device_get(_evaluate(problem, z[filled], np.asarray(weights)[members[filled]], of))
+        return jax.device_get(_evaluate(problem, z[filled], weights[members[filled]], of))
 
     def evaluate(z: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray, Observation]:
         parts = [(z[k : k + TOGETHER], members[k : k + TOGETHER]) for k in range(0, len(members), TOGETHER)]
