@@ -66,18 +66,14 @@ class Trajectory(eqx.Module):
     result: Result
 
 
-def _units(robot: Robot) -> tuple[float, ...]:
-    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering) + (_GAP,) * robot.loose
-
-
-def units_of(robot: Robot) -> Float[Array, " unknowns"]:
+def units(robot: Robot) -> tuple[float, ...]:
     """What the unknowns are measured in."""
-    return jnp.asarray(_units(robot))
+    return _UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering) + (_GAP,) * robot.loose
 
 
 def state_of(robot: Robot, y: Float[Array, " unknowns"]) -> State:
     """The state that a vector of unknowns stands for."""
-    y = y * jnp.asarray(_units(robot), y.dtype)
+    y = y * jnp.asarray(units(robot), y.dtype)
     memory = {effect.name: y[len(_UNITS) + k] for k, effect in enumerate(robot.remembering)}
     return State(y[0], y[1], y[2], y[4], memory, distance=y[3], gap=y[-1] if robot.loose else None)
 
@@ -105,7 +101,7 @@ def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
         *(jnp.asarray(effect.rate(robot, signals), y.dtype) for effect in robot.remembering),
         *[signals.speed_wheel - signals.speed_output] * robot.loose,
     ]
-    return jnp.stack(rates) / jnp.asarray(_units(robot), y.dtype)
+    return jnp.stack(rates) / jnp.asarray(units(robot), y.dtype)
 
 
 def _norm(error: Float[Array, " unknowns"]) -> Scalar:
@@ -121,26 +117,26 @@ def _step_longest(robot: Robot, conditions: Conditions) -> Scalar | None:
 
 def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[Array, " unknowns"]:
     """At rest; or as the steady fidelity travels, what effects remember settled too, at rest where it has no root."""
-    units = jnp.asarray(_units(robot), jnp.result_type(conditions.voltage))
-    rest = jnp.zeros_like(units).at[4].set(conditions.discharge / units[4])
+    size = jnp.asarray(units(robot), jnp.result_type(conditions.voltage))
+    rest = jnp.zeros_like(size).at[4].set(conditions.discharge / size[4])
     if conditions.motor_speed is not None:
-        rest = rest.at[1].set(conditions.motor_speed / units[1])
+        rest = rest.at[1].set(conditions.motor_speed / size[1])
         if not robot.has_ground:  # which it would have to grip first
             radius = robot.chassis(conditions.configuration).radius / robot.gearbox.ratio
-            rest = rest.at[2].set(radius * conditions.motor_speed / units[2])
+            rest = rest.at[2].set(radius * conditions.motor_speed / size[2])
     if robot.rig.begins is not None and conditions.begin is not None:
         first = _begun(robot, conditions)
         angle = first[3] / robot.chassis(conditions.configuration).radius
         memory = [effect.begun(robot, angle) for effect in robot.remembering]
-        known = jnp.stack([*first, jnp.asarray(conditions.discharge, units.dtype), *memory])
-        rest = rest.at[: len(known)].set(known / units[: len(known)])
+        known = jnp.stack([*first, jnp.asarray(conditions.discharge, size.dtype), *memory])
+        rest = rest.at[: len(known)].set(known / size[: len(known)])
     if not rolling:
         return rest
     settled = operating_signals(robot, conditions)
     memory = [effect.settled(robot, settled) for effect in robot.remembering]
     state = [settled.current, settled.speed_motor, settled.speed, 0.0, conditions.discharge, *memory]
     state += [jnp.zeros(())] * robot.loose
-    y = jnp.stack([jnp.asarray(x, units.dtype) for x in state]) / units
+    y = jnp.stack([jnp.asarray(x, size.dtype) for x in state]) / size
     return jnp.where(jnp.all(jnp.isfinite(y)), y, rest)
 
 

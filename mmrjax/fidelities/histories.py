@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units_of
+from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units
+from mmrjax.fidelities.rarely import rarely
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
@@ -200,9 +201,9 @@ def respond(
         first = jnp.linalg.inv(_matrix(robot, held, one, to)[0])
         second = jnp.linalg.inv(_matrix(robot, held, two, beyond)[0])
         d1 = jnp.tensordot(first, dy + to * source(t, one, held), 1)
-        jump = turns * _jump(robot, held, two)
+        jump = rarely(turns, _jump, (robot, held, two), jnp.zeros_like(two))
         known = jnp.where(
-            passes, d1 + jump.reshape(-1, *[1] * (d1.ndim - 1)) * d1[1], dy + (1 - _GAMMA) / _GAMMA * (d1 - dy)
+            passes, d1 + jump.reshape(-1, *[1] * (d1.ndim - 1)) * d1[MOTOR], dy + (1 - _GAMMA) / _GAMMA * (d1 - dy)
         )
         d2 = jnp.tensordot(second, known + beyond * source(end, two, held), 1)
         return d2, (seen(one, d1, held), seen(two, d2, eqx.combine(then, constant)))
@@ -223,17 +224,17 @@ class _Through(eqx.Module):
     """
 
     any: Bool[Array, " steps"]
-    turns: Float[Array, " steps"]
+    turns: Bool[Array, " steps"]
     before: Float[Array, " steps"]
 
 
 def _edge(robot: Robot, conditions: Conditions) -> tuple[Scalar, Array]:
     """Motor speed from which on a direction is one, in the unit of the unknowns; and by what the unknowns change with
     it where shafts and robot move as one."""
-    load, units = robot.chassis(conditions.configuration), units_of(robot)
+    load, size = robot.chassis(conditions.configuration), units(robot)
     per_speed = load.radius / robot.gearbox.ratio
-    along = jnp.zeros_like(units).at[MOTOR].set(1.0).at[GROUND].set(per_speed * units[MOTOR] / units[GROUND])
-    return load.speed_still / (per_speed * units[MOTOR]), along
+    along = jnp.zeros(len(size)).at[MOTOR].set(1.0).at[GROUND].set(per_speed * size[MOTOR] / size[GROUND])
+    return load.speed_still / (per_speed * size[MOTOR]), along
 
 
 def _through_rest(robot: Robot, conditions: Conditions, at: Float[Array, "instants unknowns"]) -> _Through:
@@ -250,7 +251,7 @@ def _through_rest(robot: Robot, conditions: Conditions, at: Float[Array, "instan
     across, into, out = a * b < 0, (a != 0) & (b == 0) & (a * after < 0), (a == 0) & (b != 0) & (before * b < 0)
     shares = jnp.abs(speed[:-1]) / jnp.maximum(jnp.abs(speed[:-1]) + jnp.abs(speed[1:]), 1e-300)
     share = jnp.where(across, shares, jnp.where(into, 1.0, 0.0))
-    return _Through(across | into | out, (across | out).astype(at.dtype), share)
+    return _Through(across | into | out, across | out, share)
 
 
 def _jump(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
