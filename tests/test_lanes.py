@@ -28,22 +28,24 @@ def test_members_of_a_batch_end_as_each_by_itself(monkeypatch, size):
     np.testing.assert_array_equal(both[1][0], turns)
 
 
-def test_a_batch_takes_as_many_turns_as_its_lanes_need(monkeypatch):
-    """One member of a hundred that takes a thousand turns does not make a thousand of the others'."""
+@pytest.fixture
+def counted(monkeypatch):
+    """A member that takes as many turns as it is told, four lanes, and the turns that are taken."""
     monkeypatch.setattr(lanes, "LANES", 4)
     taken = []
 
-    def turn(own, state):
+    def turn(_, state):
         jax.debug.callback(lambda: taken.append(1))
-        return state + 1
+        return state[0], state[1] + 1
 
+    return lambda x: lanes.until(lambda own: (own, own * 0), turn, lambda s: s[1] >= s[0], x)[1], taken
+
+
+def test_a_batch_takes_as_many_turns_as_its_lanes_need(counted):
+    """One member of a hundred that takes a thousand turns does not make a thousand of the others'."""
+    count, taken = counted
     own = jnp.asarray([30.0] + [3.0] * 40)
-    count = jax.vmap(
-        lambda x: lanes.until(
-            lambda own: (own, own * 0), lambda own, s: (s[0], turn(own, s[1])), lambda s: s[1] >= s[0], x
-        )
-    )
-    np.testing.assert_array_equal(jax.block_until_ready(count(own))[1], own)
+    np.testing.assert_array_equal(jax.block_until_ready(jax.vmap(count)(own)), own)
     jax.effects_barrier()
     assert len(taken) < 4 * 50 < 41 * 30
 
@@ -52,19 +54,9 @@ def test_no_derivative_passes_through():
     assert float(jax.grad(lambda x: halves((x, 2.0))[0])(12.0)) == 0.0
 
 
-def test_batches_of_batches_share_their_lanes(monkeypatch):
+def test_batches_of_batches_share_their_lanes(counted):
     """A long member of one batch does not make the members of the others wait."""
-    monkeypatch.setattr(lanes, "LANES", 4)
-    taken = []
-
-    def turn(own, state):
-        jax.debug.callback(lambda: taken.append(1))
-        return state + 1
-
-    def count(x):
-        begun = lambda own: (own, own * 0)  # noqa: E731
-        return lanes.until(begun, lambda own, s: (s[0], turn(own, s[1])), lambda s: s[1] >= s[0], x)[1]
-
+    count, taken = counted
     own = jnp.full((8, 8), 3.0).at[0, 0].set(40.0)
     np.testing.assert_array_equal(jax.block_until_ready(jax.vmap(jax.vmap(count))(own)), own)
     jax.effects_barrier()

@@ -422,7 +422,8 @@ def _check_pairs(robot: Robot, where: str) -> None:
             )
     for effect in robot.effects:
         ends = {p.name: float(p.value) for p in params.walk(effect)}
-        if {"low", "high"} <= ends.keys() and effect.name in effects.UNNAMED and not ends["low"] < ends["high"]:
+        curve = effect.name in effects.CURVES or effect.name in effects.CURVES_ROUND
+        if curve and not ends["low"] < ends["high"]:
             raise BadConfiguration(
                 f"{where}, effects.{effect.name}.high: got {ends['high']:g}; expected more than low, {ends['low']:g}"
             )

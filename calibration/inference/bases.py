@@ -148,11 +148,11 @@ def scaled(x: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.clip((2 * x - low - high) / (high - low), -1, 1) if high - low > 1e-9 * max(abs(high), 1e-9) else 0 * x
 
 
-def balances_of(robot: Robot | None) -> tuple[str, ...]:
-    """Those of `BALANCES` that a robot has; None: any."""
+def balances_of(robot: Robot | None, among: Sequence[str] = BALANCES) -> tuple[str, ...]:
+    """Those balances that a robot has; None: any."""
     if robot is None:
-        return BALANCES
-    return tuple(b for b in BALANCES if b not in absent(robot))
+        return tuple(among)
+    return tuple(b for b in among if b not in absent(robot))
 
 
 def channels_of(robot: Robot | None) -> tuple[Channel, ...]:
@@ -166,12 +166,21 @@ def axes_of(robot: Robot | None) -> tuple[str, ...]:
     return tuple(c for c in (SPEED, CURRENT, *EVERY_AXIS) if c in axes)
 
 
+@dataclasses.dataclass(frozen=True)
+class Scope:
+    """Where curves are looked for: balances that can lack something, and columns of the conditions."""
+
+    balances: tuple[str, ...]
+    axes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, robot: Robot | None) -> Scope:
+        """All that straight travel of a robot has; None: of the packaged one."""
+        return cls(balances_of(robot), axes_of(robot))
+
+
 def families(
-    columns: Mapping[str, np.ndarray],
-    weight: np.ndarray,
-    robot: Robot | None = None,
-    balances: Sequence[str] | None = None,
-    axes: Sequence[str] | None = None,
+    columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None, scope: Scope | None = None
 ) -> Bases:
     """Curves of one variable, and polynomials in all conditions for each configuration, in every balance; and curves
     of what the readings of a channel are off by, over the reading and over what time or order brings.
@@ -179,16 +188,15 @@ def families(
     Args:
         columns: of the table, with fitted readings; weight: 0 for rows that do not count, shape (rows,), or of points
             (see `Linearization`).
-        robot: whose balances can lack something; balances: which of them, and axes: columns of the conditions, where
-            it is not all that straight travel has.
+        robot: whose channels and balances can be off; scope: None takes `Scope.of` it.
     """
-    balances = balances_of(robot) if balances is None else balances
-    conditions = axes_of(robot) if axes is None else axes
+    scope = Scope.of(robot) if scope is None else scope
+    balances = scope.balances
     over: dict[str, tuple[str, np.ndarray]] = {}
     for variable, column in VARIABLES.items():
-        if column not in columns or (column in EVERY_AXIS and column not in conditions):
+        if column not in columns or (column in EVERY_AXIS and column not in scope.axes):
             continue
-        if variable == "order" and collinearity(columns, weight, robot, conditions) > COLLINEAR:
+        if variable == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR:
             # Another variable again in its place: tables of one size share what is compiled.
             over[variable] = next(iter(over.values()))
             continue
@@ -205,7 +213,7 @@ def families(
     new = [n for n in shown if over[n[1]][0] == n[1]]
     # As above: what is left out makes room for another of its channel, or of the first that has one.
     read = [n if n in new else next((m for m in new if m[0] == n[0]), new[0]) for n in shown] if new else []
-    spans = [scaled(columns[c], weight) for c in conditions]
+    spans = [scaled(columns[c], weight) for c in scope.axes]
     powers = [p for p in itertools.product(range(DEGREE + 1), repeat=len(spans)) if sum(p) <= DEGREE]
     terms = [
         np.prod([a**k for a, k in zip(spans, p, strict=True)], 0) * (columns["configuration"] == name)
@@ -251,29 +259,24 @@ def window(variable: str) -> Window | None:
 
 
 def windows(
-    columns: Mapping[str, np.ndarray],
-    weight: np.ndarray,
-    robot: Robot | None = None,
-    balances: Sequence[str] | None = None,
-    axes: Sequence[str] | None = None,
+    columns: Mapping[str, np.ndarray], weight: np.ndarray, robot: Robot | None = None, scope: Scope | None = None
 ) -> Bases:
     """Windows in time (at the same instants of all runs) or in the order of runs, and levels of conditions, in every
     balance and channel; in the order only where the conditions do not tell it.
 
     Args:
         columns: of the table; weight: 0 for rows that do not count, shape (rows,).
-        robot: whose balances can lack something; balances, axes: as of `families`.
+        robot, scope: as of `families`.
     """
     counts = weight > 0
-    balances = balances_of(robot) if balances is None else balances
-    conditions = axes_of(robot) if axes is None else axes
+    scope = Scope.of(robot) if scope is None else scope
     offered: list[tuple[str, np.ndarray, np.ndarray]] = []  # axis, its values, which rows are inside
     axis = next((a for a in AXES if VARIABLES[a] in columns), None)
     if axis is not None:
         x = np.asarray(columns[VARIABLES[axis]], float)
         low, high = x[counts].min(), x[counts].max()
         # Some runs one after the other are then runs at some conditions, which have windows of their own.
-        sorted_runs = axis == "order" and collinearity(columns, weight, robot, conditions) > COLLINEAR
+        sorted_runs = axis == "order" and collinearity(columns, weight, scope.axes) > COLLINEAR
         for share in WINDOWS:
             size = share * (high - low)
             for k in range(round(2 / share) - 1):
@@ -281,7 +284,7 @@ def windows(
                 inside = (x >= first) & ((x < first + size) | (k == round(2 / share) - 2))
                 offered.append((axis, x, counts & inside & (not sorted_runs)))
     for condition, (factor, _) in LEVELS.items():
-        if VARIABLES[condition] not in conditions:
+        if VARIABLES[condition] not in scope.axes:
             continue
         x = factor * np.asarray(columns[VARIABLES[condition]], float)
         levels = np.unique(x[counts])
@@ -303,29 +306,27 @@ def windows(
             np.stack([s for s, _ in shapes] * len(places))[:, :, None],
             [(place, name) for place in places for _, name in shapes],
         )
-        for places in (balances, read)
+        for places in (scope.balances, read)
         if places
     )
 
 
-def collinearity(
-    columns: Mapping[str, np.ndarray],
-    weight: np.ndarray,
-    robot: Robot | None = None,
-    axes: Sequence[str] | None = None,
-) -> float:
+def collinearity(columns: Mapping[str, np.ndarray], weight: np.ndarray, axes: Sequence[str] | None = None) -> float:
     """Share of the variance of the order of runs that their conditions explain (R²): at 1 a drift from run to run
     cannot be told from what the conditions do.
 
     Conditions are a level for each combination of configuration, what is imposed and payload, where these are few
     beside the runs, else a level for each configuration and polynomials of the others; and a polynomial of the slope.
+
+    Args:
+        columns, weight: as of `families`; axes: columns of the conditions, None: of the packaged robot's.
     """
     there = weight > 0
     x = np.asarray(columns["order"], float)[there]
     if len(x) < 4 or np.ptp(x) == 0:
         return 1.0
     _, which = np.unique(np.asarray(columns["configuration"])[there], return_inverse=True)
-    conditions = axes_of(robot) if axes is None else axes
+    conditions = axes_of(None) if axes is None else axes
     others = [c for c in conditions if c != VARIABLES["slope"]]
     cells = np.stack([which, *(np.asarray(columns[c], float)[there] for c in others)], 1)
     _, cell = np.unique(cells, axis=0, return_inverse=True)

@@ -34,4 +34,7 @@ OF_TURNS: dict[str, type[Effect]] = {effect.name: effect for effect in defined_i
 #: What robot files know beside the library.
 BESIDE: dict[str, type[Effect]] = {**UNNAMED, **OF_TURNS}
 
-__all__ = ["ALL", "BESIDE", "BY_NAME", "CURVES", "OF_TURNS", "UNNAMED", "WAVES", "Effect", "amplitude", "defined_in"]
+__all__ = [
+    "ALL", "BESIDE", "BY_NAME", "CURVES", "CURVES_ROUND", "OF_TURNS", "UNNAMED", "WAVES", "Effect", "amplitude",
+    "defined_in",
+]  # fmt: skip

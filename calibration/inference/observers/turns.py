@@ -22,17 +22,17 @@ from calibration.inference.observers.base import SearchPolicy
 from calibration.inference.observers.histories import Histories
 from calibration.inference.observers.settled import SettledLinearization, SettledRuns, shares
 from calibration.inference.problem import Observation
-from mmrjax import balances, effects, fidelities
+from mmrjax import effects, fidelities
 from mmrjax.compiling import compiled
 from mmrjax.effects import Effect
-from mmrjax.effects.curve import SIGNED
+from mmrjax.effects.curve import IN_TURNS, SIGNED, VARIABLES_ROUND
 from mmrjax.fidelities.steady import operating_signals
 from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import NOT_SETTLED, Signals
 
-#: Variables of curves in turns; a slope they have none, and time neither.
-VARIABLES = ("voltage", "current", "speed_motor", "payload", "speed", "yaw_rate", "side")
+#: Variables of curves in turns; the order of runs is the table's.
+VARIABLES = (*(v for v in IN_TURNS if v != "order"), *VARIABLES_ROUND)
 #: Balances that act round the turn; the others along the motion of the shafts of a side.
 ROUND = ("lateral", "yaw")
 
@@ -140,10 +140,9 @@ class SettledTurns(SettledRuns):
         points = {bases_room.VARIABLES[v]: np.asarray(seen[v]) for v in names}
         points |= {c: np.tile(columns[c], 2) for c in ("configuration", "order") if c in columns}
         weight = np.tile(included.astype(float), 2)
-        lacking = tuple(b for b in (*bases_room.BALANCES, *bases_room.OF_TURNS) if b not in balances.absent(robot))
-        imposed = bases_room.axes_of(robot)[0]
-        axes = (imposed, bases_room.VARIABLES["payload"], "yaw_rate", "side")
-        told = points, weight, robot, lacking, axes
+        lacking = bases_room.balances_of(robot, (*bases_room.BALANCES, *bases_room.OF_TURNS))
+        axes = (bases_room.axes_of(robot)[0], bases_room.VARIABLES["payload"], "yaw_rate", "side")  # what is imposed
+        told = points, weight, robot, bases_room.Scope(lacking, axes)
         return (*bases_room.families(*told), *bases_room.windows(*told))
 
 
