@@ -1,12 +1,6 @@
 """The campaign on rigs: cases of every kind, and what its summary says of lines."""
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
-
 import rigs
 
 
