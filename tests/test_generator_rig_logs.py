@@ -92,7 +92,7 @@ def _terms(case):
 
 
 def test_a_log_is_reproducible_and_its_effect_has_its_strength():
-    rig = gl.rig(np.random.default_rng(7), "voltage")
+    rig = gl.rig(np.random.default_rng(7), "voltage", 0.005)
     clean, again = (gl.case(rig, "", 0.0, 4).table for _ in range(2))
     assert all((clean[n] == again[n]).all() for n in clean)
     one = gl.case(rig, "series_resistance", 9.0, 4)
