@@ -130,7 +130,7 @@ def _guided(shape: Shape, place: Array) -> Array:
     """Share of a load on the main belt at `place` that passes to the lower guide [-], as in `belt.tips`."""
     run, length = shape.main.run, shape.main.length
     off = jnp.minimum(place, length - place)  # from the middle of the lower run
-    return contact.step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0)
+    return jnp.asarray(contact.step(run / 2 - off, 0.0, 0.0, shape.gear.guide_gap, 1.0))
 
 
 def _belt(shape: Shape, terrain: Terrain, belt: Loop, frame: Frame, drawn: Scalar, bears: Scalar) -> list[_Group]:
@@ -197,7 +197,8 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
     """Pairs that may touch and their normal forces (27) at coordinates `q`, velocities `v`."""
     body, front, rear = frames(shape, q)
     radius = shape.main.first
-    groups = _belt(shape, terrain, shape.main, body, radius * q[SHAFT], jnp.ones(()))
+    rear_axle = body._replace(origin=rear.origin)  # from which the main belt's loop is told
+    groups = _belt(shape, terrain, shape.main, rear_axle, radius * q[SHAFT], jnp.ones(()))
     for lever in (front, rear):
         assert lever.turns is not None
         drawn = radius * (q[SHAFT] + q[lever.turns])
@@ -235,7 +236,7 @@ def footing(shape: Shape, terrain: Terrain, q: Array, v: Array) -> Footing:
         along=own[1],
         carried=carried[1],
         force=force,
-        damped=damping_contact(force, gap, 0.0, gear.contact_damping, gear.contact_depth),
+        damped=jnp.asarray(damping_contact(force, gap, 0.0, gear.contact_damping, gear.contact_depth)),
         elastic=elastic,
         energy=elastic * depth / (exponent + 1),
         guided=guided,
@@ -252,7 +253,14 @@ def _turned(direction: Array, arm: Array) -> Array:
 def shape_of(chassis: Chassis, gear: RunningGear, radius: Scalar) -> Shape:
     """Shapes of one side of a robot, from its parameters."""
     main = Loop(radius, radius, gear.wheelbase, gear.grouser_height, gear.grouser_length, GROUSERS)
-    lever = Loop(radius, gear.levers.roller - gear.grouser_height, gear.lever_length, gear.grouser_height, gear.grouser_length, GROUSERS_LEVER)
+    lever = Loop(
+        radius,
+        gear.levers.roller - gear.grouser_height,
+        gear.lever_length,
+        gear.grouser_height,
+        gear.grouser_length,
+        GROUSERS_LEVER,
+    )
     belly = CLEARANCE - (radius + gear.grouser_height)
     return Shape(main, lever, gear, chassis.on_tracks, chassis.radius, belly)
 

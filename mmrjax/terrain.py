@@ -57,7 +57,7 @@ class Terrain(eqx.Module):
         The normal is the gradient of the distance: that of the nearest edge, or away from the nearest corner.
         """
         a, along = self.points[:-1], self.points[1:] - self.points[:-1]
-        square = jnp.maximum(jnp.sum(along**2, axis=1), 1e-30)
+        square = jnp.maximum(jnp.sum(along**2, axis=1), 1e-30)  # of no edge where a vertex stands twice
         from_a = at[:, None] - a
         share = jnp.clip(jnp.sum(from_a * along, axis=-1) / square, 0.0, 1.0)
         off = from_a - share[..., None] * along
@@ -70,7 +70,7 @@ class Terrain(eqx.Module):
         edge = jnp.stack([-edge[:, 1], edge[:, 0]], axis=1)[nearest[:, 0]]
         within = (share > 0) & (share < 1) | (least < 1e-24)
         normal = jnp.where(within[:, None], edge, (sign / length)[:, None] * off)
-        return sign * jnp.sqrt(least) - self.nose, normal
+        return jnp.where(within, jnp.sum(edge * off, axis=1), sign * length) - self.nose, normal
 
 
 def _cross(a: Array, b: Array) -> Array:

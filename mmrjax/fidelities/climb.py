@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from mmrjax import balances, contact, footing
 from mmrjax.chassis import Chassis
-from mmrjax.compiling import compiled
+from mmrjax.compiling import SMALL, compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import current_after
 from mmrjax.fidelities.linear import factorise, substitute
@@ -36,8 +36,8 @@ VERDICTS = OVER, TIPS, STALLS, SLIDES, HANGS, UNFINISHED, FAILED = range(7)
 NAMES = ("over", "tips", "stalls", "slides", "hangs", "unfinished", "failed")
 _RUNNING = -1
 
-STEP, SAMPLE = 1e-4, 2e-2  # [s]
-SETTLES = 0.3  # before the motors are switched on [s]
+STEP, SAMPLE, DURATION = 1e-4, 2e-2, 20.0  # [s]
+SETTLES, RISES = 0.3, 0.1  # before the motors are switched on, and until they have their voltage [s]
 #: Pitch beyond which a robot has turned over [rad].
 TURNED_OVER = np.radians(100.0)
 #: A robot that gains less than this way [m] in this time [s] is stuck.
@@ -90,6 +90,9 @@ SOURCES = ("supply", "levers")
 LOSSES = ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling")
 
 
+Energy = dict[str, Any]
+
+
 class Passed(eqx.Module):
     """What an instant or a sample has: means over it, and energy since the start of the run.
 
@@ -107,7 +110,7 @@ class Passed(eqx.Module):
     voltage: Scalar
     torque: Float[Array, " 2"]
     lever_current: Float[Array, " 2"]
-    energy: dict[str, Scalar]
+    energy: Energy
     stored: Scalar
     normal: Scalar
     body: Scalar
@@ -158,7 +161,8 @@ def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float
         return jnp.stack([arm[1], -arm[0]])
 
     matrix, bias, height = jnp.zeros((COORDINATES, COORDINATES)), jnp.zeros(COORDINATES), zero
-    masses, mass_lever, centre_lever = [], run.lever[0], run.lever[1]
+    mass_lever, centre_lever = run.lever[0], run.lever[1]
+    masses: list[tuple[Scalar, Array, Array | None, int | None]] = []
     arm = body.along(jnp.stack([half.forward, half.up]))
     masses.append((half.chassis, arm, None, None))
     for lever in levers:
@@ -169,7 +173,7 @@ def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float
     for mass, arm, out, turns in masses:
         columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(arm), *[jnp.zeros(2)] * 3]
         centrifugal = -arm * v[PITCH] ** 2
-        if out is not None:
+        if out is not None and turns is not None:
             columns[turns] = -across(out)
             centrifugal = -(arm - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
         moves = jnp.stack(columns, axis=1)
@@ -224,7 +228,8 @@ def carried(at: Footing, v: Array) -> tuple[Array, Scalar]:
 
 
 def instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
-    """All signals, contacts, forces and the shares of the load of an instant; `on`: 1 where the motors are driven."""
+    """All signals, contacts, forces and the shares of the load of an instant; `on`: share of their
+    voltage that the motors have."""
     at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
     share, speed = carried(at, motion.v)
     conditions = _driven(run, on)
@@ -267,13 +272,16 @@ def lever_current(robot: Robot, torque: Array, rate: Array) -> Array:
     return (torque * (1 - holds) + robot.motor.torque_loss(speed, direction)) / robot.motor.torque_constant
 
 
-def advance(run: System, motion: Motion, time: Scalar, energy: dict[str, Scalar]) -> tuple[Motion, Passed]:
+def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, Passed]:
     """One step, linearly implicit in what contacts and drive resist by as `half_robot.advance` is.
 
     (M + Δt K) Δv = Δt (Q - c), the levers' Δv imposed, whose torque follows from their rows. Energy is that of the
-    step's impulses at the mean of its velocities.
+    step's impulses at the mean of its velocities, and of a current that changes evenly.
+
+    Returns:
+        Motion and energy after it, and what was before it.
     """
-    on = (time >= SETTLES).astype(float)
+    on = jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
     signals, at, pulled, share = instant(run, motion, on)
     robot, step, radius = run.robot, run.step, run.shape.main.first
     matrix, bias, height = inertia(run, motion.q, motion.v)
@@ -283,7 +291,9 @@ def advance(run: System, motion: Motion, time: Scalar, energy: dict[str, Scalar]
     force = pulled.force @ at.along + at.force @ at.off - resisted
     force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
 
-    rises = jnp.maximum(run.chassis.ground.traction_rise(_sliding(at, motion.v, signals), at.force, signals.adhesion), 0)
+    rises = jnp.maximum(
+        run.chassis.ground.traction_rise(_sliding(at, motion.v, signals), at.force, signals.adhesion), 0
+    )
     coefficient = pulled.force / jnp.maximum(at.force, 1e-9)
     pushes = coefficient[:, None] * at.along + at.off
     shaft = _shaft_loss(run, motion, signals, at)
@@ -298,7 +308,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: dict[str, Scalar]
     middle = motion.v + gained / 2
 
     charge = robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
-    current = current_after(_Wound(robot, _driven(run, on), step), signals)
+    current = current_after(robot, _driven(run, on), step, signals)
     after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge)
 
     torque = (whole[4:] @ gained - pushed[4:]) / step
@@ -309,10 +319,12 @@ def advance(run: System, motion: Motion, time: Scalar, energy: dict[str, Scalar]
     drive = signals.torque_motor - signals.torque_idle
     mesh = drive - rotor * ratio * gained[SHAFT] / step
     own = signals.torque_load - signals.torque_track_loss - (pulled.load - pulled.guide * radius)
+    rise = current - signals.current
+    mean, resistance = signals.current + rise / 2, robot.motor.resistance
     added = run.step * robot.sides * jnp.stack([
-        signals.voltage * signals.current,
+        signals.voltage * mean,
         torque @ middle[LED],
-        signals.voltage_drop * signals.current,
+        (signals.voltage_drop + resistance * rise / 2) * mean + resistance * rise**2 / 12,
         signals.torque_motor_loss * motor,
         (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + own * middle[SHAFT],
         (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT],
@@ -320,7 +332,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: dict[str, Scalar]
         -(normal - at.elastic) @ (at.off @ middle),
         resisted @ middle,
     ])  # fmt: skip
-    energy = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
+    spent = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
     kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor * ratio**2) * motion.v[SHAFT] ** 2
     stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(at.energy)
     torques = torque * jnp.array([1.0, -1.0]) * robot.sides  # up, of a rear lever that is where ψ falls
@@ -338,15 +350,7 @@ def advance(run: System, motion: Motion, time: Scalar, energy: dict[str, Scalar]
         body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
         margin=_margin(run, motion, at, matrix),
     )
-    return after, passed
-
-
-class _Wound(eqx.Module):
-    """What `half_robot.current_after` reads of a run."""
-
-    robot: Robot
-    conditions: Conditions
-    step: Scalar
+    return after, spent, passed
 
 
 def _margin(run: System, motion: Motion, at: Footing, matrix: Array) -> Scalar:
@@ -378,9 +382,11 @@ def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> S
 
 
 class Progress(eqx.Module):
-    """Where a run stands: its verdict or that it goes on, the furthest it came and when, way of its belt since."""
+    """Where a run stands: its verdict or that it goes on, when that was given, the furthest it came and when, angle of
+    its shafts since."""
 
     verdict: Array
+    ended: Scalar
     furthest: Scalar
     since: Scalar
     belt: Scalar
@@ -403,7 +409,9 @@ def stand(run: System, clear: float = 0.1) -> Motion:
     return Motion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero)
 
 
-def _judged(run: System, before: Motion, passed: Passed, motion: Motion, progress: Progress) -> tuple[Motion, Progress]:
+def _judged(
+    run: System, before: Motion, passed: Passed, motion: Motion, progress: Progress
+) -> tuple[Motion, Progress]:
     """Whether a run has ended by now, after a sample; one that has stays as it is."""
     q, v = motion.q, motion.v
     outer = run.shape.main.first + run.shape.gear.grouser_height
@@ -415,6 +423,7 @@ def _judged(run: System, before: Motion, passed: Passed, motion: Motion, progres
     moved = gained | swings | (passed.time < SETTLES)
     progress = Progress(
         progress.verdict,
+        jnp.where(progress.verdict == _RUNNING, passed.time, progress.ended),
         jnp.where(gained, q[0], progress.furthest),
         jnp.where(moved, passed.time, progress.since),
         jnp.where(moved, q[SHAFT], progress.belt),
@@ -434,12 +443,12 @@ def _judged(run: System, before: Motion, passed: Passed, motion: Motion, progres
     return motion, dataclasses.replace(progress, verdict=verdict)
 
 
-def begin(run: System) -> tuple[Motion, dict[str, Scalar], Progress]:
+def begin(run: System) -> tuple[Motion, Energy, Progress]:
     """What a run begins with: motion, no energy yet, and that it goes on."""
     motion = stand(run)
     zero = jnp.zeros_like(motion.q[0])
     energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
-    return motion, energy, Progress(jnp.asarray(_RUNNING), motion.q[0], zero, zero)
+    return motion, energy, Progress(jnp.asarray(_RUNNING), zero, motion.q[0], zero, zero)
 
 
 def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) -> tuple[Any, Passed]:
@@ -449,18 +458,14 @@ def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) ->
         motion, energy, progress = state
 
         def small(carry: Any, j: Array) -> tuple[Any, None]:
-            motion, passed = carry
             time = first + (k * steps + j) * run.step
-            return advance(run, motion, time, passed.energy), None
+            return advance(run, carry[0], time, carry[1])[:2], None
 
-        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(
-            lambda: advance(run, motion, first, energy)[1]))  # fmt: skip
-        (after, passed), _ = jax.lax.scan(
-            small, (motion, dataclasses.replace(blank, energy=energy)), jnp.arange(steps)
-        )
+        (before, so_far), _ = jax.lax.scan(small, (motion, energy), jnp.arange(steps - 1))
+        after, spent, passed = advance(run, before, first + ((k + 1) * steps - 1) * run.step, so_far)
         ended = progress.verdict != _RUNNING
         after, progress = _judged(run, motion, passed, after, progress)
-        kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), passed.energy, energy)
+        kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
         return (after, kept, progress), passed
 
     return jax.lax.scan(sample, state, jnp.arange(samples))
@@ -482,10 +487,9 @@ class Climb(eqx.Module):
 
 @compiled
 def _begin(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float) -> Any:
-    return jax.vmap(lambda *of: begin(system(robot, *of, step)))(conditions, terrain, sequence)
+    return jax.vmap(lambda c, t, s: begin(system(robot, c, t, s, step)))(conditions, terrain, sequence)
 
 
-@compiled
 def _part(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar, step: float,
     steps: int, samples: int,
@@ -496,13 +500,16 @@ def _part(
     return jax.vmap(one)(conditions, terrain, sequence, state)
 
 
+_compiled = compiled(_part, options=SMALL)
+
+
 def climb_batch(
     robot: Robot,
     conditions: Conditions,
     terrain: Terrain,
     sequence: Sequence,
     *,
-    duration: float = 20.0,
+    duration: float = DURATION,
     step: float = STEP,
     sample: float = SAMPLE,
     part: float = 1.0,
@@ -519,18 +526,18 @@ def climb_batch(
     """
     steps, samples = round(sample / step), round(part / sample)
     state = _begin(robot, conditions, terrain, sequence, step)
-    kept, ended = [], np.full(np.shape(state[2].verdict), np.nan)
+    kept: list[Passed] = []
     parts = int(np.ceil(duration / part - 1e-9))
     for k in range(parts):
         first = jnp.asarray(k * part)
-        state, passed = _part(robot, conditions, terrain, sequence, state, first, step, steps, samples)
+        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, step, steps, samples)
         verdict = np.asarray(state[2].verdict)
-        ended = np.where((verdict != _RUNNING) & np.isnan(ended), (k + 1) * part, ended)
-        kept = [*kept, jax.device_get(passed)] if record else [jax.device_get(jax.tree.map(lambda x: x[:, -1:], passed))]
+        last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
+        kept = [*(kept if record else []), jax.device_get(last)]
         if progress is not None:
             progress((k + 1) / parts)
         if np.all(verdict != _RUNNING):
             break
     verdict = np.where(verdict == _RUNNING, UNFINISHED, verdict)
     joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *kept)
-    return Climb(verdict, ended, np.asarray(state[2].furthest), joined)
+    return Climb(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)
