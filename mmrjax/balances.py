@@ -294,6 +294,7 @@ def _current_of(robot: Robot, conditions: Conditions, signals: Callable[[Scalar]
 
 
 def _moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
+    robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
     signals = _to_slip(robot, conditions, chassis, begin(robot, conditions, state))
     if isinstance(chassis, Shaft):
@@ -363,6 +364,7 @@ def resolved(
     Returns:
         The signals, and what `mover.pull` gave.
     """
+    robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
     signals = _fill(begin(robot, conditions, state), normal=mover.normal)
     signals = _to_slip(robot, conditions, chassis, signals)
@@ -371,6 +373,18 @@ def resolved(
     signals = _pulled(robot, signals, traction)
     signals = track(robot, chassis, signals, guide)
     return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
+
+
+def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+    """Signals of an instant up to the voltage balance."""
+    robot = robot.within(conditions.configuration)
+    return electrical(robot, conditions, supply(robot, conditions, begin(robot, conditions, state, direction)))
+
+
+def demanded(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+    """Signals of an instant up to what traction has to overcome and the sliding of the contact."""
+    robot = robot.within(conditions.configuration)
+    return _to_slip(robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction))
 
 
 def settled(robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0) -> tuple[Signals, Scalar]:
@@ -383,9 +397,9 @@ def settled(robot: Robot, conditions: Conditions, state: State, direction: Scala
         The signals, and the sliding speed at which the friction law carries that demand [m/s], which
         `signals.speed_sliding` has to meet.
     """
+    robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
-    signals = begin(robot, conditions, state, direction=direction * jnp.ones_like(state.speed_motor))
-    signals = _to_slip(robot, conditions, chassis, signals)
+    signals = demanded(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
     # Nothing changes in steady travel: the rates that other fidelities compute are zero.
     still = jnp.zeros_like(signals.demand)
     signals = _fill(signals, traction=signals.demand, acceleration=still)
@@ -444,6 +458,7 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
     Each side travels at V_s = v_x - ω y_s, on the part of the slope that lies along its heading. What effects lower
     the speed of a side by is read at equal loads of both.
     """
+    robot = robot.within(conditions.configuration)
     chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
     y = SIDES * chassis.turning.width
     speed = motion.speed - motion.yaw_rate * y
