@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mmrjax import channels, contact, ground, masses, power
+from mmrjax import channels, contact, ground, masses, posture, power
 from mmrjax import chassis as chassis_room
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
@@ -384,7 +384,9 @@ def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar
 def demanded(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
     """Signals of an instant up to what traction has to overcome and the sliding of the contact."""
     robot = robot.within(conditions.configuration)
-    return _to_slip(robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction))
+    return _to_slip(
+        robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction)
+    )
 
 
 def settled(robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0) -> tuple[Signals, Scalar]:
@@ -428,19 +430,24 @@ class Travel(eqx.Module):
 
 def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar) -> Stance:
     """How a robot of this mass with its payload [kg] stands: the centre of mass of all, over axles that are a radius,
-    on tracks and a grouser, above the ground."""
-    half = masses.masses(robot, conditions, mass)
-    share = half.chassis / (mass / robot.sides)  # pulleys and wheels sit on the axles
-    axle = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height
+    on tracks and a grouser, above the ground; with levers stated in the posture that it takes on level ground."""
+    length, on_tracks = robot.running_gear.wheelbase, chassis.on_tracks
+    if conditions.states_levers:
+        rests = posture.level(robot, conditions, mass)
+        length, on_tracks, height = rests.length, rests.line, rests.centre_height
+        ahead = rests.centre_ahead - (rests.front + rests.rear) / 2
+    else:
+        ahead, up = masses.masses(robot, conditions, mass).centre
+        height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
     lateral = chassis.turning.lateral
     if conditions.adhesion_lateral is not None:
         lateral = lateral * conditions.adhesion_lateral / conditions.adhesion
     return Stance(
-        length=robot.running_gear.wheelbase,
+        length=length,
         width=chassis.turning.width,
-        height=axle + share * half.up,
-        ahead=share * half.forward,
-        on_tracks=chassis.on_tracks,
+        height=height,
+        ahead=ahead,
+        on_tracks=on_tracks,
         lateral=lateral,
         rule=chassis.turning.rule,
         nodes=chassis.turning.nodes,
