@@ -1,9 +1,9 @@
 """Contacts of half a robot with a terrain, both ways: its grousers and wheels on the ground, corners on its belts.
 
 Coordinates q of half a robot with levers: x, z [m] of the middle of the wheelbase, pitch θ [rad] nose down, angle φ
-[rad] of the pulleys relative to the chassis (the belts are rigid here: all turn alike), angles ψ_1, ψ_2 [rad] of front
-and rear lever from the chassis' forward axis, positive upward. Velocities v alike. A lever's belt runs on its lever
-at r (φ̇ + ψ̇).
+[rad] of the pulleys relative to the chassis (the belts are rigid here: all turn alike), angles ψ_1, ψ_2 [rad] of
+front and rear lever from the chassis' forward axis, positive upward. Velocities v alike. A lever's belt runs on its
+lever at r (φ̇ + ψ̇).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Shape(eqx.Module):
 
 
 class Frame(NamedTuple):
-    """Where a part is: its origin in the world [m], the angle of its first axis [rad] and which coordinate turns it."""
+    """Where a part is: its origin in the world [m], the angle of its first axis [rad], which coordinate turns it."""
 
     origin: Array
     angle: Scalar

@@ -64,7 +64,7 @@ class Loop(eqx.Module):
         return jnp.stack([-jnp.sin(turned - self.taper), -jnp.cos(turned - self.taper)], axis=-1)
 
     def turned(self, place: Array) -> Array:
-        """Angle by which the belt has turned since its lower run [rad], at `place` [m], which may be beyond an end."""
+        """Angle by which the belt has turned since its lower run [rad], at `place` [m], also beyond an end."""
         a, b, c, d = self.marks
         return jnp.clip(place - a, 0.0, b - a) / self.first + jnp.clip(place - c, 0.0, d - c) / self.second
 

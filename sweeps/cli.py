@@ -374,9 +374,9 @@ def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
 def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
     """Send a robot with levers over a step, stairs, a gap or a terrain, met squarely: over, or why not.
 
-    It begins on level ground before the obstacle. Levers stay at their angles, or follow a --sequence. With --find the
-    largest obstacle is searched for by bisection. Writes result.json, report.html and history.csv: posture, currents
-    of all four drives, margin of tipping and energy over time (docs/climb.md).
+    It begins on level ground before the obstacle. Levers stay at their angles, or follow a --sequence. With --find
+    the largest obstacle is searched for by bisection. Writes result.json, report.html and history.csv: posture,
+    currents of all four drives, margin of tipping and energy over time (docs/climb.md).
     """
     from sweeps.commands import climb as room
 

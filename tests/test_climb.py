@@ -34,37 +34,81 @@ def batch(runs, robot=ROBOT, **options):
 
 
 @functools.cache
-def climbs():
-    """A few runs that end in several ways, in one batch."""
+def first_second():
+    """Onto a step, and against a wall; a member without numbers beside them."""
     runs = [
-        (terrain.step(0.05, size=SIZE), 45, -8.4, 12),
-        (terrain.step(0.25, size=SIZE), 45, 180, 12),
-        (terrain.step(0.25, size=SIZE), 60, 180, 0.5, {"payload": 8.0}),
-        (terrain.step(np.nan, size=SIZE), 45, 180, 12),
+        (terrain.step(0.05, size=SIZE), 45, -8.4, 24),
+        (terrain.step(0.25, size=SIZE), 45, 180, 24),
+        (terrain.step(np.nan, size=SIZE), 45, 180, 24),
     ]
-    return batch(runs, duration=3.0)
+    return batch(runs, duration=0.8, part=0.8)
 
 
-def test_verdicts_and_a_member_of_no_numbers_harms_no_other():
-    assert climbs().names == ["over", "slides", "stalls", "failed"]
-    states = jax.tree.leaves(climbs().record.motion)
-    assert all(np.isfinite(np.asarray(x)[:3]).all() for x in states)
+def energy_left(record, k):
+    """What is missing of the energy that came in, and that [J]."""
+    since = {name: (x - x[:, :1])[k] for name, x in record.energy.items()}
+    come = sum(since[name] for name in SOURCES)
+    stored = (record.stored - record.stored[:, :1])[k]
+    return come - stored - sum(since[name] for name in LOSSES), come, since
 
 
-def test_energy_in_is_stored_and_lost_at_every_instant():
-    """Each way of energy is seen: left out, it would be missing."""
-    record = climbs().record
-    come = sum(record.energy[name] for name in SOURCES)
-    lost = {name: record.energy[name] for name in LOSSES}
-    for k in range(3):
-        come_k = (come - come[:, :1])[k]
-        stored = (record.stored - record.stored[:, :1])[k]
-        left = come_k - stored - sum((x - x[:, :1])[k] for x in lost.values())
+def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms_no_other():
+    record = first_second().record
+    assert first_second().names == ["unfinished", "unfinished", "failed"]
+    assert all(np.isfinite(np.asarray(x)[:2]).all() for x in jax.tree.leaves(record.motion))
+    for k in range(2):
+        left, come, since = energy_left(record, k)
         running = record.time[k] > 0.4
-        assert np.abs(left[running] / come_k[running]).max() < 1e-3
-        for name in ("winding", "gearbox", "track", "sliding", "rolling"):
-            if k == 0:
-                assert (lost[name][k, -1] - lost[name][k, 0]) > 5e-3 * come_k[-1], name
+        assert np.abs(left[running] / come[running]).max() < 1e-3
+        assert all(since[name][-1] > 2e-3 * come[-1] for name in LOSSES), since  # or it would not be missed
+    assert np.ptp(np.asarray(record.motion.q)[0, :, 1]) > 0.01  # it has climbed
+
+
+@pytest.mark.slow
+def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
+    runs = [
+        (terrain.step(0.05, size=6), 45, -8.4, 12),
+        (terrain.step(0.08, size=6), 60, 180, 6, {"adhesion": 4.0}),
+        (terrain.step(0.12, size=6), 60, 180, 4, {"adhesion": 4.0}),
+        (terrain.step(0.25, size=6), 45, 180, 12),
+        (terrain.step(0.25, size=6), 60, 180, 0.5, {"payload": 8.0}),
+        (terrain.gap(0.6), 0, 0, 12),
+        (terrain.gap(0.2), 0, 0, 12),
+    ]  # of six points each
+    verdicts = ["over", "over", "tips", "slides", "stalls", "hangs", "over"]
+    for step in (1e-4, 5e-5):
+        found = batch(runs, duration=14.0, step=step)
+        assert found.names == verdicts
+        for k in range(len(runs)):
+            left, come, _ = energy_left(found.record, k)
+            running = (found.record.time[k] > 0.4) & (found.record.time[k] < found.ended[k])
+            assert np.abs(left[running] / come[running]).max() < 1e-3, k
+
+
+def test_how_a_run_ends_is_read_off_its_motion():
+    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.step(0.08), still(0.5, 0.3))
+    motion, _, progress = climb.begin(run)
+    _, _, passed = jax.eval_shape(lambda: climb.advance(run, motion, 0.0, climb.begin(run)[1]))
+    passed = jax.tree.map(lambda x: jnp.zeros(x.shape), passed)
+
+    def verdict(time=1.0, body=0.0, turned=0.0, **places):
+        q = motion.q
+        for name, value in places.items():
+            q = q.at[{"x": 0, "z": 1, "pitch": 2}[name]].set(value)
+        at = dataclasses.replace(motion, q=q.at[3].set(turned))
+        now = dataclasses.replace(passed, time=jnp.asarray(time), body=jnp.asarray(body))
+        found, after = climb._judged(run, motion, now, at, progress)
+        assert np.isfinite(np.asarray(found.q)).all()
+        return None if after.verdict < 0 else climb.NAMES[int(after.verdict)]
+
+    assert verdict() is None
+    assert verdict(x=0.3) == "over" and verdict(x=0.1) is None
+    assert verdict(pitch=2.0) == "tips" and verdict(pitch=-1.6) is None
+    assert verdict(x=np.nan) == "failed"
+    late = 1.1 * climb.PATIENCE
+    assert verdict(late) == "stalls" and verdict(late, turned=1.0) == "slides"
+    assert verdict(late, turned=1.0, body=0.5) == "hangs" and verdict(late, turned=1.0, z=-0.1) == "hangs"
+    assert verdict(late, x=float(motion.q[0]) + 0.01) is None
 
 
 def test_dynamics_are_those_of_mujoco():

@@ -1,5 +1,7 @@
 """Terrain by signed distance, and the path of a tapered belt, against a plain NumPy brute force."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +30,7 @@ def brute(points, at):
     found = []
     for p in at:
         least = np.inf
-        for a, b in zip(points[:-1], points[1:], strict=True):
+        for a, b in itertools.pairwise(points):
             a, b = np.array(a, float), np.array(b, float)
             s = min(max(np.dot(p - a, b - a) / np.dot(b - a, b - a), 0.0), 1.0)
             least = min(least, np.hypot(*(p - a - s * (b - a))))

@@ -1,8 +1,8 @@
 """Half a robot with levers over a terrain in its plane of travel: its state, one step, and how a run ends.
 
 The bodies are the chassis with payload, two pulleys and two levers; the belts run rigidly with the pulleys, and the
-levers swing as a sequence asks, at most at their rate, with whatever torque that takes. Contacts are of `footing`, the
-drive of `balances`.
+levers swing as a sequence asks, at most at their rate, with whatever torque that takes. Contacts are of `footing`,
+the drive of `balances`.
 """
 
 from __future__ import annotations
@@ -168,18 +168,18 @@ def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float
     for lever in levers:
         axle = lever.origin - body.origin
         masses.append((half.pulley, axle, None, None))
-        out = lever.along(jnp.stack([centre_lever, zero]))
-        masses.append((mass_lever, axle + out, out, lever.turns))
-    for mass, arm, out, turns in masses:
-        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(arm), *[jnp.zeros(2)] * 3]
-        centrifugal = -arm * v[PITCH] ** 2
+        reach = lever.along(jnp.stack([centre_lever, zero]))
+        masses.append((mass_lever, axle + reach, reach, lever.turns))
+    for mass, at, out, turns in masses:
+        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(at), *[jnp.zeros(2)] * 3]
+        centrifugal = -at * v[PITCH] ** 2
         if out is not None and turns is not None:
             columns[turns] = -across(out)
-            centrifugal = -(arm - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
+            centrifugal = -(at - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
         moves = jnp.stack(columns, axis=1)
         matrix = matrix + mass * moves.T @ moves
         bias = bias + mass * moves.T @ (centrifugal + down)
-        height = height + mass * down @ (body.origin + arm)
+        height = height + mass * down @ (body.origin + at)
     turning = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
     turning += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
     for about, by in turning:
@@ -382,8 +382,8 @@ def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> S
 
 
 class Progress(eqx.Module):
-    """Where a run stands: its verdict or that it goes on, when that was given, the furthest it came and when, angle of
-    its shafts since."""
+    """Where a run stands: its verdict or that it goes on, when that was given, the furthest it came and when, angle
+    of its shafts since."""
 
     verdict: Array
     ended: Scalar
@@ -458,11 +458,11 @@ def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) ->
         motion, energy, progress = state
 
         def small(carry: Any, j: Array) -> tuple[Any, None]:
-            time = first + (k * steps + j) * run.step
-            return advance(run, carry[0], time, carry[1])[:2], None
+            return advance(run, carry[0], first + (k * steps + j) * run.step, carry[1]), None
 
-        (before, so_far), _ = jax.lax.scan(small, (motion, energy), jnp.arange(steps - 1))
-        after, spent, passed = advance(run, before, first + ((k + 1) * steps - 1) * run.step, so_far)
+        nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+        (after, spent, passed), _ = jax.lax.scan(small, (motion, energy, nothing), jnp.arange(steps))
         ended = progress.verdict != _RUNNING
         after, progress = _judged(run, motion, passed, after, progress)
         kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
@@ -491,8 +491,8 @@ def _begin(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Seq
 
 
 def _part(
-    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar, step: float,
-    steps: int, samples: int,
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
+    step: float, steps: int, samples: int,
 ) -> tuple[Any, Passed]:  # fmt: skip
     def one(conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> tuple[Any, Passed]:
         return sampled(system(robot, conditions, terrain, sequence, step), state, first, steps, samples)

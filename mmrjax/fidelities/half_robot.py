@@ -225,7 +225,9 @@ def _later(run: System, motion: Motion, signals: Signals) -> _Later:
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
     }
-    return _Later(current_after(run.robot, run.conditions, run.step, signals), motion.discharge + run.step * charge, memory)
+    return _Later(
+        current_after(run.robot, run.conditions, run.step, signals), motion.discharge + run.step * charge, memory
+    )
 
 
 def _moved(

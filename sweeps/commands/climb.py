@@ -203,8 +203,8 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
             if below < -_ON_GROUND * reach:
                 raise BadConfiguration(
                     f"levers {option}: at {np.degrees(angle):.4g} deg they begin {-1000 * below:.0f} mm below the "
-                    f"ground; expected at least {np.degrees(least):.1f} deg there, where they lie on it (a sequence may "
-                    "press them down later)"
+                    f"ground; expected at least {np.degrees(least):.1f} deg there, where they lie on it (a sequence "
+                    "may press them down later)"
                 )
     return found
 

@@ -237,6 +237,6 @@ def _bounds(spec: Spec) -> str:
 
 #: What explains a name, by kind.
 EXPLAINED: dict[str, Callable[[str, dict[str, type[Effect]]], Iterator[Line]]] = {
-    "effect": _effect, "status": _status, "verdict of a climb": _verdict, "flag": _flag, "channel": _channel, "output": _output,
-    "parameter": _parameter,
+    "effect": _effect, "status": _status, "verdict of a climb": _verdict, "flag": _flag, "channel": _channel,
+    "output": _output, "parameter": _parameter,
 }  # fmt: skip

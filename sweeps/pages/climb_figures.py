@@ -72,7 +72,7 @@ def instants(found: ClimbResult) -> list[tuple[str, int]]:
         "start": 0,
         "largest pitch": int(np.argmax(np.abs(t["pitch_deg"]))),
         "least margin": int(np.argmin(t["margin_mm"])),
-        "largest motor current": int(np.argmax(np.abs(t["motor_current_A"]))),
+        "largest motor current": int(np.argmax(np.abs(t["traction_current_A"]))),
         "half way": int(np.argmin(np.abs(t["x_mm"] - (t["x_mm"][0] + t["x_mm"].max()) / 2))),
         "end": len(t["time_s"]) - 1,
     }
@@ -107,7 +107,8 @@ def course(found: ClimbResult) -> Figure:
         ("angle [deg]", {"pitch, nose up": ("pitch_deg", BLUE), "front levers": ("front_deg", ORANGE),
                          "rear levers": ("rear_deg", PURPLE)}),
         ("margin of tipping [mm]", {"margin": ("margin_mm", VERMILION)}),
-        ("motor current [A]", {"each traction motor": ("motor_current_A", BLUE), "front levers": ("front_current_A", ORANGE),
+        ("motor current [A]", {"each traction motor": ("traction_current_A", BLUE),
+                               "front levers": ("front_current_A", ORANGE),
                                "rear levers": ("rear_current_A", PURPLE)}),
         ("energy [J]", {"from the supply": ("supply_J", INK), "sliding": ("sliding_J", VERMILION),
                         "windings": ("winding_J", ORANGE), "stored": ("stored_J", GREEN)}),

@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from mmrjax import channels
 from mmrjax.fidelities.climb import LOSSES, NAMES, OVER, SOURCES, Climb
 from mmrjax.footing import FRONT, PITCH, REAR, SHAFT
 from mmrjax.robot import Robot
@@ -60,7 +59,9 @@ class ClimbResult:
     @property
     def table(self) -> dict[str, np.ndarray]:
         """The run over time."""
-        count = int(np.sum(np.asarray(self.climb.record.time)[0] <= self.climb.ended[0] + 1e-9))  # it stays as it ended
+        count = int(
+            np.sum(np.asarray(self.climb.record.time)[0] <= self.climb.ended[0] + 1e-9)
+        )  # it stays as it ended
         r = jax.tree.map(lambda x: x[:, :count], self.climb.record)
         q, v = r.motion.q[0], r.motion.v[0]
         energy = {f"{name}_J": r.energy[name][0] for name in (*SOURCES, *LOSSES)}
@@ -73,10 +74,9 @@ class ClimbResult:
             "pitch_deg": -np.degrees(q[:, PITCH]),
             "front_deg": np.degrees(q[:, FRONT]),
             "rear_deg": 180 - np.degrees(q[:, REAR]),
-            channels.of("speed").column: 1000 * np.hypot(v[:, 0], v[:, 1]),
+            "speed_mm_s": 1000 * np.hypot(v[:, 0], v[:, 1]),
             "belt_mm_s": 1000 * radius * v[:, SHAFT],
-            channels.of("motor_current").column: r.current[0],
-            channels.of("total_current").column: sides * r.current[0],
+            "traction_current_A": r.current[0],
             "front_current_A": r.lever_current[0, :, 0],
             "rear_current_A": r.lever_current[0, :, 1],
             "front_torque_Nm": r.torque[0, :, 0],
@@ -92,7 +92,8 @@ class ClimbResult:
         """The answer in a sentence."""
         if self.sought:
             if self.largest is None:
-                return f"It gets over no {self.sought} that was tried, the smallest of {min(s for s, _ in self.tried):.0f} mm."
+                smallest = min(size for size, _ in self.tried)
+                return f"It gets over no {self.sought} that was tried, the smallest of {smallest:.0f} mm."
             beyond = [(s, v) for s, v in self.tried if s > self.largest]
             least = min(beyond, default=None)
             why = "" if least is None else f"; at {least[0]:.0f} mm it {VERDICTS[least[1]][0]}"
@@ -110,7 +111,7 @@ class ClimbResult:
             "pitch_most_deg": float(t["pitch_deg"].max()),
             "pitch_least_deg": float(t["pitch_deg"].min()),
             "margin_least_mm": float(t["margin_mm"].min()),
-            "motor_current_most_A": float(np.abs(t["motor_current_A"]).max()),
+            "traction_current_most_A": float(np.abs(t["traction_current_A"]).max()),
             "front_current_most_A": float(np.abs(t["front_current_A"]).max()),
             "rear_current_most_A": float(np.abs(t["rear_current_A"]).max()),
             "front_torque_most_Nm": float(np.abs(t["front_torque_Nm"]).max()),
