@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mmrjax import channels, contact, ground, masses, power
+from mmrjax import channels, contact, ground, masses, posture, power
 from mmrjax import chassis as chassis_room
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
@@ -294,6 +294,7 @@ def _current_of(robot: Robot, conditions: Conditions, signals: Callable[[Scalar]
 
 
 def _moving(robot: Robot, conditions: Conditions, state: State) -> Signals:
+    robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
     signals = _to_slip(robot, conditions, chassis, begin(robot, conditions, state))
     if isinstance(chassis, Shaft):
@@ -363,6 +364,7 @@ def resolved(
     Returns:
         The signals, and what `mover.pull` gave.
     """
+    robot = robot.within(conditions.configuration)
     chassis = dataclasses.replace(robot.chassis(conditions.configuration), inertia=inertia)
     signals = _fill(begin(robot, conditions, state), normal=mover.normal)
     signals = _to_slip(robot, conditions, chassis, signals)
@@ -371,6 +373,18 @@ def resolved(
     signals = _pulled(robot, signals, traction)
     signals = track(robot, chassis, signals, guide)
     return gearbox(robot, chassis, signals, pull.load - guide * chassis.radius), pull
+
+
+def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+    """Signals of an instant up to the voltage balance."""
+    robot = robot.within(conditions.configuration)
+    return electrical(robot, conditions, supply(robot, conditions, begin(robot, conditions, state, direction)))
+
+
+def demanded(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
+    """Signals of an instant up to what traction has to overcome and the sliding of the contact."""
+    robot = robot.within(conditions.configuration)
+    return _to_slip(robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction))
 
 
 def settled(robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0) -> tuple[Signals, Scalar]:
@@ -383,9 +397,9 @@ def settled(robot: Robot, conditions: Conditions, state: State, direction: Scala
         The signals, and the sliding speed at which the friction law carries that demand [m/s], which
         `signals.speed_sliding` has to meet.
     """
+    robot = robot.within(conditions.configuration)
     chassis = robot.chassis(conditions.configuration)
-    signals = begin(robot, conditions, state, direction=direction * jnp.ones_like(state.speed_motor))
-    signals = _to_slip(robot, conditions, chassis, signals)
+    signals = demanded(robot, conditions, state, direction * jnp.ones_like(state.speed_motor))
     # Nothing changes in steady travel: the rates that other fidelities compute are zero.
     still = jnp.zeros_like(signals.demand)
     signals = _fill(signals, traction=signals.demand, acceleration=still)
@@ -414,19 +428,24 @@ class Travel(eqx.Module):
 
 def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar) -> Stance:
     """How a robot of this mass with its payload [kg] stands: the centre of mass of all, over axles that are a radius,
-    on tracks and a grouser, above the ground."""
-    half = masses.masses(robot, conditions, mass)
-    share = half.chassis / (mass / robot.sides)  # pulleys and wheels sit on the axles
-    axle = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height
+    on tracks and a grouser, above the ground; with levers stated in the posture that it takes on level ground."""
+    length, on_tracks = robot.running_gear.wheelbase, chassis.on_tracks
+    if conditions.states_levers:
+        rests = posture.level(robot, conditions, mass)
+        length, on_tracks, height = rests.length, rests.line, rests.centre_height
+        ahead = rests.centre_ahead - (rests.front + rests.rear) / 2
+    else:
+        ahead, up = masses.masses(robot, conditions, mass).centre
+        height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
     lateral = chassis.turning.lateral
     if conditions.adhesion_lateral is not None:
         lateral = lateral * conditions.adhesion_lateral / conditions.adhesion
     return Stance(
-        length=robot.running_gear.wheelbase,
+        length=length,
         width=chassis.turning.width,
-        height=axle + share * half.up,
-        ahead=share * half.forward,
-        on_tracks=chassis.on_tracks,
+        height=height,
+        ahead=ahead,
+        on_tracks=on_tracks,
         lateral=lateral,
         rule=chassis.turning.rule,
         nodes=chassis.turning.nodes,
@@ -444,6 +463,7 @@ def turning(
     Args:
         loads: see `turning.grip`.
     """
+    robot = robot.within(conditions.configuration)
     chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
     y = SIDES * chassis.turning.width
     speed = motion.speed - motion.yaw_rate * y

@@ -18,7 +18,7 @@ from mmrjax.fidelities.track import Trajectory
 from mmrjax.robot import Robot
 from mmrjax.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.signals import GRAVITY
-from mmrjax.undercarriage import lever_tip
+from mmrjax.undercarriage import lever_tips
 
 FORMATS = (".png", ".gif", ".mp4")
 FORCE = 1 / 800  # length of an arrow [m/N]
@@ -73,7 +73,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
         raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = Path(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
-    levers = [] if wheeled else [lever_tip(gear, gear.lever_front, 1.0), lever_tip(gear, gear.lever_rear, -1.0)]
+    levers = [] if wheeled else lever_tips(gear, conditions)
     signals, reactions = run.signals, run.reactions
     return Scene(
         slope=float(conditions.slope),

@@ -36,13 +36,15 @@ class Configurations(eqx.Module):
 
     Attributes:
         names: in order; members: the loads, all vehicles' or all shafts'.
+        chosen: that of the configuration in hand, within equations of one run (`Robot.within`).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
     members: tuple[Any, ...]  # Load
+    chosen: Any = None  # Load | None
 
     def __init__(self, by_name: Mapping[str, Load]) -> None:
-        self.names, self.members = tuple(by_name), tuple(by_name.values())
+        self.names, self.members, self.chosen = tuple(by_name), tuple(by_name.values()), None
 
     def index(self, name: str) -> int:
         """Position of a configuration.
@@ -136,11 +138,23 @@ class Robot(eqx.Module):
 
     def chassis(self, configuration: Index) -> Any:
         """The load of the configuration with this index; traceable and batchable."""
-        first, *others = self.configurations.members
-        chosen = first
+        if self.configurations.chosen is not None:
+            return self.configurations.chosen
+        chosen, *others = self.configurations.members
         for k, other in enumerate(others, 1):
-            chosen = jax.tree.map(lambda a, b: jnp.where(configuration == k, b, a), chosen, other)  # noqa: B023
+            here = jnp.asarray(configuration == k)
+            chosen = jax.tree.map(lambda a, b: jnp.where(here, b, a), chosen, other)  # noqa: B023
         return chosen
+
+    def within(self, configuration: Index) -> Robot:
+        """This robot in the configuration with this index: its load is chosen here, once, for all equations that ask
+        for it."""
+        if self.configurations.chosen is not None:
+            return self
+        chosen = eqx.tree_at(
+            lambda c: c.chosen, self.configurations, self.chassis(configuration), is_leaf=lambda x: x is None
+        )
+        return dataclasses.replace(self, configurations=chosen)
 
     @property
     def radius_pulley(self) -> Scalar:

@@ -6,6 +6,7 @@ import math
 
 import equinox as eqx
 
+from mmrjax.levers import Levers
 from mmrjax.params import Scalar, parameter
 from mmrjax.tables import GROUSERS, TEETH_BELT, TEETH_PULLEY
 
@@ -256,3 +257,4 @@ class RunningGear(eqx.Module):
         relative_sd=0.05,
         source="Table 7",
     )
+    levers: Levers = eqx.field(default_factory=Levers, kw_only=True)

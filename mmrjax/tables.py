@@ -10,6 +10,8 @@ TRACKED, WHEELED = CONFIGURATIONS = ("6T2A", "4W2T")
 
 #: Main track of one side: teeth of belt and pulley, grousers (Section 3.4.4); pitches [m] (Section 3.2.4).
 TEETH_BELT, TEETH_PULLEY, GROUSERS = 168, 48, 24
+#: Track of one lever (Section 3.4.4).
+TEETH_LEVER, GROUSERS_LEVER = 112, 16
 PITCH_TOOTH, PITCH_GROUSER = 5e-3, 35e-3
 RADIUS_PULLEY = TEETH_PULLEY * PITCH_TOOTH / (2 * math.pi)  # 38.2 mm
 
@@ -44,6 +46,8 @@ CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
     "motor_speed_right": (-1e4, 1e4, "rad/s"),
     "heading_deg": (-360.0, 360.0, "deg"),
     "adhesion_lateral": (1e-3, 100.0, ""),
+    "levers_front_deg": (-180.0, 180.0, "deg"),
+    "levers_rear_deg": (-180.0, 180.0, "deg"),
 }
 
 

@@ -1,6 +1,7 @@
 """Parameters: the walk, replacement, and the numbers of Tables 1-7."""
 
 import dataclasses
+import math
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ import reference
 
 from mmrjax import params, robots
 from mmrjax.params import parameter
+from mmrjax.tables import GROUSERS_LEVER, PITCH_GROUSER, PITCH_TOOTH, TEETH_LEVER
 
 
 def test_nominal_values_are_those_of_the_reference(robot):
@@ -104,3 +106,14 @@ def test_simplified_robots_are_table_a4(build, torque):
     assert float(robot.gearbox.efficiency(0.03, 900.0)) == 0.75
     assert float(robot.configurations["6T2A"].track.torque_loss(20.0, 1.0)) == torque
     np.testing.assert_allclose(robot.battery.voltage(5.0, 3000.0), 33.6, rtol=1e-12)
+
+
+def test_track_of_a_lever_closes_around_its_pulley_and_roller(robot):
+    """112 teeth of 5 mm: two straight runs and two arcs, whose radii are less by a grouser than those over them."""
+    gear, levers = robot.running_gear, robot.running_gear.levers
+    large, small = float(robot.radius_pulley), float(levers.roller - gear.grouser_height)
+    tilt = math.asin((large - small) / float(gear.lever_length))
+    runs = 2 * float(gear.lever_length) * math.cos(tilt)
+    loop = runs + large * (math.pi + 2 * tilt) + small * (math.pi - 2 * tilt)
+    assert loop == pytest.approx(TEETH_LEVER * PITCH_TOOTH, abs=5e-4)
+    assert pytest.approx(GROUSERS_LEVER * PITCH_GROUSER) == TEETH_LEVER * PITCH_TOOTH

@@ -183,7 +183,8 @@ def propose(linear: Linearization, balance: str, counts: np.ndarray, curve: Smoo
     if not ranked:
         return Proposal("", (), (), (), (), 0.0, 0.0, len(terms))
     located = {SAME_AS.get(curve.variable, curve.variable)}
-    foreign = [len({v for k in chosen for v in terms[k].variables} - located) for chosen, _ in ranked]
+    foreign_of = [frozenset(term.variables) - located for term in terms]
+    foreign = [len(frozenset().union(*(foreign_of[k] for k in chosen))) for chosen, _ in ranked]
     dear = [bic + FOREIGN * n for (_, bic), n in zip(ranked, foreign, strict=True)]
     near = [c for c, bic in zip(ranked, dear, strict=True) if bic < min(dear) + NO_EVIDENCE]
     chosen, bic = min(near, key=lambda c: (sum(terms[k].complexity for k in c[0]), c[1]))

@@ -94,17 +94,16 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     return jnp.minimum(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
 
 
-def slides_in_place(robot: Robot, conditions: Conditions, state: State, sense: Scalar) -> Array:
+def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     """Whether a robot that cannot travel, as the demand is above what the ground holds, slides; else it stands.
 
     It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the
     motors turn the movers faster than V_s, up to which the ground holds more the faster they slide.
-
-    Args:
-        state: whose current and speeds are not read; sense: in which it would travel, 1 or -1.
     """
-    chassis = robot.chassis(conditions.configuration)
-    still = _still(state)
+    robot = robot.within(conditions.configuration)
+    chassis, sense = robot.chassis(conditions.configuration), direction(robot, conditions)
+    none = jnp.zeros_like(conditions.voltage)
+    still = State(none, none, none, conditions.discharge)
     turning = sense * chassis.ground.friction.speed_static * robot.gearbox.ratio / chassis.radius
     spun = dataclasses.replace(still, speed_motor=turning * jnp.ones_like(still.speed))
     if conditions.motor_speed is not None:
@@ -112,7 +111,7 @@ def slides_in_place(robot: Robot, conditions: Conditions, state: State, sense: S
     else:
         spun = dataclasses.replace(spun, current=current_settled(robot, conditions, spun))
         spins = sense * _carried(robot, conditions, spun, sense).torque_net > 0
-    forward, backward = (balances.settled(robot, conditions, still, way)[0] for way in (1.0, -1.0))
+    forward, backward = (balances.demanded(robot, conditions, still, way + none) for way in (1.0, -1.0))
     return (_ground_margin(forward, backward) < 0) | spins
 
 
@@ -121,7 +120,8 @@ def current_settled(robot: Robot, conditions: Conditions, state: State) -> Scala
     balance."""
 
     def left(current: Scalar) -> Scalar:
-        return balances.settled(robot, conditions, dataclasses.replace(state, current=current), 0.0)[0].voltage_left
+        here = dataclasses.replace(state, current=current)
+        return balances.driven(robot, conditions, here, jnp.zeros_like(state.speed)).voltage_left
 
     guess = left(jnp.zeros_like(state.current)) / robot.motor.resistance
     first, second = left(0.5 * guess), left(guess)

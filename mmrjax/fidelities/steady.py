@@ -50,9 +50,10 @@ _balanced = compiled(balances.settled)
 
 
 @compiled
-def _residual(unknowns: Vector, robot: Robot, conditions: Conditions) -> Vector:
+def _residual(unknowns: Vector, robot: Robot, own: tuple[Conditions, Array]) -> Vector:
+    conditions, sense = own
+    robot = robot.within(conditions.configuration)
     _, conditions = _sound(robot, conditions)
-    sense = direction(robot, conditions)
     signals, creep = _balanced(robot, conditions, _state(unknowns, conditions.discharge), sense)
     # Moving with balanced torques, or at rest with too little torque: speed >= 0, torque <= 0 in the direction of
     # travel, one of them 0.
@@ -97,7 +98,8 @@ def _root(robot: Robot, conditions: Conditions) -> tuple[State, Array]:
     tolerance = float(jnp.finfo(jnp.result_type(conditions.voltage)).eps) ** 0.85
     sound = _sound(robot, conditions)[1]
     start = jax.lax.stop_gradient(_start(robot, sound))
-    unknowns, solved = root(_residual, start, robot, conditions, tolerance, not robot.effects)
+    own = conditions, direction(robot, sound)
+    unknowns, solved = root(_residual, start, robot, own, tolerance, not robot.effects)
     return _state(unknowns, sound.discharge), solved
 
 
@@ -171,12 +173,19 @@ def operating_point(robot: Robot, conditions: Conditions) -> tuple[Result, Array
     if conditions.turns:
         return turning.operating_point(robot, conditions)
     signals, status, sound = operating(robot, conditions)
-    return result(robot, signals, status), sound
+    return result(robot.within(conditions.configuration), signals, status), sound
+
+
+def _slides_in_place(robot: Robot, conditions: Conditions) -> Array:
+    robot = robot.within(conditions.configuration)
+    return slides_in_place(robot, _sound(robot, conditions)[1])
 
 
 def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Array]:
     """Every signal of `operating_point`, its status, and whether robot and conditions are sound."""
     state, solved = _root(robot, conditions)
+    given = jax.lax.stop_gradient((robot, conditions))  # as they came: nothing is stored for a loop that seldom turns
+    robot = robot.within(conditions.configuration)
     sound, conditions = _sound(robot, conditions)
     sense = direction(robot, conditions)
     signals, _ = _balanced(robot, conditions, state, sense)
@@ -188,8 +197,7 @@ def operating(robot: Robot, conditions: Conditions) -> tuple[Signals, Array, Arr
     status = jnp.where(still, STALLED, travels(signals.speed, voltage))
     if robot.has_ground:
         beyond = jnp.abs(signals.demand) > signals.adhesion_limit
-        at = jax.lax.stop_gradient((robot, conditions, state, sense))
-        slides = rarely(beyond, slides_in_place, at, jnp.zeros_like(beyond))
+        slides = rarely(beyond, _slides_in_place, given, jnp.zeros_like(beyond))
         status = jnp.where(beyond, jnp.where(slides, SLIDES, STALLED), status)
     status = jnp.where(solved, status, FAILED)
     empty = (conditions.battery > 0.5) & robot.battery.empty(conditions.discharge)
