@@ -205,16 +205,18 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
     """
     size = SETTLING + len(SIDES)
     moves = np.arange(size) >= (0 if conditions.of_sides().motor_speed is None else 4)
-    still, slow = -jnp.eye(size), jnp.diag(jnp.arange(size) < SETTLING)
+    still, slow = -np.eye(size), np.diag(np.arange(size) < SETTLING)
 
     def begun(held: tuple[Robot, Conditions], patient: bool = False) -> _Search:
         """Its first step goes nowhere: it only looks round."""
         guess = jnp.concatenate([_guess(*held)[:SETTLING], jnp.zeros(len(SIDES))])
         first, turns = jnp.asarray(FIRST), jnp.asarray(0)
-        return _Search(guess, jnp.zeros_like(guess), still, first, turns, jnp.asarray(patient), jnp.asarray(False))
+        return _Search(
+            guess, jnp.zeros_like(guess), jnp.asarray(still), first, turns, jnp.asarray(patient), jnp.asarray(False)
+        )
 
     def turn(held: tuple[Robot, Conditions], search: _Search) -> _Search:
-        solve, determinant = inverse(slow / search.step - search.jacobian)
+        solve, determinant = inverse(jnp.asarray(slow) / search.step - search.jacobian)
         step = solve(search.rates)
         largest, patient = jnp.max(jnp.abs(step)), search.patient
         there = search.y + step * jnp.where(patient, 1.0, _share(*held, search.y, step))
@@ -235,7 +237,7 @@ def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[A
 
     end = lanes.until(begun, turn, lambda search: (search.turns >= TURNS) | search.solved, (robot, conditions))
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
-    slope = jnp.where(sound, end.jacobian, still)
+    slope = jnp.where(sound, end.jacobian, jnp.asarray(still))
     y = end.y + inverse(-slope)[0](jnp.where(sound, _balance(robot, conditions, end.y), 0.0))
     return motion_of(robot, _whole(conditions, y)), _loads(robot, conditions, y), sound
 
