@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from mmrjax import posture
 from mmrjax.conditions import Conditions
 from mmrjax.params import Scalar
-from mmrjax.posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Outline
+from mmrjax.posture import BELTS, FRONT_ROLLER, REAR_ROLLER, Outline, Posture
 from mmrjax.robot import Robot
 
 #: Pitches that are looked at at once, and how often the best one's neighbourhood is looked at again.
@@ -166,3 +166,15 @@ def steps_over_levers(
     pairs = np.stack(np.meshgrid(front_deg, rear_deg, indexing="ij"), -1)
     found = _over_levers(robot, conditions, jnp.asarray(pairs.reshape(-1, 2), float))
     return jax.tree.map(lambda x: x.reshape(*pairs.shape[:2], *x.shape[1:]), found)
+
+
+@jax.jit
+def standing(robot: Robot, conditions: Conditions) -> tuple[Posture, Limits, Outline, Step]:
+    """How a robot stands in each run of a batch, its limits there, and its outline at rest and on its highest step;
+    leaves of shape (runs, ...)."""
+
+    def of_one(one: Conditions) -> tuple[Posture, Limits, Outline, Step]:
+        side, rests = posture.outline(robot, one), posture.posture(robot, one)
+        return rests, limits(robot, one), side.pitched(rests.pitch), step(side)
+
+    return jax.vmap(of_one)(conditions)

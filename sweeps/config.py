@@ -195,6 +195,10 @@ class OneRun(Part):
     total_mass_kg: float | None = about(
         None, "Total mass", usual="the robot's own mass and the payload", flag="--mass"
     )
+    levers_front_deg: float | None = about(
+        None, "Angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="the robot's"
+    )
+    levers_rear_deg: float | None = about(None, "The same of the rear levers", usual="the robot's")
 
 
 class GridPart(Part):
