@@ -57,7 +57,7 @@ MORE = {
     "tips_back_deg": "slope on which it tips, uphill", "tips_forward_deg": "downhill", "tips_aside_deg": "across",
     "highest_step_mm": "centre of mass over the edge", "widest_gap_mm": "bridged by the contact",
     "tip_front_mm": "top of a lever's roller", "tip_rear_mm": "the same of the rear ones",
-    "length_mm": "overall", "height_mm": "overall",
+    "overall_length_mm": "overall", "overall_height_mm": "overall",
     "voltages_V": "axis of supply_voltage_V", "payloads_kg": "axis of payload_kg",
     "slopes_deg": "axis of slope_deg", "motor_speeds_rpm": "axis of motor_speed_rpm",
     "motor_currents_A": "axis of motor_current_A",
