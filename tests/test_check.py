@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import json
 import math
-import sys
 from pathlib import Path
 
 import equinox as eqx
@@ -24,18 +23,10 @@ from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.requirements import CUT_OFF, QUANTITIES, Point, evaluate, packed, ratings
 from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
-from sweeps import cli
+from tests.commands import command
 from tests.pages import Tables, drawn, outside
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json").read_text("utf-8"))
-
-
-def command(arguments):
-    """Run a command in this process; returns its exit code."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        cli.main()
-    return end.value.code
 
 
 def read(text):
