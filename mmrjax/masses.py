@@ -110,6 +110,20 @@ def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     its levers folded and without payload (`inertia_tracked`, `inertia_wheeled`), the body's is what the other parts
     leave of that.
     """
+    fixed, levers, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
+    return Masses(*_together([*fixed, *levers]), body, pulley, inertia_pulley)
+
+
+def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
+    """The same of all but the levers, which stand on their axles."""
+    fixed, _, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
+    return Masses(*_together(fixed), body, pulley, inertia_pulley)
+
+
+def _of_robot(
+    robot: Robot, conditions: Conditions, mass: Scalar
+) -> tuple[list[_Part], list[_Part], Scalar, Scalar, Scalar]:
+    """Parts fixed in the chassis, levers, mass of the body, mass and inertia of what turns on an axle."""
     kind, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = kind.on_tracks
     wheeled = 1 - tracked
@@ -133,8 +147,7 @@ def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     left = stated - _together(folded).inertia
     body = body._replace(inertia=jnp.where(left > 0, left, body.inertia))
 
-    chassis = _together([body, belt, *levers, payload])
-    return Masses(*chassis, body.mass, pulley, inertia_pulley)
+    return [body, belt, payload], levers, body.mass, pulley, inertia_pulley
 
 
 def check_parts(robot: Robot) -> None:

@@ -22,6 +22,8 @@ from mmrjax.robot import Robot
 
 #: Pitches that are looked at at once, and how often the best one's neighbourhood is looked at again.
 PITCHES, CLOSER = 181, 4
+#: Of the best posture: front, rear and pitch looked at in each round, and by how much the next one looks closer.
+_ROUNDS = (((7, 19, 10), 3.0), *(((5, 5, 5), 2.0),) * 10)
 #: How far beside the highest step its two sides are looked at [rad].
 _BESIDE = 1e-5
 
@@ -126,6 +128,65 @@ def step(side: Outline) -> Step:
     there = side.pitched(best)
     height = step_at(still, best) + share * moved[0] + (1 - share) * moved[1]
     return Step(height, best, there, -lowest(there)[0])
+
+
+def with_levers(conditions: Conditions, front: Scalar, rear: Scalar) -> Conditions:
+    """Conditions with levers at these angles [rad]."""
+    front, rear = (jnp.broadcast_to(jnp.degrees(x), conditions.shape) for x in (front, rear))
+    return dataclasses.replace(conditions, levers_front_deg=front, levers_rear_deg=rear)
+
+
+def flush(robot: Robot) -> Scalar:
+    """Angle at which a lever's lower run is in line with the main belt [rad], downward."""
+    gear = robot.running_gear
+    return -jnp.arcsin((robot.radius_pulley + gear.grouser_height - gear.levers.roller) / gear.lever_length)
+
+
+def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scalar]:
+    """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers
+    [rad]; its derivatives are those at these angles.
+
+    What any robot that climbs slowly can get over, in whatever sequence of postures: as its tail leaves the lower
+    ground, the centre of mass has to be over the step, and what is under it is no higher than in the best posture.
+    """
+    still, there = jax.lax.stop_gradient((robot, conditions))
+    levers = still.running_gear.levers
+    least, most = levers.angle_least, levers.angle_most
+
+    def height(at: Array) -> Scalar:
+        return step_at(posture.outline(still, with_levers(there, at[0], at[1])), at[2])
+
+    low = jnp.stack(jnp.broadcast_arrays(least, least, 0.0))
+    high = jnp.stack(jnp.broadcast_arrays(most, most, jnp.pi / 2))
+    best, wide = (low + high) / 2, (high - low) / 2
+    for count, closer in _ROUNDS:
+        axes = [jnp.linspace(-1.0, 1.0, n) for n in count]
+        grid = jnp.stack(jnp.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        near = jnp.clip(best + wide * grid, low, high)
+        best, wide = near[jnp.argmax(jax.vmap(height)(near))], wide / closer
+    front, rear = best[0], best[1]
+    return step(posture.outline(robot, with_levers(conditions, front, rear))), front, rear
+
+
+def stairs_rise(robot: Robot, conditions: Conditions, tread: Scalar, friction: Scalar) -> Scalar:
+    """The highest rise of stairs of this tread [m] on which one run's robot stands without rocking or sliding, its
+    levers flush with the belt.
+
+    A belt of friction μ that holds by that alone slides where tan α = μ, with tan α = rise / tread. On noses
+    t / cos α apart it always has one behind gravity's line through its centre of mass and one ahead of it if it
+    reaches that far both ways: ℓ - h tan α ≥ t / cos α at the tail, of the centre of mass ℓ ahead of the tail and h
+    above the belt; 0 where not even noses without rise are. Grousers that catch a nose hold more, and a robot that
+    rocks may get on.
+    """
+    angle = flush(robot)
+    rests = posture.level(robot, with_levers(conditions, angle, angle))
+    tail, nose = rests.centre_ahead - rests.rear, rests.front - rests.centre_ahead
+    # ℓ cos α - h sin α = t
+    reach = jnp.sqrt(tail**2 + rests.centre_height**2)
+    rocks = jnp.arccos(jnp.clip(tread / reach, 0.0, 1.0 - 1e-12)) - jnp.arctan2(rests.centre_height, tail)
+    bridged = jnp.minimum(tail, nose) >= tread
+    steepest = jnp.minimum(jnp.arctan(friction), jnp.maximum(rocks, 0.0))
+    return jnp.where(bridged, tread * jnp.tan(steepest), 0.0) * rests.line
 
 
 def limits(robot: Robot, conditions: Conditions) -> Limits:

@@ -11,7 +11,9 @@ from calibration.data import sides
 from calibration.data.columns import HEADING, LEVERS, RPM, SPEED, SUPPLY
 from calibration.data.errors import BadData, number
 from calibration.data.table import Runs
+from mmrjax import params
 from mmrjax.robot import Robot
+from mmrjax.running_gear import RunningGear
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].
@@ -51,12 +53,24 @@ def check(runs: Runs, robot: Robot) -> None:
         _angle(runs)
 
 
+def cannot_stand(robot: Robot) -> str | None:
+    """Why it is not known how a robot stands; None where it is."""
+    if not robot.has_ground:
+        return "the robot's load is a shaft, which stands on no ground"
+    usual = {p.name: float(p.value) for p in params.walk(RunningGear())}
+    if not robot.rig.inherits and all(float(p.value) == usual[p.name] for p in params.walk(robot.running_gear)):
+        return "the robot's file states no running_gear; state its wheelbase, levers and masses there"
+    return None
+
+
 def misplaced(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
     """Row and column in which levers cannot stand as a table states it, and why: a configuration without them, an
     angle beyond their range; None where they can."""
     stated = [name for name in LEVERS if runs.has(name)]
     if not stated:
         return None
+    if why := cannot_stand(robot):
+        return 0, stated[0], why
     on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
     if not on_tracks.all():
         row = int(np.argmin(on_tracks))

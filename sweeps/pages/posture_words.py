@@ -17,8 +17,8 @@ COLUMNS = {
     "tips_back_deg": ("tips back on [°]", "{:.1f}"), "tips_forward_deg": ("tips forward on [°]", "{:.1f}"),
     "tips_aside_deg": ("tips aside on [°]", "{:.1f}"), "highest_step_mm": ("highest step [mm]", "{:.0f}"),
     "widest_gap_mm": ("widest gap [mm]", "{:.0f}"), "tip_front_mm": ("front tip up to [mm]", "{:.0f}"),
-    "tip_rear_mm": ("rear tip up to [mm]", "{:.0f}"), "length_mm": ("length [mm]", "{:.0f}"),
-    "height_mm": ("height [mm]", "{:.0f}"),
+    "tip_rear_mm": ("rear tip up to [mm]", "{:.0f}"), "overall_length_mm": ("length [mm]", "{:.0f}"),
+    "overall_height_mm": ("height [mm]", "{:.0f}"),
 }  # fmt: skip
 #: Rows of that table at most.
 ROWS = 20

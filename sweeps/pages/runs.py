@@ -56,7 +56,7 @@ def write(
     """
     album, robot = Album(folder), file.robot
     names = labels(runs)
-    known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": []}
+    known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": [], "posture": None}
     if histories is not None:
         known |= _histories(album, robot, runs, names, histories)
     if stands is not None:

@@ -88,8 +88,8 @@ def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | Non
         "widest_gap_mm": millimetres * limits.gap,
         "tip_front_mm": millimetres * limits.tip_front,
         "tip_rear_mm": millimetres * limits.tip_rear,
-        "length_mm": millimetres * limits.length,
-        "height_mm": millimetres * limits.height,
+        "overall_length_mm": millimetres * limits.length,
+        "overall_height_mm": millimetres * limits.height,
     }
     first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
     there = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
