@@ -384,7 +384,9 @@ def driven(robot: Robot, conditions: Conditions, state: State, direction: Scalar
 def demanded(robot: Robot, conditions: Conditions, state: State, direction: Scalar) -> Signals:
     """Signals of an instant up to what traction has to overcome and the sliding of the contact."""
     robot = robot.within(conditions.configuration)
-    return _to_slip(robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction))
+    return _to_slip(
+        robot, conditions, robot.chassis(conditions.configuration), begin(robot, conditions, state, direction)
+    )
 
 
 def settled(robot: Robot, conditions: Conditions, state: State, direction: Scalar = 1.0) -> tuple[Signals, Scalar]:
