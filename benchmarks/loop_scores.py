@@ -430,4 +430,7 @@ def ends(f: Figures) -> None:
     judged = [x for x in f.lines if "verdict" in x]
     if judged:
         seconds = [x["seconds"] for x in judged]
-        f.note(f"{len(judged)} cases; seconds a case: median {np.median(seconds):.2f}, mean {np.mean(seconds):.2f}")
+        f.note(
+            f"{len(judged)} cases; seconds a case: median {np.median(seconds):.2f}, mean {np.mean(seconds):.2f}, "
+            f"most {max(seconds):.0f}; memory {max(x.get('memory', 0) for x in judged) / 1e9:.1f} GB"
+        )

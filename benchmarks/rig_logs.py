@@ -147,15 +147,7 @@ def summary(lines: list[dict]) -> list[str]:
     f.say("  without it", compared, lambda x: x["held_out"]["found"] <= (1 + TENTH) * x["held_out"]["own"])
     late = [x for x in every if x.get("delay")]
     f.say("delay within 3 of its sds", late, lambda x: abs(x["delay"][0] - x["made"]["delay"]) < 3 * x["delay"][1])
-    for what in ("skipped", "error"):
-        for text, count in Counter(x[what][:150] for x in f.lines if what in x).most_common(12):
-            f.note(f"{what} {count}: {text}")
-    seconds = [x["seconds"] for x in every]
-    if seconds:
-        most = max(x.get("memory", 0) for x in every) / 1e9
-        f.note(
-            f"seconds to a verdict: median {np.median(seconds):.0f}, most {max(seconds):.0f}; memory {most:.1f} GB"
-        )
+    scores.ends(f)
     return f.out
 
 

@@ -164,7 +164,7 @@ def summary(lines: list[dict]) -> list[str]:
     _library(f)
     _outside(f)
     _identifiability(f)
-    _ends(f)
+    scores.ends(f)
     return f.out
 
 
@@ -258,16 +258,6 @@ def missed(x: dict) -> list[str]:
 def missed_own(x: dict) -> list[str]:
     """The same by the generator's own analysis."""
     return [n for n, p in x["parameters"].items() if p["own"] is not None and p["own"] > SURE and not p["held"]]
-
-
-def _ends(f: scores.Figures) -> None:
-    for what in ("skipped", "error"):
-        for text, count in Counter(x[what][:150] for x in f.lines if what in x).most_common(12):
-            f.note(f"{what} {count}: {text}")
-    seconds = [x["seconds"] for x in f.lines if "seconds" in x]
-    if seconds:
-        most = max(x.get("memory", 0) for x in f.lines) / 1e9
-        f.note(f"seconds a rig: median {np.median(seconds):.0f}, most {max(seconds):.0f}; memory {most:.1f} GB")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,9 @@ from typing import Any, Protocol
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from mmrjax import channels, contact, ground, masses, power
+from mmrjax import channels, contact, ground, masses, posture, power
 from mmrjax import chassis as chassis_room
 from mmrjax.chassis import Chassis
 from mmrjax.conditions import Conditions
@@ -25,7 +25,7 @@ from mmrjax.robot import Load, Robot
 from mmrjax.shaft import Shaft
 from mmrjax.signals import GRAVITY, PlaneMotion, Signals, State
 from mmrjax.trigonometry import cosine, sine
-from mmrjax.turning import SIDES, Grip, Stance, grip
+from mmrjax.turning import SIDES, Grip, Stance, grip, total
 
 #: Every balance with its unit and what it closes.
 BALANCES = {
@@ -430,30 +430,40 @@ class Travel(eqx.Module):
 
 def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar) -> Stance:
     """How a robot of this mass with its payload [kg] stands: the centre of mass of all, over axles that are a radius,
-    on tracks and a grouser, above the ground."""
-    half = masses.masses(robot, conditions, mass)
-    share = half.chassis / (mass / robot.sides)  # pulleys and wheels sit on the axles
-    axle = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height
+    on tracks and a grouser, above the ground; with levers stated in the posture that it takes on level ground."""
+    length, on_tracks = robot.running_gear.wheelbase, chassis.on_tracks
+    if conditions.states_levers:
+        rests = posture.level(robot, conditions, mass)
+        length, on_tracks, height = rests.length, rests.line, rests.centre_height
+        ahead = rests.centre_ahead - (rests.front + rests.rear) / 2
+    else:
+        ahead, up = masses.masses(robot, conditions, mass).centre
+        height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
     lateral = chassis.turning.lateral
     if conditions.adhesion_lateral is not None:
         lateral = lateral * conditions.adhesion_lateral / conditions.adhesion
     return Stance(
-        length=robot.running_gear.wheelbase,
+        length=length,
         width=chassis.turning.width,
-        height=axle + share * half.up,
-        ahead=share * half.forward,
-        on_tracks=chassis.on_tracks,
+        height=height,
+        ahead=ahead,
+        on_tracks=on_tracks,
         lateral=lateral,
         rule=chassis.turning.rule,
         nodes=chassis.turning.nodes,
     )
 
 
-def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel:
+def turning(
+    robot: Robot, conditions: Conditions, motion: PlaneMotion, loads: Float[Array, " 2"] | None = None
+) -> Travel:
     """All signals of a robot free to turn: both sides by the balances above, the supply and the ground between them.
 
     Each side travels at V_s = v_x - ω y_s, on the part of the slope that lies along its heading. What effects lower
     the speed of a side by is read at equal loads of both.
+
+    Args:
+        loads: see `turning.grip`.
     """
     robot = robot.within(conditions.configuration)
     chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
@@ -466,10 +476,10 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
     none, drawn = both(0.0), both(motion.discharge)
     state = State(motion.current, motion.speed_motor, speed, drawn, motion.memory, distance=none)
     signals = jax.vmap(functools.partial(begin, robot))(own, state)
-    sine_slope, mass = sine(conditions.slope), jnp.max(jnp.asarray(signals.mass))
+    sine_slope, mass = sine(conditions.slope), jnp.maximum(*jnp.asarray(signals.mass))
     signals = _fill(
         signals,
-        total_current=both(jnp.mean(signals.total_current)),
+        total_current=both(total(jnp.asarray(signals.total_current)) / 2),
         side=jnp.sign(SIDES),
         direction_turn=both(contact.direction(motion.yaw_rate * chassis.turning.width / 2, chassis.speed_still)),
         slope=both(jnp.arcsin(sine_slope * cosine(motion.heading))),
@@ -479,20 +489,20 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
     rolling = chassis.ground.force_resistance(1.0, even.direction_travel)
     units = robot.sides / 2
     stands = stance(robot, conditions, chassis, mass)
-    load, sliding = jnp.sum(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
+    load, sliding = total(units * jnp.asarray(even.normal)), jnp.asarray(even.speed_sliding)
     held = grip(
         stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
-        jnp.asarray(rolling),
+        jnp.asarray(rolling), loads,
     )  # fmt: skip
     own_load = jax.vmap(lambda s: travel(robot, chassis, s))(_fill(even, normal=held.normal / units))
     lateral, yaw = (
-        units * jnp.sum(both(jax.vmap(lambda s, name=name: added(robot, s, name))(own_load)))
+        units * total(both(jax.vmap(lambda s, name=name: added(robot, s, name))(own_load)))
         for name in ("lateral", "yaw")
     )
     pull = held.ahead - units * own_load.resistance
-    along = jnp.sum(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
-    across = jnp.sum(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
-    turn = (jnp.sum(held.moment) - jnp.sum(y * pull) - yaw) / chassis.turning.inertia
+    along = total(pull) - mass * GRAVITY * sine_slope * cosine(motion.heading)
+    across = total(held.aside) + mass * GRAVITY * sine_slope * sine(motion.heading) - lateral
+    turn = (total(held.moment - y * pull) - yaw) / chassis.turning.inertia
     acceleration = along / mass + motion.yaw_rate * motion.speed_lateral
     pulled = _fill(own_load, traction=held.ahead / units, acceleration=acceleration - turn * y)
     pulled = jax.vmap(lambda s: track(robot, chassis, s))(pulled)
@@ -500,7 +510,7 @@ def turning(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Travel
         pulled = jax.vmap(lambda s: gearbox(robot, chassis, s))(pulled)
     else:
         pulled = jax.vmap(lambda c, s: _speed_imposed(robot, c, chassis, s))(own, pulled)
-        pulled = _fill(pulled, total_current=both(jnp.mean(pulled.total_current)))
+        pulled = _fill(pulled, total_current=both(total(jnp.asarray(pulled.total_current)) / 2))
     return Travel(
         pulled,
         held,

@@ -49,6 +49,8 @@ class Conditions(eqx.Module):
         motor_speed_left, motor_speed_right: as `motor_speed`, of either side; None: `motor_speed`.
         heading_deg: at the start, from uphill, positive to the left [deg]; None: 0. It too frees the robot to turn.
         adhesion_lateral: as `adhesion`, across the travel; None: `adhesion`.
+        levers_front_deg, levers_rear_deg: angles at which the levers stand, 0 along the wheelbase outward, positive
+            up, 180 folded [deg]; None: those of the running gear, as folded as it states them.
     """
 
     configuration: Int[Array, "..."] | np.ndarray
@@ -74,6 +76,8 @@ class Conditions(eqx.Module):
     motor_speed_right: Float[Array, "..."] | None
     heading_deg: Float[Array, "..."] | None
     adhesion_lateral: Float[Array, "..."] | None
+    levers_front_deg: Float[Array, "..."] | None
+    levers_rear_deg: Float[Array, "..."] | None
 
     def __init__(
         self,
@@ -100,6 +104,8 @@ class Conditions(eqx.Module):
         motor_speed_right: Number | None = None,
         heading_deg: Number | None = None,
         adhesion_lateral: Number | None = None,
+        levers_front_deg: Number | None = None,
+        levers_rear_deg: Number | None = None,
     ) -> None:
         which: Any = configuration if isinstance(configuration, jax.Array) else np.asarray(configuration)
         if which.dtype.kind != "U":
@@ -110,6 +116,7 @@ class Conditions(eqx.Module):
         others |= {"motor_current": motor_current, "heading_deg": heading_deg, "adhesion_lateral": adhesion_lateral}
         others |= {"duty_left": duty_left, "duty_right": duty_right, "open_left": open_left, "open_right": open_right}
         others |= {"motor_speed_left": motor_speed_left, "motor_speed_right": motor_speed_right}
+        others |= {"levers_front_deg": levers_front_deg, "levers_rear_deg": levers_rear_deg}
         optional = {name: _number(value) for name, value in others.items() if value is not None}
         shapes = [x.shape for x in (which, *numbers, *optional.values())]
         try:
@@ -145,6 +152,11 @@ class Conditions(eqx.Module):
     def voltage_follows(self) -> bool:
         """Whether the motors' voltage is what an imposed speed or current takes."""
         return self.motor_speed is not None or self.motor_current is not None
+
+    @property
+    def states_levers(self) -> bool:
+        """Whether it is stated at which angles levers stand: the robot then rests on what they leave it."""
+        return self.levers_front_deg is not None or self.levers_rear_deg is not None
 
     @property
     def turns(self) -> bool:

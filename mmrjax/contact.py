@@ -89,6 +89,13 @@ class Friction(eqx.Module):
         falling = step(size, self.speed_static, self.static, self.speed_dynamic, self.dynamic)
         return jnp.where(slow, creeping, falling / size)
 
+    def per_speed_rise(self, square: Scalar) -> Scalar:
+        """Derivative of `per_speed` by that square [s³/m³]."""
+        slow = square < self.speed_static**2
+        size = jnp.sqrt(jnp.where(slow, self.speed_static**2, square))
+        falling = (self.rise(size) - self.per_speed(square)) / (2 * size**2)
+        return jnp.where(slow, -self.static / (2 * self.speed_static**3), falling)
+
     def rise(self, speed: Scalar) -> Scalar:
         """How fast the coefficient rises with sliding `speed` [s/m]; negative between V_s and V_d."""
         size, width = jnp.abs(speed), self.speed_dynamic - self.speed_static

@@ -36,6 +36,12 @@ class Masses(eqx.Module):
     pulley: Scalar
     inertia_pulley: Scalar
 
+    @property
+    def centre(self) -> tuple[Scalar, Scalar]:
+        """Centre of mass of all, ahead of the middle of the wheelbase and above it [m]; pulleys sit on the axles."""
+        share = self.chassis / (self.chassis + 2 * self.pulley)
+        return share * self.forward, share * self.up
+
     def pitching(self, wheelbase: Scalar) -> Scalar:
         """Moment of inertia in pitch of all about the middle of the wheelbase, where pulleys do not turn on their
         axles [kg·m²]; J of the pulleys about their axles apart."""
@@ -76,12 +82,22 @@ def _belt(gear: RunningGear, radius: Scalar) -> _Part:
     return _Part(mass, nothing, nothing, loop - mass * radius**2)
 
 
+def lever_angles(gear: RunningGear, conditions: Conditions) -> tuple[Scalar, Scalar]:
+    """Angles of front and rear levers, 0 along the wheelbase outward, positive up [rad]: those that the conditions
+    state, else those of the running gear, whose rear one is measured from forward."""
+    front, rear = conditions.levers_front_deg, conditions.levers_rear_deg
+    return (
+        gear.lever_front if front is None else jnp.radians(front),
+        jnp.pi - gear.lever_rear if rear is None else jnp.radians(rear),
+    )
+
+
 def _levers(gear: RunningGear, tracked: Scalar, front: Scalar, rear: Scalar) -> list[_Part]:
-    """The levers of one side at their angles [rad]."""
+    """The levers of one side at their angles [rad], see `lever_angles`."""
     mass, inertia, half = gear.lever_mass * tracked, gear.lever_inertia * tracked, gear.wheelbase / 2
     along = gear.lever_centre
     return [
-        _Part(mass, side * half + along * jnp.cos(angle), along * jnp.sin(angle), inertia)
+        _Part(mass, side * (half + along * jnp.cos(angle)), along * jnp.sin(angle), inertia)
         for side, angle in ((1.0, front), (-1.0, rear))
     ]
 
@@ -94,13 +110,27 @@ def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     its levers folded and without payload (`inertia_tracked`, `inertia_wheeled`), the body's is what the other parts
     leave of that.
     """
+    fixed, levers, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
+    return Masses(*_together([*fixed, *levers]), body, pulley, inertia_pulley)
+
+
+def without_levers(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
+    """The same of all but the levers, which stand on their axles."""
+    fixed, _, body, pulley, inertia_pulley = _of_robot(robot, conditions, mass)
+    return Masses(*_together(fixed), body, pulley, inertia_pulley)
+
+
+def _of_robot(
+    robot: Robot, conditions: Conditions, mass: Scalar
+) -> tuple[list[_Part], list[_Part], Scalar, Scalar, Scalar]:
+    """Parts fixed in the chassis, levers, mass of the body, mass and inertia of what turns on an axle."""
     kind, gear = robot.chassis(conditions.configuration), robot.running_gear
     tracked = kind.on_tracks
     wheeled = 1 - tracked
     pulley = gear.pulley_mass + gear.additional_pulley_mass + gear.wheel_mass * wheeled
     inertia_pulley = kind.inertia / 2
     belt = _belt(gear, robot.radius_pulley)
-    levers = _levers(gear, tracked, gear.lever_front, gear.lever_rear)
+    levers = _levers(gear, tracked, *lever_angles(gear, conditions))
     nothing = jnp.zeros_like(belt.mass)
     payload = _Part(conditions.payload / robot.sides, gear.payload_offset, gear.payload_height, nothing)
     weighs = mass / robot.sides - 2 * pulley - belt.mass - sum(p.mass for p in levers) - payload.mass
@@ -110,15 +140,14 @@ def masses(robot: Robot, conditions: Conditions, mass: Scalar) -> Masses:
     folded = [
         body._replace(inertia=nothing),
         belt,
-        *_levers(gear, tracked, jnp.pi, jnp.zeros_like(tracked)),
+        *_levers(gear, tracked, jnp.pi, jnp.pi),
         *pulleys,
     ]
     stated = jnp.where(wheeled > 0.5, gear.inertia_wheeled, gear.inertia_tracked) / robot.sides
     left = stated - _together(folded).inertia
     body = body._replace(inertia=jnp.where(left > 0, left, body.inertia))
 
-    chassis = _together([body, belt, *levers, payload])
-    return Masses(*chassis, body.mass, pulley, inertia_pulley)
+    return [body, belt, payload], levers, body.mass, pulley, inertia_pulley
 
 
 def check_parts(robot: Robot) -> None:

@@ -21,7 +21,7 @@ from mmrjax.params import Scalar
 from mmrjax.robot import Robot
 from mmrjax.signals import GRAVITY
 from mmrjax.trigonometry import cosine, sine
-from mmrjax.undercarriage import lever_tip
+from mmrjax.undercarriage import lever_tips
 
 with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
     import mujoco
@@ -44,10 +44,9 @@ def text(robot: Robot, conditions: Conditions, mass: float, step: float = 1e-4) 
     sin, cos = float(jnp.sin(conditions.slope)), float(jnp.cos(conditions.slope))
     levers = ""
     if not wheeled:
-        for side, angle in ((1.0, gear.lever_front), (-1.0, gear.lever_rear)):
-            x, z = (float(c) for c in lever_tip(gear, angle, side))
+        for side, (x, z) in zip((1.0, -1.0), lever_tips(gear, conditions), strict=True):
             for y in (-0.15, 0.15):
-                ends = f"{side * base / 2:.9g} {y} 0 {x:.9g} {y} {z:.9g}"
+                ends = f"{side * base / 2:.9g} {y} 0 {float(x):.9g} {y} {float(z):.9g}"
                 levers += f'<geom type="capsule" size="0.012" fromto="{ends}" rgba=".35 .4 .45 1"/>\n      '
     pulleys = ""
     for name, x in (("driving", base / 2), ("driven", -base / 2)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from collections.abc import Iterable
 from pathlib import Path as File
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from mmrjax.fidelities.track import Trajectory
 from mmrjax.robot import Robot
 from mmrjax.running_gear import GROUSERS, TEETH_BELT
 from mmrjax.signals import GRAVITY
-from mmrjax.undercarriage import lever_tip
+from mmrjax.undercarriage import lever_tips
 
 FORMATS = (".png", ".gif", ".mp4")
 FORCE = 1 / 800  # length of an arrow [m/N]
@@ -73,7 +74,7 @@ def scene(robot: Robot, conditions: Conditions, run: Trajectory) -> Scene:
         raise ValueError("run: its coordinates are not finite, there is nothing to draw; expected a run that ended")
     chassis = robot.chassis(conditions.configuration)
     path, wheeled = Path(robot.radius_pulley, gear), bool(chassis.on_tracks < 0.5)
-    levers = [] if wheeled else [lever_tip(gear, gear.lever_front, 1.0), lever_tip(gear, gear.lever_rear, -1.0)]
+    levers = [] if wheeled else lever_tips(gear, conditions)
     signals, reactions = run.signals, run.reactions
     return Scene(
         slope=float(conditions.slope),
@@ -284,14 +285,10 @@ def render(
     if file.suffix == ".png":
         figure(view, frames[0]).savefig(file)
         return file
+    if file.suffix == ".gif":
+        return film_gif((figure(view, k) for k in frames), file, rate)
     pictures = (_pixels(figure(view, k)) for k in frames)
     first = next(pictures)
-    if file.suffix == ".gif":
-        from PIL import Image
-
-        images = [Image.fromarray(p).quantize(256) for p in itertools.chain([first], pictures)]
-        images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
-        return file
     import imageio_ffmpeg
 
     writer = imageio_ffmpeg.write_frames(str(file), (first.shape[1], first.shape[0]), fps=rate, quality=7)
@@ -302,4 +299,13 @@ def render(
     for picture in itertools.chain([first], pictures):
         writer.send(picture.tobytes())
     writer.close()
+    return file
+
+
+def film_gif(sheets: Iterable[Any], file: File, rate: int) -> File:
+    """Write figures of one size as a film (.gif) of `rate` frames a second."""
+    from PIL import Image
+
+    images = [Image.fromarray(_pixels(sheet)).quantize(256) for sheet in sheets]
+    images[0].save(file, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0)
     return file

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mmrjax import balances, energy
+from mmrjax import balances, energy, static_limits
 from mmrjax.channels import MM, RPM
 from mmrjax.conditions import Conditions
 from mmrjax.derived import steepest_slope
@@ -73,6 +73,11 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity("turn_in_place_rad_s", "rad/s", 1.0, True, "yaw rate on the spot", "turn", LEVEL),
         Quantity("turning_radius_mm", "mm", MM, False, "turning radius beside a braked side", "turn", LEVEL),
         Quantity("side_slope_deg", "deg", 1.0, True, "steepest slope travelled across", "across", (PAYLOAD,)),
+        Quantity("step_mm", "mm", MM, True, "highest step", "posture", (PAYLOAD,)),
+        Quantity("stairs_rise_mm", "mm", MM, True, "highest rise of stairs", "posture", (PAYLOAD,)),
+        Quantity("gap_mm", "mm", MM, True, "widest gap", "posture", (PAYLOAD,)),
+        Quantity("length_mm", "mm", MM, False, "length with levers folded", "posture", ()),
+        Quantity("height_mm", "mm", MM, False, "height with levers folded", "posture", ()),
     )
 }
 
@@ -110,6 +115,7 @@ class Point(eqx.Module):
         charge: state of charge [-], of an external supply its voltage [V]; charge_end: to which the battery is used.
         share: of the time that the robot drives, for its endurance; 0 standing still [-].
         slope_deg: [deg]; payload: [kg]; ambient: [°C].
+        tread: of stairs [m].
     """
 
     configuration: Index
@@ -122,6 +128,7 @@ class Point(eqx.Module):
     slope_deg: Scalar
     payload: Scalar
     ambient: Scalar
+    tread: Scalar
 
 
 class Found(eqx.Module):
@@ -346,9 +353,25 @@ def _across(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
     return Found(jnp.degrees(jnp.arctan(jnp.minimum(slides, tips))), jnp.asarray(CONVERGED))
 
 
+def _posture(robot: Robot, point: Point, of: Ratings, name: str) -> Found:
+    """What geometry allows a robot on level ground, see `static_limits`: the highest step in any posture of its
+    levers, stairs and gaps with its levers flush, its size with them folded."""
+    conditions = Conditions(configuration=jnp.asarray(point.configuration), payload=point.payload)
+    if name == "step_mm":
+        value = static_limits.best_step(robot, conditions)[0].height
+    elif name == "stairs_rise_mm":
+        friction = robot.chassis(point.configuration).ground.friction.static * point.adhesion
+        value = static_limits.stairs_rise(robot, conditions, point.tread, friction)
+    else:
+        angle = static_limits.flush(robot) if name == "gap_mm" else jnp.pi
+        found = static_limits.limits(robot, static_limits.with_levers(conditions, angle, angle))
+        value = {"gap_mm": found.gap, "length_mm": found.length, "height_mm": found.height}[name]
+    return Found(jnp.asarray(value), jnp.asarray(CONVERGED))
+
+
 #: How a group of quantities is computed: (robot, point, ratings, name) -> Found.
 GROUPS = {"travel": _travel, "slope": _slope, "payload": _payload, "endurance": _endurance, "mass": _mass,
-          "turn": _turn, "across": _across}  # fmt: skip
+          "turn": _turn, "across": _across, "posture": _posture}  # fmt: skip
 
 
 def evaluate(robot: Robot, point: Point, of: Ratings, name: str) -> Found:

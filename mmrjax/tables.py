@@ -46,6 +46,8 @@ CONDITION_LIMITS: dict[str, tuple[float, float, str]] = {
     "motor_speed_right": (-1e4, 1e4, "rad/s"),
     "heading_deg": (-360.0, 360.0, "deg"),
     "adhesion_lateral": (1e-3, 100.0, ""),
+    "levers_front_deg": (-180.0, 180.0, "deg"),
+    "levers_rear_deg": (-180.0, 180.0, "deg"),
 }
 
 

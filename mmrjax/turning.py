@@ -13,8 +13,6 @@ loads are those of a rigid robot in balance at every instant.
 
 from __future__ import annotations
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,6 +21,7 @@ from jaxtyping import Array, Float
 
 from mmrjax.contact import Friction
 from mmrjax.params import Scalar, parameter
+from mmrjax.rarely import rarely
 
 #: Of a side's contact line from the middle of the robot, in shares of B [-]: left, right.
 SIDES = np.array([0.5, -0.5])
@@ -39,6 +38,11 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     ends = np.zeros(count)
     ends[[0, -1]] = 0.5
     return place, weight / 2, ends
+
+
+def total(sides: Float[Array, "2 ..."]) -> Array:
+    """Sum over both sides, as two numbers: XLA makes a call of every reduction, however short."""
+    return sides[0] + sides[1]
 
 
 class Turning(eqx.Module):
@@ -114,6 +118,7 @@ class Grip(eqx.Module):
         across: power that lateral sliding turns into heat [W].
         moved: load that has moved from the left side to the right one [N]; centre: of pressure, ahead of the middle
             of the contact [m].
+        lacking: by how much both are above what these forces move: nothing, but in a search for them [N, m].
     """
 
     normal: Float[Array, " 2"]
@@ -123,23 +128,106 @@ class Grip(eqx.Module):
     across: Float[Array, " 2"]
     moved: Scalar
     centre: Scalar
+    lacking: Float[Array, " 2"]
 
 
-def pressure(stance: Stance, centre: Scalar) -> tuple[Array, Array]:
-    """Nodes of a contact [m], from its middle, and the share of the load that each bears [-].
+def footprint(stance: Stance, centre: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Middle of what a contact bears on, from its own middle [m], half the length of that [m], and how much more than
+    the mean its front end bears [-].
 
     Tracks: p = (N/L)(1 + 12 x_p x / L²), and from |x_p| = L/6 on a triangle of length 3 (L/2 - |x_p|), its foot where
     the contact lifts off (middle third rule). Wheels: by the lever.
     """
     tracks, length = stance.on_tracks > 0.5, stance.length
-    out = jnp.abs(centre)
     tilt = jnp.clip(jnp.where(tracks, 6.0, 2.0) * centre / length, -1.0, 1.0)
-    borne = jnp.where(tracks, jnp.clip(3 * (length / 2 - out), 1e-6 * length, length), length)
-    middle = jnp.sign(centre) * (length - borne) / 2
+    borne = jnp.where(tracks, jnp.clip(3 * (length / 2 - jnp.abs(centre)), 1e-6 * length, length), length)
+    return jnp.sign(centre) * (length - borne) / 2, borne / 2, tilt
+
+
+def pressure(stance: Stance, centre: Scalar) -> tuple[Array, Array]:
+    """Nodes of a contact [m], from its middle, and the share of the load that each bears [-]: see `footprint`."""
+    tracks = stance.on_tracks > 0.5
+    middle, half, tilt = footprint(stance, centre)
     line, share, ends = _nodes(stance.nodes)
     place = jnp.where(tracks, line, np.sign(line))
-    weight = jnp.where(tracks, share, ends)
-    return middle + place * borne / 2, weight * (1 + tilt * place)
+    return middle + place * half, jnp.where(tracks, share, ends) * (1 + tilt * place)
+
+
+class Law(eqx.Module):
+    """What of a contact's law nodes share.
+
+    Attributes:
+        friction: along; ratio: λ^(2a-2), by which sliding across weighs more than along in a direction [-].
+        on_tracks, nodes: see `Stance`.
+    """
+
+    friction: Friction
+    ratio: Scalar
+    on_tracks: Scalar
+    nodes: int = eqx.field(static=True)
+
+    def places(self) -> Array:
+        """Nodes on -1..1."""
+        line = _nodes(self.nodes)[0]
+        return jnp.where(self.on_tracks > 0.5, line, np.sign(line))
+
+    def over(self, x: Scalar, most: int) -> Float[Array, "2 powers"]:
+        """Σ w zᵏ x over the nodes z with their weights w, for k from 0 to `most`."""
+        line, share, ends = _nodes(self.nodes)
+        powers = np.arange(most + 1)
+        of_line = share[:, None] * line[:, None] ** powers
+        of_ends = ends[:, None] * np.sign(line)[:, None] ** powers
+        both = jnp.asarray(x) @ np.concatenate([of_line, of_ends], axis=1)
+        return jnp.where(self.on_tracks > 0.5, both[..., : most + 1], both[..., most + 1 :])
+
+    def per_speed(self, along: Scalar, across: Scalar) -> Scalar:
+        """Force along over load and sliding speed [s/m], at the squares of the sliding speeds [m²/s²]."""
+        square, weighed = along + across, along + self.ratio * across
+        return jnp.sqrt((square + STILL) / (weighed + STILL)) * self.friction.per_speed(square)
+
+    def per_speed_rise(self, along: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
+        """Derivatives of `per_speed` by those squares [s³/m³]."""
+        square, weighed = along + across, along + self.ratio * across
+        turned, held = jnp.sqrt((square + STILL) / (weighed + STILL)), self.friction.per_speed(square)
+        slower = turned * self.friction.per_speed_rise(square)
+        share = held * turned / 2
+        return (
+            slower + share * (1 / (square + STILL) - 1 / (weighed + STILL)),
+            slower + share * (1 / (square + STILL) - self.ratio / (weighed + STILL)),
+        )
+
+
+@eqx.filter_custom_jvp
+def moments(law: Law, sliding: Float[Array, " 2"], middle: Scalar, end: Scalar) -> Float[Array, "2 4"]:
+    """Moments of order 0 to 3 of `Law.per_speed` over a contact that is even loaded, from its middle and in halves of
+    its length [s/m]; of each side.
+
+    Args:
+        sliding: along, of each side [m/s]; middle: across, at the middle of the contact [m/s]; end: by how much
+            more at its front end [m/s].
+    """
+    across = middle + end * law.places()
+    return law.over(law.per_speed(sliding[:, None] ** 2, across**2), 3)
+
+
+@moments.def_jvp
+def _moments_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    """By the speeds in closed form, once for however many directions; by the law's own numbers as it is computed."""
+    law, sliding, middle, end = primals
+    across = middle + end * law.places()
+    along = sliding[:, None] ** 2
+    found = law.over(law.per_speed(along, across**2), 3)
+    by_along, by_across = law.per_speed_rise(along, across**2)
+    change = jnp.zeros_like(found)
+    if tangents[1] is not None:
+        change += 2 * (sliding * tangents[1])[:, None] * law.over(by_along, 3)
+    if tangents[2] is not None or tangents[3] is not None:
+        first = law.over(by_across * across, 4)
+        for tangent, part in ((tangents[2], first[:, :4]), (tangents[3], first[:, 1:])):
+            change += 0.0 if tangent is None else 2 * tangent * part
+    if any(x is not None for x in jax.tree.leaves(tangents[0])):
+        change += eqx.filter_jvp(lambda law: law.over(law.per_speed(along, across**2), 3), (law,), (tangents[0],))[1]
+    return found, change
 
 
 def grip(
@@ -151,6 +239,7 @@ def grip(
     lateral_speed: Scalar,
     yaw_rate: Scalar,
     resistance: Float[Array, " 2"],
+    loads: Float[Array, " 2"] | None = None,
 ) -> Grip:
     """Forces and loads of both sides, which hang together.
 
@@ -162,42 +251,28 @@ def grip(
         load: normal to the ground, of both sides [N].
         sliding: u_x of each side [m/s]; lateral_speed: v_y [m/s]; yaw_rate: ω [rad/s].
         resistance: rolling resistance over the normal load, with its sign, of each side [-].
+        loads: T [N] and x_p [m] where a search that holds more unknowns finds them too; None: found here.
     """
 
     given = stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance
-
-    def lacking(loads: Array, given: Any) -> Array:
-        stance, load, resistance = given[0], given[3], given[7]
-        found = _at_loads(loads, *given[:7])
-        along = jnp.sum(found.ahead - resistance * found.normal)
-        moved = stance.height * jnp.sum(found.aside) / stance.width
-        # Nothing presses on a vertical ground.
-        centre = stance.ahead - stance.height * along / jnp.maximum(load, 1e-9)
-        return loads - jnp.stack([moved, centre])
-
-    def corrected(loads: Array, left: Array, slope: Array) -> Array:
-        (a, b), (c, d) = slope
-        return loads - jnp.stack([d * left[0] - b * left[1], a * left[1] - c * left[0]]) / (a * d - b * c)
-
+    if loads is not None:
+        return _at_loads(loads, None, *given)
     held = jax.lax.stop_gradient(given)
-
-    def linearised(loads: Array) -> tuple[Array, Array]:
-        return jax.jacfwd(lambda x: (lacking(x, held),) * 2, has_aux=True)(loads)
-
-    def step(_: int, loads: Array) -> Array:
-        slope, left = linearised(loads)
-        return corrected(loads, left, slope)
-
-    nothing = held[3] * held[4][0]
-    begun = jnp.stack([jnp.zeros_like(nothing), held[0].ahead * jnp.ones_like(nothing)])
-    at = jax.lax.fori_loop(0, LOAD_STEPS - 1, step, begun)
-    # The last step alone carries the derivatives, which are the implicit ones.
-    slope, _ = linearised(at)
-    return _at_loads(corrected(at, lacking(at, given), slope), *given[:7])
+    at = _loads(*held)
+    found, rise = _at_loads(at, None, *given), jax.jacfwd(lambda x: _at_loads(x, None, *held))(at)
+    # The last step alone carries the derivatives, which are the implicit ones; it is so small that lines will do.
+    change = _step(found.lacking, rise.lacking)
+    return jax.tree.map(lambda x, slope: x - slope @ change, found, rise)
 
 
-def _at_loads(
-    loads: Array,
+def _step(lacking: Float[Array, " 2"], slope: Float[Array, "2 2"]) -> Float[Array, " 2"]:
+    """Newton's of the loads, to be taken off."""
+    (a, b), (c, d) = slope
+    first, second = lacking
+    return jnp.stack([d * first - b * second, a * second - c * first]) / (a * d - b * c)
+
+
+def _loads(
     stance: Stance,
     friction: Friction,
     adhesion: Scalar,
@@ -205,24 +280,79 @@ def _at_loads(
     sliding: Array,
     lateral_speed: Scalar,
     yaw_rate: Scalar,
+    resistance: Array,
+) -> Float[Array, " 2"]:
+    """The load that has moved [N] and the centre of pressure [m], without derivatives; arguments of `_at_loads`.
+
+    As long as all of the contact bears, the moments of its law do not depend on them.
+    """
+    given = stance, friction, adhesion, load, sliding, lateral_speed, yaw_rate, resistance
+
+    def steps(loads: Array, given: tuple, even: Array | None) -> Array:
+        def step(_: int, loads: Array) -> Array:
+            def lacking(x: Array) -> tuple[Array, Array]:
+                return (_at_loads(x, even, *given).lacking,) * 2
+
+            slope, left = jax.jacfwd(lacking, has_aux=True)(loads)
+            return loads - _step(left, slope)
+
+        return jax.lax.fori_loop(0, LOAD_STEPS, step, loads, unroll=even is not None)
+
+    nothing = load * sliding[0]
+    begun = jnp.stack([jnp.zeros_like(nothing), stance.ahead * jnp.ones_like(nothing)])
+    even = moments(*_along(begun[1], stance, friction, sliding, lateral_speed, yaw_rate))
+    found = steps(begun, given, even)
+    lifts = (stance.on_tracks > 0.5) & (jnp.maximum(jnp.abs(begun[1]), jnp.abs(found[1])) > stance.length / 6)
+    return rarely(lifts, lambda at, given: steps(at, given, None), (begun, given), found)
+
+
+def _along(
+    centre: Scalar, stance: Stance, friction: Friction, sliding: Array, lateral_speed: Scalar, yaw_rate: Scalar
+) -> tuple[Law, Array, Scalar, Scalar]:
+    """Arguments of `moments` where the centre of pressure is there."""
+    place, half, _ = footprint(stance, centre)
+    law = Law(friction, stance.lateral ** (2 * stance.rule - 2), stance.on_tracks, stance.nodes)
+    return law, sliding, -lateral_speed - yaw_rate * (place - stance.ahead), -yaw_rate * half
+
+
+def _at_loads(
+    loads: Array,
+    even: Array | None,
+    stance: Stance,
+    friction: Friction,
+    adhesion: Scalar,
+    load: Scalar,
+    sliding: Array,
+    lateral_speed: Scalar,
+    yaw_rate: Scalar,
+    resistance: Array,
 ) -> Grip:
-    """What the ground does where so much load has moved, and the centre of pressure is there."""
+    """What the ground does where so much load has moved, and the centre of pressure is there.
+
+    The lateral speed of a contact is linear along it, and so is the load that it bears: its forces and moments are
+    sums of four moments of the law over an even load; `even` are these, where they are known.
+    """
     moved, centre = loads
     normal = jnp.maximum(load / 2 - 2 * SIDES * moved, 0.0)
-    place, share = pressure(stance, centre)
+    place, half, tilt = footprint(stance, centre)
     arm = place - stance.ahead
-    across = -lateral_speed - yaw_rate * arm
-    along, squared = sliding[:, None] ** 2, across**2
-    weighed = along + stance.lateral ** (2 * stance.rule - 2) * squared
-    turned = jnp.sqrt((along + squared + STILL) / (weighed + STILL))
-    holds = adhesion * share * turned * friction.per_speed(along + squared)
-    aside = stance.lateral**stance.rule * holds * across
+    law, _, middle, end = _along(centre, stance, friction, sliding, lateral_speed, yaw_rate)
+    even = moments(law, sliding, middle, end) if even is None else even
+    zeroth, first, second = (even[:, k] + tilt * even[:, k + 1] for k in range(3))
+    held, across = adhesion * normal, adhesion * normal * stance.lateral**stance.rule
+    aside = across * (middle * zeroth + end * first)
+    turned = across * (middle * first + end * second)
+    ahead = held * zeroth * sliding
+    outward = stance.height * total(aside) / stance.width
+    # Nothing presses on a vertical ground.
+    behind = stance.height * total(ahead - resistance * normal) / jnp.maximum(load, 1e-9)
     return Grip(
         normal=normal,
-        ahead=normal * jnp.sum(holds, -1) * sliding,
-        aside=normal * jnp.sum(aside, -1),
-        moment=normal * jnp.sum(aside * arm, -1),
-        across=normal * jnp.sum(aside * across, -1),
+        ahead=ahead,
+        aside=aside,
+        moment=arm * aside + half * turned,
+        across=middle * aside + end * turned,
         moved=moved,
         centre=centre,
+        lacking=loads - jnp.stack([outward, stance.ahead - behind]),
     )

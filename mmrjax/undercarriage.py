@@ -19,7 +19,9 @@ from jaxtyping import Array, Float
 
 from mmrjax.belt import Path, Runs, Tips, runs, tension_along, tips
 from mmrjax.chassis import Chassis
+from mmrjax.conditions import Conditions
 from mmrjax.contact import damping_contact, force_contact
+from mmrjax.masses import lever_angles
 from mmrjax.params import Scalar
 from mmrjax.running_gear import GROUSERS, TEETH_BELT, WHEELS, RunningGear
 from mmrjax.signals import GRAVITY, Signals
@@ -254,6 +256,9 @@ def reactions(path: Path, at: Touch, pulled: Pull) -> Reactions:
     )
 
 
-def lever_tip(gear: RunningGear, angle: Scalar, side: float) -> tuple[Scalar, Scalar]:
-    """Tip of a lever at `angle` [rad] on the front (side 1) or rear (-1) axle, in the chassis frame [m]."""
-    return side * gear.wheelbase / 2 + gear.lever_length * jnp.cos(angle), gear.lever_length * jnp.sin(angle)
+def lever_tips(gear: RunningGear, conditions: Conditions) -> list[tuple[Scalar, Scalar]]:
+    """Tips of the front and the rear lever, in the chassis frame [m]."""
+    return [
+        (side * (gear.wheelbase / 2 + gear.lever_length * jnp.cos(angle)), gear.lever_length * jnp.sin(angle))
+        for side, angle in zip((1.0, -1.0), lever_angles(gear, conditions), strict=True)
+    ]

@@ -47,6 +47,8 @@ CONDITIONS: dict[str, str] = {
     "motor_speed_right": "motor speed imposed on the right side",
     "heading_deg": "heading at the start, from uphill, positive to the left",
     "adhesion_lateral": "the same as adhesion, across the travel",
+    "levers_front_deg": "angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded",
+    "levers_rear_deg": "angle of the rear levers, 0 along the wheelbase outward, positive up, 180 folded",
 }
 #: What every point has beside its outputs: code into `signals.STATUSES`, bit mask over `signals.FLAGS`.
 STATUS, FLAGS = CODES

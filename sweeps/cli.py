@@ -367,6 +367,23 @@ def resonance(told: Told, out: _Out = None, force: _Force = False) -> int:
 
 
 @_command(
+    config.Climb,
+    example="mmrjax climb --step 120 --levers-front 45 --levers-rear -8.5 --voltage 6; mmrjax climb --find step",
+    failure="numbers of the run went wrong (verdict failed). That a robot does not get over is an answer: 0",
+)
+def climb(told: Told, out: _Out = None, force: _Force = False) -> int:
+    """Send a robot with levers over a step, stairs, a gap or a terrain, met squarely: over, or why not.
+
+    It begins on level ground before the obstacle. Levers stay at their angles, or follow a --sequence. With --find
+    the largest obstacle is searched for by bisection. Writes result.json, report.html and history.csv: posture,
+    currents of all four drives, margin of tipping and energy over time (docs/climb.md).
+    """
+    from sweeps.commands import climb as room
+
+    return room.climb(told.config, out, force)
+
+
+@_command(
     config.Check,
     arguments=("requirements",),
     example="mmrjax check requirements.toml --robot found/robot.toml --set gearbox.ratio=40",

@@ -195,6 +195,10 @@ class OneRun(Part):
     total_mass_kg: float | None = about(
         None, "Total mass", usual="the robot's own mass and the payload", flag="--mass"
     )
+    levers_front_deg: float | None = about(
+        None, "Angle of the front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="the robot's"
+    )
+    levers_rear_deg: float | None = about(None, "The same of the rear levers", usual="the robot's")
 
 
 class GridPart(Part):
@@ -413,6 +417,65 @@ class Resonance(RobotPart, FidelityPart, OutputPart):
     surface: Literal[tuple(SURFACES)] = about(  # type: ignore[valid-type]  # names of a table
         BENCH, "Surface of Table 5, which scales the adhesion"
     )
+
+
+Angle = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
+Height = Annotated[float, Field(gt=0, le=5000, allow_inf_nan=False)]
+
+
+class Climb(RobotPart, SupplyPart, OutputPart):
+    """One robot over an obstacle, or the largest that it gets over."""
+
+    configuration: str | None = about(None, "One of the robot's", usual="its first")
+    step_mm: Height | None = about(None, "Height of a step")
+    stairs: str | None = about(None, "RISExTREADxCOUNT in mm, such as 170x290x3")
+    gap_mm: Height | None = about(None, "Width of a trench")
+    terrain: Path | None = about(None, "CSV of a polyline with columns x_m and z_m, or x_mm and z_mm", format="path")
+    nose_mm: Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)] = about(
+        0.0, "Radius of the noses of step or stairs"
+    )
+    levers_front_deg: Angle | None = about(
+        None, "Front levers, 0 along the wheelbase outward, positive up, 180 folded", usual="as the robot states them"
+    )
+    levers_rear_deg: Angle | None = about(None, "Rear levers, the same", usual="as the robot states them")
+    sequence: Path | None = about(
+        None, "CSV of lever angles: x_mm (middle of the robot from the obstacle) or time_s, front_deg, rear_deg",
+        format="path",
+    )  # fmt: skip
+    supply_voltage_V: Voltage | None = about(None, "Supply voltage (V)", usual="12", flag="--voltage")
+    payload_kg: Payload = about(0.0, "Additional load mass")
+    surface: Literal[tuple(SURFACES)] = about(  # type: ignore[valid-type]  # names of a table
+        BENCH, "Surface of Table 5, which scales the adhesion"
+    )
+    find: Literal["step", "stairs", "gap"] | None = about(
+        None, "Look for the largest that it gets over, in place of one run; of stairs the rise at --stairs' tread"
+    )
+    film: bool = about(False, "Write climb.gif")
+    duration_s: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False)] = about(20.0, "Longest run")
+    time_step_s: Annotated[float, Field(gt=0, le=1e-3, allow_inf_nan=False)] = about(
+        1e-4, "Integration step", solver=True
+    )
+
+    @model_validator(mode="after")
+    def _one_obstacle(self) -> Self:
+        given = [name for name in ("step_mm", "stairs", "gap_mm", "terrain") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise PydanticCustomError("idle", f"{given[0]} and {given[1]} are stated both; state one obstacle")
+        if not given and self.find is None:
+            raise PydanticCustomError(
+                "idle", "no obstacle is stated; state step_mm, stairs, gap_mm or terrain, or find"
+            )
+        if self.find == "stairs" and self.stairs is None:
+            raise PydanticCustomError("idle", "find stairs needs stairs, whose tread and count stay")
+        if self.find is not None and given and not given[0].startswith(self.find):
+            raise PydanticCustomError("idle", f"find {self.find} acts without {given[0]}")
+        if self.sequence is not None and (self.levers_front_deg, self.levers_rear_deg) != (None, None):
+            raise PydanticCustomError("idle", "levers_front_deg and levers_rear_deg act without sequence only")
+        if self.battery and self.supply_voltage_V is not None:
+            raise PydanticCustomError("idle", "supply_voltage_V acts without battery only")
+        if self.film and self.find is not None:
+            raise PydanticCustomError("idle", "film acts without find only")
+        return self
 
 
 class Reproduce(RobotPart, ModelPart):

@@ -10,6 +10,7 @@ from typing import Any
 from calibration.data import effect_file, posterior, robot_file
 from calibration.data import runs as records
 from calibration.data.columns import IMPOSED, Layout
+from calibration.data.contradictions import misplaced
 from calibration.data.errors import BadConfiguration, choices
 from calibration.data.posterior import Posterior
 from calibration.data.robot_file import RobotFile
@@ -132,4 +133,8 @@ def one_run(
     if robot.has_ground:
         bench = {"surface": BENCH} if robot.rig.scales_adhesion else {}
         given = {**bench, "payload_kg": 0.0, "slope_deg": 0.0, **given}
-    return records.single({**given, "configuration": name}, layout)
+    run = records.single({**given, "configuration": name}, layout)
+    if found := misplaced(run, robot):
+        _, column, why = found
+        raise BadConfiguration(f"{OPTIONS[column]}: {why}")
+    return run

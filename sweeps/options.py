@@ -14,7 +14,17 @@ from sweeps import config
 from sweeps.config import Part
 
 #: Units that names of fields end with, the longest first, and as they are written.
-UNITS = {"rad_s": "rad/s", "m_s": "m/s", "s": "s", "V": "V", "rpm": "rpm", "kg": "kg", "deg": "deg", "mAh": "mAh"}
+UNITS = {
+    "rad_s": "rad/s",
+    "m_s": "m/s",
+    "s": "s",
+    "V": "V",
+    "rpm": "rpm",
+    "kg": "kg",
+    "deg": "deg",
+    "mm": "mm",
+    "mAh": "mAh",
+}
 _TYPES = {"boolean": bool, "integer": int, "number": float, "string": str, "object": list[str]}
 _LISTS = {"number": str, "string": list[str]}  # an axis is one text
 

@@ -1,6 +1,5 @@
 """A calibration from table to result, and every way in which data can be unfit for one."""
 
-import csv
 import dataclasses
 import json
 import math
@@ -33,6 +32,7 @@ from mmrjax import channels, robots
 from mmrjax.fidelities.steady import steady_batch
 from sweeps.commands.calibrate import print_calibration
 from sweeps.pages import calibration as calibration_page
+from tests.commands import rows as rows_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = json.loads((ROOT / "docs" / "schemas" / "calibrate.schema.json").read_text(encoding="utf-8"))
@@ -305,11 +305,6 @@ def test_drive_reads_settled_rows_rolling_and_agrees_with_steady(measured):
     assert all(abs(p.with_steady.apart_in_sd) < 0.01 for p in made.parameters.values())
     jsonschema.validate(made.to_json(), SCHEMA)
     assert any(note.startswith("rows 3: read from a rolling start; from standstill") for note in made.notes)
-
-
-def rows_of(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def test_the_command_leaves_a_folder_that_other_commands_take(tmp_path, monkeypatch, capsys):

@@ -3,20 +3,16 @@
 import json
 import os
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
+import campaign
 import generator as g
 import generator_wide as gw
-import numpy as np
-import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
-
-import campaign
 import loop
 import loop_findings
 import loop_scores as scores
+import numpy as np
+import pytest
 
 
 def line(verdict="none", classes=(), where=None, truth=(), **more):

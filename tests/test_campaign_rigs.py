@@ -1,12 +1,6 @@
 """The campaign on rigs: cases of every kind, and what its summary says of lines."""
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
-
 import rigs
 
 
@@ -90,7 +84,7 @@ def test_errors_and_refused_cases_are_listed():
     said = rigs.summary(
         [{"kind": "clean", "seed": 0, "error": "BadData: x"}, {"kind": "library", "seed": 1, "skipped": "y"}]
     )
-    assert "error 1: BadData: x" in said and "skipped 1: y" in said
+    assert "error: clean: BadData: x: 1" in said and "skipped: library: y: 1" in said
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import json
 import math
-import sys
 from pathlib import Path
 
 import equinox as eqx
@@ -19,23 +18,15 @@ import pytest
 from calibration.data import requirements, robot_file
 from calibration.data.errors import BadConfiguration
 from calibration.sizing import sheet
-from mmrjax import params
+from mmrjax import params, posture
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch
 from mmrjax.requirements import CUT_OFF, QUANTITIES, Point, evaluate, packed, ratings
 from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
-from sweeps import cli
+from tests.commands import command
 from tests.pages import Tables, drawn, outside
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "check.schema.json").read_text("utf-8"))
-
-
-def command(arguments):
-    """Run a command in this process; returns its exit code."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        cli.main()
-    return end.value.code
 
 
 def read(text):
@@ -157,7 +148,7 @@ def test_change_follows_the_derivative(result):
 def point(**given):
     usual = {
         "configuration": 0, "adhesion": 1.0, "adhesion_lateral": 1.0, "battery": 1.0, "charge": 1.0, "charge_end": 0.0, "share": 0.0,
-        "slope_deg": 0.0, "payload": 0.0, "ambient": 25.0,
+        "slope_deg": 0.0, "payload": 0.0, "ambient": 25.0, "tread": 0.29,
     }  # fmt: skip
     return Point(**{k: jnp.asarray(v, int if k == "configuration" else float) for k, v in {**usual, **given}.items()})
 
@@ -392,3 +383,88 @@ def test_contradictions_are_those_of_one_use():
     assert [r.sense for r in asked.each] == ["least", "most"]
     asked = read("payload_kg = 8\nslope_deg = 8\n[envelope]\npayload_kg = [0, 8]\nslope_deg = [0, 8]")
     assert len(asked.each) == 2
+
+
+OF_POSTURE = """
+step_mm = 300
+gap_mm = { least = 300, payload_kg = 0 }
+length_mm = 400
+height_mm = 100
+[envelope]
+payload_kg = [0, 8]
+"""
+
+
+@pytest.fixture(scope="module")
+def of_posture(robot):
+    asked = requirements.read(OF_POSTURE, "posture.toml")
+    return {o.requirement.name: o for o in sheet.check(robot, asked, changes=False)}
+
+
+def test_steps_and_sizes_of_section_2_2(of_posture):
+    """300 mm no posture allows; 400 and 100 mm hold."""
+    assert of_posture["step_mm"].value == pytest.approx(245.6, abs=0.1) and not of_posture["step_mm"].met
+    assert of_posture["step_mm"].at["payload_kg"] == 8
+    assert of_posture["gap_mm"].value == pytest.approx(352.7, abs=0.1) and of_posture["gap_mm"].met
+    assert of_posture["length_mm"].value == pytest.approx(387.4, abs=0.1) and of_posture["length_mm"].met
+    assert of_posture["height_mm"].value == pytest.approx(87.4, abs=0.1) and of_posture["height_mm"].met
+
+
+@pytest.mark.slow
+def test_longer_levers_would_get_over_the_step(robot):
+    alone = requirements.read("step_mm = 300\n[envelope]\npayload_kg = [0, 8]\n", "posture.toml")
+    (found,) = sheet.check(robot, alone)
+    (longer,) = (c for c in found.change if c.parameter == "running_gear.lever_length")
+    assert longer.before == pytest.approx(0.205) and longer.after == pytest.approx(0.259, abs=0.002)
+    assert longer.gradient > 0 and longer.breaks == ()
+    changed = params.replace(robot, {"running_gear.lever_length": longer.after})
+    assert sheet.check(changed, alone, changes=False)[0].met
+
+
+def test_stairs_need_friction_reach_and_a_tread(robot):
+    """A flat belt holds up to its friction; on asphalt its length decides."""
+    text = 'stairs_rise_mm = {{ least = 170, tread_mm = 290, surface = "{}" }}'
+
+    def rise(surface):
+        (found,) = sheet.check(robot, requirements.read(text.format(surface), "stairs.toml"), changes=False)
+        assert found.at["tread_mm"] == 290 and not found.met
+        return found.value
+
+    friction = float(robot.configurations["6T2A"].ground.friction.static)
+    assert rise("lacquered_wood") == pytest.approx(290 * friction, rel=1e-6)
+    rests = posture.level(robot, Conditions(0, levers_front_deg=-8.4707, levers_rear_deg=-8.4707))
+    reach, high = float(rests.length) / 2, float(rests.centre_height)
+    angle = math.atan(rise("asphalt") / 290)
+    assert reach - high * math.tan(angle) == pytest.approx(0.29 / math.cos(angle), abs=1e-4)
+    with pytest.raises(BadConfiguration, match="stairs_rise_mm: stairs without a tread; expected a table such as"):
+        requirements.read("stairs_rise_mm = 170", "stairs.toml")
+    with pytest.raises(BadConfiguration, match="step_mm, tread_mm: no such key"):
+        requirements.read("step_mm = { least = 100, tread_mm = 290 }", "stairs.toml")
+
+
+def test_derivatives_of_the_highest_step_are_differences(robot):
+    given = (
+        "running_gear.lever_length",
+        "running_gear.wheelbase",
+        "6T2A.mass",
+        "running_gear.centre_height",
+        "6T2A.radius",
+    )
+    known = {p.name: float(p.value) for p in params.walk(robot)}
+    theta = jnp.asarray([known[n] for n in given])
+
+    @jax.jit
+    def value(theta):
+        made = params.replace(robot, dict(zip(given, theta, strict=True)))
+        return evaluate(made, point(payload=3.0), ratings(robot), "step_mm").value
+
+    exact = np.asarray(jax.jit(jax.grad(value))(theta))
+    for k in range(len(given)):
+        up, down = (float(value(theta.at[k].multiply(1 + s * 1e-4))) for s in (1, -1))
+        assert exact[k] == pytest.approx((up - down) / (2e-4 * float(theta[k])), rel=2e-3), given[k]
+
+
+def test_posture_of_a_robot_that_states_no_running_gear_is_not_known(robot):
+    bare = dataclasses.replace(robot, rig=dataclasses.replace(robot.rig, inherits=False))
+    with pytest.raises(BadConfiguration, match="step_mm: the robot's file states no running_gear"):
+        sheet.refuse(bare, requirements.read("step_mm = 100", "posture.toml"))

@@ -1,6 +1,5 @@
 """The command line as a user runs it: run folders, exit codes, messages, interruption."""
 
-import csv
 import json
 import os
 import re
@@ -16,17 +15,13 @@ import pytest
 from calibration.data.errors import BadConfiguration
 from sweeps import cli, config
 from sweeps.points import scale
+from tests.commands import rows as table
 
 MMRJAX = [sys.executable, "-c", "from sweeps.cli import main; main()"]
 HEADER = (
     "configuration,supply_voltage_V,total_mass_kg,payload_kg,slope_deg,total_current_A,motor_speed_rpm,speed_mm_s"
 )
 CLIMBS = ["--set", "6T2A.ground.friction.static=0.6", "--set", "4W2T.ground.friction.static=0.6"]
-
-
-def table(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def test_sweep_is_table_8_in_both_configurations(mmrjax, tmp_path):

@@ -1,17 +1,12 @@
 """Programs are shared by what equations cannot tell apart, and by nothing else."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
+import generator_rigs as gr
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-import generator_rigs as gr
 
 from calibration.data import robot_file
 from calibration.data import runs as records

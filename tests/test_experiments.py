@@ -1,14 +1,13 @@
 """The next experiment: what the menu foresees, which experiment is chosen, and what its readings say."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import equinox as eqx
 import generator as g
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from loop_experiments import supported
 from synthetic import SETTLED, table
 from test_generator import SHAPES
 
@@ -24,9 +23,6 @@ from calibration.discovery.stated_values import Shift
 from mmrjax import channels, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.effects import BY_NAME
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
-from loop_experiments import supported
 
 PAIRS = {
     ("series_resistance", "supply_sag"): {"one motor, 6T2A", "one motor, 4W2T", "stall, one motor"},

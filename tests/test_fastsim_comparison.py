@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import sys
-from pathlib import Path
 from typing import Any
 
+import fastsim_comparison as comparison
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-
-import fastsim_comparison as comparison
 
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.steady import steady_batch

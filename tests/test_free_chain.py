@@ -1,15 +1,10 @@
 """The free chain of 168 masses (benchmarks/free_chain.py) sees the belt as the track model does."""
 
-import sys
-from pathlib import Path
-
+import free_chain
 import numpy as np
 import pytest
 
 from mmrjax.running_gear import RunningGear
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-import free_chain
 
 pytestmark = pytest.mark.slow  # compiles for a minute
 

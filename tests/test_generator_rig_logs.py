@@ -1,13 +1,12 @@
 """The generator of rigs' logs against the simulator's histories, and its labels."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import generator_rig_logs as gl
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import rig_logs
 
 from calibration.data import robot_file
 from calibration.data import runs as records
@@ -16,10 +15,6 @@ from calibration.inference.observers.histories import _common
 from calibration.inference.ranges import check_ranges
 from mmrjax import params
 from mmrjax.effects import BY_NAME
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
-
-import rig_logs
 
 #: Of the sds of the readings, rms: both methods' own errors, and the windings', of which the file says nothing.
 ERROR = 0.3
@@ -97,7 +92,7 @@ def _terms(case):
 
 
 def test_a_log_is_reproducible_and_its_effect_has_its_strength():
-    rig = gl.rig(np.random.default_rng(7), "voltage")
+    rig = gl.rig(np.random.default_rng(7), "voltage", 0.005)
     clean, again = (gl.case(rig, "", 0.0, 4).table for _ in range(2))
     assert all((clean[n] == again[n]).all() for n in clean)
     one = gl.case(rig, "series_resistance", 9.0, 4)

@@ -221,7 +221,7 @@ def test_first_screen_answers_in_a_minute(shown, capsys, tmp_path):
     (effect,) = found.effects
     assert words.answer(found) == f"No: missing is a {effect.families[0]}." and words.answer(found) in page.text
     a = effect.parameters["amplitude"]
-    size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changed(found, effect.name)
+    size, change = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}", loop_page.changes(found)[effect.name]
     size += f", which changes the {change.channel.label} by {100 * change.rms:.2g} %"
     assert f"{effect.families[0]} ({effect.name}): {size}; {words.how_sure(found, effect)}." in page.text
     stated, again, with_it = page.tables["summary"][1:]
@@ -247,11 +247,11 @@ def test_what_an_effect_changes_is_that_of_the_robot_without_it(shown, capsys):
     """And the law that is drawn is of the robot that is written, as the dots are."""
     found = shown("churning", capsys).found
     (effect,) = found.effects
-    change = loop_page.changed(found, effect.name)
+    change = loop_page.changes(found)[effect.name]
     k = [c.name for c in found.channels].index(change.channel.name)
     here = found.included
     np.testing.assert_allclose(change.with_it[here], found.readings_of_rows.after[here, k], rtol=1e-5)
-    assert change.rms > 0.01 and loop_page.changed(found, "brush_drop") is None
+    assert change.rms > 0.01 and "brush_drop" not in loop_page.changes(found)
     assert "laws" in drawn(shown("churning", capsys).text)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 
@@ -21,6 +20,7 @@ from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.profile import profile
 from mmrjax.signals import STATUSES
 from sweeps import cli
+from tests.commands import rows
 
 HOUR = profile([0.0, 3600.0], "voltage", duty=1.0, slope_deg=10.0, payload=5.0)
 #: Room for the steps of a mission, as the command keeps; one program serves all with the same cut-off.
@@ -232,11 +232,6 @@ def run_folder(folder, capsys, monkeypatch):
         (folder / "out.txt").write_text(out)
         (folder / "err.txt").write_text(err)
     return folder / "a"
-
-
-def rows(path):
-    with path.open() as stream:
-        return list(csv.DictReader(stream))
 
 
 def test_words_and_files_say_cut_off_and_the_charge_that_is_left(run_folder):

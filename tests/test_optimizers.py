@@ -1,14 +1,13 @@
 """The fit: exact Jacobians, both optimizers, many starts, recovered truth, coverage, and what holds what."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from interval_coverage import coverage
 
 from calibration.data import runs as records
 from calibration.data.columns import Layout
@@ -18,9 +17,6 @@ from calibration.inference import optimizers as fit
 from calibration.inference.normal_equations import backward, cholesky, forward
 from mmrjax import robots
 from mmrjax.signals import CONVERGED, SLIDES
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "benchmarks"))
-from interval_coverage import coverage
 
 solve = eqx.filter_jit(lambda *args, **options: fit.levenberg_marquardt(*args, **options)[0])
 STATED = "current=2%,motor_speed=0.5%,speed=1%"

@@ -21,10 +21,12 @@ KINDS = {
     "loop": (config.Loop, config.MembersPart),
     "sensitivity": (config.Sensitivity,),
     "resonance": (config.Resonance,),
+    "climb": (config.Climb,),
     "check": (config.Check,),
     "size": (config.Size,),
 }
 HIDDEN = {
+    "climb": {"--time-step"},
     "sweep": {"--shard", "--scheduler"},
     "calibrate": {"--population", "--generations", "--members"},
     "loop": {"--population", "--generations", "--members", "--replicates"},

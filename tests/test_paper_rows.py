@@ -1,15 +1,10 @@
 """The paper's fifteen consistent simulated rows by one set of constants (benchmarks/paper_rows.py)."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
+import paper_rows
 import pytest
 
 from mmrjax import channels
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-import paper_rows
 
 pytestmark = pytest.mark.slow  # two searches with `steady`, half a minute
 

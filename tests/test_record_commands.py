@@ -8,11 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import record
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import record  # noqa: E402
 
 WAS = {
     "words": "simulate",

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
-import sys
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,22 +15,15 @@ import pytest
 from mmrjax.fidelities.modes import Mode
 from mmrjax.fidelities.track import track_batch
 from mmrjax.signals import CONVERGED
-from sweeps import cli, config
+from sweeps import config
 from sweeps.commands import resonance as room
 from sweeps.pages.resonance_figures import resonance_map
 from sweeps.points import run
+from tests.commands import command, rows
 from tests.pages import Tables, drawn, outside
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "resonance.schema.json").read_text("utf-8"))
 SMALL = ("resonance", "--voltages", "24:40:2", "--payloads", "8,0", "--duration", "1")
-
-
-def command(arguments):
-    """Run a command in this process; returns its exit code."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        cli.main()
-    return end.value.code
 
 
 #: Damping ratio and, by payload [kg], frequency [Hz] of the oscillators of `waves`; by signal and payload, the one that
@@ -106,11 +97,6 @@ def tracked(request, tmp_path_factory):
         patch.setattr(room, "print_resonance", kept.append)
         assert command([*SMALL, "--out", folder]) == 0
     return folder, kept[0]
-
-
-def rows(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 def test_ripple_peaks_where_harmonics_meet_natural_frequencies(tracked):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 
@@ -19,6 +18,7 @@ from mmrjax.robots import nominal
 from sweeps import capabilities
 from sweeps.commands import rig_new
 from sweeps.points import imposed
+from tests.commands import rows as rows_of
 
 #: Words of the paper's robot, its parts, its tables and its surfaces; none is a rig's.
 FORBIDDEN = (
@@ -46,11 +46,6 @@ def words_of_others(*texts):
 def left_in(folder):
     """The texts of a run folder."""
     return [path.read_text(encoding="utf-8") for path in sorted(folder.rglob("*")) if path.suffix in TEXTS]
-
-
-def rows_of(path):
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
 
 
 def of_kind(tmp_path, kind, speed=False):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import tomllib
@@ -28,6 +27,7 @@ from calibration.sensitivity.result import Points
 from calibration.sensitivity.study import Study
 from mmrjax import params
 from mmrjax.fidelities.steady import steady_batch
+from tests.commands import rows as table
 from tests.pages import Tables
 
 ROOT = Path(__file__).parents[1]
@@ -47,11 +47,6 @@ def study(robot):
         np.array([0.0, 5, 0, 25]),
     )  # fmt: skip
     return Study(robot, inputs, points, chosen_outputs(("total_current", "speed"), robot))
-
-
-def table(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 # --- the study ----------------------------------------------------------------------------------------------------

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ import pytest
 from calibration.sensitivity import derivative, information, morris, shapley, sobol
 from calibration.sensitivity.replicates import REPLICATES, ratio
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 A, B = 7.0, 0.1
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import sys
 from pathlib import Path
 
 import jax
@@ -20,7 +19,7 @@ from calibration.sizing import chart, search, sheet
 from calibration.sizing.design import OBJECTIVES, build, evaluate, task
 from calibration.sizing.options import BELT_STAGE, MOTOR, drives, options
 from mmrjax import params
-from sweeps import cli
+from tests.commands import command
 from tests.pages import Tables, drawn, outside
 
 SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "size.schema.json").read_text("utf-8"))
@@ -34,14 +33,6 @@ payload_kg = [0, 8]
 slope_deg = [0, 10]
 state_of_charge = [0.1, 1]
 """
-
-
-def command(arguments):
-    """Run a command in this process; returns its exit code."""
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
-        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
-        cli.main()
-    return end.value.code
 
 
 #: The same without what takes a search or an integral at every design.

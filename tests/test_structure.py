@@ -636,7 +636,6 @@ CALLED: dict[tuple[str, str], str] = {
     ("loop_baselines", "pose"): "other ways to select effects, on the loop's own problem after its own preparation",
     ("loop_baselines", "fit_base"): "the same",
     ("loop_findings", "pose"): "further runs, read by fits that the loop made after its own preparation",
-    ("calibrate", "pose"): "coverage about a known truth: problems without a table of their own",
     ("track_table", "pose"): "a function of its own by that name: rows of the paper through a resolved running gear",
     ("track_table", "with_table_mass"): "the same rows, searched by members and not by `calibrate`",
 }

@@ -1,6 +1,5 @@
 """What once gave plausible wrong answers: reverse, rollback, standing, charging, the battery's end, rated limits."""
 
-import csv
 import json
 import re
 
@@ -15,14 +14,10 @@ from mmrjax.fidelities.drive import drive_batch
 from sweeps.commands.simulate import PEAK, remarks
 from sweeps.pages import history_figures, words
 from sweeps.pages import runs as runs_page
+from tests.commands import rows as table
 
 SPEED_STATIC = 0.02  # V_s of the packaged robot [m/s]: within it contacts creep
 SPEED_REST = 0.1 * SPEED_STATIC
-
-
-def table(path):
-    with path.open(newline="") as stream:
-        return list(csv.DictReader(stream))
 
 
 @pytest.fixture(scope="module")

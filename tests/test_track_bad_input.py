@@ -212,3 +212,9 @@ def test_robot_thrown_over_by_its_own_motion_tips_and_harms_no_other(robot):
     answer = _batch(tall, runs, 1.0, 1e-4, 1e-3, False).result
     assert answer.status.tolist() == [TIPS, CONVERGED]
     assert np.isnan(float(answer.reading["speed"][0])) and np.isfinite(float(answer.reading["speed"][1]))
+
+
+def test_lever_stated_of_a_run_below_the_ground_is_refused(robot):
+    lowered = Conditions(levers_front_deg=jnp.asarray([180.0, 180.0]), levers_rear_deg=jnp.asarray([40.0, -60.0]))
+    with pytest.raises(ValueError, match="levers_rear_deg: got -60 deg, its tip 134 mm below the ground"):
+        track_batch(robot, lowered)

@@ -1,8 +1,5 @@
 """The MJCF in C MuJoCo, stepped with the same forces, against MJX; and the mass constants of a member."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -103,7 +100,6 @@ def test_c_mujoco_agrees_over_a_second(robot, step_both, name):
 @pytest.mark.slow
 def test_c_mujoco_shakes_alike():
     """Set S at 33 V, 5 deg, 8 kg: 12 000 steps in which contacts open and close; goal a fifth, found 1e-13."""
-    sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
     import shaking
 
     found = shaking.native(33.0, 5.0, 8.0)

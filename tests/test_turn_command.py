@@ -1,6 +1,5 @@
 """The command `simulate` of a robot whose sides are driven apart."""
 
-import csv
 import json
 
 import numpy as np
@@ -11,11 +10,7 @@ from calibration.data.errors import BadData
 from mmrjax import robots
 from sweeps.pages import turn_words
 from sweeps.points.job import showing_turns
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+from tests.commands import rows
 
 
 @pytest.mark.slow

@@ -285,6 +285,36 @@ def test_load_moves_to_the_outer_side_and_to_the_rear_as_forces_say():
     assert float(held.normal[1] - held.normal[0]) == pytest.approx(2 * float(held.moved), rel=1e-9)
 
 
+@pytest.mark.parametrize(("height", "lifts"), [(0.06, False), (0.2, True)])
+@pytest.mark.parametrize("on_tracks", [0.0, 1.0])
+def test_forces_and_their_derivatives_are_those_of_loads_in_balance(height, lifts, on_tracks):
+    """Against sums over the nodes and differences, where all of a track bears and where its front has lifted off."""
+    friction, load = Friction(static=0.9, dynamic=0.7), 100.0
+
+    def held(x):
+        stance = Stance(0.3, 0.5, height, 0.01, on_tracks, x[0], x[1])
+        return grip(stance, friction, 1.0, load, x[2:4], x[4], x[5], jnp.array([0.05, 0.05]))
+
+    x = jnp.asarray([1.2, 1.4, 0.015, 0.09, -0.03, 0.25])
+    found = held(x)
+    place, share = pressure(Stance(0.3, 0.5, height, 0.01, on_tracks, 1.2, 1.4), found.centre)
+    along, across = x[2:4, None], -x[4] - x[5] * (place - 0.01)
+    size = jnp.hypot(along, across)
+    force = friction.coefficient(size) / jnp.hypot(along, 1.2**0.4 * across) * share * found.normal[:, None]
+    np.testing.assert_allclose(jnp.sum(force * along, 1), found.ahead, rtol=1e-9)
+    np.testing.assert_allclose(jnp.sum(1.2**1.4 * force * across, 1), found.aside, rtol=1e-9)
+    np.testing.assert_allclose(jnp.sum(1.2**1.4 * force * across * (place - 0.01), 1), found.moment, rtol=1e-9)
+    assert bool((jnp.abs(found.centre) > 0.05) & (on_tracks > 0.5)) == (lifts and on_tracks > 0.5)
+    assert float(found.moved) == pytest.approx(height * float(jnp.sum(found.aside)) / 0.5, rel=1e-9)
+    exact, step = jax.jacfwd(held)(x), 1e-6
+    for k in range(len(x)):
+        ahead, behind = held(x.at[k].add(step)), held(x.at[k].add(-step))
+        for name in ("normal", "ahead", "aside", "moment", "across", "moved", "centre"):
+            difference = (getattr(ahead, name) - getattr(behind, name)) / (2 * step)
+            scale = 1e-6 * (1 + float(jnp.abs(difference).max()))
+            np.testing.assert_allclose(getattr(exact, name)[..., k], difference, rtol=1e-6, atol=scale, err_msg=name)
+
+
 @pytest.mark.parametrize("centre", [0.0, 0.03, -0.05, 0.08, -0.12])
 @pytest.mark.parametrize("on_tracks", [0.0, 1.0])
 def test_pressure_has_its_sum_and_its_centre(centre, on_tracks):

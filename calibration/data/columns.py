@@ -12,6 +12,7 @@ from calibration.data.units import Quantity
 from mmrjax import channels
 from mmrjax.channels import RPM as RPM
 from mmrjax.channels import Channel
+from mmrjax.tables import CONDITION_LIMITS
 
 if TYPE_CHECKING:
     from mmrjax.rig import Instrument
@@ -36,6 +37,10 @@ SIDES: dict[str, tuple[float, float]] = {"duty_left": (-1.0, 1.0), "duty_right":
 #: The same where speeds are imposed.
 SPEEDS = tuple(channels.of(f"motor_speed_{side}").column for side in ("left", "right"))
 HEADING: dict[str, tuple[float, float]] = {"heading_deg": (-360.0, 360.0)}
+#: Angles of a tracked robot's levers, 0 along the wheelbase outward, positive up, 180 folded.
+LEVERS: dict[str, tuple[float, float]] = {
+    name: CONDITION_LIMITS[name][:2] for name in ("levers_front_deg", "levers_rear_deg")
+}
 #: Place of a row in the sequence in which runs were made; without it that of the row in the file.
 ORDER: dict[str, tuple[float, float]] = {"order": (0.0, 1e9)}
 #: Columns that say when a row was measured; a table without either was measured in the order of its rows.
@@ -61,6 +66,7 @@ _OF_CONDITIONS = {
     "duty_left": Quantity("duty_left", units.SHARE, SIDES["duty_left"]),
     "duty_right": Quantity("duty_right", units.SHARE, SIDES["duty_right"]),
     "heading_deg": Quantity("heading", units.ANGLE, HEADING["heading_deg"]),
+    **{name: Quantity(name.removesuffix("_deg"), units.ANGLE, limits) for name, limits in LEVERS.items()},
 }
 
 
@@ -68,7 +74,7 @@ def ranges() -> dict[str, tuple[float, float]]:
     """Least and greatest value of every number column."""
     readings = {c.column: c.range for c in channels.EVERY}
     deviations = {c.sd_column: (0.0, c.sd_largest) for c in channels.EVERY}
-    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **SIDES, **HEADING, **ORDER}
+    return {**CONDITIONS, **readings, **deviations, **TIME, **DUTY, **SIDES, **HEADING, **LEVERS, **ORDER}
 
 
 def _of_channel(channel: Channel) -> dict[str, Quantity]:
@@ -170,7 +176,7 @@ class Layout:
     @property
     def idle(self) -> tuple[str, ...]:
         """Columns of conditions that do not act on its load."""
-        return () if self.has_ground else (*ON_GROUND, "surface")
+        return () if self.has_ground else (*ON_GROUND, *LEVERS, "surface")
 
     @property
     def imposed_column(self) -> str:
@@ -211,6 +217,8 @@ class Layout:
         driven: tuple[str, ...] = DRIVING if self.imposed == "voltage" else ()
         if self.sides:
             driven = (*driven, *self.sides, *HEADING)
+        if self.has_ground:
+            driven = (*driven, *LEVERS)
         named = ("configuration", *self.axes, SUPPLY, *self.measured_columns, *self.deviation_columns, "surface")
         return tuple(dict.fromkeys(c for c in (*named, "run_id", "time_s", *driven, *ORDER) if c not in self.idle))
 

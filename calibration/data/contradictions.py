@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import sides
-from calibration.data.columns import HEADING, RPM, SPEED, SUPPLY
+from calibration.data.columns import HEADING, LEVERS, RPM, SPEED, SUPPLY
 from calibration.data.errors import BadData, number
 from calibration.data.table import Runs
+from mmrjax import params
 from mmrjax.robot import Robot
+from mmrjax.running_gear import RunningGear
 
 #: Share of the motors' back-EMF below which no voltage turns them at an imposed speed [-], and least back-EMF that
 #: tells [V].
@@ -39,6 +41,9 @@ def check(runs: Runs, robot: Robot) -> None:
         raise BadData(f"{runs.source}, {', '.join((*runs.layout.sides, *HEADING))}: {why}")
     if runs.turns:
         sides.check(runs)
+    if found := misplaced(runs, robot):
+        row, column, why = found
+        raise BadData(f"{runs.source} row {row + 1}, {column}: {why}")
     if robot.rig.imposed == "motor_speed" and not runs.sampled and not runs.turns:
         for column in (SUPPLY, "motor_voltage_V"):
             _voltage(runs, robot, column)
@@ -46,6 +51,47 @@ def check(runs: Runs, robot: Robot) -> None:
         _time(runs)
     if runs.sampled and runs.has("output_angle_deg"):
         _angle(runs)
+
+
+def cannot_stand(robot: Robot) -> str | None:
+    """Why it is not known how a robot stands; None where it is."""
+    if not robot.has_ground:
+        return "the robot's load is a shaft, which stands on no ground"
+    usual = {p.name: float(p.value) for p in params.walk(RunningGear())}
+    if not robot.rig.inherits and all(float(p.value) == usual[p.name] for p in params.walk(robot.running_gear)):
+        return "the robot's file states no running_gear; state its wheelbase, levers and masses there"
+    return None
+
+
+def misplaced(runs: Runs, robot: Robot) -> tuple[int, str, str] | None:
+    """Row and column in which levers cannot stand as a table states it, and why: a configuration without them, an
+    angle beyond their range; None where they can."""
+    stated = [name for name in LEVERS if runs.has(name)]
+    if not stated:
+        return None
+    if why := cannot_stand(robot):
+        return 0, stated[0], why
+    on_tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])[runs.configurations(robot)]
+    if not on_tracks.all():
+        row = int(np.argmin(on_tracks))
+        have = [n for n, c in robot.configurations.items() if float(c.on_tracks) > 0.5]
+        others = f"those that have: {', '.join(have)}" if have else "no configuration of the robot has"
+        return row, stated[0], f"{runs['configuration'][row]} has no levers; {others}"
+    levers = robot.running_gear.levers
+    low, high = (float(np.degrees(x)) for x in (levers.angle_least, levers.angle_most))
+    for name in stated:
+        beyond = (runs[name] < low - 1e-9) | (runs[name] > high + 1e-9)
+        if beyond.any():
+            row = int(np.argmax(beyond))
+            return (
+                row,
+                name,
+                (
+                    f"got {runs[name][row]:g}; expected {low:g} to {high:g}, the range of the robot's levers "
+                    "(running_gear.levers.angle_least, angle_most)"
+                ),
+            )
+    return None
 
 
 def cannot_turn(robot: Robot, names: Iterable[str]) -> str | None:

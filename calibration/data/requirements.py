@@ -34,6 +34,8 @@ KEYS = ("configuration", "surface", "battery", *RANGES)
 DUTIES = ("standing", "driving")
 #: Least and greatest that a requirement may state, in the unit of its name.
 STATED = (0.0, 1e6)
+#: Stairs have a rise and a tread, whose least and greatest are stated [mm].
+STAIRS, TREAD, TREADS = "stairs_rise_mm", "tread_mm", (10.0, 5000.0)
 #: In place of a number: what the part in question permits; and the quantities of which parts state that.
 RATED = "rated"
 RATINGS = ("winding_C", "motor_speed_rpm", "gearbox_speed_rpm", "gearbox_Nm")
@@ -87,6 +89,7 @@ class Requirement:
             least; else at most.
         envelope: over which.
         share: of the time that the robot drives, for the endurance; 0: it stands.
+        tread_mm: of stairs, for their rise.
         source: where the requirement comes from.
     """
 
@@ -96,6 +99,7 @@ class Requirement:
     envelope: Envelope
     share: float = 0.0
     source: str = ""
+    tread_mm: float = 0.0
 
     @property
     def quantity(self) -> Quantity:
@@ -178,7 +182,7 @@ def read(text: str, where: str) -> Requirements:
 
 def _stem(name: str) -> str:
     """A name without its unit."""
-    units = ("_m_s", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
+    units = ("_m_s", "_mm", "_deg", "_kg", "_min", "_C", "_Nm", "_rpm", "_A", "_Wh", "_V")
     return next((name.removesuffix(u) for u in units if name.endswith(u)), name)
 
 
@@ -244,7 +248,9 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
     table = dict(value) if isinstance(value, dict) else {quantity_key(quantity): value}
     limits = {s: _limit(table.pop(s), where, quantity) for s in ("least", "most") if s in table}
     source, duty, share = table.pop("source", ""), table.pop("duty", None), table.pop("share", None)
-    known = ("least", "most", "source", *KEYS, *(("duty", "share") if name == "endurance_min" else ()))
+    tread = table.pop(TREAD) if TREAD in table and name == STAIRS else None
+    own_keys = {"endurance_min": ("duty", "share"), STAIRS: (TREAD,)}.get(name, ())
+    known = ("least", "most", "source", *KEYS, *own_keys)
     for key in table:
         if key not in known:
             raise BadConfiguration(f"{where}, {_unknown(key, known)}")
@@ -254,6 +260,11 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
         raise BadConfiguration(f"{where}, source: got {source!r}; expected text")
     if name != "endurance_min" and (duty is not None or share is not None):
         raise BadConfiguration(f"{where}: duty and share are of endurance_min alone")
+    if name == STAIRS and tread is None:
+        raise BadConfiguration(
+            f"{where}: stairs without a tread; expected a table such as {{ least = 170, {TREAD} = 290 }}"
+        )
+    depth = 0.0 if tread is None else stated_number(tread, f"{where}, {TREAD}", *TREADS, "mm")
     own = _envelope(envelope, table, where)
     if name == "endurance_min" and not own.battery:
         raise BadConfiguration(f"{where}: endurance needs the battery, and the envelope states supply_voltage_V")
@@ -264,7 +275,7 @@ def _requirements(name: str, value: Any, envelope: Envelope, where: str) -> list
             )
         own = dataclasses.replace(own, state_of_charge=(own.charge_end, own.charge_end))
     driven = _share(duty, share, where)
-    return [Requirement(name, limit, sense == "least", own, driven, source) for sense, limit in limits.items()]
+    return [Requirement(name, limit, sense == "least", own, driven, source, depth) for sense, limit in limits.items()]
 
 
 def _limit(value: Any, where: str, quantity: Quantity) -> float | None:
@@ -300,7 +311,8 @@ _SAME = {"speed_end_of_charge_m_s": "speed_m_s", "gearbox_speed_rpm": "motor_spe
 def _contradictions(each: list[Requirement], envelope: Envelope, where: str) -> None:
     for a, b in combinations(each, 2):
         least, most = (a, b) if a.least else (b, a)
-        same = _SAME.get(a.name, a.name) == _SAME.get(b.name, b.name) and a.share == b.share
+        same = _SAME.get(a.name, a.name) == _SAME.get(b.name, b.name)
+        same = same and (a.share, a.tread_mm) == (b.share, b.tread_mm)
         if least.limit is None or most.limit is None:
             continue
         if same and least.least and not most.least and least.limit > most.limit and a.envelope.meets(b.envelope):

@@ -227,7 +227,6 @@ DRAW = "draw"
 # --- remarks --------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
 class AssumedNoise(Note):
     """Channels whose sds nobody states, and what is usual, as an option states it."""
 
@@ -235,21 +234,18 @@ class AssumedNoise(Note):
     usual: str
 
 
-@dataclasses.dataclass(frozen=True)
 class NoiseFromSeries(Note):
     """Channels whose sds nobody states, as the scatter along series shows them."""
 
     noise: tuple[SeriesNoise, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class Copies(Note):
     """Numbers of rows that copy earlier ones."""
 
     rows: tuple[int, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class KeptOut(Note):
     """Numbers of rows that do not count: `unusable` ones, or `outliers`."""
 
@@ -257,7 +253,6 @@ class KeptOut(Note):
     why: str
 
 
-@dataclasses.dataclass(frozen=True)
 class PhasesDiffer(Note):
     """A wave with another phase in each run: what it explains with a phase of its own in each, and with one [σ²]."""
 
@@ -265,7 +260,6 @@ class PhasesDiffer(Note):
     held: float
 
 
-@dataclasses.dataclass(frozen=True)
 class StillLacks(Note):
     """A place that lacks something over a variable, beside what was found."""
 
@@ -273,7 +267,6 @@ class StillLacks(Note):
     variable: str
 
 
-@dataclasses.dataclass(frozen=True)
 class Late(Note):
     """A delay of what is imposed that the rig's file does not state, with its sd [s]."""
 
@@ -281,7 +274,6 @@ class Late(Note):
     sd: float
 
 
-@dataclasses.dataclass(frozen=True)
 class Led(Note):
     """By what the leader of a class was chosen.
 
@@ -304,7 +296,6 @@ class Led(Note):
     rise_chi2: float
 
 
-@dataclasses.dataclass(frozen=True)
 class LostReplicates(Note):
     """Bootstrap tables that could be fitted again, of those that were asked for."""
 
@@ -312,7 +303,6 @@ class LostReplicates(Note):
     asked: int
 
 
-@dataclasses.dataclass(frozen=True)
 class Outstanding(Note):
     """Verdicts at other noises that the time did not do for: factors of the sds, and `assumed` or `estimated`."""
 
@@ -320,7 +310,6 @@ class Outstanding(Note):
     word: str
 
 
-@dataclasses.dataclass(frozen=True)
 class TooFewReplicates(Note):
     """Bootstrap tables that do not do for every kind of evidence."""
 
@@ -427,7 +416,6 @@ class TooWeak:
 Instruction = NothingPossible | NoMenu | NothingTells | CarryOut | MoreRuns | TooWeak
 
 
-@dataclasses.dataclass(frozen=True)
 class RestsOn(Note):
     """An effect that stands by one run alone, which would have to be made again, and others beside it.
 
@@ -443,7 +431,6 @@ class RestsOn(Note):
     beside: tuple[float, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
 class Unwritten(Note):
     """What was found predicts data held out worse than the refit does, or no better, and is not in the robot that is
     written: a `curve`, or effects; by how much, and the standard error [nat a reading]."""

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import NamedTuple, dataclass_transform
 
 
+@dataclass_transform(frozen_default=True)
 class Note:
-    """Something worth saying; `words.notes.sentence` makes English of it, where it has no sentence of its own."""
+    """Something worth saying; `words.notes.sentence` makes English of it, where it has no sentence of its own.
+
+    A kind is a class with its fields, which makes a frozen dataclass of it.
+    """
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True)(cls)
 
     @property
     def statement(self) -> str:
@@ -19,7 +26,6 @@ class Note:
 Notes = tuple[Note | str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class Step(Note):
     """What a long computation does next.
 
@@ -31,14 +37,12 @@ class Step(Note):
     about: tuple[object, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
 class HeldByPrior(Note):
     """Parameters that are held by their priors."""
 
     names: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class FarFromPrior(Note):
     """A parameter far from its prior.
 
@@ -52,7 +56,6 @@ class FarFromPrior(Note):
     of: str
 
 
-@dataclasses.dataclass(frozen=True)
 class NoiseOff(Note):
     """Residuals without structure that are not of the size of the sds.
 
@@ -65,7 +68,6 @@ class NoiseOff(Note):
     source: str
 
 
-@dataclasses.dataclass(frozen=True)
 class Fact(Note):
     """What is so of a table or a fit, without a name or a number: a row of `words.fits.FACTS`."""
 
@@ -75,14 +77,12 @@ class Fact(Note):
 # --- of a table -----------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
 class Unmeasured(Note):
     """A free parameter that moves no reading."""
 
     name: str
 
 
-@dataclasses.dataclass(frozen=True)
 class Constant(Note):
     """A condition that does not vary.
 
@@ -96,7 +96,6 @@ class Constant(Note):
     alike: str
 
 
-@dataclasses.dataclass(frozen=True)
 class EndsEarly(Note):
     """Histories that end before the robot is under way: the longest [s], and their speed over that of steady travel
     [-], NaN where it is not known."""
@@ -106,7 +105,6 @@ class EndsEarly(Note):
     share: float
 
 
-@dataclasses.dataclass(frozen=True)
 class NeverGrips(Note):
     """Histories in which the movers slide to the end: the robot's speed over theirs [-]."""
 
@@ -114,7 +112,6 @@ class NeverGrips(Note):
     share: float
 
 
-@dataclasses.dataclass(frozen=True)
 class CoarseSteps(Note):
     """Histories so long [s] that their steps [s] do not resolve waves of a shaft."""
 
@@ -122,21 +119,18 @@ class CoarseSteps(Note):
     step: float
 
 
-@dataclasses.dataclass(frozen=True)
 class ManyChanges(Note):
     """Changes of a run's supply that are too many for the steps of each."""
 
     changes: int
 
 
-@dataclasses.dataclass(frozen=True)
 class StopsOnSlope(Note):
     """Histories whose motors are not driven on a slope."""
 
     runs: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class InheritedPriors(Note):
     """A part that is not the nominal robot's while friction of it is.
 
@@ -149,7 +143,6 @@ class InheritedPriors(Note):
     kept: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class OffBy(Note):
     """Readings that no robot like this one shows.
 
@@ -167,7 +160,6 @@ class OffBy(Note):
     imposed: str
 
 
-@dataclasses.dataclass(frozen=True)
 class SlopesIn(Note):
     """Slopes in another unit: the current rises so many times as fast with them as it should."""
 
@@ -178,14 +170,12 @@ class SlopesIn(Note):
 # --- of a fit -------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
 class EstimatedNoise(Note):
     """Channels whose noise was estimated, with the sd [%]."""
 
     percent: tuple[tuple[str, float], ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class BesideSteady(Note):
     """Parameters within their intervals of the optimum with `steady`, of how many; the furthest and how far [sd]."""
 
@@ -195,7 +185,6 @@ class BesideSteady(Note):
     sds: float
 
 
-@dataclasses.dataclass(frozen=True)
 class OfRows(Note):
     """Numbers of rows of which something is so: they are `limited` by adhesion, all but a share of it [-], the
     running gear `jumps`, or a status."""
@@ -205,7 +194,6 @@ class OfRows(Note):
     share: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True)
 class AtBound(Note):
     """A parameter at its `lower` or `upper` bound."""
 
@@ -213,7 +201,6 @@ class AtBound(Note):
     side: str
 
 
-@dataclasses.dataclass(frozen=True)
 class ProductAlone(Note):
     """A guide's share that acts by its product with its friction alone, which is `free` or held."""
 
@@ -222,7 +209,6 @@ class ProductAlone(Note):
     free: bool
 
 
-@dataclasses.dataclass(frozen=True)
 class PriorOfProduct(Note):
     """A guide friction whose prior is that of its product with the guides' share, which the model puts at `share`."""
 
@@ -232,7 +218,6 @@ class PriorOfProduct(Note):
     share: float
 
 
-@dataclasses.dataclass(frozen=True)
 class NoPrediction(Note):
     """Rows without a prediction where blocks of a kind are held out, of how many."""
 
@@ -241,7 +226,6 @@ class NoPrediction(Note):
     of: int
 
 
-@dataclasses.dataclass(frozen=True)
 class SamePredictions(Note):
     """Kinds of blocks without which every row is predicted as without those of `kind`."""
 
@@ -249,14 +233,12 @@ class SamePredictions(Note):
     others: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class BlockNotConverged(Note):
     """A kind of block without which a search did not converge."""
 
     kind: str
 
 
-@dataclasses.dataclass(frozen=True)
 class Agreement(Note):
     """How searches from many starts ended: `agree` of them at the best optimum, `elsewhere` at others, the next of
     which costs `more` [½σ²], the rest without converging."""
@@ -268,7 +250,6 @@ class Agreement(Note):
     open: int
 
 
-@dataclasses.dataclass(frozen=True)
 class Elsewhere(Note):
     """Searches that converged at other values of parameters, of how many."""
 
@@ -277,7 +258,6 @@ class Elsewhere(Note):
     names: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class InPieces(Note):
     """A parameter whose 95 % interval is in pieces."""
 
@@ -288,7 +268,6 @@ class InPieces(Note):
 # --- of a search by population --------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
 class Generations(Note):
     """Members and generations of a search, and whether the last gained nothing that counts."""
 
@@ -297,14 +276,12 @@ class Generations(Note):
     settled: bool
 
 
-@dataclasses.dataclass(frozen=True)
 class LostRows(Note):
     """Members with a row that is lost, by status."""
 
     members: dict[str, int]
 
 
-@dataclasses.dataclass(frozen=True)
 class MembersJump(Note):
     """Members whose running gear jumps in some row, and in which rows the best's does."""
 
@@ -320,14 +297,12 @@ class Edge(NamedTuple):
     sds: float
 
 
-@dataclasses.dataclass(frozen=True)
 class EndedAtEdge(Note):
     """Parameters at the edge of what was allowed, by name."""
 
     edge: dict[str, Edge]
 
 
-@dataclasses.dataclass(frozen=True)
 class ReadFromMembers(Note):
     """Parameters by which the derivatives of a run are not to be trusted, and what the regression over the members
     leaves [sd rms]."""

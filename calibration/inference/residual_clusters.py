@@ -63,7 +63,6 @@ class LevelMean:
         return f"{self.level} at {self.within}" if self.within else self.level
 
 
-@dataclasses.dataclass(frozen=True)
 class ResidualCluster(Note):
     """Residuals of a channel that go with a column without a role.
 

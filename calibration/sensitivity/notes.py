@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from calibration.inference.notes import Note
 
 
-@dataclasses.dataclass(frozen=True)
 class Sampling(Note):
     """A method that goes over so many operating points now."""
 
@@ -15,7 +12,6 @@ class Sampling(Note):
     points: int
 
 
-@dataclasses.dataclass(frozen=True)
 class PointsLeftOut(Note):
     """Operating points of outputs that are left out, of how many: the robot does not travel there, or too many of the
     sample do not."""
@@ -26,7 +22,6 @@ class PointsLeftOut(Note):
     outputs: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class SampleLeftOut(Note):
     """Operating points of outputs at which up to a share of the sample does not travel, and is left out."""
 
@@ -35,7 +30,6 @@ class SampleLeftOut(Note):
     outputs: tuple[str, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class Inert(Note):
     """Inputs by which every derivative is zero: they are not sampled, or they are `correlated` with others."""
 
@@ -43,7 +37,6 @@ class Inert(Note):
     correlated: bool
 
 
-@dataclasses.dataclass(frozen=True)
 class Tied(Note):
     """Inputs that are kept at their ratio to another one."""
 

@@ -319,7 +319,8 @@ def size(
     by_motor: dict[str, Found] = {}
     for k in np.argsort(every_cost):
         name = chosen.drives[choice.drive[everything[0][k]]].motor.name
-        by_motor.setdefault(name, found(*everything, every_f, every_g, int(k)))
+        if name not in by_motor:  # a design is a robot to build, and these are a thousand
+            by_motor[name] = found(*everything, every_f, every_g, int(k))
     order = [int(k) for k in np.argsort(real_cost) if np.all(real_g[k][kept] >= 0)]
     different: dict[tuple[int, int], int] = {}
     for k in order:

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from calibration.data.contradictions import cannot_turn
+from calibration.data.contradictions import cannot_stand, cannot_turn
 from calibration.data.errors import BadConfiguration, choices
-from calibration.data.requirements import Envelope, Requirement, Requirements
+from calibration.data.requirements import STAIRS, TREAD, Envelope, Requirement, Requirements
 from mmrjax import params
+from mmrjax.channels import MM
 from mmrjax.compiling import compiled
 from mmrjax.requirements import AMBIENT, AXES, CHARGE, PAYLOAD, SLOPE, Point, Ratings, evaluate, ratings
 from mmrjax.robot import Robot
@@ -33,6 +34,8 @@ CHANGEABLE = (
 )  # fmt: skip
 OF_CONFIGURATION = ("mass", "radius", "ground.friction.static", "ground.rolling_resistance", "track.loss_coulomb",
                     "turning.width")  # fmt: skip
+#: The same of what a posture allows.
+OF_LEVERS = ("running_gear.lever_length", "running_gear.levers.roller")
 #: Bounds within which a change is looked for, beside those of the field: least and greatest multiple of what it is.
 REACH = (0.1, 10.0)
 #: Values of a parameter in one call, calls along a ladder, and digits that a stated change has.
@@ -125,7 +128,8 @@ def refuse(robot: Robot, asked: Requirements) -> None:
     """Refuse requirements that no robot of these configurations could be held against.
 
     Raises:
-        BadConfiguration: a configuration that the robot does not have; a turn that it cannot make; an
+        BadConfiguration: a configuration that the robot does not have; a turn that it cannot make; a posture of a
+            robot that does not state how it stands; an
             envelope with a slope that the surface does not hold, whatever drives the robot: tan α above μ_s.
     """
     for r in asked.each:
@@ -138,6 +142,8 @@ def refuse(robot: Robot, asked: Requirements) -> None:
             )
         turns = r.quantity.group in ("turn", "across")
         if turns and (why := cannot_turn(robot, (_configuration(robot, e),))):
+            raise BadConfiguration(f"{where}: {why}")
+        if r.quantity.group == "posture" and (why := cannot_stand(robot)):
             raise BadConfiguration(f"{where}: {why}")
         chassis = robot.configurations[_configuration(robot, e)]
         friction = float(chassis.ground.friction.static) * adhesion_ratio(e.surface, float(chassis.on_tracks) > 0.5)
@@ -176,6 +182,7 @@ def points(robot: Robot, requirement: Requirement) -> Point:
         adhesion_lateral=same(lateral_ratio(e.surface, on_tracks)), battery=same(float(e.battery)),
         charge=jnp.asarray(charge), charge_end=same(e.charge_end), share=same(requirement.share),
         slope_deg=jnp.asarray(slope), payload=jnp.asarray(payload), ambient=jnp.asarray(warm),
+        tread=same(MM * requirement.tread_mm),
     )  # fmt: skip
 
 
@@ -295,7 +302,8 @@ def check(robot: Robot, asked: Requirements, *, changes: bool = True) -> tuple[O
     held = []
     for r in asked.each:
         configuration = _configuration(robot, r.envelope)
-        held.append(_Held(robot, r, (*parameters(robot, configuration), CELLS)))
+        of_levers = OF_LEVERS if r.quantity.group == "posture" else ()
+        held.append(_Held(robot, r, (*parameters(robot, configuration), *of_levers, CELLS)))
     found = [_outcome(h) for h in held]
     if changes:
         found = [o if o.met else _with_changes(h, o, held, found) for h, o in zip(held, found, strict=True)]
@@ -337,6 +345,8 @@ def _corner(held: _Held, k: int) -> dict[str, Any]:
             "share": r.share,
             "state_of_charge": [low, e.charge[1]],
         }
+    if r.name == STAIRS:
+        found[TREAD] = r.tread_mm
     return {"configuration": _configuration(held.robot, e), "surface": e.surface, **found}
 
 

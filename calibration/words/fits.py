@@ -2,46 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
-from calibration.inference import blocks
+from calibration.inference import blocks, notes
 from calibration.inference.identifiability import HELD
-from calibration.inference.notes import (
-    Agreement,
-    AtBound,
-    BesideSteady,
-    BlockNotConverged,
-    Edge,
-    Elsewhere,
-    EndedAtEdge,
-    EstimatedNoise,
-    Fact,
-    FarFromPrior,
-    Generations,
-    HeldByPrior,
-    InPieces,
-    LostRows,
-    MembersJump,
-    NoiseOff,
-    NoPrediction,
-    OfRows,
-    PriorOfProduct,
-    ProductAlone,
-    ReadFromMembers,
-    SamePredictions,
-    Shown,
-)
 from mmrjax import channels
 
 if TYPE_CHECKING:
     from calibration.inference.lack_of_fit import Adequacy
     from calibration.inference.residual_clusters import ResidualCluster
     from calibration.inference.result import CalibrationResult
-
-
-def held_by_prior(note: HeldByPrior) -> str:
-    """Which parameters are held by their priors."""
-    return f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {', '.join(note.names)}"
 
 
 #: What a parameter far from its prior means, by what it is told of.
@@ -67,17 +38,7 @@ LOST_AS = {
 }  # fmt: skip
 
 
-def fact(note: Fact) -> str:
-    """What is so."""
-    return FACTS[note.what]
-
-
-def far_from_prior(note: FarFromPrior) -> str:
-    """A parameter far from its prior, and what that means."""
-    return FAR[note.of].format(note.name, note.sds)
-
-
-def noise_off(note: NoiseOff) -> str:
+def noise_off(note: notes.NoiseOff) -> str:
     """By what sds are off."""
     if not note.channel:
         return (
@@ -90,7 +51,7 @@ def noise_off(note: NoiseOff) -> str:
     )
 
 
-def estimated_noise(note: EstimatedNoise) -> str:
+def estimated_noise(note: notes.EstimatedNoise) -> str:
     """Channels whose noise was estimated."""
     each = ", ".join(f"{channel.replace('_', ' ')} {percent:.1f} %" for channel, percent in note.percent)
     return (
@@ -99,15 +60,7 @@ def estimated_noise(note: EstimatedNoise) -> str:
     )
 
 
-def beside_steady(note: BesideSteady) -> str:
-    """How far parameters are from the optimum with `steady`."""
-    return (
-        f"{note.inside} of {note.of} parameters lie within their 95 % intervals of the same problem's optimum with "
-        f"steady; furthest apart is {note.furthest}, {note.sds:.2f} sd"
-    )
-
-
-def of_rows(note: OfRows) -> str:
+def of_rows(note: notes.OfRows) -> str:
     """Of which rows something is so."""
     rows = f"rows {', '.join(map(str, note.rows))}"
     if note.what == "limited":
@@ -120,27 +73,14 @@ def of_rows(note: OfRows) -> str:
     return f"{rows}: {note.what} with the calibrated robot"
 
 
-def at_bound(note: AtBound) -> str:
-    """A parameter at its bound."""
-    return f"{note.name} is at its {note.side} bound"
-
-
-def product_alone(note: ProductAlone) -> str:
+def product_alone(note: notes.ProductAlone) -> str:
     """A product of which one factor or both are free."""
     if note.free:
         return f"only the product {note.friction} x {note.share} acts; the priors alone divide it"
     return f"{note.share} is found with {note.friction} held: only their product acts"
 
 
-def prior_of_product(note: PriorOfProduct) -> str:
-    """A guide friction whose prior is that of a product."""
-    return (
-        f"{note.name}: its prior, {note.mean:.3g} ± {note.sd:.2g}, is that of its product with the share of the "
-        f"guides in the other fidelities; the track model puts {note.share:.0%} of the weight on them"
-    )
-
-
-def no_prediction(note: NoPrediction) -> str:
+def no_prediction(note: notes.NoPrediction) -> str:
     """Rows that a fit without their block does not predict."""
     return (
         f"held out by {blocks.in_words(note.kind)}: {note.rows} of {note.of} rows have no prediction, because the "
@@ -148,7 +88,7 @@ def no_prediction(note: NoPrediction) -> str:
     )
 
 
-def same_predictions(note: SamePredictions) -> str:
+def same_predictions(note: notes.SamePredictions) -> str:
     """Kinds of blocks that tell nothing beside another."""
     return (
         f"held out by {' or by '.join(blocks.in_words(k) for k in note.others)}: the same predictions as held out by "
@@ -156,12 +96,7 @@ def same_predictions(note: SamePredictions) -> str:
     )
 
 
-def block_not_converged(note: BlockNotConverged) -> str:
-    """A search without a block that did not converge."""
-    return f"a search without a block of {note.kind} did not converge"
-
-
-def agreement(note: Agreement) -> str:
+def agreement(note: notes.Agreement) -> str:
     """Whether searches from many starts agree."""
     if note.starts == 1:
         return "one search, which did not converge" if note.open else "one search"
@@ -175,19 +110,6 @@ def agreement(note: Agreement) -> str:
     return ", ".join(parts)
 
 
-def elsewhere(note: Elsewhere) -> str:
-    """Searches that converged elsewhere."""
-    return f"{note.searches} of {note.of} searches converged at other values of {', '.join(note.names)}"
-
-
-def in_pieces(note: InPieces) -> str:
-    """An interval in pieces."""
-    return (
-        f"{note.name}: the values within its 95 % interval are in {note.pieces} pieces, with worse ones between "
-        "them; samples closer together would tell them apart"
-    )
-
-
 def header(found: CalibrationResult, robot_name: str) -> str:
     """What heads the calibrated robot's file."""
     return f"calibrated from {robot_name} with {found.source}; the free parameters: {', '.join(found.parameters)}"
@@ -196,7 +118,7 @@ def header(found: CalibrationResult, robot_name: str) -> str:
 # --- a search by population -----------------------------------------------------------------------------
 
 
-def generations(note: Generations) -> str:
+def generations(note: notes.Generations) -> str:
     """How far a search went."""
     end = "the last gained nothing that counts"
     if not note.settled:
@@ -204,13 +126,13 @@ def generations(note: Generations) -> str:
     return f"{note.members} members in {note.generations} generations; {end}"
 
 
-def lost_rows(note: LostRows) -> str:
+def lost_rows(note: notes.LostRows) -> str:
     """Members with a row that is lost."""
     lost = ", ".join(f"{note.members[status]} {how}" for status, how in LOST_AS.items() if status in note.members)
     return f"of the members, in some row: {lost}; a row that is lost costs a member its rank"
 
 
-def members_jump(note: MembersJump) -> str:
+def members_jump(note: notes.MembersJump) -> str:
     """Members whose running gear jumps."""
     best = f"the best in rows {', '.join(map(str, note.best))}" if note.best else "the best in none"
     return (
@@ -219,32 +141,23 @@ def members_jump(note: MembersJump) -> str:
     )
 
 
-def edge(at: Edge) -> str:
+def edge(at: notes.Edge) -> str:
     """Where a parameter is at the edge of what was allowed."""
     if at.bound:
         return f"at its {at.bound} bound"
     return f"{abs(at.sds):.1f} prior sd {'below' if at.sds < 0 else 'above'} the middle of its prior"
 
 
-def ended_at_edge(note: EndedAtEdge) -> str:
+def ended_at_edge(note: notes.EndedAtEdge) -> str:
     """A search that ended at the edge of what was allowed."""
     named = ", ".join(f"{name} {edge(at)}" for name, at in note.edge.items())
     return f"the search ended at the edge of what was allowed: its best member has {named}"
 
 
-def read_from_members(note: ReadFromMembers) -> str:
-    """What the rows determine where derivatives are not to be trusted."""
-    return (
-        f"derivatives of the run by {', '.join(note.names)} are not those of its differences (contacts open and "
-        "close): what the rows determine is read from a regression over the members near the best, which leaves "
-        f"{note.left:.2g} sd rms"
-    )
-
-
 # --- what residuals show --------------------------------------------------------------------------------
 
 
-def shown_by(test: Shown) -> str:
+def shown_by(test: notes.Shown) -> str:
     """What the most telling test shows."""
     of = f"the residuals of {channels.of(test.channel).label}" if test.channel else ""
     return {
@@ -306,3 +219,34 @@ def residual_cluster(c: ResidualCluster) -> str:
         f"{what} cluster by {c.column}{within}{signs} (simulated less measured at levels {each}{more}; {p}), {role}: "
         "give each level its own configuration, or find what differs"
     )
+
+
+#: Kind of note → a sentence with its fields, or a function that makes one.
+SAID: dict[type, str | Callable[[Any], str]] = {
+    notes.HeldByPrior: f"not determined by these runs (posterior sd above {HELD:g} of the prior's): {{names}}",
+    notes.FarFromPrior: lambda note: FAR[note.of].format(note.name, note.sds),
+    notes.NoiseOff: noise_off,
+    notes.Fact: lambda note: FACTS[note.what],
+    notes.EstimatedNoise: estimated_noise,
+    notes.BesideSteady: "{inside} of {of} parameters lie within their 95 % intervals of the same problem's optimum "
+    "with steady; furthest apart is {furthest}, {sds:.2f} sd",
+    notes.OfRows: of_rows,
+    notes.AtBound: "{name} is at its {side} bound",
+    notes.ProductAlone: product_alone,
+    notes.PriorOfProduct: "{name}: its prior, {mean:.3g} ± {sd:.2g}, is that of its product with the share of the "
+    "guides in the other fidelities; the track model puts {share:.0%} of the weight on them",
+    notes.NoPrediction: no_prediction,
+    notes.SamePredictions: same_predictions,
+    notes.BlockNotConverged: "a search without a block of {kind} did not converge",
+    notes.Agreement: agreement,
+    notes.Elsewhere: "{searches} of {of} searches converged at other values of {names}",
+    notes.InPieces: "{name}: the values within its 95 % interval are in {pieces} pieces, with worse ones between "
+    "them; samples closer together would tell them apart",
+    notes.Generations: generations,
+    notes.LostRows: lost_rows,
+    notes.MembersJump: members_jump,
+    notes.EndedAtEdge: ended_at_edge,
+    notes.ReadFromMembers: "derivatives of the run by {names} are not those of its differences (contacts open and "
+    "close): what the rows determine is read from a regression over the members near the best, which leaves "
+    "{left:.2g} sd rms",
+}

@@ -3,35 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.discovery.notes import (
-    DRAW,
-    Asked,
-    AssumedNoise,
-    Copies,
-    CurveOver,
-    FreedValue,
-    KeptOut,
-    Late,
-    Led,
-    LostReplicates,
-    Missing,
-    NameSupport,
-    NameTest,
-    NoiseFromSeries,
-    Outstanding,
-    PhasesDiffer,
-    RestsOn,
-    RuledOut,
-    StillLacks,
-    Summary,
-    TooFewReplicates,
-    Unwritten,
-)
+from calibration.discovery import notes
 from calibration.discovery.settings import FIT, HELD_OUT
 from calibration.inference import bases
 from calibration.inference import blocks as blocks_room
@@ -54,7 +31,7 @@ if TYPE_CHECKING:
 # --- the verdict ----------------------------------------------------------------------------------------
 
 
-def statement(said: Summary) -> str:
+def statement(said: notes.Summary) -> str:
     """A verdict in a sentence or a few."""
     text = _verdict(said)
     if said.aside:
@@ -67,7 +44,7 @@ def statement(said: Summary) -> str:
     return text
 
 
-def _verdict(said: Summary) -> str:
+def _verdict(said: notes.Summary) -> str:
     where, p = said.where, said.p
     if said.verdict == "none":
         return f"Nothing is missing: what the fitted model leaves is what noise leaves (family-wise p = {p:.2g})."
@@ -84,7 +61,7 @@ def _verdict(said: Summary) -> str:
     return f"Missing: {'; '.join(names)} (family-wise p {p_value(p)}).{in_model}{left}"
 
 
-def brief(said: Summary) -> str:
+def brief(said: notes.Summary) -> str:
     """A verdict, and the effects in the model by their leaders."""
     found = []
     for word, established in (("established", True), ("tentative", False)):
@@ -105,7 +82,7 @@ def at_other_noise(found: Sequence[Sensitivity]) -> str:
     return "; ".join(each)
 
 
-def _named(one: Missing) -> str:
+def _named(one: notes.Missing) -> str:
     """An effect, with what it cannot be told from."""
     if len(one.names) + len(one.values) == 1:
         return one.names[0]
@@ -115,7 +92,7 @@ def _named(one: Missing) -> str:
     return f"{family}{', or '.join([listed, *values])} (these data cannot tell which)"
 
 
-def _tentative(those: Sequence[Missing], support: NameSupport | None) -> str:
+def _tentative(those: Sequence[notes.Missing], support: notes.NameSupport | None) -> str:
     """Effects that are in the model without a name of their own, each with what speaks against it."""
     if not those:
         return ""
@@ -152,7 +129,7 @@ def shown_over(variable: str) -> str:
     return f"in the runs at {happens.words}"
 
 
-def freed_value(v: FreedValue) -> str:
+def freed_value(v: notes.FreedValue) -> str:
     """`motor.resistance is 1.94 ohm`."""
     return f"{v.name} is {v.value:.3g} {v.unit}".strip()
 
@@ -280,7 +257,7 @@ REASONS = {
 }
 
 
-def reason(support: NameSupport | None) -> str:
+def reason(support: notes.NameSupport | None) -> str:
     """Why names do not stand, or beside what they do; empty where there is nothing to say."""
     if support is None:
         return ""
@@ -292,7 +269,7 @@ def reason(support: NameSupport | None) -> str:
     )
 
 
-def _strength(test: NameTest) -> str:
+def _strength(test: notes.NameTest) -> str:
     """How much an effect explains by itself, and what chance and the loss of a row leave of that."""
     less = "" if test.row is None else f", without {test.what} {test.row} {test.root_without:.1f}"
     return f"{test.effect} {test.root:.1f} σ (chance {test.needed:.1f}{less})"
@@ -309,7 +286,7 @@ DOUBTS = {
 }
 
 
-def doubts(test: NameTest | None) -> str:
+def doubts(test: notes.NameTest | None) -> str:
     """What speaks against an effect by itself; empty for nothing."""
     if test is None or not test.fails:
         return ""
@@ -318,7 +295,7 @@ def doubts(test: NameTest | None) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _curve(c: CurveOver) -> str:
+def _curve(c: notes.CurveOver) -> str:
     return f"{'curve' if len(c.variables) == 1 else 'surface'} in the {_over(c.place, *c.variables)}"
 
 
@@ -358,7 +335,7 @@ RULED_OUT = {
 }
 
 
-def why_ruled_out(reasons: Sequence[RuledOut]) -> str:
+def why_ruled_out(reasons: Sequence[notes.RuledOut]) -> str:
     """Why effects are not plausible, each."""
     return "; ".join(RULED_OUT[r.why].format(r, check=" and ".join(r.check)) for r in reasons)
 
@@ -400,7 +377,7 @@ def hidden(found: DiscoveryResult) -> str:
 
 def stated_value(name: str, s: StatedValue) -> str:
     """`motor.resistance is 1.94 ohm (stated 0.611, +9.6 sds)`."""
-    return f"{freed_value(FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
+    return f"{freed_value(notes.FreedValue(name, s.value, s.unit))} (stated {s.stated:.3g}, {s.prior_sds:+.1f} sds)"
 
 
 def alike(e: FoundEffect) -> str:
@@ -443,7 +420,7 @@ def _change(before: float, after: float) -> str:
 # --- the track model ------------------------------------------------------------------------------------
 
 
-def asked(about: Asked) -> str:
+def asked(about: notes.Asked) -> str:
     """What the track model was asked about."""
     return {
         "missing": f"what is missing in the {about.balance} balance over {about.variable.replace('_', ' ')}",
@@ -478,12 +455,7 @@ def resolved(found: Resolved) -> str:
 # --- remarks --------------------------------------------------------------------------------------------
 
 
-def assumed_noise(note: AssumedNoise) -> str:
-    """Channels whose sds nobody states."""
-    return f"no sd is stated for {', '.join(note.channels)}: {note.usual} is assumed; state yours with --noise"
-
-
-def noise_from_series(note: NoiseFromSeries) -> str:
+def noise_from_series(note: notes.NoiseFromSeries) -> str:
     """Channels whose sds are estimated along series."""
     shown = [
         f"{s.channel.label} {100 * s.size:.2g} %"
@@ -500,7 +472,7 @@ def noise_from_series(note: NoiseFromSeries) -> str:
     )
 
 
-def copies(note: Copies) -> str:
+def copies(note: notes.Copies) -> str:
     """Rows that copy earlier ones."""
     rows = ", ".join(map(str, note.rows))
     if len(note.rows) == 1:
@@ -508,7 +480,7 @@ def copies(note: Copies) -> str:
     return f"rows {rows} are exact copies of earlier ones and count once"
 
 
-def kept_out(note: KeptOut) -> str:
+def kept_out(note: notes.KeptOut) -> str:
     """Rows that do not count."""
     why = {
         "unusable": "are not used: the fitted model slides or fails there",
@@ -517,21 +489,13 @@ def kept_out(note: KeptOut) -> str:
     return f"rows {', '.join(map(str, note.rows))} {why[note.why]}"
 
 
-def phases_differ(note: PhasesDiffer) -> str:
-    """A wave with another phase in each run."""
-    return (
-        f"the wave stands at another angle in each run (it explains {note.free:.0f} σ² free in each, {note.held:.0f} "
-        "with one phase): robot.toml holds the mean; start runs from a mark"
-    )
-
-
-def still_lacks(note: StillLacks) -> str:
+def still_lacks(note: notes.StillLacks) -> str:
     """What the effects found leave."""
     place, over = bases.in_words(note.place), note.variable.replace("_", " ")
     return f"what was found does not explain everything: the {place} still lacks something over {over}"
 
 
-def late(note: Late) -> str:
+def late(note: notes.Late) -> str:
     """How late what is imposed acts, and what to state."""
     when = "later" if note.delay > 0 else "earlier"
     return (
@@ -540,13 +504,13 @@ def late(note: Late) -> str:
     )
 
 
-def led(note: Led) -> str:
+def led(note: notes.Led) -> str:
     """By what the leader of a class was chosen, and whether the other way would have chosen another."""
     names, leader = note.names, note.leader
     by = {
         HELD_OUT: "errors held out",
         FIT: "the fit to all rows",
-        DRAW: f"the fit to all rows, as errors held out are within {note.told:.0%}",
+        notes.DRAW: f"the fit to all rows, as errors held out are within {note.told:.0%}",
     }
     each = ", ".join(f"{n} {x:.2f} σ" for n, x in zip(names, note.rms_sigma, strict=True))
     said = f"{names[leader]} comes first in its class by {by[note.by]}; errors held out: {each}"
@@ -559,7 +523,7 @@ def led(note: Led) -> str:
     return said
 
 
-def rests_on(note: RestsOn) -> str:
+def rests_on(note: notes.RestsOn) -> str:
     """An effect that stands by one run alone."""
     test = note.test
     at = _conditions(note.conditions)
@@ -572,7 +536,7 @@ def rests_on(note: RestsOn) -> str:
     )
 
 
-def unwritten(note: Unwritten) -> str:
+def unwritten(note: notes.Unwritten) -> str:
     """Why what was found is not in the robot that is written."""
     what = "the curve" if note.curve else "what was found"
     how = "no better than" if note.curve and note.gain > 0 else "worse than"
@@ -582,12 +546,7 @@ def unwritten(note: Unwritten) -> str:
     )
 
 
-def lost_replicates(note: LostReplicates) -> str:
-    """Bootstrap tables that could not be fitted again."""
-    return f"only {note.settled} of {note.asked} bootstrap tables could be fitted again; the thresholds are theirs"
-
-
-def outstanding(note: Outstanding) -> str:
+def outstanding(note: notes.Outstanding) -> str:
     """Verdicts that are not there yet."""
     at = " and ".join(f"{f:g}" for f in note.factors)
     return (
@@ -596,6 +555,22 @@ def outstanding(note: Outstanding) -> str:
     )
 
 
-def too_few_replicates(note: TooFewReplicates) -> str:
-    """Bootstrap tables that are too few."""
-    return f"{note.settled} bootstrap tables are too few for every kind of evidence to count; use 500 or more"
+#: Kind of note → a sentence with its fields, or a function that makes one.
+SAID: dict[type, str | Callable[[Any], str]] = {
+    notes.AssumedNoise: "no sd is stated for {channels}: {usual} is assumed; state yours with --noise",
+    notes.NoiseFromSeries: noise_from_series,
+    notes.Copies: copies,
+    notes.KeptOut: kept_out,
+    notes.PhasesDiffer: "the wave stands at another angle in each run (it explains {free:.0f} σ² free in each, "
+    "{held:.0f} with one phase): robot.toml holds the mean; start runs from a mark",
+    notes.StillLacks: still_lacks,
+    notes.Late: late,
+    notes.Led: led,
+    notes.LostReplicates: "only {settled} of {asked} bootstrap tables could be fitted again; the thresholds are "
+    "theirs",
+    notes.Outstanding: outstanding,
+    notes.TooFewReplicates: "{settled} bootstrap tables are too few for every kind of evidence to count; use 500 or "
+    "more",
+    notes.RestsOn: rests_on,
+    notes.Unwritten: unwritten,
+}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
-from calibration.sensitivity.notes import Inert, PointsLeftOut, SampleLeftOut, Sampling, Tied
+from calibration.sensitivity import notes
 
 if TYPE_CHECKING:
     from calibration.sensitivity.result import SensitivityResult
@@ -35,12 +36,12 @@ def statement(found: SensitivityResult) -> str:
     )
 
 
-def sampling(note: Sampling) -> str:
+def sampling(note: notes.Sampling) -> str:
     """What a method goes over."""
     return f"{METHODS[note.method]}, over {note.points} operating points"
 
 
-def points_left_out(note: PointsLeftOut) -> str:
+def points_left_out(note: notes.PointsLeftOut) -> str:
     """Points that are left out."""
     who = "too many robots of the sample do" if note.sampled else "the robot does"
     return (
@@ -49,7 +50,7 @@ def points_left_out(note: PointsLeftOut) -> str:
     )
 
 
-def sample_left_out(note: SampleLeftOut) -> str:
+def sample_left_out(note: notes.SampleLeftOut) -> str:
     """Points at which some of the sample is left out."""
     return (
         f"at {note.points} operating points up to {100 * note.share:.1f} % of the sample is left out, since the "
@@ -57,7 +58,7 @@ def sample_left_out(note: SampleLeftOut) -> str:
     )
 
 
-def inert(note: Inert) -> str:
+def inert(note: notes.Inert) -> str:
     """Inputs by which every derivative is zero."""
     names = ", ".join(note.inputs)
     if note.correlated:
@@ -68,6 +69,11 @@ def inert(note: Inert) -> str:
     return f"not sampled, since every derivative by them is exactly zero where one was taken: {names}"
 
 
-def tied(note: Tied) -> str:
-    """Inputs that are kept at their ratio to another one."""
-    return f"kept at their ratio to another input, and part of what it does: {', '.join(note.inputs)}"
+#: Kind of note → a sentence with its fields, or a function that makes one.
+SAID: dict[type, str | Callable[[Any], str]] = {
+    notes.Sampling: sampling,
+    notes.PointsLeftOut: points_left_out,
+    notes.SampleLeftOut: sample_left_out,
+    notes.Inert: inert,
+    notes.Tied: "kept at their ratio to another input, and part of what it does: {inputs}",
+}

@@ -3,20 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 from calibration.data.errors import number
-from calibration.inference.notes import (
-    CoarseSteps,
-    Constant,
-    EndsEarly,
-    InheritedPriors,
-    ManyChanges,
-    NeverGrips,
-    OffBy,
-    SlopesIn,
-    StopsOnSlope,
-    Unmeasured,
-)
+from calibration.inference import notes
 
 #: What would measure a parameter that the data do not, by the start or end of its name.
 WOULD_MEASURE = {
@@ -48,20 +39,20 @@ def would_measure(name: str) -> str:
     return "runs under conditions in which it acts"
 
 
-def unmeasured(note: Unmeasured) -> str:
+def unmeasured(note: notes.Unmeasured) -> str:
     """A free parameter that moves no reading."""
     return (
         f"{note.name}: nothing in these data measures it; its value is its prior's. {would_measure(note.name)} would"
     )
 
 
-def constant(note: Constant) -> str:
+def constant(note: notes.Constant) -> str:
     """A condition that does not vary."""
     here = f"{note.column} is {number(note.value)} in every row"
     return f"{here}: {ALIKE[note.alike]}, and only their priors tell them apart"
 
 
-def ends_early(note: EndsEarly) -> str:
+def ends_early(note: notes.EndsEarly) -> str:
     """Histories that end before the robot is under way."""
     at = "" if math.isnan(note.share) else f", at {note.share:.0%} of the speed of steady travel"
     return (
@@ -70,7 +61,7 @@ def ends_early(note: EndsEarly) -> str:
     )
 
 
-def never_grips(note: NeverGrips) -> str:
+def never_grips(note: notes.NeverGrips) -> str:
     """Histories in which the movers slide to the end."""
     return (
         f"{_runs(note.runs, 'never grips', 'never grip')}: in the end the robot travels at {note.share:.0%} of the "
@@ -82,7 +73,7 @@ def _runs(names: tuple[str, ...], one: str, several: str) -> str:
     return f"run {names[0]} {one}" if len(names) == 1 else f"runs {', '.join(names)} {several}"
 
 
-def coarse_steps(note: CoarseSteps) -> str:
+def coarse_steps(note: notes.CoarseSteps) -> str:
     """Steps that do not resolve waves."""
     return (
         f"runs of {note.lasts:.0f} s are followed in steps of {1e3 * note.step:.0f} ms: waves of a shaft faster than "
@@ -90,24 +81,7 @@ def coarse_steps(note: CoarseSteps) -> str:
     )
 
 
-def many_changes(note: ManyChanges) -> str:
-    """Changes of a supply that are too many for the steps of each."""
-    return (
-        f"a run's supply changes {note.changes} times: inrushes after a change are followed in fewer steps than that "
-        "of a start; cut the runs where the current of an inrush matters"
-    )
-
-
-def stops_on_slope(note: StopsOnSlope) -> str:
-    """What a run is followed by where its motors are not driven on a slope."""
-    return (
-        f"run {', '.join(note.runs)}: the motors are not driven on a slope; histories have smooth friction at rest, "
-        "and a robot that should stand there creeps by some mm/s. Leave rows at rest out where their readings are "
-        "finer than that"
-    )
-
-
-def inherited_priors(note: InheritedPriors) -> str:
+def inherited_priors(note: notes.InheritedPriors) -> str:
     """A part that is not the nominal robot's while friction of it is."""
     changed = ", ".join(f"{name} {number(mine)} for {number(nominal)}" for name, mine, nominal in note.changed)
     one = len(note.kept) == 1
@@ -118,7 +92,7 @@ def inherited_priors(note: InheritedPriors) -> str:
     )
 
 
-def off_by(note: OffBy) -> str:
+def off_by(note: notes.OffBy) -> str:
     """Readings that no robot like this one shows."""
     off, size = (note.factor, "large") if note.factor > 1 else (1 / note.factor, "small")
     what = f"{note.column}: readings are about {number(float(f'{off:.2g}'))} times too {size} for this robot"
@@ -128,9 +102,20 @@ def off_by(note: OffBy) -> str:
     return f"{what}{alike}" if note.others else f"{what}; check the unit, {note.unit}, and the robot's file"
 
 
-def slopes_in(note: SlopesIn) -> str:
-    """Slopes in another unit."""
-    return (
-        f"slope_deg: the current rises {note.rise:.2g} times as fast with the slope as this robot's; are the slopes "
-        f"in {note.unit}? expected degrees"
-    )
+#: Kind of note → a sentence with its fields, or a function that makes one.
+SAID: dict[type, str | Callable[[Any], str]] = {
+    notes.Unmeasured: unmeasured,
+    notes.Constant: constant,
+    notes.EndsEarly: ends_early,
+    notes.NeverGrips: never_grips,
+    notes.CoarseSteps: coarse_steps,
+    notes.ManyChanges: "a run's supply changes {changes} times: inrushes after a change are followed in fewer steps "
+    "than that of a start; cut the runs where the current of an inrush matters",
+    notes.StopsOnSlope: "run {runs}: the motors are not driven on a slope; histories have smooth friction at rest, "
+    "and a robot that should stand there creeps by some mm/s. Leave rows at rest out where their readings are finer "
+    "than that",
+    notes.InheritedPriors: inherited_priors,
+    notes.OffBy: off_by,
+    notes.SlopesIn: "slope_deg: the current rises {rise:.2g} times as fast with the slope as this robot's; are the "
+    "slopes in {unit}? expected degrees",
+}

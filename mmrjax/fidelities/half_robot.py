@@ -134,7 +134,7 @@ def _rotating(run: System, signals: Signals) -> Scalar:
     return inertia_reduced(motor, ratio, signals.efficiency_load, signals.inertia_added)
 
 
-def current_after(run: System, signals: Signals) -> Scalar:
+def current_after(robot: Robot, conditions: Conditions, step: Scalar, signals: Signals) -> Scalar:
     """Motor current one step on [A]: exponential Euler, exact for a winding at constant speed.
 
     L dI/dt = U_left(I); I + Δt U_left / L · (e^z - 1) / z with z = Δt U_left' / L. The electrical time
@@ -143,14 +143,12 @@ def current_after(run: System, signals: Signals) -> Scalar:
     """
 
     def left(current: Scalar) -> Scalar:
-        shifted = dataclasses.replace(signals, current=current, total_current=run.robot.sides * current)
-        return balances.electrical(
-            run.robot, run.conditions, balances.supply(run.robot, run.conditions, shifted)
-        ).voltage_left
+        shifted = dataclasses.replace(signals, current=current, total_current=robot.sides * current)
+        return balances.electrical(robot, conditions, balances.supply(robot, conditions, shifted)).voltage_left
 
     voltage, slope = jax.jvp(left, (signals.current,), (jnp.ones_like(signals.current),))
-    z = run.step * slope / signals.inductance
-    return signals.current + run.step / signals.inductance * voltage * jnp.expm1(z) / z
+    z = step * slope / signals.inductance
+    return signals.current + step / signals.inductance * voltage * jnp.expm1(z) / z
 
 
 def resistance(run: System, motion: Motion, signals: Signals, at: Touch, pulled: Pull) -> Float[Array, "5 5"]:
@@ -227,7 +225,9 @@ def _later(run: System, motion: Motion, signals: Signals) -> _Later:
         effect.name: motion.memory[effect.name] + run.step * effect.rate(run.robot, signals)
         for effect in run.robot.remembering
     }
-    return _Later(current_after(run, signals), motion.discharge + run.step * charge, memory)
+    return _Later(
+        current_after(run.robot, run.conditions, run.step, signals), motion.discharge + run.step * charge, memory
+    )
 
 
 def _moved(

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float
 
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.drive import GROUND, MOTOR, moving, rates, start, state_of, units
-from mmrjax.fidelities.rarely import rarely
 from mmrjax.params import Scalar
+from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals
 

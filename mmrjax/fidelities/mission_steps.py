@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 from mmrjax import balances, energy
 from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.rarely import rarely
 from mmrjax.fidelities.rest import current_at_rest, firmness
 from mmrjax.fidelities.result import exceeded, mask
 from mmrjax.fidelities.rosenbrock import stages
 from mmrjax.params import Scalar
 from mmrjax.profile import MOTOR_SPEED, SPEED, Instant, Profile
+from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
 from mmrjax.signals import Signals, State
 

@@ -114,7 +114,8 @@ def stages(
         return found, found
 
     (jacobian, jacobian_q), (f, g) = jax.jacfwd(both, has_aux=True)(y0)
-    solve = (inverse if inverted else _solver)(jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian)
+    matrix = jnp.eye(y0.shape[0], dtype=y0.dtype) / (h * _GAMMA) - jacobian
+    solve = inverse(matrix)[0] if inverted else _solver(matrix)
     u, v, y, q = [solve(f)], [], y0, q0
     v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
     for stage in range(1, 6):
@@ -136,10 +137,13 @@ def _solver(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float
     return lambda vector: jax.scipy.linalg.lu_solve(factors, vector)
 
 
-def inverse(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
-    """Solves by the inverse, found in place by Gauss and Jordan, a column at a time; no rows are exchanged."""
+def inverse(matrix: Float[Array, "n n"]) -> tuple[Callable[[Float[Array, " n"]], Float[Array, " n"]], Array]:
+    """What solves by the inverse, found in place by Gauss and Jordan, a column at a time; no rows are exchanged. And
+    the determinant."""
+    determinant = jnp.ones((), matrix.dtype)
     for k in range(matrix.shape[0]):
         pivot = matrix[k, k]
+        determinant *= pivot
         row, column = matrix[k] / pivot, matrix[:, k].at[k].set(0.0)
         matrix = (matrix - jnp.outer(column, row)).at[k].set(row).at[:, k].set((-column / pivot).at[k].set(1 / pivot))
-    return lambda vector: matrix @ vector
+    return lambda vector: matrix @ vector, determinant

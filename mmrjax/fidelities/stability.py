@@ -14,7 +14,7 @@ from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
 from mmrjax.fidelities.half_robot import Motion, System, advance, roll, stand, system
 from mmrjax.robot import Robot
-from mmrjax.undercarriage import lever_tip
+from mmrjax.undercarriage import lever_tips
 
 SAFETY = 0.75  # of the linear limit: contacts bear more than when standing, by their ripple
 LEAST = 0.01  # [m/s], V_s that the linear limit is found with at least
@@ -93,11 +93,16 @@ def refuse(robot: Robot, conditions: Conditions, step: float, sample: float) -> 
     tracked = on_tracks[np.asarray(conditions.configuration, int)] > 0.5
     gear = robot.running_gear
     height = float(robot.radius_pulley + gear.grouser_height)  # levers are on tracks alone
-    for name, angle, side in (("lever_front", gear.lever_front, 1.0), ("lever_rear", gear.lever_rear, -1.0)):
-        tip = float(lever_tip(gear, angle, side)[1])
+    for name, (_, up) in zip(("lever_front", "lever_rear"), lever_tips(gear, conditions), strict=True):
+        tips = np.ravel(np.asarray(up))
+        tip = float(np.min(tips))
         if tracked.any() and tip < -height:
+            of_run = f"levers_{name.removeprefix('lever_')}_deg"
+            stated = getattr(conditions, of_run)
+            stands = np.degrees(float(getattr(gear, name))) if stated is None else np.ravel(stated)[np.argmin(tips)]
+            name = name if stated is None else of_run
             raise ValueError(
-                f"{name}: got {np.degrees(float(angle)):.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the "
+                f"{name}: got {stands:.0f} deg, its tip {1e3 * (-tip - height):.0f} mm below the "
                 "ground; expected a posture on the main tracks, with both tips above the ground"
             )
     limits = largest_step(robot, conditions)

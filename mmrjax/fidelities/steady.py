@@ -19,9 +19,9 @@ from mmrjax.fidelities import turning
 from mmrjax.fidelities.base import Fidelity, Progress, Run
 from mmrjax.fidelities.elimination import Vector
 from mmrjax.fidelities.newton import root
-from mmrjax.fidelities.rarely import rarely
 from mmrjax.fidelities.rest import creeps, direction, slides_in_place, voltage_at_rest
 from mmrjax.fidelities.result import result, travels, turned, withhold
+from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
 from mmrjax.signals import (
     BATTERY_EMPTY,

@@ -28,6 +28,7 @@ from mmrjax.signals import (
     BATTERY_EMPTY,
     CONVERGED,
     FAILED,
+    GRAVITY,
     NOT_SETTLED,
     STALLED,
     TIPS,
@@ -35,9 +36,12 @@ from mmrjax.signals import (
     Result,
     Signals,
 )
+from mmrjax.turning import SIDES
 
 # Units of the unknowns: currents, motor speeds, speed, lateral speed, yaw rate; heading, place; discharge.
 _UNITS = (10.0, 10.0, 1000.0, 1000.0, 1.0, 1.0, 10.0, 1.0, 1.0, 1.0, 10.0)
+#: Of the whole robot, in the order of the unknowns, after the currents and the motor speeds.
+_OF_ROBOT = ("speed", "speed_lateral", "yaw_rate", "heading", "place_x", "place_y", "discharge")
 #: Unknowns of a robot that travels straight.
 OF_STRAIGHT = 5
 #: Unknowns that settle on level ground.
@@ -46,6 +50,8 @@ SETTLING = 7
 #: Of the search for a settled turn: implicit Euler's first step, its shortest and longest [s]; by what the next is
 #: longer, and shorter where the rates grew by more than `WORSE`, or an unknown changed by more than `FAR` units.
 FIRST, SHORTEST, LONGEST, LONGER, SHORTER, WORSE, FAR = 0.05, 1e-6, 1e9, 3.0, 0.25, 1.05, 0.1
+#: The first attempt is given up after so many turns, and the second after `TURNS`.
+SOON = 12
 #: It has ended at a change so small where the rates are small too [1/s] or the step is long [s]; and failed after so
 #: many.
 SMALL, SMALL_RATE, LONG, TURNS = 1e-9, 1e-7, 10.0, 200
@@ -74,8 +80,11 @@ _turning = compiled(balances.turning)
 @compiled
 def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) -> Float[Array, " unknowns"]:
     """Rates of the unknowns, in their units [1/s]; those of a motor whose speed is imposed are 0."""
+    return _rates(robot, conditions, y, _turning(robot, conditions, motion_of(robot, y)))
+
+
+def _rates(robot: Robot, conditions: Conditions, y: Array, travel: balances.Travel) -> Array:
     motion, kept = motion_of(robot, y), _kept(robot, y.shape[0])
-    travel = _turning(robot, conditions, motion)
     signals = travel.signals
     free = conditions.of_sides().motor_speed is None
     cos, sin = jnp.cos(motion.heading), jnp.sin(motion.heading)
@@ -88,7 +97,7 @@ def rates(robot: Robot, conditions: Conditions, y: Float[Array, " unknowns"]) ->
         motion.yaw_rate,
         motion.speed * cos - motion.speed_lateral * sin,
         motion.speed * sin + motion.speed_lateral * cos,
-        robot.battery.current(jnp.mean(jnp.asarray(signals.total_current))) * (conditions.battery > 0.5),  # eq. (11)
+        robot.battery.current(jnp.asarray(signals.total_current)[0]) * (conditions.battery > 0.5),  # eq. (11)
     ]
     for effect in kept:
         found.extend(jax.vmap(lambda s, effect=effect: effect.rate(robot, s))(signals))
@@ -105,10 +114,11 @@ def start(robot: Robot, conditions: Conditions, rolling: bool = False) -> Float[
         y = y.at[2:4].set(own.motor_speed)
     if not rolling:
         return y / size
-    settled, solved = _settled(robot, conditions)
-    signals = balances.turning(robot, conditions, motion_of(robot, settled)).signals
+    settled, loads, solved = _settled(robot, conditions)
+    signals = balances.turning(robot, conditions, settled, loads).signals
     memory = [jax.vmap(lambda s, e=e: e.settled(robot, s))(signals) for e in robot.remembering]
-    rolls = jnp.concatenate([settled * size[: len(_UNITS)], *memory]).at[7].set(y[7])
+    flat = [settled.current, settled.speed_motor, *(jnp.reshape(getattr(settled, name), 1) for name in _OF_ROBOT)]
+    rolls = jnp.concatenate([*flat, *memory]).at[7].set(y[7])
     return jnp.where(solved & jnp.all(jnp.isfinite(rolls)), rolls, y) / size
 
 
@@ -131,59 +141,105 @@ class _Search(eqx.Module):
     """A search for a settled turn.
 
     Attributes:
-        y: those of the unknowns that settle; rates: theirs [1/s]; jacobian: of these by those.
-        step: length of the next step [s]; turns: steps taken; solved: whether it has ended well.
+        y: those of the unknowns that settle, and the loads; rates: what `_balance` gives; jacobian: of these by y.
+        step: length of the next step [s]; turns: steps taken in this attempt; patient: whether it is the second one.
+        solved: whether it has ended well.
     """
 
-    y: Float[Array, " 7"]
-    rates: Float[Array, " 7"]
-    jacobian: Float[Array, "7 7"]
+    y: Float[Array, " 9"]
+    rates: Float[Array, " 9"]
+    jacobian: Float[Array, "9 9"]
     step: Scalar
     turns: Scalar
+    patient: Array
     solved: Array
 
 
-def _settled(robot: Robot, conditions: Conditions) -> tuple[Float[Array, " 11"], Bool[Array, ""]]:
-    """The unknowns of a settled turn on level ground, and whether it was found.
+def _balance(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 9"]:
+    """Rates of the unknowns that settle [1/s], and minus what the loads are too large by."""
+    whole = _whole(conditions, y)
+    travel = _turning(robot, conditions, motion_of(robot, whole), _loads(robot, conditions, y))
+    lacking = travel.grip.lacking / _load_units(robot, conditions)
+    return jnp.concatenate([_rates(robot, conditions, whole, travel)[:SETTLING], -lacking])
+
+
+def _whole(conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 11"]:
+    """All unknowns of a robot that has not moved from its place."""
+    charge = jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
+    return jnp.concatenate([y[:SETTLING], charge])
+
+
+def _turning_round(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 4"]:
+    """The speeds with whose sign friction turns round, of both sides and of their movers, over that within which it
+    does [-]."""
+    chassis = robot.chassis(conditions.configuration)
+    _, shafts, ahead, _, yaw = jnp.split(y[:SETTLING] * jnp.asarray(_UNITS[:SETTLING]), [2, 4, 5, 6])
+    sides, movers = ahead - yaw * SIDES * chassis.turning.width, shafts * chassis.radius / robot.gearbox.ratio
+    return jnp.concatenate([sides, movers]) / chassis.speed_still
+
+
+def _share(robot: Robot, conditions: Conditions, y: Array, step: Array) -> Scalar:
+    """Share of a step that goes no farther than `FAR`, nor beyond where friction turns round."""
+    share = jnp.minimum(1.0, FAR / jnp.max(jnp.abs(step[:SETTLING])))
+    now, then = (_turning_round(robot, conditions, at) for at in (y, y + share * step))
+    across = (now * then < 0) & (jnp.minimum(jnp.abs(now), jnp.abs(then)) > 1)
+    return share * jnp.min(jnp.where(across, now / jnp.where(across, now - then, 1.0), 1.0))
+
+
+def _load_units(robot: Robot, conditions: Conditions) -> Float[Array, " 2"]:
+    """Units of the load that moves to a side [N] and of the centre of pressure [m]."""
+    return jnp.stack([robot.chassis(conditions.configuration).mass * GRAVITY, robot.running_gear.wheelbase])
+
+
+def _loads(robot: Robot, conditions: Conditions, y: Float[Array, " 9"]) -> Float[Array, " 2"]:
+    return y[SETTLING:] * _load_units(robot, conditions)
+
+
+def _settled(robot: Robot, conditions: Conditions) -> tuple[PlaneMotion, Float[Array, " 2"], Bool[Array, ""]]:
+    """The motion of a settled turn on level ground, its loads, see `turning.grip`, and whether it was found.
 
     Implicit Euler's steps, longer and longer, follow a run to where it settles; in the end they are Newton's, and the
-    last of those carries the derivatives, which are the implicit ones.
+    last of those carries the derivatives, which are the implicit ones. A first attempt takes every step, none of them
+    farther than `_share` lets it. Where it has not ended soon, or at a turn that is not stable, a second begins anew
+    and takes none that lets the rates grow.
     """
-    moves = np.arange(SETTLING) >= (0 if conditions.of_sides().motor_speed is None else 4)
-    still = -np.eye(SETTLING)
+    size = SETTLING + len(SIDES)
+    moves = np.arange(size) >= (0 if conditions.of_sides().motor_speed is None else 4)
+    still, slow = -np.eye(size), np.diag(np.arange(size) < SETTLING)
 
-    def others(conditions: Conditions) -> Array:
-        return jnp.zeros(len(_UNITS) - SETTLING).at[-1].set(conditions.discharge / _UNITS[-1])
-
-    def of(y: Array, robot: Robot, conditions: Conditions) -> Array:
-        return rates(robot, conditions, jnp.concatenate([y, others(conditions)]))[:SETTLING]
-
-    def begun(held: tuple[Robot, Conditions]) -> _Search:
+    def begun(held: tuple[Robot, Conditions], patient: bool = False) -> _Search:
         """Its first step goes nowhere: it only looks round."""
-        guess = _guess(*held)[:SETTLING]
-        none = jnp.zeros_like(guess)
-        return _Search(guess, none, jnp.asarray(still), jnp.asarray(FIRST), jnp.asarray(0), jnp.asarray(False))
+        guess = jnp.concatenate([_guess(*held)[:SETTLING], jnp.zeros(len(SIDES))])
+        first, turns = jnp.asarray(FIRST), jnp.asarray(0)
+        return _Search(
+            guess, jnp.zeros_like(guess), jnp.asarray(still), first, turns, jnp.asarray(patient), jnp.asarray(False)
+        )
 
     def turn(held: tuple[Robot, Conditions], search: _Search) -> _Search:
-        step = inverse(jnp.eye(SETTLING) / search.step - search.jacobian)(search.rates)
-        there = search.y + step
-        slope, found = jax.jacfwd(lambda y: (of(y, *held),) * 2, has_aux=True)(there)
+        solve, determinant = inverse(jnp.asarray(slow) / search.step - search.jacobian)
+        step = solve(search.rates)
+        largest, patient = jnp.max(jnp.abs(step)), search.patient
+        there = search.y + step * jnp.where(patient, 1.0, _share(*held, search.y, step))
+        slope, found = jax.jacfwd(lambda y: (_balance(*held, y),) * 2, has_aux=True)(there)
         slope = jnp.where(moves[:, None], slope, still)  # what does not move has no equation of its own
         before, after = jnp.linalg.norm(search.rates), jnp.linalg.norm(found)
-        worse = (~(after <= WORSE * before + SMALL) | (jnp.max(jnp.abs(step)) > FAR)) & (search.turns > 0)
-        ended = ~worse & (jnp.max(jnp.abs(step)) < SMALL) & ((search.step > LONG) | (after < SMALL_RATE))
+        worse = patient & (~(after <= WORSE * before + SMALL) | (largest > FAR)) & (search.turns > 0)
+        settled = (search.step > LONG) | patient & (after < SMALL_RATE)
+        ended = ~worse & (largest < SMALL) & settled
         y, found, slope = (
             jnp.where(worse, old, new)
             for old, new in ((search.y, there), (search.rates, found), (search.jacobian, slope))
         )
         length = jnp.clip(search.step * jnp.where(worse, SHORTER, LONGER), SHORTEST, LONGEST)
-        return _Search(y, found, slope, length, search.turns + 1, ended)
+        gone = _Search(y, found, slope, length, search.turns + 1, patient, ended & (patient | (determinant > 0)))
+        anew = ~patient & jnp.where(ended, determinant <= 0, search.turns >= SOON)
+        return jax.tree.map(lambda x, y: jnp.where(anew, x, y), begun(held, True), gone)
 
     end = lanes.until(begun, turn, lambda search: (search.turns >= TURNS) | search.solved, (robot, conditions))
     sound = end.solved & jnp.all(jnp.isfinite(end.jacobian))
-    slope = jnp.where(sound, end.jacobian, still)
-    last = inverse(-slope)(jnp.where(sound, of(end.y, robot, conditions), 0.0))
-    return jnp.concatenate([end.y + last, others(conditions)]), sound
+    slope = jnp.where(sound, end.jacobian, jnp.asarray(still))
+    y = end.y + inverse(-slope)[0](jnp.where(sound, _balance(robot, conditions, end.y), 0.0))
+    return motion_of(robot, _whole(conditions, y)), _loads(robot, conditions, y), sound
 
 
 def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, PlaneMotion, Array]:
@@ -197,9 +253,8 @@ def circling(robot: Robot, conditions: Conditions) -> tuple[balances.Travel, Pla
         than friction at rest is resolved; `tips` where no load is left on a side or at an end; `battery_empty`;
         `not_settled` where no settled turn was found: it may be that there is none, as friction falls with sliding.
     """
-    y, solved = _settled(robot, conditions)
-    motion = motion_of(robot, y)
-    travel = balances.turning(robot, conditions, motion)
+    motion, loads, solved = _settled(robot, conditions)
+    travel = balances.turning(robot, conditions, motion, loads)
     status = _status(robot, conditions, travel, motion)
     return travel, motion, jnp.where(solved, status, NOT_SETTLED)
 

@@ -20,6 +20,7 @@ from mmrjax.params import Parameter, Spec
 from mmrjax.signals import Result
 from sweeps.console import say
 from sweeps.pages import words
+from sweeps.results.climb import VERDICTS
 
 #: A line of an explanation: heading and text.
 Line = tuple[str, str]
@@ -71,6 +72,7 @@ def names(library: dict[str, type[Effect]]) -> dict[str, list[str]]:
     return {
         "effects": [name for name in library if name not in effects.UNNAMED],
         "statuses": list(words.STATUSES),
+        "verdicts of a climb": list(VERDICTS),
         "flags": list(words.FLAGS),
         "channels": [c.name for c in channels.EVERY],
         "outputs": list(dict.fromkeys(o.name for o in EVERY_OUTPUT)),
@@ -147,6 +149,12 @@ def _status(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
             yield "in short", about.why
         yield "exit code", "3, since a solver failed" if name == "failed" else "0: it is an answer"
         yield "in files", "column status of runs.csv, counts in result.json"
+
+
+def _verdict(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
+    if name in VERDICTS:
+        yield "means", VERDICTS[name][1]
+        yield "in files", "verdict of result.json of mmrjax climb"
 
 
 def _flag(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
@@ -229,6 +237,6 @@ def _bounds(spec: Spec) -> str:
 
 #: What explains a name, by kind.
 EXPLAINED: dict[str, Callable[[str, dict[str, type[Effect]]], Iterator[Line]]] = {
-    "effect": _effect, "status": _status, "flag": _flag, "channel": _channel, "output": _output,
-    "parameter": _parameter,
+    "effect": _effect, "status": _status, "verdict of a climb": _verdict, "flag": _flag, "channel": _channel,
+    "output": _output, "parameter": _parameter,
 }  # fmt: skip

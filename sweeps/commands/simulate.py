@@ -23,8 +23,9 @@ from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say
 from sweeps.inputs import beside_robot, load_robot, one_run, read_runs
-from sweeps.pages import words
+from sweeps.pages import posture_words, words
 from sweeps.points import run, scale, uncertainty
+from sweeps.results import posture
 from sweeps.skeleton import page
 from sweeps.store import RunFolder, open_folder
 
@@ -61,6 +62,7 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         table, histories = _simulated(folder, robot, runs, config)
         table[PERMISSIBLE] = permissible(robot, table)
+        stands = posture.postures(robot, runs, run.commanded(robot, runs, config))
         notes = remarks(robot, table)
         found = None
         if drawn is not None and config.posterior is not None:
@@ -75,12 +77,16 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         if len(runs) > _SHOWN:
             say(f"... and {len(runs) - _SHOWN} more in runs.csv")
         further: dict[str, Any] = {"notes": notes}
+        if stands is not None:
+            folder.write_table("posture.csv", stands.table)
+            say(posture_words.stands(stands))
+            notes += posture_words.remarks(stands)
         if histories is not None and robot.has_ground:
             further["starts"] = starts(robot, histories, runs)
         if PEAK in table:
             further[PEAK] = float(np.nanmax(table[PEAK], initial=0.0))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, further)
-        shown = page("runs", file, model=config.model, runs=table, histories=histories)
+        shown = page("runs", file, model=config.model, runs=table, histories=histories, stands=stands)
         return run.leave(folder, config, result, shown)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mmrjax.channels import Channel
@@ -31,17 +33,7 @@ def parity(table: dict[str, np.ndarray], channels: Sequence[Channel], band: bool
         for kind, (colour, marker) in look.items():
             pick = both & (table["configuration"] == kind)
             if pick.any():
-                axes.plot(
-                    measured[pick],
-                    simulated[pick],
-                    marker,
-                    ms=5,
-                    mec="white",
-                    mew=0.5,
-                    color=colour,
-                    label=kind,
-                    rasterized=bool(pick.sum() > 2000),
-                )
+                _dots(axes, measured[pick], simulated[pick], marker, color=colour, label=kind)
         axes.set(xlabel=f"measured {axis_label(channel)}", ylabel=f"simulated {axis_label(channel)}")
         axes.set_xlim(*span)
         axes.set_ylim(*span)
@@ -94,17 +86,8 @@ def errors_over(
             for side, (kind, (colour, marker)) in zip(sides, look.items(), strict=True):
                 pick = (table["configuration"] == kind) & np.isfinite(error)
                 if pick.any():
-                    axes.plot(
-                        table[condition][pick] + side * shift,
-                        error[pick],
-                        marker,
-                        ms=5,
-                        mec="white",
-                        mew=0.5,
-                        color=colour,
-                        label=kind,
-                        rasterized=bool(pick.sum() > 2000),
-                    )
+                    moved = table[condition][pick] + side * shift
+                    _dots(axes, moved, error[pick], marker, color=colour, label=kind)
             if row[0] is grid[-1, 0]:
                 axes.set_xlabel(words)
                 if levels.size <= 8:
@@ -115,3 +98,8 @@ def errors_over(
             axes.legend(loc="best")
             break
     return fig
+
+
+def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, marker: str, **look: Any) -> None:
+    """Readings of a configuration; very many of them as a picture."""
+    axes.plot(x, y, marker, ms=5, mec="white", mew=0.5, rasterized=len(x) > 2000, **look)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from calibration.words.notes import sentence
 from mmrjax import params
 from mmrjax.channels import Channel
 from mmrjax.effects import BY_NAME
+from mmrjax.robot import Robot
 from sweeps.pages import cluster_figures, loop_figures
 from sweeps.pages.page import Album, columns, conditions, curves, first_rows, render, rms, words_shown
 from sweeps.pages.words import GLOSSARY
@@ -62,13 +63,13 @@ def alike(found: DiscoveryResult) -> list[str]:
     return [*(words.alike(e) for e in found.effects), *without_name]
 
 
-def findings(found: DiscoveryResult) -> list[dict[str, str]]:
+def findings(found: DiscoveryResult, changed: Mapping[str, Change]) -> list[dict[str, str]]:
     """Each effect of the model for the first screen: what it is, how large, how sure, what else it could be."""
     listed = []
     for e in found.effects:
         a = e.parameters["amplitude"]
         size = f"{a.value:.3g} ± {a.sd:.2g} {a.unit}"
-        if (change := changed(found, e.name)) is not None:
+        if (change := changed.get(e.name)) is not None:
             size += f", which changes the {change.channel.label} by {100 * change.rms:.2g} %"
         sure, other = words.how_sure(found, e), words.alike(e)
         listed.append({"name": e.name, "what": ", or ".join(e.families), "size": size, "sure": sure, "alike": other})
@@ -90,20 +91,29 @@ class Change:
     with_it: np.ndarray
 
 
-def changed(found: DiscoveryResult, name: str) -> Change | None:
-    """What an effect changes in settled runs; None of histories, and where it is not in the robot that is written."""
-    if not isinstance(found.detail, EquationDefects) or name not in {e.name for e in found.robot.effects}:
-        return None
+def changes(found: DiscoveryResult) -> dict[str, Change]:
+    """What each effect changes in settled runs; nothing of histories, and of effects that the written robot lacks."""
+    added = [e.name for e in found.effects if e.name in {x.name for x in found.robot.effects}]
+    if not isinstance(found.detail, EquationDefects) or not added:
+        return {}
     conditions = found.runs.conditions(found.robot)
-    none = params.replace(found.robot, {f"effects.{name}.amplitude": np.asarray(0.0)})
-    without, with_it = (mm.simulate(robot, conditions).reading for robot in (none, found.robot))
-    changes = []
-    for c in found.channels:
-        a, b = np.asarray(without[c.name]), np.asarray(with_it[c.name])
-        there = found.included & np.isfinite(a) & np.isfinite(b) & (b != 0)
-        if there.any():
-            changes.append(Change(c, float(np.sqrt(np.mean((a[there] / b[there] - 1) ** 2))), a, b))
-    return max(changes, key=lambda change: change.rms, default=None)
+
+    def shown(robot: Robot) -> dict[str, np.ndarray]:
+        results = mm.simulate(robot, conditions)
+        return {c.name: np.asarray(getattr(results, c.name)) for c in found.channels}
+
+    with_it, most = shown(found.robot), {}
+    for name in added:
+        without = shown(params.replace(found.robot, {f"effects.{name}.amplitude": params.as_float(0.0)}))
+        moved = []
+        for c in found.channels:
+            a, b = without[c.name], with_it[c.name]
+            there = found.included & np.isfinite(a) & np.isfinite(b) & (b != 0)
+            if there.any():
+                moved.append(Change(c, float(np.sqrt(np.mean((a[there] / b[there] - 1) ** 2))), a, b))
+        if moved:
+            most[name] = max(moved, key=lambda change: change.rms)
+    return most
 
 
 def would_be_seen(found: DiscoveryResult) -> list[dict[str, Any]]:
@@ -187,9 +197,9 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
     if found.residual_clusters:
         album.add("clusters", lambda: cluster_figures.clusters(found.residual_clusters))
     album.add("errors", lambda: loop_figures.errors(found))
-    changes = {e.name: change for e in found.effects if (change := changed(found, e.name)) is not None}
-    if changes:
-        album.add("laws", lambda: loop_figures.laws(found, table, changes))
+    changed = changes(found)
+    if changed:
+        album.add("laws", lambda: loop_figures.laws(found, table, changed))
     if found.unnamed is not None:
         curve = found.unnamed
         album.add("curve", lambda: loop_figures.curve(rows_of(found), curve, float(found.robot.sides)))
@@ -204,7 +214,7 @@ def write(folder: Path, found: DiscoveryResult, *, robot_name: str) -> Path:
         of_channels=found.channels,
         title=f"Is the {words_shown(Path(robot_name).name)} model complete?",
         answer=words.answer(found),
-        findings=findings(found),
+        findings=findings(found, changed),
         summary=summary(found),
         unseen=unseen(found),
         would_be_seen=would_be_seen(found),

@@ -11,7 +11,7 @@ import numpy as np
 
 from mmrjax.channels import MM, RPM
 from sweeps import capabilities
-from sweeps.pages import power_figures, words
+from sweeps.pages import posture_words, power_figures, words
 from sweeps.pages.page import Album, columns, conditions, first_rows, label, named, render, statuses
 from sweeps.points.imposed import UNLIMITED
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mmrjax.fidelities.base import Run
     from mmrjax.robot import Robot
     from sweeps.pages.history_figures import Start
+    from sweeps.results.posture import Postures
 
 #: What the table of runs shows beside conditions and channels: heading, factor, format.
 FURTHER = {
@@ -38,6 +39,7 @@ def write(
     model: str,
     runs: dict[str, np.ndarray],
     histories: Run | None = None,
+    stands: Postures | None = None,
 ) -> Path:
     """Write `report.html` and `figures/` for a few finished runs.
 
@@ -47,15 +49,23 @@ def write(
         model: fidelity.
         runs: the finished table of runs.
         histories: the same as a batch with its history, of a fidelity that keeps it.
+        stands: in which posture, where the runs state levers.
 
     Returns:
         The path of the page.
     """
     album, robot = Album(folder), file.robot
     names = labels(runs)
-    known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": []}
+    known: dict[str, Any] = {"shown": 0, "ripple": [], "averaged": 0.0, "courses": [], "starts": [], "posture": None}
     if histories is not None:
         known |= _histories(album, robot, runs, names, histories)
+    if stands is not None:
+        from sweeps.pages import posture_figures
+
+        known["posture"] = posture_words.table(stands)
+        album.add("posture", lambda: posture_figures.rest_and_step(stands))
+        if len(names) == 1:
+            album.add("steps", lambda: posture_figures.steps(stands.over))
     chain = np.flatnonzero(power_figures.drawable(runs) & np.isin(runs["status"], words.SETTLED))[:CHAINS]
     if chain.size:
         picked = {key: value[chain] for key, value in runs.items()}

@@ -1,0 +1,117 @@
+"""Terrains and sequences of lever angles from outside: CSV with units in the column names, checked cell by cell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as Rows
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from calibration.data import delimited
+from calibration.data.errors import BadConfiguration, BadData, is_number
+from mmrjax import terrain
+from mmrjax.fidelities.climb import Sequence
+from mmrjax.robot import Robot
+from mmrjax.terrain import Terrain
+
+#: A polyline longer or higher than this is taken for one in other units [m].
+LARGEST = 50.0
+#: Metres of one.
+_LENGTHS = {"m": 1.0, "mm": 1e-3}
+
+
+def stairs(text: str) -> tuple[float, float, int]:
+    """Rise and tread [m] and count of «170x290x3» in mm.
+
+    Raises:
+        BadConfiguration: something else, or a stair without rise or tread.
+    """
+    cells = text.lower().replace("×", "x").split("x")
+    numbers = [float(c) if is_number(c) else np.nan for c in cells]
+    if len(cells) != 3 or not np.isfinite(numbers).all():
+        raise BadConfiguration(f"--stairs: got {text}; expected RISExTREADxCOUNT in mm, such as 170x290x3")
+    rise, tread, count = numbers
+    for name, value, least, most in (("rise", rise, 1, 2000), ("tread", tread, 10, 5000), ("count", count, 1, 50)):
+        if not least <= value <= most or (name == "count" and value != int(value)):
+            unit = "" if name == "count" else " mm"
+            raise BadConfiguration(f"--stairs: got a {name} of {value:g}{unit}; expected {least} to {most}{unit}")
+    return rise / 1000, tread / 1000, int(count)
+
+
+def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, np.ndarray], Rows[str]]:
+    """Columns of the first of some headers that a file has."""
+    try:
+        lines = path.read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadConfiguration(f"{option}: {path} cannot be read; expected a CSV file") from error
+    lines = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    rows, _ = delimited.cells(path.name, lines)
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    names = next((names for names in wanted if set(names) <= set(header)), None)
+    if names is None:
+        either = ", or ".join(" and ".join(names) for names in wanted)
+        raise BadData(f"{path.name}: got columns {', '.join(header) or 'none'}; expected {either}")
+    found: dict[str, list[float]] = {name: [] for name in names}
+    for k, row in enumerate(rows[1:], 2):
+        for name in names:
+            j = header.index(name)
+            cell = row[j] if j < len(row) else ""
+            if not is_number(cell) or not np.isfinite(float(cell)):
+                raise BadData(f"{path.name} row {k}, {name}: got {cell!r}; expected a number")
+            found[name].append(float(cell))
+    if len(rows) < 2:
+        raise BadData(f"{path.name}: has no rows; expected at least one")
+    return {name: np.array(values) for name, values in found.items()}, names
+
+
+def read_terrain(path: Path) -> Terrain:
+    """A polyline from a file: level ground up to its first point and from its last one on.
+
+    Raises:
+        BadConfiguration: no such file.
+        BadData: columns without units, cells without numbers, ground that folds back, metres that are millimetres, or
+            a first point that is not at the origin's height.
+    """
+    columns, names = _read(path, "--terrain", [("x_m", "z_m"), ("x_mm", "z_mm")])
+    scale = _LENGTHS[names[0].rpartition("_")[2]]
+    x, z = (columns[name] * scale for name in names)
+    largest = max(np.ptp(x), np.ptp(z))
+    if largest > LARGEST:
+        hint = "; is the file in millimetres? Name its columns x_mm and z_mm then" if scale == 1.0 else ""
+        raise BadData(f"{path.name}: is {largest:g} m large; expected at most {LARGEST:g} m{hint}")
+    try:
+        return terrain.polyline(x - x[0], z - z[0])
+    except ValueError as error:
+        raise BadData(f"{path.name}: {error}") from error
+
+
+def read_sequence(path: Path, robot: Robot) -> Sequence:
+    """Lever angles over distance or time from a file.
+
+    Raises:
+        BadConfiguration: no such file.
+        BadData: other columns, cells without numbers, knots that do not rise, an angle beyond the robot's range.
+    """
+    angles = ("front_deg", "rear_deg")
+    columns, names = _read(path, "--sequence", [("x_mm", *angles), ("time_s", *angles)])
+    at = columns[names[0]] * (1e-3 if names[0] == "x_mm" else 1.0)
+    if (falls := np.flatnonzero(np.diff(at) <= 0)).size:
+        raise BadData(
+            f"{path.name} row {falls[0] + 3}, {names[0]}: got {columns[names[0]][falls[0] + 1]:g} after "
+            f"{columns[names[0]][falls[0]]:g}; expected values that rise"
+        )
+    for name in angles:
+        for k, value in enumerate(columns[name]):
+            if why := beyond(robot, value):
+                raise BadData(f"{path.name} row {k + 2}, {name}: {why}")
+    front, rear = (jnp.asarray(np.radians(columns[name])) for name in angles)
+    return Sequence(jnp.asarray(at), front, rear, names[0] == "time_s")
+
+
+def beyond(robot: Robot, angle: float) -> str:
+    """Why levers cannot stand at an angle [deg]; empty where they can."""
+    levers = robot.running_gear.levers
+    least, most = (float(np.degrees(np.asarray(x))) for x in (levers.angle_least, levers.angle_most))
+    within = least - 1e-6 <= angle <= most + 1e-6
+    return "" if within else f"got {angle:g} deg; expected {least:.4g} to {most:.4g} deg, the range of the levers"

@@ -1,0 +1,543 @@
+"""Half a robot with levers over a terrain in its plane of travel: its state, one step, and how a run ends.
+
+The bodies are the chassis with payload, two pulleys and two levers; the belts run rigidly with the pulleys, and the
+levers swing as a sequence asks, at most at their rate, with whatever torque that takes. Contacts are of `footing`,
+the drive of `balances`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mmrjax import balances, contact, footing
+from mmrjax.chassis import Chassis
+from mmrjax.compiling import SMALL, compiled
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.half_robot import current_after
+from mmrjax.fidelities.linear import factorise, substitute
+from mmrjax.footing import COORDINATES, FRONT, PITCH, REAR, SHAFT, Footing, Shape
+from mmrjax.gearbox import Gearbox
+from mmrjax.masses import Masses, without_levers
+from mmrjax.params import Scalar
+from mmrjax.robot import Robot
+from mmrjax.signals import GRAVITY, Signals, State
+from mmrjax.terrain import Terrain
+
+#: How a climb ends; the last two: its time was over while it still went on, numbers that mean nothing.
+VERDICTS = OVER, TIPS, STALLS, SLIDES, HANGS, UNFINISHED, FAILED = range(7)
+NAMES = ("over", "tips", "stalls", "slides", "hangs", "unfinished", "failed")
+_RUNNING = -1
+
+STEP, SAMPLE, DURATION = 1e-4, 2e-2, 20.0  # [s]
+SETTLES, RISES = 0.3, 0.1  # before the motors are switched on, and until they have their voltage [s]
+#: Pitch beyond which a robot has turned over [rad].
+TURNED_OVER = np.radians(100.0)
+#: A robot that gains less than this way [m] in this time [s] is stuck.
+GAIN, PATIENCE = 5e-3, 2.0
+#: A belt slower than this [m/s] stands; a body that bears more than this share of the weight hangs.
+STANDS, BEARS = 5e-3, 0.1
+#: Time in which levers come to their rate and near their angle [s].
+_SWINGS = 0.03
+FREE, LED = np.array([0, 1, 2, 3]), np.array([4, 5])
+
+
+class Sequence(eqx.Module):
+    """Angles of the levers over distance or time, straight between knots and constant beyond them.
+
+    Attributes:
+        at: knots, of the middle of the wheelbase from where the obstacle begins [m], or times [s].
+        front, rear: angles at them, 0 along the wheelbase outward, positive up [rad].
+        over_time: whether knots are times.
+    """
+
+    at: Float[Array, " knots"]
+    front: Float[Array, " knots"]
+    rear: Float[Array, " knots"]
+    over_time: bool = eqx.field(default=False, static=True)
+
+    def angles(self, place: Scalar, time: Scalar) -> Float[Array, " 2"]:
+        """ψ of both levers that are asked for, see `footing` [rad]."""
+        at = time if self.over_time else place
+        return jnp.stack([jnp.interp(at, self.at, self.front), jnp.pi - jnp.interp(at, self.at, self.rear)])
+
+
+def still(front: Scalar, rear: Scalar) -> Sequence:
+    """Levers that stay at their angles [rad]."""
+    one = jnp.zeros(1)
+    return Sequence(one, one + front, one + rear)
+
+
+class Motion(eqx.Module):
+    """State of half a robot: coordinates and velocities (see `footing`), current of one motor [A], charge taken from
+    the battery [C]."""
+
+    q: Float[Array, " 6"]
+    v: Float[Array, " 6"]
+    current: Scalar
+    discharge: Scalar
+
+
+#: Where energy goes, per side: what comes in, then what is lost.
+SOURCES = ("supply", "levers")
+LOSSES = ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling")
+
+
+Energy = dict[str, Any]
+
+
+class Passed(eqx.Module):
+    """What an instant or a sample has: means over it, and energy since the start of the run.
+
+    Attributes:
+        current: of one motor [A]; torque: of each pair of levers on the chassis' side, up [N·m].
+        energy: in and lost, by the names of `SOURCES` and `LOSSES`, of the whole robot [J].
+        stored: in motion, height, contacts and windings, of the whole robot [J].
+        body: share of all normal force that the body bears [-].
+        margin: how far the centre of mass is within the outermost contacts [m].
+    """
+
+    time: Scalar
+    motion: Motion
+    current: Scalar
+    voltage: Scalar
+    torque: Float[Array, " 2"]
+    lever_current: Float[Array, " 2"]
+    energy: Energy
+    stored: Scalar
+    normal: Scalar
+    body: Scalar
+    margin: Scalar
+
+
+class System(eqx.Module):
+    """One run's constants."""
+
+    robot: Robot
+    conditions: Conditions
+    terrain: Terrain
+    sequence: Sequence
+    shape: Shape
+    half: Masses
+    lever: Float[Array, " 3"]
+    chassis: Chassis
+    step: Scalar
+
+
+def system(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: Scalar = STEP) -> System:
+    """Constants of one run (scalar conditions); the robot may hold tracers."""
+    zero = jnp.zeros_like(conditions.voltage)
+    mass = balances.begin(robot, conditions, State(zero, zero, zero, zero)).mass
+    chassis, gear = robot.chassis(conditions.configuration), robot.running_gear
+    lever = jnp.stack([gear.lever_mass, gear.lever_centre, gear.lever_inertia]) * jnp.stack(
+        [chassis.on_tracks, jnp.ones(()), chassis.on_tracks]
+    )
+    return System(
+        robot, conditions, terrain, sequence, footing.shape_of(chassis, gear, robot.radius_pulley),
+        without_levers(robot, conditions, mass), lever, chassis, jnp.asarray(step, float),
+    )  # fmt: skip
+
+
+def inertia(run: System, q: Array, v: Array) -> tuple[Float[Array, "6 6"], Float[Array, " 6"], Scalar]:
+    """Mass matrix M without rotors, bias c (centrifugal forces and gravity) and potential energy, per side.
+
+    M v' + c = Q. Each body's centre of mass moves by its arm about the middle of the wheelbase and, of a lever, about
+    its axle; gravity is tilted by the slope of the conditions.
+    """
+    half, shape = run.half, run.shape
+    body, *levers = footing.frames(shape, q)
+    down = GRAVITY * jnp.stack([jnp.sin(run.conditions.slope), jnp.cos(run.conditions.slope)])
+    zero, one = jnp.zeros(()), jnp.ones(())
+
+    def across(arm: Array) -> Array:
+        """Velocity of a point at `arm` that turns nose down, per angular speed."""
+        return jnp.stack([arm[1], -arm[0]])
+
+    matrix, bias, height = jnp.zeros((COORDINATES, COORDINATES)), jnp.zeros(COORDINATES), zero
+    mass_lever, centre_lever = run.lever[0], run.lever[1]
+    masses: list[tuple[Scalar, Array, Array | None, int | None]] = []
+    arm = body.along(jnp.stack([half.forward, half.up]))
+    masses.append((half.chassis, arm, None, None))
+    for lever in levers:
+        axle = lever.origin - body.origin
+        masses.append((half.pulley, axle, None, None))
+        reach = lever.along(jnp.stack([centre_lever, zero]))
+        masses.append((mass_lever, axle + reach, reach, lever.turns))
+    for mass, at, out, turns in masses:
+        columns = [jnp.stack([one, zero]), jnp.stack([zero, one]), across(at), *[jnp.zeros(2)] * 3]
+        centrifugal = -at * v[PITCH] ** 2
+        if out is not None and turns is not None:
+            columns[turns] = -across(out)
+            centrifugal = -(at - out) * v[PITCH] ** 2 - out * (v[PITCH] - v[turns]) ** 2
+        moves = jnp.stack(columns, axis=1)
+        matrix = matrix + mass * moves.T @ moves
+        bias = bias + mass * moves.T @ (centrifugal + down)
+        height = height + mass * down @ (body.origin + at)
+    turning = [(half.inertia, {PITCH: 1.0}), (2 * half.inertia_pulley, {PITCH: 1.0, SHAFT: 1.0})]
+    turning += [(run.lever[2], {PITCH: 1.0, k: -1.0}) for k in (FRONT, REAR)]
+    for about, by in turning:
+        row = jnp.zeros(COORDINATES).at[np.array(list(by))].set(jnp.array(list(by.values())))
+        matrix = matrix + about * jnp.outer(row, row)
+    return matrix, bias, height
+
+
+class _Pull(eqx.Module):
+    """What the contacts do, as `balances.resolved` asks for it."""
+
+    traction: Scalar
+    guide: Scalar
+    load: Scalar
+    force: Float[Array, " pairs"]
+
+
+class _Mover(eqx.Module):
+    at: Footing
+    v: Array
+    radius: Scalar
+
+    @property
+    def normal(self) -> Scalar:
+        """Normal load of one side, of all that rolls [N]."""
+        return jnp.sum(self.at.force * self.at.rolls)
+
+    def pull(self, chassis: Chassis, signals: Signals) -> _Pull:
+        """Friction of the contacts (25) by Fig. 7, and of the guide (26)."""
+        at = self.at
+        force = jnp.asarray(chassis.ground.traction(_sliding(at, self.v, signals), at.force, signals.adhesion))
+        guide = jnp.sum(chassis.track.guide_friction * at.guided * at.force * signals.direction)
+        load = guide * self.radius - jnp.sum(force * at.along[:, SHAFT] + at.force * at.off[:, SHAFT])
+        return _Pull(jnp.sum(force), guide, load, force)
+
+
+def _sliding(at: Footing, v: Array, signals: Signals) -> Array:
+    return -(at.along @ v) - signals.speed_slip_terms
+
+
+def carried(at: Footing, v: Array) -> tuple[Array, Scalar]:
+    """Share of the load of each contact that rolls, and the robot's speed along the ground, their mean by load."""
+    bears = at.force * at.rolls
+    share = bears / jnp.maximum(jnp.sum(bears), 1e-9)
+    return share, share @ (at.carried @ v)
+
+
+def instant(run: System, motion: Motion, on: Scalar) -> tuple[Signals, Footing, _Pull, Array]:
+    """All signals, contacts, forces and the shares of the load of an instant; `on`: share of their
+    voltage that the motors have."""
+    at = footing.footing(run.shape, run.terrain, motion.q, motion.v)
+    share, speed = carried(at, motion.v)
+    conditions = _driven(run, on)
+
+    ratio = run.robot.gearbox.ratio
+    state = State(motion.current, ratio * motion.v[SHAFT], speed, motion.discharge)
+    mover = _Mover(at, motion.v, run.shape.main.first)
+    signals, pulled = balances.resolved(run.robot, conditions, state, mover, 2 * run.half.inertia_pulley)
+    return signals, at, pulled, share
+
+
+def _driven(run: System, on: Scalar) -> Conditions:
+    return dataclasses.replace(run.conditions, duty=run.conditions.duty * on)
+
+
+def asked(run: System, motion: Motion, time: Scalar) -> Float[Array, " 2"]:
+    """Angular speeds of the levers after a step [rad/s]: towards the sequence's angles, at most at their rate."""
+    rate = run.robot.running_gear.levers.rate
+    toward = (run.sequence.angles(motion.q[0], time) - motion.q[LED]) / (4 * _SWINGS)
+    return motion.v[LED] + run.step / _SWINGS * (jnp.clip(toward, -rate, rate) - motion.v[LED])
+
+
+def lever_current(robot: Robot, torque: Array, rate: Array) -> Array:
+    """Current of the motor of a pair of levers [A] at its torque [N·m] and angular speed [rad/s], up both.
+
+    M_d = M / (i_p i_w) by the efficiencies of planetary gear and worm, driven (20) or overhauling, plus the motor's
+    friction (14); a worm of an efficiency up to 1/2 holds a lever that stands, without current.
+    """
+    levers = robot.running_gear.levers
+    direction = contact.direction(rate, 1e-2)
+    for ratio, efficiency in (
+        (levers.worm_ratio, levers.worm_efficiency),
+        (levers.planetary_ratio, levers.planetary_efficiency),
+    ):
+        gear = Gearbox(ratio=ratio, efficiency_load=efficiency, mesh_theory=True)
+        flows = jnp.abs(direction) * gear.efficiency_flow(torque * direction, 1.0) + (1 - jnp.abs(direction))
+        torque = torque / (ratio * flows)
+    holds = (levers.worm_efficiency <= 0.5) * (1 - jnp.abs(direction))
+    speed = rate * levers.worm_ratio * levers.planetary_ratio
+    return (torque * (1 - holds) + robot.motor.torque_loss(speed, direction)) / robot.motor.torque_constant
+
+
+def advance(run: System, motion: Motion, time: Scalar, energy: Energy) -> tuple[Motion, Energy, Passed]:
+    """One step, linearly implicit in what contacts and drive resist by as `half_robot.advance` is.
+
+    (M + Δt K) Δv = Δt (Q - c), the levers' Δv imposed, whose torque follows from their rows. Energy is that of the
+    step's impulses at the mean of its velocities, and of a current that changes evenly.
+
+    Returns:
+        Motion and energy after it, and what was before it.
+    """
+    on = jnp.clip((time - SETTLES) / RISES, 0.0, 1.0)
+    signals, at, pulled, share = instant(run, motion, on)
+    robot, step, radius = run.robot, run.step, run.shape.main.first
+    matrix, bias, height = inertia(run, motion.q, motion.v)
+    ratio, rotor = robot.gearbox.ratio, robot.motor.inertia
+    armature = rotor * ratio**2 * signals.efficiency_load + signals.inertia_added
+    resisted = signals.resistance * (share @ at.carried)
+    force = pulled.force @ at.along + at.force @ at.off - resisted
+    force = force.at[SHAFT].set(signals.torque_net - resisted[SHAFT])
+
+    rises = jnp.maximum(
+        run.chassis.ground.traction_rise(_sliding(at, motion.v, signals), at.force, signals.adhesion), 0
+    )
+    coefficient = pulled.force / jnp.maximum(at.force, 1e-9)
+    pushes = coefficient[:, None] * at.along + at.off
+    shaft = _shaft_loss(run, motion, signals, at)
+    damping = (at.along.T * rises) @ at.along + (pushes.T * at.damped) @ at.off
+    damping = damping.at[SHAFT, SHAFT].add(shaft)
+    whole = matrix.at[SHAFT, SHAFT].add(armature) + step * damping
+    led = asked(run, motion, time) - motion.v[LED]
+    pushed = step * (force - bias)
+    free = substitute(factorise(whole[:4, :4]), pushed[:4] - whole[:4, 4:] @ led)
+    gained = jnp.concatenate([free, led])
+    v = motion.v + gained
+    middle = motion.v + gained / 2
+
+    charge = robot.battery.current(signals.total_current) * (run.conditions.battery > 0.5)
+    current = current_after(robot, _driven(run, on), step, signals)
+    after = Motion(motion.q + step * v, v, current, motion.discharge + step * charge)
+
+    torque = (whole[4:] @ gained - pushed[4:]) / step
+    off, along = at.off @ gained, at.along @ gained
+    normal = at.force - at.damped * off
+    friction = pulled.force - rises * along - coefficient * at.damped * off
+    motor = ratio * middle[SHAFT]
+    drive = signals.torque_motor - signals.torque_idle
+    mesh = drive - rotor * ratio * gained[SHAFT] / step
+    own = signals.torque_load - signals.torque_track_loss - (pulled.load - pulled.guide * radius)
+    rise = current - signals.current
+    mean, resistance = signals.current + rise / 2, robot.motor.resistance
+    added = run.step * robot.sides * jnp.stack([
+        signals.voltage * mean,
+        torque @ middle[LED],
+        (signals.voltage_drop + resistance * rise / 2) * mean + resistance * rise**2 / 12,
+        signals.torque_motor_loss * motor,
+        (signals.torque_idle + (1 - signals.efficiency_load) * mesh) * motor + own * middle[SHAFT],
+        (signals.torque_track_loss + shaft * gained[SHAFT]) * middle[SHAFT],
+        -friction @ (at.along @ middle),
+        -(normal - at.elastic) @ (at.off @ middle),
+        resisted @ middle,
+    ])  # fmt: skip
+    spent = {name: energy[name] + added[k] for k, name in enumerate((*SOURCES, *LOSSES))}
+    kinetic = motion.v @ matrix @ motion.v + (signals.inertia_added + rotor * ratio**2) * motion.v[SHAFT] ** 2
+    stored = kinetic / 2 + signals.inductance * motion.current**2 / 2 + height + jnp.sum(at.energy)
+    torques = torque * jnp.array([1.0, -1.0]) * robot.sides  # up, of a rear lever that is where ψ falls
+    total = jnp.sum(at.force)
+    passed = Passed(
+        time=time,
+        motion=motion,
+        current=signals.current,
+        voltage=signals.voltage,
+        torque=torques,
+        lever_current=lever_current(robot, torques, middle[LED] * jnp.array([1.0, -1.0])),
+        energy=energy,
+        stored=robot.sides * stored,
+        normal=total,
+        body=jnp.sum(at.force * (1 - at.rolls)) / jnp.maximum(total, 1e-9),
+        margin=_margin(run, motion, at, matrix),
+    )
+    return after, spent, passed
+
+
+def _margin(run: System, motion: Motion, at: Footing, matrix: Array) -> Scalar:
+    """How far gravity's line through the centre of mass is within the outermost contacts [m], level ground assumed
+    below."""
+    total = matrix[0, 0]
+    ahead = -matrix[1, PITCH] / total
+    centre = motion.q[0] + ahead
+    bears = at.force > 0
+    first = jnp.min(jnp.where(bears, at.place, jnp.inf))
+    last = jnp.max(jnp.where(bears, at.place, -jnp.inf))
+    return jnp.where(jnp.any(bears), jnp.minimum(centre - first, last - centre), 0.0)
+
+
+def _shaft_loss(run: System, motion: Motion, signals: Signals, at: Footing) -> Scalar:
+    """How the drive's losses rise with the speed of the shaft [N·m·s], as they do steeply from rest; contacts and
+    winding apart, which are resolved. Where they fall: nothing."""
+    one = jnp.ones_like(motion.v[SHAFT])
+    force = jnp.sum(run.chassis.track.guide_friction * at.guided * at.force) * run.shape.main.first
+
+    def loss(speed: Scalar) -> Scalar:
+        direction = contact.direction(run.chassis.radius * speed, run.chassis.speed_still)
+        motor = speed * run.robot.gearbox.ratio
+        own = run.robot.motor.torque_loss(motor, direction) + run.robot.gearbox.torque_idle(motor, direction)
+        track = run.chassis.track.torque_loss(speed, direction)
+        return track + force * direction + own * run.robot.gearbox.ratio * signals.efficiency_load
+
+    return jnp.maximum(jax.jvp(loss, (motion.v[SHAFT],), (one,))[1], 0.0)
+
+
+class Progress(eqx.Module):
+    """Where a run stands: its verdict or that it goes on, when that was given, the furthest it came and when, angle
+    of its shafts since."""
+
+    verdict: Array
+    ended: Scalar
+    furthest: Scalar
+    since: Scalar
+    belt: Scalar
+
+
+def stand(run: System, clear: float = 0.1) -> Motion:
+    """At rest on the ground before the obstacle, its foremost point `clear` [m] from it."""
+    shape = run.shape
+    angles = run.sequence.angles(-jnp.inf, 0.0)
+    outer = shape.main.first + shape.gear.grouser_height
+    axle = jnp.where(shape.on_tracks > 0.5, outer, shape.wheel)
+    tip = shape.gear.lever_length * jnp.cos(angles[0]) + shape.gear.levers.roller
+    reach = shape.half + jnp.maximum(axle, jnp.where(shape.on_tracks > 0.5, tip, 0.0))
+    x = -(reach + clear)
+    below = jnp.stack([x, jnp.zeros_like(x)])
+    gap, normal = (a[0] for a in run.terrain.distance(below[None]))
+    place = below + (axle - gap - 2e-5) * normal
+    zero = jnp.zeros_like(x)
+    q = jnp.stack([place[0], place[1], jnp.arctan2(normal[0], normal[1]), zero, angles[0], angles[1]])
+    return Motion(q, jnp.zeros(COORDINATES), zero, run.conditions.discharge + zero)
+
+
+def _judged(
+    run: System, before: Motion, passed: Passed, motion: Motion, progress: Progress
+) -> tuple[Motion, Progress]:
+    """Whether a run has ended by now, after a sample; one that has stays as it is."""
+    q, v = motion.q, motion.v
+    outer = run.shape.main.first + run.shape.gear.grouser_height
+    finite = jnp.all(jnp.isfinite(q)) & jnp.all(jnp.isfinite(v)) & jnp.isfinite(motion.current)
+    finite = finite & (jnp.max(jnp.abs(v)) < 1e4)
+    rear = q[0] - run.shape.half * jnp.cos(q[PITCH])
+    gained = q[0] > progress.furthest + GAIN
+    swings = jnp.max(jnp.abs(v[LED])) > 0.05
+    moved = gained | swings | (passed.time < SETTLES)
+    progress = Progress(
+        progress.verdict,
+        jnp.where(progress.verdict == _RUNNING, passed.time, progress.ended),
+        jnp.where(gained, q[0], progress.furthest),
+        jnp.where(moved, passed.time, progress.since),
+        jnp.where(moved, q[SHAFT], progress.belt),
+    )
+    waits = passed.time - progress.since
+    stuck = waits > PATIENCE
+    stands = jnp.abs(q[SHAFT] - progress.belt) * run.shape.main.first < STANDS * PATIENCE
+    fallen = q[1] < jnp.minimum(run.terrain.points[0, 1], run.terrain.points[-1, 1])
+    why = jnp.where(stands, STALLS, jnp.where((passed.body > BEARS) | fallen, HANGS, SLIDES))
+    verdict = jnp.where(stuck, why, _RUNNING)
+    verdict = jnp.where(rear > run.terrain.finish + outer, OVER, verdict)
+    verdict = jnp.where(jnp.abs(q[PITCH]) > TURNED_OVER, TIPS, verdict)
+    verdict = jnp.where(finite, verdict, FAILED)
+    ended = progress.verdict != _RUNNING
+    verdict = jnp.where(ended, progress.verdict, verdict)
+    motion = jax.tree.map(lambda new, old: jnp.where(finite & ~ended, new, old), motion, before)
+    return motion, dataclasses.replace(progress, verdict=verdict)
+
+
+def begin(run: System) -> tuple[Motion, Energy, Progress]:
+    """What a run begins with: motion, no energy yet, and that it goes on."""
+    motion = stand(run)
+    zero = jnp.zeros_like(motion.q[0])
+    energy = dict.fromkeys((*SOURCES, *LOSSES), zero)
+    return motion, energy, Progress(jnp.asarray(_RUNNING), zero, motion.q[0], zero, zero)
+
+
+def sampled(run: System, state: Any, first: Scalar, steps: int, samples: int) -> tuple[Any, Passed]:
+    """A part of a run of so many `samples` of so many `steps`, from time `first` [s]: its end and its record."""
+
+    def sample(state: Any, k: Array) -> tuple[Any, Passed]:
+        motion, energy, progress = state
+
+        def small(carry: Any, j: Array) -> tuple[Any, None]:
+            return advance(run, carry[0], first + (k * steps + j) * run.step, carry[1]), None
+
+        nothing = jax.eval_shape(lambda: advance(run, motion, first, energy)[2])
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), nothing)
+        (after, spent, passed), _ = jax.lax.scan(small, (motion, energy, nothing), jnp.arange(steps))
+        ended = progress.verdict != _RUNNING
+        after, progress = _judged(run, motion, passed, after, progress)
+        kept = jax.tree.map(lambda new, old: jnp.where(ended, old, new), spent, energy)
+        return (after, kept, progress), passed
+
+    return jax.lax.scan(sample, state, jnp.arange(samples))
+
+
+class Climb(eqx.Module):
+    """Runs: verdicts as indices into `NAMES`, when they were given [s], and records of shape (runs, samples)."""
+
+    verdict: np.ndarray
+    ended: np.ndarray
+    furthest: np.ndarray
+    record: Passed
+
+    @property
+    def names(self) -> list[str]:
+        """The verdicts in words."""
+        return [NAMES[k] for k in self.verdict]
+
+
+@compiled
+def _begin(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float) -> Any:
+    return jax.vmap(lambda c, t, s: begin(system(robot, c, t, s, step)))(conditions, terrain, sequence)
+
+
+def _part(
+    robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
+    step: float, steps: int, samples: int,
+) -> tuple[Any, Passed]:  # fmt: skip
+    def one(conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> tuple[Any, Passed]:
+        return sampled(system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
+
+    return jax.vmap(one)(conditions, terrain, sequence, state)
+
+
+_compiled = compiled(_part, options=SMALL)
+
+
+def climb_batch(
+    robot: Robot,
+    conditions: Conditions,
+    terrain: Terrain,
+    sequence: Sequence,
+    *,
+    duration: float = DURATION,
+    step: float = STEP,
+    sample: float = SAMPLE,
+    part: float = 1.0,
+    record: bool = True,
+    progress: Callable[[float], None] | None = None,
+) -> Climb:
+    """Climb over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
+
+    Args:
+        duration: of the longest run [s]; step, sample: intervals of integration and of the record [s].
+        part: length of run between two looks at whether all have ended [s].
+        record: whether samples are kept; else the record is the last sample.
+        progress: told the share of the time that is done.
+    """
+    steps, samples = round(sample / step), round(part / sample)
+    state = _begin(robot, conditions, terrain, sequence, step)
+    kept: list[Passed] = []
+    parts = int(np.ceil(duration / part - 1e-9))
+    for k in range(parts):
+        first = jnp.asarray(k * part)
+        state, passed = _compiled(robot, conditions, terrain, sequence, state, first, step, steps, samples)
+        verdict = np.asarray(state[2].verdict)
+        last = passed if record else jax.tree.map(lambda x: x[:, -1:], passed)
+        kept = [*(kept if record else []), jax.device_get(last)]
+        if progress is not None:
+            progress((k + 1) / parts)
+        if np.all(verdict != _RUNNING):
+            break
+    verdict = np.where(verdict == _RUNNING, UNFINISHED, verdict)
+    joined = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *kept)
+    return Climb(verdict, np.asarray(state[2].ended), np.asarray(state[2].furthest), joined)

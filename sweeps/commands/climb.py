@@ -1,0 +1,221 @@
+"""The command `climb`: a robot over an obstacle, or the largest obstacle that it gets over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from calibration.data import robot_file, terrains
+from calibration.data.errors import BadConfiguration
+from mmrjax import masses, terrain
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities import climb as fidelity
+from mmrjax.fidelities.climb import Climb, Sequence, climb_batch
+from mmrjax.robot import Robot
+from mmrjax.tables import adhesion_ratio
+from mmrjax.terrain import Terrain
+from sweeps import config as configuration
+from sweeps.console import progress, say
+from sweeps.inputs import check_configurations, load_robot
+from sweeps.points import imposed
+from sweeps.results.climb import VERDICTS, ClimbResult
+from sweeps.skeleton import leave, page
+from sweeps.store import open_folder
+
+#: Voltage where none is stated [V]: slow enough that a robot climbs rather than leaps.
+SLOW = 12.0
+#: A search: sizes [mm] between which it begins, runs of a round, and how near its ends come [mm].
+SOUGHT = {"step": (10.0, 450.0), "stairs": (20.0, 400.0), "gap": (20.0, 800.0)}
+ROUND, NEAR = 12, 1.0
+#: The part of the largest run's angles that lies within this of the ground at the start is on it [rad].
+_ON_GROUND = 2e-3
+
+
+def climb(config: configuration.Climb, out: Path | None, force: bool) -> int:
+    """Climb and leave a run folder; returns the exit code.
+
+    0 done, whatever the verdict; 3 numbers went wrong.
+    """
+    file = load_robot(config)
+    robot = file.robot
+    imposed.check_on_ground(robot, "climb")
+    if robot.rig.imposed != "voltage":
+        raise BadConfiguration("climb: the robot's file says that its motors are not driven by voltage")
+    name = config.configuration or robot.configurations.names[0]
+    check_configurations(robot, (name,), "--configuration")
+    try:
+        masses.check_parts(robot)
+    except ValueError as error:
+        raise BadConfiguration(f"climb: {error}") from error
+    if config.battery:
+        imposed.check_battery(robot)
+    voltage = SLOW if config.supply_voltage_V is None else config.supply_voltage_V
+    config = config.model_copy(
+        update={"configuration": name, "supply_voltage_V": None if config.battery else voltage}
+    )
+    sequence = _sequence(config, robot, name)
+    _, words = _terrain(config, 0.1)
+    conditions = Conditions(
+        name, voltage, payload=config.payload_kg, battery=config.battery, discharge=3.6 * config.discharge_mAh,
+        adhesion=adhesion_ratio(config.surface, bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)),
+    ).resolved(robot)  # fmt: skip
+    with open_folder("climb", config, robot, out, force) as folder:
+
+        def run(sizes: np.ndarray) -> tuple[Terrain, Climb]:
+            with progress(1, quiet=False) as advance:
+                every = [_terrain(config, float(size) / 1000)[0] for size in sizes]
+                grounds = jax.tree.map(lambda *x: jnp.stack(x), *every)
+                told = _shares(advance)
+                whole = [
+                    jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(sizes)), c)
+                    for c in (conditions, sequence)
+                ]
+                ended = climb_batch(
+                    robot,
+                    whole[0],
+                    grounds,
+                    whole[1],
+                    duration=config.duration_s,
+                    step=config.time_step_s,
+                    progress=told,
+                )
+                told(1.0)
+            return grounds, ended
+
+        if config.find is None:
+            grounds, ended = run(np.array([np.nan]))
+            chosen, largest = 0, None
+            tried: tuple[tuple[float, str], ...] = ()
+        else:
+            grounds, ended, chosen, tried, largest = _searched(config.find, run)
+        one = jax.tree.map(lambda x: x[chosen : chosen + 1], ended)
+        found = ClimbResult(
+            robot, name, words, jax.tree.map(lambda x: x[chosen], grounds), one, tried, largest,
+            {"step": "step", "stairs": "rise of such stairs", "gap": "gap", None: ""}[config.find],
+        )  # fmt: skip
+        folder.write_table("history.csv", found.table)
+        folder.write_json("result.json", found.to_json())
+        robot_file.write(robot, folder.partial / "robot.toml", note=f"the robot of this climb, from {config.robot}")
+        if config.film:
+            from sweeps.pages import climb_figures
+
+            climb_figures.film(found, folder.partial / "climb.gif")
+        print_climb(found)
+        manifest = {"seed": None, "verdict": found.verdict}
+        return leave(folder, config, manifest, solved=found.verdict != "failed", page=page("climb", found, file))
+
+
+def _shares(advance: Callable[[float], None]) -> Callable[[float], None]:
+    done = 0.0
+
+    def told(share: float) -> None:
+        nonlocal done
+        advance(max(share - done, 0.0))
+        done = max(done, share)
+
+    return told
+
+
+def _searched(
+    what: str, run: Callable[[np.ndarray], tuple[Terrain, Climb]]
+) -> tuple[Terrain, Climb, int, tuple[tuple[float, str], ...], float | None]:
+    """The largest size that is got over [mm]: rounds of sizes side by side, between the largest that was got over
+    below all that were not and the next; the run of the largest, or of the smallest tried, is shown."""
+    low, high = SOUGHT[what]
+    sizes = np.linspace(low, high, ROUND)
+    tried: dict[float, str] = {}
+    kept: tuple[Terrain, Climb, int] | None = None
+    while True:
+        grounds, ended = run(sizes)
+        tried |= {float(s): v for s, v in zip(sizes, ended.names, strict=True)}
+        order = sorted(tried)
+        over = [s for s in order if tried[s] == "over" and all(tried[t] == "over" for t in order if t < s)]
+        best = max(over, default=None)
+        if kept is None or best in sizes:
+            kept = grounds, ended, int(np.flatnonzero(sizes == best)[0]) if best in sizes else 0
+        beyond = [s for s in order if best is None or s > best]
+        if best is None or not beyond or min(beyond) - best <= NEAR:
+            return *kept, tuple((s, tried[s]) for s in order), best
+        inner = np.linspace(best, min(beyond), ROUND + 2)[1:-1]
+        sizes = np.unique(np.round(inner, 1))
+
+
+def _terrain(config: configuration.Climb, size: float) -> tuple[Terrain, str]:
+    """The obstacle, of a search of a `size` [m], and what it is in words."""
+    nose = config.nose_mm / 1000
+    if config.terrain is not None:
+        return terrains.read_terrain(config.terrain), f"the terrain of {config.terrain.name}"
+    if config.stairs is not None:
+        rise, tread, count = terrains.stairs(config.stairs)
+        if nose >= min(rise, tread) / 2:
+            raise BadConfiguration(
+                f"--nose: got {config.nose_mm:g} mm; expected less than half of rise and tread, "
+                f"{500 * min(rise, tread):g} mm"
+            )
+        if config.find is None:
+            return terrain.stairs(rise, tread, count, nose), f"{count} stairs of {1e3 * rise:g} x {1e3 * tread:g} mm"
+        return terrain.stairs(size, tread, count, nose), f"{count} stairs of {1e3 * tread:g} mm tread"
+    if config.gap_mm is not None or config.find == "gap":
+        width = size if config.gap_mm is None else config.gap_mm / 1000
+        return terrain.gap(width), "a gap" if config.gap_mm is None else f"a gap of {config.gap_mm:g} mm"
+    height = size if config.step_mm is None else config.step_mm / 1000
+    return terrain.step(height, nose), "a step" if config.step_mm is None else f"a step of {config.step_mm:g} mm"
+
+
+def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
+    """What the levers do.
+
+    Raises:
+        BadConfiguration: levers are asked of a configuration without, an angle beyond their range, a lever that
+            begins below the ground.
+    """
+    stated = config.sequence, config.levers_front_deg, config.levers_rear_deg
+    gear = robot.running_gear
+    tracked = bool(np.asarray(robot.configurations[name].on_tracks) > 0.5)
+    if not tracked and stated != (None, None, None):
+        with_levers = [n for n, c in robot.configurations.items() if np.asarray(c.on_tracks) > 0.5]
+        raise BadConfiguration(
+            f"--levers-front, --levers-rear, --sequence: {name} has no levers"
+            + (f"; expected --configuration {' or '.join(with_levers)}" if with_levers else "")
+        )
+    if config.sequence is not None:
+        found = terrains.read_sequence(config.sequence, robot)
+    else:
+        own = float(np.degrees(np.asarray(gear.lever_front))), 180 - float(np.degrees(np.asarray(gear.lever_rear)))
+        angles = []
+        for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):
+            angle = usual if given is None else given
+            if given is not None and (why := terrains.beyond(robot, angle)):
+                raise BadConfiguration(f"{option}: {why}")
+            angles.append(float(np.radians(angle)))
+        found = fidelity.still(*angles)
+    if tracked:
+        axle = float(np.asarray(robot.radius_pulley + gear.grouser_height))
+        reach, roller = (float(np.asarray(x)) for x in (gear.lever_length, gear.levers.roller))
+        least = -float(np.arcsin((axle - roller) / reach))
+        for option, angle in (("front", float(found.front[0])), ("rear", float(found.rear[0]))):
+            below = axle + reach * np.sin(angle) - roller
+            if below < -_ON_GROUND * reach:
+                raise BadConfiguration(
+                    f"levers {option}: at {np.degrees(angle):.4g} deg they begin {-1000 * below:.0f} mm below the "
+                    f"ground; expected at least {np.degrees(least):.1f} deg there, where they lie on it (a sequence "
+                    "may press them down later)"
+                )
+    return found
+
+
+def print_climb(found: ClimbResult) -> None:
+    """The answer, and what it took; for a person."""
+    say(found.statement())
+    shown = Table(box=None, pad_edge=False, show_header=False)
+    for key, value in found.numbers().items():
+        stem, _, unit = key.rpartition("_")
+        shown.add_row(stem.replace("_", " "), f"{value:.3g}", unit)
+    say(shown)
+    if found.tried:
+        say(", ".join(f"{size:g} mm {VERDICTS[verdict][0]}" for size, verdict in found.tried))

@@ -1,0 +1,160 @@
+"""Figures of a climb: silhouettes at its decisive instants, currents and margin on the way, and its film."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from mmrjax import footing, loop
+from mmrjax.footing import PITCH, SHAFT
+from mmrjax.render import film_gif
+from sweeps.pages.figure_style import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, figure, style
+from sweeps.results.climb import ClimbResult
+
+_GROUND = "#b8a98f"
+#: Silhouettes of a page at most; frames of a film a second, and how often it is slower than life.
+SHOWN, RATE, SLOW = 6, 12, 2.0
+
+
+def _outlines(found: ClimbResult, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Closed outlines of the belts, and tips of their grousers, in the world [m]."""
+    robot = found.robot
+    chassis = robot.configurations[found.configuration]
+    shape = footing.shape_of(chassis, robot.running_gear, robot.radius_pulley)
+    body, front, rear = footing.frames(shape, jnp.asarray(q))
+    belts = [(shape.main, body._replace(origin=rear.origin), q[SHAFT])]
+    if np.asarray(chassis.on_tracks) > 0.5:
+        belts += [(shape.lever, lever, q[SHAFT] + q[lever.turns]) for lever in (front, rear)]
+    drawn = []
+    for belt, frame, turned in belts:
+        path = frame.world(belt.point(jnp.linspace(0.0, belt.length, 120)[:-1]))
+        tips = frame.world(loop.tips(belt, belt.places(belt.first * turned)).at)
+        drawn.append((np.asarray(path), np.asarray(tips)))
+    if np.asarray(chassis.on_tracks) < 0.5:
+        round_ = np.linspace(0, 2 * np.pi, 60)
+        circle = float(chassis.radius) * np.stack([np.cos(round_), np.sin(round_)], 1)
+        drawn += [(np.asarray(lever.origin) + circle, np.zeros((0, 2))) for lever in (front, rear)]
+    return drawn
+
+
+def _ground(axes: Any, found: ClimbResult, begin: float, end: float) -> None:
+    points = np.asarray(found.terrain.points) + np.array([-1.0, 1.0]) * float(found.terrain.nose)
+    points = points[(points[:, 0] > begin - 200) & (points[:, 0] < end + 200)]
+    bottom = points[:, 1].min() - 0.08 if points[:, 1].min() > -1 else -0.25
+    outline = np.concatenate([points, [[points[-1, 0], bottom], [points[0, 0], bottom]]])
+    axes.add_patch(Polygon(np.maximum(outline, [-1e9, bottom]), color=_GROUND, alpha=0.55, lw=0))
+    axes.plot(*points.T, color=INK, lw=1.2)
+
+
+def _draw(axes: Any, found: ClimbResult, q: np.ndarray, colour: str = BLUE) -> None:
+    outlines = _outlines(found, q)
+    cos, sin = np.cos(-q[PITCH]), np.sin(-q[PITCH])
+    half = float(found.robot.running_gear.wheelbase) / 2
+    box = np.array([(-half, -0.033), (half, -0.033), (half + 0.01, 0.043), (-half - 0.01, 0.043)])
+    box = box @ np.array([[cos, sin], [-sin, cos]]) + q[:2]
+    axes.add_patch(Polygon(box, facecolor=colour, edgecolor=INK, lw=0.8, alpha=0.55))
+    for path, tips in outlines:
+        axes.add_patch(Polygon(path, facecolor=colour, edgecolor=INK, lw=1.4, alpha=0.35))
+        axes.add_patch(Polygon(path, fill=False, edgecolor=INK, lw=1.2))
+        if len(tips):
+            axes.plot(*tips.T, ".", color=INK, ms=2.5)
+
+
+def instants(found: ClimbResult) -> list[tuple[str, int]]:
+    """Samples of the run that decide it, in the order of time: what is there, and which."""
+    t = found.table
+    picked = {
+        "start": 0,
+        "largest pitch": int(np.argmax(np.abs(t["pitch_deg"]))),
+        "least margin": int(np.argmin(t["margin_mm"])),
+        "largest motor current": int(np.argmax(np.abs(t["traction_current_A"]))),
+        "half way": int(np.argmin(np.abs(t["x_mm"] - (t["x_mm"][0] + t["x_mm"].max()) / 2))),
+        "end": len(t["time_s"]) - 1,
+    }
+    named: dict[int, str] = {}
+    for name, k in picked.items():
+        named[k] = f"{named[k]}, {name}" if k in named else name
+    return [(named[k], k) for k in sorted(named)][:SHOWN]
+
+
+def silhouettes(found: ClimbResult) -> Figure:
+    """The robot at the decisive instants."""
+    shown = instants(found)
+    q = np.asarray(found.climb.record.motion.q)[0]
+    fig, axes = figure(-(-len(shown) // 3), 3, 2.7 * -(-len(shown) // 3))
+    for ax, (name, k) in zip(axes.ravel(), shown, strict=False):
+        _ground(ax, found, q[k, 0] - 0.5, q[k, 0] + 0.5)
+        _draw(ax, found, q[k])
+        ax.set(xlim=(q[k, 0] - 0.48, q[k, 0] + 0.48), ylim=(q[k, 1] - 0.34, q[k, 1] + 0.34), aspect="equal")
+        ax.set_title(f"{found.table['time_s'][k]:.2f} s: {name}", fontsize=9)
+        ax.axis("off")
+    for ax in axes.ravel()[len(shown) :]:
+        ax.axis("off")
+    return fig
+
+
+def course(found: ClimbResult) -> Figure:
+    """Posture, margin and the currents of all drives over the place of the robot."""
+    t = found.table
+    x = t["x_mm"]
+    fig, axes = figure(4, 1, 8.0, sharex=True)
+    rows = [
+        ("angle [deg]", {"pitch, nose up": ("pitch_deg", BLUE), "front levers": ("front_deg", ORANGE),
+                         "rear levers": ("rear_deg", PURPLE)}),
+        ("margin of tipping [mm]", {"margin": ("margin_mm", VERMILION)}),
+        ("motor current [A]", {"each traction motor": ("traction_current_A", BLUE),
+                               "front levers": ("front_current_A", ORANGE),
+                               "rear levers": ("rear_current_A", PURPLE)}),
+        ("energy [J]", {"from the supply": ("supply_J", INK), "sliding": ("sliding_J", VERMILION),
+                        "windings": ("winding_J", ORANGE), "stored": ("stored_J", GREEN)}),
+    ]  # fmt: skip
+    for ax, (label, lines) in zip(axes.ravel(), rows, strict=True):
+        for name, (column, colour) in lines.items():
+            ax.plot(x, t[column], color=colour, lw=1.3, label=name)
+        ax.set_ylabel(label)
+        ax.axvline(0, color=FAINT, lw=0.8)
+        if len(lines) > 1:
+            ax.legend(loc="upper left", ncols=len(lines))
+    axes[-1, 0].set_xlabel("middle of the robot from where the obstacle begins [mm]")
+    return fig
+
+
+def search(found: ClimbResult) -> Figure:
+    """How each size that was tried ended."""
+    sizes, verdicts = np.array([s for s, _ in found.tried]), [v for _, v in found.tried]
+    kinds = list(dict.fromkeys(verdicts))
+    fig, axes = figure(1, 1, 1.0 + 0.4 * len(kinds))
+    ax = axes[0, 0]
+    for k, kind in enumerate(kinds):
+        at = sizes[[v == kind for v in verdicts]]
+        ax.plot(at, np.full(len(at), k), "o", color=GREEN if kind == "over" else VERMILION, ms=5)
+    ax.set_yticks(range(len(kinds)), kinds)
+    ax.set_ylim(-0.6, len(kinds) - 0.4)
+    ax.set_xlabel(f"{found.sought} [mm]")
+    return fig
+
+
+def film(found: ClimbResult, path: Path) -> None:
+    """The run as a film."""
+    record = found.climb.record
+    time, q = found.table["time_s"], np.asarray(record.motion.q)[0]
+    frames = [int(np.argmin(np.abs(time - t))) for t in np.arange(time[0], time[-1], 1 / (RATE * SLOW))]
+    low, high = q[:, 1].min() - 0.3, q[:, 1].max() + 0.35
+
+    def picture(k: int) -> Figure:
+        with style():
+            sheet = Figure(figsize=(7.2, 4.6), dpi=80, layout="constrained")
+            ax = sheet.subplots()
+            _ground(ax, found, q[k, 0] - 0.7, q[k, 0] + 0.7)
+            _draw(ax, found, q[k])
+            ax.set(xlim=(q[k, 0] - 0.6, q[k, 0] + 0.6), ylim=(low, high), aspect="equal")
+            ax.set_title(f"{found.obstacle}, {time[k]:.2f} s, motors {np.asarray(record.current)[0, k]:.1f} A")
+            ax.axis("off")
+        return sheet
+
+    film_gif((picture(k) for k in frames), path, RATE)

@@ -1,0 +1,134 @@
+"""What the command `climb` found: how a robot gets over an obstacle, or how large one may be, in words."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from mmrjax.fidelities.climb import LOSSES, NAMES, OVER, SOURCES, Climb
+from mmrjax.footing import FRONT, PITCH, REAR, SHAFT
+from mmrjax.robot import Robot
+from mmrjax.terrain import Terrain
+
+#: Verdicts in words.
+VERDICTS: dict[str, tuple[str, str]] = {
+    "over": ("gets over", "the rear axle is past the obstacle and a wheel's radius beyond"),
+    "tips": ("tips over", "the robot pitched by more than 100 deg"),
+    "stalls": ("stalls", "it comes no further and its tracks stand: the motors cannot turn them"),
+    "slides": ("slides", "it comes no further and its tracks run on: the ground does not hold them"),
+    "hangs": ("hangs", "it comes no further with its body on an edge, or has fallen into a gap"),
+    "unfinished": ("is under way", "the time was over while it still went on; take a longer --duration"),
+    "failed": ("failed", "numbers of the run went wrong; please report the conditions"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ClimbResult:
+    """What the command found.
+
+    Attributes:
+        robot, configuration, obstacle: of the run; the last in words.
+        terrain: of the run that is shown; climb: that run, alone.
+        radius: of the pulleys [m].
+        tried: sizes [mm] and verdicts of a search; largest: that it got over [mm], None: no search or none.
+        sought: what was searched for, empty: nothing.
+    """
+
+    robot: Robot
+    configuration: str
+    obstacle: str
+    terrain: Terrain
+    climb: Climb
+    tried: tuple[tuple[float, str], ...] = ()
+    largest: float | None = None
+    sought: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """How the run that is shown ended."""
+        return NAMES[int(self.climb.verdict[0])]
+
+    @property
+    def over(self) -> bool:
+        """Whether it got over."""
+        return int(self.climb.verdict[0]) == OVER
+
+    @property
+    def table(self) -> dict[str, np.ndarray]:
+        """The run over time."""
+        count = int(
+            np.sum(np.asarray(self.climb.record.time)[0] <= self.climb.ended[0] + 1e-9)
+        )  # it stays as it ended
+        r = jax.tree.map(lambda x: x[:, :count], self.climb.record)
+        q, v = r.motion.q[0], r.motion.v[0]
+        energy = {f"{name}_J": r.energy[name][0] for name in (*SOURCES, *LOSSES)}
+        sides = float(self.robot.sides)
+        radius = float(self.robot.radius_pulley)
+        return {
+            "time_s": r.time[0],
+            "x_mm": 1000 * q[:, 0],
+            "z_mm": 1000 * q[:, 1],
+            "pitch_deg": -np.degrees(q[:, PITCH]),
+            "front_deg": np.degrees(q[:, FRONT]),
+            "rear_deg": 180 - np.degrees(q[:, REAR]),
+            "speed_mm_s": 1000 * np.hypot(v[:, 0], v[:, 1]),
+            "belt_mm_s": 1000 * radius * v[:, SHAFT],
+            "traction_current_A": r.current[0],
+            "front_current_A": r.lever_current[0, :, 0],
+            "rear_current_A": r.lever_current[0, :, 1],
+            "front_torque_Nm": r.torque[0, :, 0],
+            "rear_torque_Nm": r.torque[0, :, 1],
+            "margin_mm": 1000 * r.margin[0],
+            "reaction_N": sides * r.normal[0],
+            "body_share": r.body[0],
+            **energy,
+            "stored_J": r.stored[0] - r.stored[0, 0],
+        }
+
+    def statement(self) -> str:
+        """The answer in a sentence."""
+        if self.sought:
+            if self.largest is None:
+                smallest = min(size for size, _ in self.tried)
+                return f"It gets over no {self.sought} that was tried, the smallest of {smallest:.0f} mm."
+            beyond = [(s, v) for s, v in self.tried if s > self.largest]
+            least = min(beyond, default=None)
+            why = "" if least is None else f"; at {least[0]:.0f} mm it {VERDICTS[least[1]][0]}"
+            return f"The largest {self.sought} that it gets over is {self.largest:.0f} mm{why}."
+        short, meaning = VERDICTS[self.verdict]
+        return f"The robot {short}: {self.obstacle}" + ("." if self.over else f"; {meaning}.")
+
+    def numbers(self) -> dict[str, float]:
+        """Largest and final numbers of the run that is shown."""
+        t = self.table
+        spent = t["supply_J"][-1] - t["supply_J"][0]
+        return {
+            "time_s": float(t["time_s"][-1]),
+            "furthest_mm": float(1000 * self.climb.furthest[0]),
+            "pitch_most_deg": float(t["pitch_deg"].max()),
+            "pitch_least_deg": float(t["pitch_deg"].min()),
+            "margin_least_mm": float(t["margin_mm"].min()),
+            "traction_current_most_A": float(np.abs(t["traction_current_A"]).max()),
+            "front_current_most_A": float(np.abs(t["front_current_A"]).max()),
+            "rear_current_most_A": float(np.abs(t["rear_current_A"]).max()),
+            "front_torque_most_Nm": float(np.abs(t["front_torque_Nm"]).max()),
+            "rear_torque_most_Nm": float(np.abs(t["rear_torque_Nm"]).max()),
+            "energy_J": float(spent),
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """`result.json`."""
+        return {
+            "schema": "mmrjax.climb/1",
+            "statement": self.statement(),
+            "configuration": self.configuration,
+            "obstacle": self.obstacle,
+            "verdict": self.verdict,
+            "sought": self.sought or None,
+            "largest_mm": self.largest,
+            "tried": [{"size_mm": size, "verdict": verdict} for size, verdict in self.tried],
+            "run": self.numbers(),
+        }

@@ -1,0 +1,109 @@
+"""How the runs of a table stand on what their levers leave them, and what geometry allows them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from calibration.data.columns import LEVERS
+from calibration.data.table import Runs
+from mmrjax import static_limits
+from mmrjax.channels import MM
+from mmrjax.conditions import Conditions
+from mmrjax.masses import lever_angles
+from mmrjax.posture import Outline
+from mmrjax.robot import Robot
+
+#: Angles at which the map of highest steps looks at front and rear levers [deg].
+ANGLES = np.arange(-180.0, 181.0, 6.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Drawn:
+    """A robot from the side on the ground: lower, and from its centre of mass on higher by a step.
+
+    Attributes:
+        side: in a frame along the ground; base: height of its middle of the wheelbase [m]; step: [m]; slope: [rad].
+    """
+
+    side: Outline
+    base: float
+    step: float
+    slope: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class StepMap:
+    """Highest steps over angles of the levers.
+
+    Attributes:
+        angles_deg: of front and rear; step_mm: shape (front, rear).
+        best: the highest, drawn; front_deg, rear_deg: there.
+        own_deg: the run's own angles, front and rear.
+    """
+
+    angles_deg: np.ndarray
+    step_mm: np.ndarray
+    best: Drawn
+    front_deg: float
+    rear_deg: float
+    own_deg: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Postures:
+    """Of the runs of a table.
+
+    Attributes:
+        table: by column; rest, step: the first run's, drawn, at rest and on its highest step; over: of the first run.
+    """
+
+    table: dict[str, np.ndarray]
+    rest: Drawn
+    step: Drawn
+    over: StepMap
+
+
+def postures(robot: Robot, runs: Runs, conditions: Conditions) -> Postures | None:
+    """How the runs of a table stand; None where it states no levers."""
+    if not conditions.states_levers:
+        return None
+    rests, limits, lies, steps = jax.device_get(static_limits.standing(robot, conditions))
+    shown = ("configuration", *(c for c in ("payload_kg", "slope_deg", *LEVERS) if runs.has(c)))
+    degrees, millimetres = 180 / np.pi, 1 / MM
+    table = {name: runs[name] for name in shown} | {
+        "pitch_deg": degrees * rests.pitch,
+        "contact_mm": millimetres * rests.length,
+        "bears": np.where(rests.line > 0.5, "all along", "at its ends"),
+        "load_front_percent": 100 * rests.load_front,
+        "centre_height_mm": millimetres * rests.centre_height,
+        "margin_mm": millimetres * rests.margin,
+        "inertia_kg_m2": rests.inertia,
+        "tips_back_deg": degrees * limits.tips_back,
+        "tips_forward_deg": degrees * limits.tips_forward,
+        "tips_aside_deg": degrees * limits.tips_aside,
+        "highest_step_mm": millimetres * limits.step,
+        "widest_gap_mm": millimetres * limits.gap,
+        "tip_front_mm": millimetres * limits.tip_front,
+        "tip_rear_mm": millimetres * limits.tip_rear,
+        "overall_length_mm": millimetres * limits.length,
+        "overall_height_mm": millimetres * limits.height,
+    }
+    first, side, step = jax.tree.map(lambda x: x[0], (conditions, lies, steps))
+    there = Drawn(side, float(rests.height[0]), 0.0, float(first.slope))
+    return Postures(table, there, _on_step(step), step_map(robot, first))
+
+
+def step_map(robot: Robot, conditions: Conditions) -> StepMap:
+    """Highest steps of one run over the angles of its levers."""
+    found = jax.device_get(static_limits.steps_over_levers(robot, conditions, ANGLES, ANGLES))
+    front, rear = np.unravel_index(np.argmax(found.height), found.height.shape)
+    best = _on_step(jax.tree.map(lambda x: x[front, rear], found))
+    own = tuple(float(np.degrees(x)) for x in lever_angles(robot.running_gear, conditions))
+    return StepMap(ANGLES, found.height / MM, best, float(ANGLES[front]), float(ANGLES[rear]), (own[0], own[1]))
+
+
+def _on_step(found: static_limits.Step) -> Drawn:
+    return Drawn(found.side, float(found.base), float(found.height))

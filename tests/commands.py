@@ -1,0 +1,26 @@
+"""The command line in this process, and the tables that it leaves."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from sweeps import cli
+
+
+def command(arguments: Iterable[object]) -> int:
+    """Run a command; returns its exit code."""
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+        patch.setattr(sys, "argv", ["mmrjax", *map(str, arguments)])
+        cli.main()
+    return end.value.code
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))

@@ -1,0 +1,213 @@
+"""Half a robot with levers over terrain: its dynamics against C MuJoCo, energy, tilted gravity, verdicts."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mmrjax import footing, terrain
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities import climb
+from mmrjax.fidelities.climb import LOSSES, SOURCES, climb_batch, still, system
+from mmrjax.robots import nominal
+from mmrjax.signals import GRAVITY
+
+ROBOT = nominal()
+SIZE = 4  # points of every terrain here, so that one program serves them
+
+
+def batch(runs, robot=ROBOT, **options):
+    """Runs of (terrain, front, rear in degrees, volts, further conditions)."""
+    grounds = jax.tree.map(lambda *x: jnp.stack(x), *[r[0] for r in runs])
+    sequences = jax.tree.map(lambda *x: jnp.stack(x), *[still(np.radians(r[1]), np.radians(r[2])) for r in runs])
+    more = [r[4] if len(r) > 4 else {} for r in runs]
+    of = {
+        k: np.array([m.get(k, d) for m in more]) for k, d in (("adhesion", 1.0), ("payload", 0.0), ("slope_deg", 0.0))
+    }
+    which = np.array([m.get("configuration", 0) for m in more])
+    conditions = Conditions(which, voltage=np.array([float(r[3]) for r in runs]), **of).resolved(robot)
+    return climb_batch(robot, conditions, grounds, sequences, **options)
+
+
+@functools.cache
+def first_second():
+    """Onto a step, and against a wall; a member without numbers beside them."""
+    runs = [
+        (terrain.step(0.05, size=SIZE), 45, -8.4, 24),
+        (terrain.step(0.25, size=SIZE), 45, 180, 24),
+        (terrain.step(np.nan, size=SIZE), 45, 180, 24),
+    ]
+    return batch(runs, duration=0.8, part=0.8)
+
+
+def energy_left(record, k):
+    """What is missing of the energy that came in, and that [J]."""
+    since = {name: (x - x[:, :1])[k] for name, x in record.energy.items()}
+    come = sum(since[name] for name in SOURCES)
+    stored = (record.stored - record.stored[:, :1])[k]
+    return come - stored - sum(since[name] for name in LOSSES), come, since
+
+
+def test_energy_in_is_stored_and_lost_at_every_instant_and_a_failed_member_harms_no_other():
+    record = first_second().record
+    assert first_second().names == ["unfinished", "unfinished", "failed"]
+    assert all(np.isfinite(np.asarray(x)[:2]).all() for x in jax.tree.leaves(record.motion))
+    for k in range(2):
+        left, come, since = energy_left(record, k)
+        running = record.time[k] > 0.4
+        assert np.abs(left[running] / come[running]).max() < 1e-3
+        assert all(since[name][-1] > 2e-3 * come[-1] for name in LOSSES), since  # or it would not be missed
+    assert np.ptp(np.asarray(record.motion.q)[0, :, 1]) > 0.01  # it has climbed
+
+
+@pytest.mark.slow
+def test_verdicts_of_whole_climbs_and_their_energy_and_half_the_step():
+    runs = [
+        (terrain.step(0.05, size=6), 45, -8.4, 12),
+        (terrain.step(0.08, size=6), 60, 180, 6, {"adhesion": 4.0}),
+        (terrain.step(0.12, size=6), 60, 180, 4, {"adhesion": 4.0}),
+        (terrain.step(0.25, size=6), 45, 180, 12),
+        (terrain.step(0.25, size=6), 60, 180, 0.5, {"payload": 8.0}),
+        (terrain.gap(0.6), 0, 0, 12),
+        (terrain.gap(0.2), 0, 0, 12),
+    ]  # of six points each
+    verdicts = ["over", "over", "tips", "slides", "stalls", "hangs", "over"]
+    for step in (1e-4, 5e-5):
+        found = batch(runs, duration=14.0, step=step)
+        assert found.names == verdicts
+        for k in range(len(runs)):
+            left, come, _ = energy_left(found.record, k)
+            running = (found.record.time[k] > 0.4) & (found.record.time[k] < found.ended[k])
+            assert np.abs(left[running] / come[running]).max() < 1e-3, k
+
+
+def test_how_a_run_ends_is_read_off_its_motion():
+    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.step(0.08), still(0.5, 0.3))
+    motion, _, progress = climb.begin(run)
+    _, _, passed = jax.eval_shape(lambda: climb.advance(run, motion, 0.0, climb.begin(run)[1]))
+    passed = jax.tree.map(lambda x: jnp.zeros(x.shape), passed)
+
+    def verdict(time=1.0, body=0.0, turned=0.0, **places):
+        q = motion.q
+        for name, value in places.items():
+            q = q.at[{"x": 0, "z": 1, "pitch": 2}[name]].set(value)
+        at = dataclasses.replace(motion, q=q.at[3].set(turned))
+        now = dataclasses.replace(passed, time=jnp.asarray(time), body=jnp.asarray(body))
+        found, after = climb._judged(run, motion, now, at, progress)
+        assert np.isfinite(np.asarray(found.q)).all()
+        return None if after.verdict < 0 else climb.NAMES[int(after.verdict)]
+
+    assert verdict() is None
+    assert verdict(x=0.3) == "over" and verdict(x=0.1) is None
+    assert verdict(pitch=2.0) == "tips" and verdict(pitch=-1.6) is None
+    assert verdict(x=np.nan) == "failed"
+    late = 1.1 * climb.PATIENCE
+    assert verdict(late) == "stalls" and verdict(late, turned=1.0) == "slides"
+    assert verdict(late, turned=1.0, body=0.5) == "hangs" and verdict(late, turned=1.0, z=-0.1) == "hangs"
+    assert verdict(late, x=float(motion.q[0]) + 0.01) is None
+
+
+def test_dynamics_are_those_of_mujoco():
+    """Mass matrix and bias of chassis, pulleys and levers as hinged bodies, at random states."""
+    conditions = Conditions(0, voltage=6.0, slope_deg=12.0, payload=5.0).resolved(ROBOT)
+    run = system(ROBOT, conditions, terrain.flat(), still(0.5, 0.3))
+    half, (mass, along, about) = run.half, (float(x) for x in run.lever)
+    base = float(ROBOT.running_gear.wheelbase) / 2
+    down = -GRAVITY * np.array([np.sin(np.radians(12)), 0, np.cos(np.radians(12))])
+
+    def hinged(name, x, m, at, j, axis):
+        return (
+            f'<body pos="{x} 0 0"><inertial pos="{at} 0 0" mass="{m}" diaginertia="{j} {j} {j}"/>'
+            f'<joint name="{name}" type="hinge" axis="0 {axis} 0"/></body>'
+        )
+
+    pulley = float(half.pulley), 0, float(half.inertia_pulley)
+    text = f"""<mujoco><compiler inertiafromgeom="false"/><option gravity="{down[0]} 0 {down[2]}"/><worldbody><body>
+      <inertial pos="{float(half.forward)} 0 {float(half.up)}" mass="{float(half.chassis)}"
+        diaginertia="{" ".join([str(float(half.inertia))] * 3)}"/>
+      <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint type="hinge" axis="0 1 0"/>
+      {hinged("p1", base, *pulley, 1)}{hinged("p2", -base, *pulley, 1)}
+      {hinged("l1", base, mass, along, about, -1)}{hinged("l2", -base, mass, along, about, -1)}
+    </body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    # both pulleys turn as one
+    ties = np.zeros((7, 6))
+    ties[[0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 3, 3, 4, 5]] = 1
+    random = np.random.default_rng(5)
+    for _ in range(5):
+        q, v = random.normal(size=6), 3 * random.normal(size=6)
+        data.qpos[:], data.qvel[:] = ties @ q, ties @ v
+        mujoco.mj_forward(model, data)
+        whole = np.zeros((7, 7))
+        mujoco.mj_fullM(model, data, whole)
+        matrix, bias, _ = climb.inertia(run, jnp.asarray(q), jnp.asarray(v))
+        assert np.asarray(matrix) == pytest.approx(ties.T @ whole @ ties, abs=1e-11)
+        assert np.asarray(bias) == pytest.approx(ties.T @ data.qfrc_bias, abs=1e-10)
+
+
+def test_rates_of_all_gaps_are_the_derivatives_of_the_gaps():
+    """Each contact moves as its distance changes, so that elastic contacts keep what they store."""
+    run = system(ROBOT, Conditions(0, voltage=6.0).resolved(ROBOT), terrain.step(0.08, nose=0.01), still(0.5, 0.3))
+    q = jnp.array([-0.12, 0.075, -0.2, 1.3, 0.6, 3.4])
+    v = jnp.array([0.3, -0.2, 0.7, 2.0, 0.4, -0.5])
+
+    def gaps(t):
+        return footing.footing(run.shape, run.terrain, q + t * v, v).gap
+
+    rates = np.asarray(footing.footing(run.shape, run.terrain, q, v).gap_rate)
+    numeric = np.asarray((gaps(1e-6) - gaps(-1e-6)) / 2e-6)
+    near = np.abs(np.asarray(gaps(0.0))) < 0.5
+    off = np.abs(rates - numeric)[near]
+    # where two features are equally near, and on wheels that don't bear, there is none
+    assert np.median(off) < 1e-7 and (off > 1e-5).mean() < 0.03
+
+
+def test_polyline_of_constant_slope_is_tilted_gravity():
+    angle = np.radians(10.0)
+    conditions = [Conditions(0, voltage=10.0, slope_deg=slope).resolved(ROBOT) for slope in (0.0, 10.0)]
+    grounds = terrain.slope(angle), terrain.flat()
+    raised, level = (system(ROBOT, *of, still(np.pi, np.pi)) for of in zip(conditions, grounds, strict=True))
+    start = climb.stand(level)
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, z = (float(a) for a in start.q[:2])
+
+    @jax.jit
+    def end(sys_, motion):
+        none = dict.fromkeys((*SOURCES, *LOSSES), jnp.zeros(()))
+        return jax.lax.fori_loop(0, 500, lambda k, m: climb.advance(sys_, m, 1.0 + k * sys_.step, none)[0], motion)
+
+    tilted = end(level, start)
+    q = start.q.at[0].set(x * cos - z * sin).at[1].set(x * sin + z * cos).at[2].set(-angle)
+    ended = end(raised, dataclasses.replace(start, q=q))
+    along = float(ended.q[0] * cos + ended.q[1] * sin)
+    assert along == pytest.approx(float(tilted.q[0]), abs=1e-9)
+    assert float(tilted.q[3]) > 0.01  # it has been driven
+    assert float(ended.q[2]) + angle == pytest.approx(float(tilted.q[2]), abs=1e-9)
+    assert float(ended.q[3]) == pytest.approx(float(tilted.q[3]), abs=1e-9)
+    assert float(ended.current) == pytest.approx(float(tilted.current), rel=1e-8)
+
+
+@pytest.mark.slow
+def test_largest_step_of_a_nose_up_robot_is_that_of_statics():
+    """Slow, on a ground that holds: the centre of mass has to come over the edge under the belt. The tail stands on
+    grousers, the edge lies between two of them."""
+    gear = ROBOT.running_gear
+    outer, inner = float(ROBOT.radius_pulley + gear.grouser_height), float(ROBOT.radius_pulley)
+    front = np.radians(60.0)
+    conditions = Conditions(0, voltage=4.0).resolved(ROBOT)
+    run = system(ROBOT, conditions, terrain.flat(), still(front, np.pi))
+    q = jnp.zeros(6).at[4].set(front).at[5].set(0.0)
+    matrix, *_ = climb.inertia(run, q, jnp.zeros(6))
+    ahead = float(-matrix[1, 2] / matrix[0, 0]) + float(gear.wheelbase) / 2
+    up = float(matrix[0, 2] / matrix[0, 0])
+    theta = np.radians(np.linspace(5, 70, 400))
+    height = outer - inner * np.cos(theta) + (ahead - (up + inner) * np.tan(theta)) * np.sin(theta)
+    limit = height.max()
+    # a grouser more or less under the edge, and the way that the robot is at
+    runs = [(terrain.step(limit + d, size=SIZE), 60, 180, 4, {"adhesion": 4.0}) for d in (-0.006, 0.008)]
+    assert batch(runs, duration=14.0, step=2e-4).names == ["over", "tips"]

@@ -1,0 +1,105 @@
+"""Levers stated of runs: `simulate` leaves their posture, and what cannot be is refused in a sentence."""
+
+import csv
+
+import numpy as np
+import pytest
+
+from calibration.data import contradictions
+from calibration.data import runs as records
+from calibration.data.errors import BadConfiguration, BadData
+from mmrjax import params, robots
+from sweeps.inputs import one_run
+from sweeps.pages import posture_words
+from sweeps.results import posture
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return robots.nominal()
+
+
+@pytest.fixture(scope="module")
+def flush(robot):
+    cells = {"levers_front_deg": 180.0, "levers_rear_deg": -8.5, "slope_deg": 15.0}
+    runs = one_run(robot, cells)
+    return posture.postures(robot, runs, runs.conditions(robot))
+
+
+def test_posture_of_a_run(flush):
+    table = flush.table
+    assert table["levers_rear_deg"] == [-8.5] and table["bears"] == ["all along"]
+    assert table["highest_step_mm"][0] == pytest.approx(231.6, abs=0.2)
+    assert table["contact_mm"][0] == pytest.approx(503, abs=1)
+    assert table["pitch_deg"][0] == pytest.approx(-0.0119, abs=1e-4)  # the tail 0.1 mm up
+    assert flush.over.step_mm.max() == pytest.approx(270, abs=0.5) and flush.over.step_mm.shape == (61, 61)
+    k = np.argmin(abs(posture.ANGLES - 180)), np.argmin(abs(posture.ANGLES + 6))
+    assert flush.over.step_mm[k] < table["highest_step_mm"][0] + 5
+    assert "steps up to 232 mm" in posture_words.stands(flush) and posture_words.remarks(flush) == []
+
+
+def test_a_run_that_would_tip_is_said_to(flush):
+    tipping = posture.Postures({**flush.table, "margin_mm": np.array([-3.0])}, flush.rest, flush.step, flush.over)
+    assert posture_words.remarks(tipping) == [
+        "posture: the run would tip over on that slope; currents and speeds are of a robot that is held on it"
+    ]
+
+
+def test_runs_without_levers_have_no_posture(robot):
+    runs = one_run(robot, {})
+    assert posture.postures(robot, runs, runs.conditions(robot)) is None
+
+
+def test_one_pair_alone_leaves_the_other_as_the_robot_states_it(robot):
+    raised = params.replace(robot, {"running_gear.lever_rear": np.pi / 2})
+    conditions = one_run(raised, {"levers_front_deg": 20.0}).conditions(raised)
+    assert conditions.levers_rear_deg is None and conditions.states_levers
+    tops = posture.postures(raised, one_run(raised, {"levers_front_deg": 20.0}), conditions).table
+    assert tops["tip_rear_mm"][0] == pytest.approx(262, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        (
+            {"configuration": "4W2T", "levers_rear_deg": 10.0},
+            "--levers-rear: 4W2T has no levers; those that have: 6T2A",
+        ),
+        ({"levers_front_deg": 200.0}, "levers_front_deg: got 200; expected -180 to 180"),
+    ],
+)
+def test_levers_that_cannot_be_are_refused(robot, cells, words):
+    with pytest.raises(BadConfiguration, match=words):
+        one_run(robot, cells)
+
+
+def test_angle_beyond_the_range_of_a_robots_levers_is_refused(robot):
+    narrow = params.replace(robot, {"running_gear.levers.angle_least": np.radians(-45.0)})
+    words = r"--levers-rear: got -60; expected -45 to 180, the range of the robot's levers"
+    with pytest.raises(BadConfiguration, match=words):
+        one_run(narrow, {"levers_rear_deg": -60.0})
+
+
+def test_a_table_states_levers_by_row(robot, tmp_path):
+    head = "configuration,supply_voltage_V,payload_kg,slope_deg,total_mass_kg,levers_front_deg,levers_rear_deg\n"
+    path = tmp_path / "runs.csv"
+    path.write_text(head + "6T2A,33,0,0,13.1,30,-8\n6T2A,24,0,5,13.1,180,180\n")
+    runs = records.read(path, robot=robot, measured=False)
+    conditions = runs.conditions(robot)
+    assert conditions.levers_front_deg.tolist() == [30, 180] and conditions.levers_rear_deg.tolist() == [-8, 180]
+    assert contradictions.misplaced(runs, robot) is None
+    path.write_text(head + "6T2A,33,0,0,13.1,30,-8\n4W2T,24,0,5,11.5,180,180\n")
+    with pytest.raises(BadData, match=r"runs.csv row 2, levers_front_deg: 4W2T has no levers"):
+        records.read(path, robot=robot, measured=False)
+
+
+@pytest.mark.slow
+def test_simulate_leaves_posture_and_page(tmp_path, mmrjax):
+    folder = tmp_path / "run"
+    code, out, _ = mmrjax("simulate", "--levers-front", "30", "--levers-rear", "-8", "--out", str(folder))
+    assert code == 0 and "steps up to 236 mm" in out
+    with (folder / "posture.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["highest_step_mm"]) == pytest.approx(236, abs=1)
+    page = (folder / "report.html").read_text()
+    assert 'id="posture-section"' in page and (folder / "figures" / "steps.svg").exists()
