@@ -605,7 +605,7 @@ class Sensitivity(RobotPart, FidelityPart, SupplyPart, OutputPart):
     vary: tuple[str, ...] = about((), "A condition that is uncertain too, repeatable: voltage=22:26, slope_deg=0:5")
     outputs: tuple[str, ...] = about(
         (),
-        "Outputs, comma-separated: those of a run, steepest_slope, start for the three of a start",
+        "Outputs, comma-separated: those of a run, steepest_slope, highest_step, best_step, start for its three",
         usual="current, speeds, slip, power, efficiency, steepest slope",
     )
     evaluations: Annotated[int, Field(ge=1, le=1_000_000_000)] | None = about(

@@ -13,7 +13,7 @@ import pytest
 
 from mmrjax import derived, params
 from mmrjax.conditions import Conditions
-from mmrjax.derived import start, steepest_slope
+from mmrjax.derived import posture, start, steepest_slope
 from mmrjax.fidelities.drive import drive
 from mmrjax.fidelities.steady import steady
 from mmrjax.signals import CONVERGED, SLIDES, STALLED, STATUSES
@@ -154,3 +154,14 @@ def test_crossing_is_exact_for_a_cubic():
     t = jnp.linspace(0.0, 1.0, 6)
     k, share = start.crossing(t, t**3, 3 * t**2, jnp.asarray(0.3))
     assert float(t[k] + share * (t[k + 1] - t[k])) == pytest.approx(0.3 ** (1 / 3), abs=1e-9)
+
+
+# --- posture ------------------------------------------------------------------------------------------------------
+
+
+def test_steps_of_a_posture_and_of_any_are_those_of_the_static_limits(robot):
+    found = posture.compute(robot, asked(0, 24.0, payload=8.0, levers_front_deg=-30.0, levers_rear_deg=180.0))
+    assert math.degrees(float(found["pitch"])) == pytest.approx(8.57, abs=0.01)
+    assert float(found["highest_step"]) < float(found["best_step"]) == pytest.approx(0.2456, abs=1e-4)
+    folded = posture.compute(robot, asked(0, 24.0, payload=8.0))
+    assert float(folded["pitch"]) == 0 and float(folded["highest_step"]) == pytest.approx(0.0671, abs=1e-4)

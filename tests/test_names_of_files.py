@@ -52,10 +52,10 @@ MORE = {
     "discharge_mAh": "charge already taken from the battery",
     "levers_front_deg": "0 along the wheelbase outward, positive up", "levers_rear_deg": "the same of the rear ones",
     # posture and what geometry allows
-    "pitch_deg": "nose up", "contact_mm": "length of the contact", "load_front_percent": "of the load at the front",
+    "contact_mm": "length of the contact", "load_front_percent": "of the load at the front",
     "centre_height_mm": "centre of mass above the ground", "margin_mm": "from gravity's line to the contact's end",
     "tips_back_deg": "slope on which it tips, uphill", "tips_forward_deg": "downhill", "tips_aside_deg": "across",
-    "highest_step_mm": "centre of mass over the edge", "widest_gap_mm": "bridged by the contact",
+    "widest_gap_mm": "bridged by the contact",
     "tip_front_mm": "top of a lever's roller", "tip_rear_mm": "the same of the rear ones",
     "overall_length_mm": "overall", "overall_height_mm": "overall",
     "voltages_V": "axis of supply_voltage_V", "payloads_kg": "axis of payload_kg",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence as Rows
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from calibration.data import delimited
-from calibration.data.errors import BadConfiguration, BadData, is_number
+from calibration.data.errors import BadConfiguration, BadData
 from mmrjax import terrain
 from mmrjax.fidelities.climb import Sequence
 from mmrjax.robot import Robot
@@ -28,7 +29,7 @@ def stairs(text: str) -> tuple[float, float, int]:
         BadConfiguration: something else, or a stair without rise or tread.
     """
     cells = text.lower().replace("×", "x").split("x")
-    numbers = [float(c) if is_number(c) else np.nan for c in cells]
+    numbers = [_number(c) for c in cells]
     if len(cells) != 3 or not np.isfinite(numbers).all():
         raise BadConfiguration(f"--stairs: got {text}; expected RISExTREADxCOUNT in mm, such as 170x290x3")
     rise, tread, count = numbers
@@ -37,6 +38,13 @@ def stairs(text: str) -> tuple[float, float, int]:
             unit = "" if name == "count" else " mm"
             raise BadConfiguration(f"--stairs: got a {name} of {value:g}{unit}; expected {least} to {most}{unit}")
     return rise / 1000, tread / 1000, int(count)
+
+
+def _number(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
 def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, np.ndarray], Rows[str]]:
@@ -57,9 +65,9 @@ def _read(path: Path, option: str, wanted: Rows[Rows[str]]) -> tuple[dict[str, n
         for name in names:
             j = header.index(name)
             cell = row[j] if j < len(row) else ""
-            if not is_number(cell) or not np.isfinite(float(cell)):
+            if not np.isfinite(value := _number(cell)):
                 raise BadData(f"{path.name} row {k}, {name}: got {cell!r}; expected a number")
-            found[name].append(float(cell))
+            found[name].append(value)
     if len(rows) < 2:
         raise BadData(f"{path.name}: has no rows; expected at least one")
     return {name: np.array(values) for name, values in found.items()}, names

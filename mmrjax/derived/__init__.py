@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -36,6 +37,7 @@ class Derived:
 
 
 _SLOPE, _START = "mmrjax.derived.steepest_slope", "mmrjax.derived.start"
+_POSTURE = "mmrjax.derived.posture"
 
 #: Read through the module, so that a line more is an output more everywhere.
 TABLE: tuple[Derived, ...] = (
@@ -45,6 +47,9 @@ TABLE: tuple[Derived, ...] = (
     Derived("peak_current", "peak_current_A", "A", 1.0, "peak current of the start, all motors", _START, 2),
     Derived("time_to_speed", "time_to_speed_s", "s", 1.0, "time to 95 % of speed", _START, 3),
     Derived("energy_start", "energy_start_J", "J", 1.0, "electrical energy of the start", _START, 2),
+    Derived("pitch", "pitch_deg", "deg", math.pi / 180, "pitch at rest, nose up", _POSTURE, 2),
+    Derived("highest_step", "highest_step_mm", "mm", 1e-3, "highest step of the posture", _POSTURE, 1),
+    Derived("best_step", "best_step_mm", "mm", 1e-3, "highest step in any posture", _POSTURE, 1),
 )
 
 

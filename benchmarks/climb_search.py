@@ -1,0 +1,114 @@
+"""The highest step that a robot gets over, by a search over sequences of its lever angles; and time of 1000 climbs.
+
+    python benchmarks/climb_search.py --surface asphalt --members 2048 --generations 4 --out found.json
+
+Members have angles of front and rear levers at knots of time, and a height of their own; of each generation the
+highest that were got over beget the next, angles and height changed at random. `--adhesion 4` is a ground that holds
+whatever is asked, which shows what geometry and torque leave.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mmrjax import robots, terrain
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities.climb import NAMES, OVER, Sequence, climb_batch
+from mmrjax.tables import SURFACES, adhesion_ratio
+
+#: Times at which angles are free [s], between which they go straight.
+KNOTS = np.array([0.3, 1.5, 3.0, 4.5, 6.0, 7.5, 9.0, 10.5])
+LENGTH = 13.0
+#: Least angle in which a lever begins [deg].
+FLUSH = -8.4
+
+
+def run(
+    robot: object, angles: np.ndarray, heights: np.ndarray, volts: float, adhesion: float, payload: float, step: float
+) -> object:
+    """Climbs of members with angles (members, 2, knots) [deg] over steps of their heights [m]."""
+    n = len(heights)
+    conditions = Conditions(0, voltage=np.full(n, volts), adhesion=adhesion, payload=payload).resolved(robot)
+    grounds = jax.vmap(lambda h: terrain.step(h))(jnp.asarray(heights))
+    front, rear = (jnp.asarray(np.radians(angles[:, k])) for k in range(2))
+    sequence = Sequence(jnp.broadcast_to(jnp.asarray(KNOTS), front.shape), front, rear, True)
+    return climb_batch(
+        robot, conditions, grounds, sequence, duration=LENGTH, step=step, sample=0.05, part=1.0, record=False
+    )
+
+
+def mutated(random: np.random.Generator, parents: np.ndarray, n: int, spread: float) -> np.ndarray:
+    """Angles of members of the next generation: of two parents each, moved."""
+    a, b = parents[random.integers(len(parents), size=(2, n))]
+    angles = np.where(random.random(a.shape) < 0.8, a, b) + spread * random.normal(size=a.shape)
+    return bounded(angles)
+
+
+def bounded(angles: np.ndarray) -> np.ndarray:
+    """Angles within the range of the levers, not below the ground in the beginning."""
+    angles = np.clip(angles, -170, 180)
+    angles[:, :, 0] = np.maximum(angles[:, :, 0], FLUSH)
+    return angles
+
+
+def main() -> None:
+    """Search, and say what was found."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--surface", default="lacquered_wood", choices=list(SURFACES))
+    parser.add_argument("--adhesion", type=float, help="in place of the surface's, as a ratio to the bench")
+    parser.add_argument("--members", type=int, default=2048)
+    parser.add_argument("--generations", type=int, default=4)
+    parser.add_argument("--volts", type=float, default=12.0)
+    parser.add_argument("--payload", type=float, default=0.0)
+    parser.add_argument("--step", type=float, default=2e-4)
+    parser.add_argument("--seconds", type=float, default=1e9, help="after which no generation is begun")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out")
+    told = parser.parse_args()
+    robot, random = robots.nominal(), np.random.default_rng(told.seed)
+    adhesion = adhesion_ratio(told.surface, True) if told.adhesion is None else told.adhesion
+    n, begun, parents = told.members, time.time(), []
+    best: list[tuple[float, np.ndarray, float]] = []
+    for generation in range(told.generations):
+        if time.time() - begun > told.seconds:
+            break
+        if not best:
+            held = random.uniform([[-60], [-90]], [[120], [180]], (n, 2, len(KNOTS)))
+            # half of them stay for a while where they are
+            angles = bounded(np.where(random.random(held.shape) < 0.5, np.roll(held, 1, axis=2), held))
+            heights = random.uniform(0.1, 0.3, n)
+        else:
+            parents = np.array([angles for _, angles, _ in best])
+            tops = np.array([h for h, *_ in best])
+            angles = mutated(random, parents, n, 25.0 * 0.7**generation)
+            heights = random.choice(tops, n) + random.uniform(-0.01, 0.04, n)
+        start = time.time()
+        found = run(robot, angles, heights, told.volts, adhesion, told.payload, told.step)
+        took = time.time() - start
+        over = np.flatnonzero(found.verdict == OVER)
+        best += [(float(heights[k]), angles[k], float(found.ended[k])) for k in over]
+        best = sorted(best, key=lambda b: -b[0])[:48]
+        counts = {name: int(np.sum(found.verdict == k)) for k, name in enumerate(NAMES)}
+        top = f"{1000 * best[0][0]:.0f} mm" if best else "none"
+        print(f"generation {generation}: {took:.1f} s, {counts}, highest {top}", flush=True)
+    if best and told.out:
+        height, angles, ended = best[0]
+        with open(told.out, "w") as stream:
+            json.dump(
+                {
+                    "surface": told.surface, "adhesion": adhesion, "volts": told.volts, "payload_kg": told.payload,
+                    "height_mm": 1000 * height, "time_s": ended, "knots_s": KNOTS.tolist(),
+                    "front_deg": angles[0].round(1).tolist(), "rear_deg": angles[1].round(1).tolist(),
+                    "others_mm": [round(1000 * h, 1) for h, *_ in best],
+                }, stream, indent=1,
+            )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""The command `climb`: what it leaves, how it searches, and what it refuses."""
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+
+from calibration.data import terrains
+from calibration.data.errors import BadConfiguration, BadData
+from mmrjax.robots import nominal
+from sweeps.commands import climb as room
+
+SCHEMA = json.loads((Path(__file__).parents[1] / "docs" / "schemas" / "climb.schema.json").read_text("utf-8"))
+
+REFUSED = {
+    "levers of a wheeled robot": (["--step", "50", "--configuration", "4W2T", "--levers-front", "30"],
+                                  r"4W2T has no levers; expected --configuration 6T2A"),
+    "a lever below the ground": (["--step", "50", "--levers-front", "-30"],
+                                 r"levers front: at -30 deg they begin 72 mm below the ground; expected at least -8\.5"),
+    "an angle beyond the range": (["--step", "50", "--levers-rear", "190"],
+                                  r"--levers-rear: got 190 deg; expected -180 to 180 deg"),
+    "a stair without tread": (["--stairs", "170x0x3"], r"--stairs: got a tread of 0 mm; expected 10 to 5000 mm"),
+    "words for stairs": (["--stairs", "high"], r"--stairs: got high; expected RISExTREADxCOUNT"),
+    "a nose larger than its stair": (["--stairs", "100x290x2", "--nose", "60"], r"--nose: got 60 mm; expected less than"),
+    "two obstacles": (["--step", "50", "--gap", "90"], r"step_mm and gap_mm are stated both"),
+    "none": ([], r"no obstacle is stated"),
+    "a search of another kind": (["--find", "gap", "--step", "50"], r"find gap acts without step_mm"),
+    "no such terrain": (["--terrain", "none.csv"], r"--terrain: none\.csv cannot be read"),
+    "a bench": (["--step", "50", "--robot", "bench.toml"], r"climb: the robot's load is a shaft"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_climbed_is_refused_in_one_sentence(mmrjax, tmp_path, case):
+    arguments, message = REFUSED[case]
+    if case == "a bench":
+        assert mmrjax("rig", "new", "bench.toml", "--kind", "bench")[0] == 0
+        message = r"climb: |bench\.toml"
+    code, _, err = mmrjax("climb", *arguments, "--out", "c")
+    assert code == 2 and err.count("\n") == 1, err
+    assert re.search(message, err), err
+    assert not (tmp_path / "c").exists()
+
+
+def test_files_of_terrain_and_sequence_are_read_with_their_units(tmp_path):
+    (tmp_path / "t.csv").write_text("# a kerb\nx_mm;z_mm\n100;0\n100;80\n300,5;80\n")
+    ground = terrains.read_terrain(tmp_path / "t.csv")
+    assert float(ground.finish) == pytest.approx(0.2005)
+    assert float(ground.distance(jnp.array([[0.1, 0.1]]))[0][0]) == pytest.approx(0.02)
+    (tmp_path / "s.csv").write_text("x_mm,front_deg,rear_deg\n-300,45,180\n0,0,-8\n")
+    sequence = terrains.read_sequence(tmp_path / "s.csv", nominal())
+    assert np.degrees(np.asarray(sequence.angles(-0.15, 0.0))) == pytest.approx([22.5, 180 - 86])
+    assert not sequence.over_time
+
+
+FILES = {
+    "millimetres": ("x_m,z_m\n0,0\n3000,120\n", r"is 3000 m large; .* is the file in millimetres\?"),
+    "no units": ("x,z\n0,0\n1,0\n", r"got columns x, z; expected x_m and z_m, or x_mm and z_mm"),
+    "folds back": ("x_m,z_m\n0,0\n0.3,0.1\n0.2,0.2\n", r"x falls from 0\.3 to 0\.2 m at point 3"),
+    "a word": ("x_m,z_m\n0,0\n1,high\n", r"row 3, z_m: got 'high'; expected a number"),
+    "a point": ("x_m,z_m\n0,0\n", r"two points or more"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_terrains_that_are_none_are_refused_in_one_sentence(tmp_path, case):
+    text, message = FILES[case]
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(BadData, match=message):
+        terrains.read_terrain(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("time_s,front_deg,rear_deg\n1,0,0\n1,0,0\n", r"row 3, time_s: got 1 after 1; expected values that rise"),
+        ("time_s,front_deg,rear_deg\n1,0,270\n", r"row 2, rear_deg: got 270 deg; expected -180 to 180"),
+        ("front_deg,rear_deg\n1,0\n", r"expected x_mm and front_deg and rear_deg, or time_s"),
+    ],
+)
+def test_sequences_that_are_none_are_refused_in_one_sentence(tmp_path, text, message):
+    (tmp_path / "s.csv").write_text(text)
+    with pytest.raises(BadData, match=message):
+        terrains.read_sequence(tmp_path / "s.csv", nominal())
+
+
+def test_stairs_are_read_and_refused_as_they_are_written():
+    assert terrains.stairs("170x290x3") == (0.17, 0.29, 3)
+    with pytest.raises(BadConfiguration, match=r"count of 2\.5"):
+        terrains.stairs("170x290x2.5")
+
+
+@pytest.mark.parametrize("limit", [87.3, 449.0, 5.0])
+def test_search_ends_within_a_millimetre_of_the_largest_that_is_got_over(limit):
+    rounds = []
+
+    class Ended:
+        def __init__(self, sizes):
+            # beyond the limit one more is got over by chance: what lies beyond a failure does not count
+            self.names = ["over" if s <= limit or abs(s - 300) < 8 else "slides" for s in sizes]
+
+    def run(sizes):
+        rounds.append(sizes)
+        return sizes, Ended(sizes)
+
+    sizes, _, chosen, tried, best = room._searched("step", run)
+    if limit < 10:
+        assert best is None and dict(tried)[10.0] == "slides"
+        return
+    assert limit - 1.2 <= best <= limit and sizes[chosen] == best
+    assert len(rounds) <= 4 and dict(tried)[best] == "over"
+
+
+def test_one_climb_leaves_a_folder_whose_energy_adds_up(mmrjax, tmp_path):
+    code, out, _ = mmrjax(
+        "climb", "--gap", "60", "--levers-front", "45", "--voltage", "24", "--duration", "2", "--time-step", "4e-4",
+        "--out", "c",
+    )  # fmt: skip
+    assert code == 0 and "The robot gets over: a gap of 60 mm." in out
+    folder = tmp_path / "c"
+    result = json.loads((folder / "result.json").read_text("utf-8"))
+    jsonschema.validate(result, SCHEMA)
+    assert result["verdict"] == "over" and result["largest_mm"] is None
+    with (folder / "history.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    last = {name: float(value) for name, value in rows[-1].items()}
+    assert last["x_mm"] > 60 and last["front_deg"] == pytest.approx(45, abs=0.1)
+    lost = sum(
+        last[f"{name}_J"] for name in ("winding", "motor", "gearbox", "track", "sliding", "contact", "rolling")
+    )
+    assert last["supply_J"] + last["levers_J"] == pytest.approx(lost + last["stored_J"], rel=5e-3)
+    page = (folder / "report.html").read_text("utf-8")
+    assert "The robot gets over: a gap of 60 mm." in page and page.count("<svg") == 2
