@@ -25,8 +25,9 @@ from mmrjax.robot import Robot
 from sweeps import config as configuration
 from sweeps.console import say
 from sweeps.inputs import load_robot, one_run
-from sweeps.pages import turn_words
+from sweeps.pages import posture_words, turn_words
 from sweeps.points import run
+from sweeps.results import posture
 from sweeps.skeleton import page
 from sweeps.store import open_folder
 
@@ -75,6 +76,9 @@ def simulate(config: configuration.Simulate, given: str | dict[str, Any], out: P
         print_sides(facts.sides)
         for note in facts.notes:
             say(f"- {note}")
+        if (stands := posture.postures(robot, runs, asked)) is not None:
+            folder.write_table("posture.csv", stands.table)
+            say(posture_words.stands(stands))
         result = run.SimulationResult("simulate", config.model, robot, runs, table, {"turn": turn})
         shows = page("turn", file, model=config.model, run=table, facts=facts, history=history, turns=turns)
         return run.leave(folder, config, result, shows)
