@@ -24,6 +24,7 @@ import test_settle
 from calibration.data import columns
 from mmrjax import channels, derived, missions, outputs, requirements
 from mmrjax.derived import turn
+from mmrjax.fidelities.climb import LOSSES, SOURCES
 from mmrjax.fidelities.resonance import SIGNALS
 from sweeps import capabilities, cli, config
 from sweeps.points import export
@@ -81,6 +82,17 @@ MORE = {
     "estimated_percent": "sd of readings as the fit has them",
     # missions
     "energy_by_where_Wh": "energy that goes to each sink",
+    # climbs
+    "x_mm": "middle of the robot from where the obstacle begins", "z_mm": "the same above the ground before it",
+    "front_deg": "front levers", "rear_deg": "rear levers", "belt_mm_s": "of the main belt",
+    "traction_current_A": "of each traction motor", "front_current_A": "of the motor of the front levers",
+    "rear_current_A": "of that of the rear ones", "front_torque_Nm": "of the pair", "rear_torque_Nm": "of the pair",
+    "reaction_N": "of the ground, both sides", "stored_J": "in motion, height, contacts and windings",
+    **{f"{name}_J": "since the run began" for name in (*SOURCES, *LOSSES)},
+    "furthest_mm": "largest x", "pitch_most_deg": "nose up", "pitch_least_deg": "nose up",
+    "margin_least_mm": "of the run", "traction_current_most_A": "of the run", "front_current_most_A": "of the run",
+    "rear_current_most_A": "of the run", "front_torque_most_Nm": "of the run", "rear_torque_most_Nm": "of the run",
+    "energy_J": "from the supply",
     # robots that are found
     "radius_m": "of the driving wheel",
 }  # fmt: skip
@@ -438,6 +450,7 @@ OTHERS = {
     "resonance": (
         "resonance", "--voltages", "16:32:2", "--payloads", "0", "--duration", "0.5", "--step", "0.0002", "--no-report",
     ),
+    "climb": ("climb", "--gap", "60", "--voltage", "24", "--duration", "2", "--time-step", "4e-4", "--no-report"),
     "battery": ("simulate", "--profile", "patrol", "--battery", "--no-report"),
     "turn": ("simulate", "--left", "24", "--right", "12", "--model", "drive", "--duration", "1", "--no-report"),
     "settle": ("settle", "log.csv", "--robot", "rig.toml"),
