@@ -494,7 +494,9 @@ def turning(
         stands, chassis.ground.friction, conditions.adhesion, load, sliding, motion.speed_lateral, motion.yaw_rate,
         jnp.asarray(rolling), loads,
     )  # fmt: skip
-    own_load = jax.vmap(lambda s: travel(robot, chassis, s))(_fill(even, normal=held.normal / units))
+    own_load = jax.vmap(lambda s: travel(robot, chassis, s))(
+        _fill(even, normal=held.normal / units, moment_lateral=held.moment / units)
+    )
     lateral, yaw = (
         units * total(both(jax.vmap(lambda s, name=name: added(robot, s, name))(own_load)))
         for name in ("lateral", "yaw")

@@ -112,6 +112,7 @@ class Signals(eqx.Module):
     speed_lateral: Scalar = 0.0  # v_y to the left [m/s]
     yaw_rate: Scalar = 0.0  # ω, positive to the left [rad/s]
     direction_turn: Scalar = 0.0  # way round, -1..1, positive to the left [-]
+    moment_lateral: Scalar = 0.0  # of the lateral forces about the centre of mass, positive to the left [N·m]
     heading: Scalar = 0.0  # ψ from uphill, positive to the left [rad]
     place_x: Scalar = 0.0  # uphill of where the run started [m]
     place_y: Scalar = 0.0  # to the left of that [m]

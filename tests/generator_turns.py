@@ -54,7 +54,7 @@ CASES = {
     "torque": Planted(right={"motor.torque_constant": 0.93 * _TORQUE}, named=("side_torque",)),
     "voltage": Planted(duty=(1.0, 0.97), named=("side_voltage",), family="voltage drop"),
     "moment": Planted(moment=0.004, named=("turning_resistance",), family="resistance to turning"),
-    "grip": Planted(grip=lambda omega: LATERAL * (1 + 0.1 * abs(omega)), named=("turning_resistance",)),
+    "grip": Planted(grip=lambda omega: LATERAL * (1 + 0.1 * abs(omega)), named=("lateral_grip",)),
     "radius": Planted(left={"6T2A.radius": 1.015 * _RADIUS}, named=("side_radius",), family="slip"),
 }
 

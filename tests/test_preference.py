@@ -174,7 +174,7 @@ def test_page_and_terminal_begin_with_what_gets_worse(traced, tmp_path, capsys):
     text = loop_page.write(tmp_path, found, robot_name="nominal").read_text("utf-8")
     page = Tables(text)
     assert said in page.text
-    assert text.index('id="worse"') < text.index('id="effects"') < text.index('id="errors"')
+    assert text.index('id="worse"') < text.index('id="errors"') < text.index('id="effects"')
     assert page.tables["errors"][1][0].startswith("as stated, nothing fitted")
     assert len(page.tables["alternatives_held_out"]) == 1 + len(traced.held_out)
 

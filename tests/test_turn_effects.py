@@ -80,7 +80,8 @@ PLACES = [8, 9, 7, 4, 5, 6, 0, 1, 2, 3, 10]
 
 def test_terms_are_their_equations():
     robot, values = robots.nominal(), {name: amplitude(name) for name in effects.OF_TURNS}
-    signals = balances.turning(robot, RUN, MOTION).signals
+    travel = jax.jit(lambda m: balances.turning(robot, RUN, m))(MOTION)
+    signals, grip = travel.signals, travel.grip
     terms = {}
     for name, a in values.items():
         effect = effects.OF_TURNS[name](amplitude=a)
@@ -95,6 +96,9 @@ def test_terms_are_their_equations():
     np.testing.assert_allclose(terms["side_radius"], values["side_radius"] * side * rolled, rtol=1e-9)
     resisted = values["turning_resistance"] * np.asarray(signals.normal) * -1.1
     np.testing.assert_allclose(terms["turning_resistance"], resisted, rtol=1e-9)
+    assert float(jnp.sum(grip.moment)) > 0.5  # against a turn to the right
+    dug = values["lateral_grip"] * 1.1 * -np.asarray(grip.moment)
+    np.testing.assert_allclose(terms["lateral_grip"], dug, rtol=1e-9)
 
 
 def test_energy_is_kept_and_resistance_to_turning_takes_it():
@@ -114,8 +118,9 @@ def test_energy_is_kept_and_resistance_to_turning_takes_it():
     assert float(sum(sinks.values()) + change) == pytest.approx(float(source), rel=1e-9)
     rolls = with_amplitudes(robots.nominal(), {"side_radius": amplitude("side_radius")})  # slides as much
     plain = energy.sinks_turning(rolls, RUN, balances.turning(rolls, RUN, MOTION))
-    load = float(jnp.sum(balances.turning(robot, RUN, MOTION).signals.normal))
-    taken = amplitude("turning_resistance") * load * 1.1**2
+    seen = balances.turning(robot, RUN, MOTION)
+    load, moment = float(jnp.sum(seen.signals.normal)), float(jnp.sum(seen.grip.moment))
+    taken = amplitude("turning_resistance") * load * 1.1**2 + amplitude("lateral_grip") * moment * 1.1**2
     assert float(sinks["sliding"] - plain["sliding"]) == pytest.approx(taken, rel=1e-6)
 
 

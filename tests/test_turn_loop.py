@@ -65,7 +65,7 @@ def test_loop_looks_for_effects_of_turns_beside_the_library(posed):
     assert {"6T2A.turning.width", "6T2A.turning.lateral"} < set(space.coordinates.base.names)
 
 
-@pytest.mark.parametrize("name", ["side_voltage", "side_torque", "turning_resistance", "iron_loss"])
+@pytest.mark.parametrize("name", ["side_voltage", "side_torque", "turning_resistance", "lateral_grip", "iron_loss"])
 def test_signature_is_what_the_effect_does(posed, linear, shown, name):
     _, space = posed
     k = space.library.names.index(name)

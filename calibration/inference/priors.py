@@ -160,11 +160,12 @@ def known(robot: Robot) -> dict[str, Parameter]:
 
 def friction(robot: Robot, configuration: str) -> tuple[str, ...]:
     """The friction parameters of a configuration that are free by default, of those that its load has: what no
-    channel can show or is zero is held."""
+    channel can show or is zero is held. The ground's friction shows in the speed, as slip; in turns it is what all
+    channels show."""
     names = [*FRICTION, *SHAFT]
     if float(robot.configurations[configuration].on_tracks) > 0.5:
         names.insert(2, GUIDE_SHARE)
-    if not robot.rig.inherits and "speed" not in robot.rig.channels:
+    if not (robot.rig.inherits or robot.rig.turns or "speed" in robot.rig.channels):
         names = [n for n in names if not n.startswith("ground.friction.")]
     return _uncertain(robot, (f"{configuration}.{name}" for name in names))
 

@@ -134,3 +134,29 @@ class SideRadius(Effect):
 
     def term(self, robot: Robot, signals: Signals) -> Scalar:
         return self.amplitude * signals.side * signals.speed_theoretical
+
+
+class LateralGrip(Effect):
+    """ΔM_ψ = a |ω| M_y against the turn, M_y the moment of each side's lateral forces: φ_y (1 + a |ω|) in the turn.
+
+    Grousers that dig in, or loose ground that piles up beside the tracks, the more the faster they are dragged aside.
+    What it changes of the lateral force, which a settled turn needs for its path alone, is left to the sliding.
+
+    Source: a ratio of frictions linear in the yaw rate; that the coefficient of lateral resistance is no constant of
+    the ground, Wong, Theory of Ground Vehicles, chapter 6. From `turning_resistance` it differs where contacts creep.
+    """
+
+    balance = "yaw"
+    driver = "speed"
+    dissipative = True
+
+    amplitude: Scalar = amplitude(
+        unit="s/rad",
+        meaning="relative rise of the lateral friction over the yaw rate",
+        bounds=(-0.1, 2.0),
+        sd=0.05,
+        source="a fifth at 4 rad/s",
+    )
+
+    def term(self, robot: Robot, signals: Signals) -> Scalar:
+        return -self.amplitude * signals.yaw_rate * signals.direction_turn * signals.moment_lateral
