@@ -146,8 +146,9 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
     """The highest step of one run in any posture within the levers' range, and the angles of front and rear levers
     [rad]; its derivatives are those at these angles.
 
-    What any robot that climbs slowly can get over, in whatever sequence of postures: as its tail leaves the lower
-    ground, the centre of mass has to be over the step, and what is under it is no higher than in the best posture.
+    What a robot that climbs slowly can get over in whatever sequence of postures, where the wall of the step carries
+    nothing: as its tail leaves the lower ground, the centre of mass has to be over the step, and what is under it is no
+    higher than in the best posture.
     """
     still, there = jax.lax.stop_gradient((robot, conditions))
     levers = still.running_gear.levers
