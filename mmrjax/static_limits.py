@@ -147,8 +147,8 @@ def best_step(robot: Robot, conditions: Conditions) -> tuple[Step, Scalar, Scala
     [rad]; its derivatives are those at these angles.
 
     What a robot that climbs slowly can get over in whatever sequence of postures, where the wall of the step carries
-    nothing: as its tail leaves the lower ground, the centre of mass has to be over the step, and what is under it is no
-    higher than in the best posture.
+    nothing: as its tail leaves the lower ground, the centre of mass has to be over the step, and what is under it is
+    no higher than in the best posture.
     """
     still, there = jax.lax.stop_gradient((robot, conditions))
     levers = still.running_gear.levers
