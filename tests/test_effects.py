@@ -63,7 +63,7 @@ SIGNAL_UNITS = {
     "1/s": "speed_motor speed_wheel speed_output yaw_rate",
     "1/s^2": "acceleration_wheel",
     "N·m": "torque_electromagnetic torque_motor_loss torque_motor torque_track_loss torque_load torque_idle "
-    "torque_input torque_gear torque_output torque_net",
+    "torque_input torque_gear torque_output torque_net moment_lateral",
     "H": "inductance",
     "kg·m^2": "inertia_added",
     "rad": "angle heading",

@@ -83,7 +83,8 @@ MORE = {
     # missions
     "energy_by_where_Wh": "energy that goes to each sink",
     # climbs
-    "x_mm": "middle of the robot from where the obstacle begins", "z_mm": "the same above the ground before it",
+    "z_mm": "middle of the robot above the ground before the obstacle",
+    "nose_mm": "radius of rounded noses", "time_step_s": "step of a climb",
     "front_deg": "front levers", "rear_deg": "rear levers", "belt_mm_s": "of the main belt",
     "traction_current_A": "of each traction motor", "front_current_A": "of the motor of the front levers",
     "rear_current_A": "of that of the rear ones", "front_torque_Nm": "of the pair", "rear_torque_Nm": "of the pair",
