@@ -336,9 +336,7 @@ def margin(run: System) -> Scalar:
 
 def centre(run: System) -> tuple[Scalar, Scalar, Scalar]:
     """Centre of mass ahead of and above the middle of the wheelbase [m], and the mass of half a robot [kg]."""
-    total = run.half.chassis + 2 * run.half.pulley
-    share = run.half.chassis / total
-    return run.half.forward * share, run.half.up * share, total
+    return *run.half.centre, run.half.chassis + 2 * run.half.pulley
 
 
 def axle_height(run: System) -> Scalar:

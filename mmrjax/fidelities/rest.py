@@ -100,7 +100,6 @@ def slides_in_place(robot: Robot, conditions: Conditions) -> Array:
     It slides down where gravity less rolling resistance is above the adhesion. It slides in its place where the
     motors turn the movers faster than V_s, up to which the ground holds more the faster they slide.
     """
-    robot = robot.within(conditions.configuration)
     chassis, sense = robot.chassis(conditions.configuration), direction(robot, conditions)
     none = jnp.zeros_like(conditions.voltage)
     still = State(none, none, none, conditions.discharge)
