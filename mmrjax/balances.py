@@ -439,19 +439,30 @@ def stance(robot: Robot, conditions: Conditions, chassis: Chassis, mass: Scalar)
     else:
         ahead, up = masses.masses(robot, conditions, mass).centre
         height = chassis.radius + chassis.on_tracks * robot.running_gear.grouser_height + up
-    lateral = chassis.turning.lateral
-    if conditions.adhesion_lateral is not None:
-        lateral = lateral * conditions.adhesion_lateral / conditions.adhesion
     return Stance(
         length=length,
         width=chassis.turning.width,
         height=height,
         ahead=ahead,
         on_tracks=on_tracks,
-        lateral=lateral,
+        lateral=lateral_friction(conditions, chassis),
         rule=chassis.turning.rule,
         nodes=chassis.turning.nodes,
     )
+
+
+def states_of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> State:
+    """States of left and right side, a leading axis of 2: each travels at V_s = v_x - ω y_s."""
+    speed = motion.speed - motion.yaw_rate * SIDES * robot.chassis(conditions.configuration).turning.width
+    none, drawn = jnp.zeros_like(speed), jnp.broadcast_to(motion.discharge, speed.shape)
+    return State(motion.current, motion.speed_motor, speed, drawn, motion.memory, motion.temperature, distance=none)
+
+
+def lateral_friction(conditions: Conditions, chassis: Chassis) -> Scalar:
+    """Lateral friction over longitudinal on this ground, λ [-]."""
+    own = chassis.turning.lateral
+    stated = conditions.adhesion_lateral
+    return own if stated is None else own * stated / conditions.adhesion
 
 
 def turning(
@@ -459,8 +470,8 @@ def turning(
 ) -> Travel:
     """All signals of a robot free to turn: both sides by the balances above, the supply and the ground between them.
 
-    Each side travels at V_s = v_x - ω y_s, on the part of the slope that lies along its heading. What effects lower
-    the speed of a side by is read at equal loads of both.
+    Each side is on the part of the slope that lies along its heading. What effects lower the speed of a side by is
+    read at equal loads of both.
 
     Args:
         loads: see `turning.grip`.
@@ -468,14 +479,11 @@ def turning(
     robot = robot.within(conditions.configuration)
     chassis, own = robot.chassis(conditions.configuration), conditions.of_sides()
     y = SIDES * chassis.turning.width
-    speed = motion.speed - motion.yaw_rate * y
 
     def both(x: Scalar) -> Array:
-        return jnp.broadcast_to(x, speed.shape)
+        return jnp.broadcast_to(x, y.shape)
 
-    none, drawn = both(0.0), both(motion.discharge)
-    state = State(motion.current, motion.speed_motor, speed, drawn, motion.memory, distance=none)
-    signals = jax.vmap(functools.partial(begin, robot))(own, state)
+    signals = jax.vmap(functools.partial(begin, robot))(own, states_of_sides(robot, conditions, motion))
     sine_slope, mass = sine(conditions.slope), jnp.maximum(*jnp.asarray(signals.mass))
     signals = _fill(
         signals,

@@ -22,7 +22,11 @@ MODES = ("voltage", "motor_speed", "speed", "brake", "coast")
 VOLTAGE, MOTOR_SPEED, SPEED, BRAKE, COAST = range(len(MODES))
 
 #: What a profile may state for each row besides the mode, and of which a row keeps what the conditions say if not.
-CONDITIONS = ("voltage", "duty", "slope_deg", "payload", "adhesion")
+CONDITIONS = ("voltage", "duty", "duty_left", "duty_right", "slope_deg", "payload", "adhesion")
+#: What it may state besides, which is no condition.
+FURTHER = ("voltage_left", "voltage_right", "yaw_rate", "current_other")
+#: What drives the sides apart, stated of both or of none.
+PAIRS = (("duty_left", "duty_right"), ("voltage_left", "voltage_right"))
 
 
 class Instant(eqx.Module):
@@ -32,9 +36,14 @@ class Instant(eqx.Module):
     demand: Scalar
     voltage: Scalar | None
     duty: Scalar | None
+    duty_left: Scalar | None
+    duty_right: Scalar | None
     slope_deg: Scalar | None
     payload: Scalar | None
     adhesion: Scalar | None
+    voltage_left: Scalar | None
+    voltage_right: Scalar | None
+    yaw_rate: Scalar | None
     current_other: Scalar | None
 
     def conditions(self, otherwise: Conditions) -> Conditions:
@@ -43,9 +52,11 @@ class Instant(eqx.Module):
         if "payload" in stated and otherwise.total_mass is not None:
             stated["total_mass"] = otherwise.total_mass + stated["payload"] - otherwise.payload
         held = (self.mode == BRAKE) | (self.mode == COAST)
-        duty = jnp.where(held, 0.0, stated.pop("duty", otherwise.duty))
+        for name in ("duty", "duty_left", "duty_right"):
+            duty = stated.get(name, getattr(otherwise, name))
+            stated[name] = None if duty is None else jnp.where(held, 0.0, duty)
         coasts = jnp.where(self.mode == COAST, 1.0, otherwise.open)
-        return dataclasses.replace(otherwise, **stated, duty=duty, open=coasts)
+        return dataclasses.replace(otherwise, **stated, open=coasts)
 
 
 class Profile(eqx.Module):
@@ -58,6 +69,9 @@ class Profile(eqx.Module):
         voltage: of the external supply [V]; duty: share of the supply's voltage [-]; slope_deg: [deg]; payload: [kg];
             adhesion: as a ratio to the robot's surface [-]; current_other: of other consumers on the battery [A].
             Shape (rows,), or None: as the conditions (the robot, for current_other) say.
+        duty_left, duty_right: as `duty`, of either side; voltage_left, voltage_right: given to the motors of either
+            side [V], as a share of what the source has at no load; yaw_rate: demanded beside a ground speed, positive
+            to the left [rad/s]. Stating any of them makes the robot free to turn.
         linear: whether values change linearly from a row to the next; else they hold until it.
         cycles: how often the rows are run through.
     """
@@ -67,9 +81,14 @@ class Profile(eqx.Module):
     demand: Float[Array, " rows"]
     voltage: Float[Array, " rows"] | None = None
     duty: Float[Array, " rows"] | None = None
+    duty_left: Float[Array, " rows"] | None = None
+    duty_right: Float[Array, " rows"] | None = None
     slope_deg: Float[Array, " rows"] | None = None
     payload: Float[Array, " rows"] | None = None
     adhesion: Float[Array, " rows"] | None = None
+    voltage_left: Float[Array, " rows"] | None = None
+    voltage_right: Float[Array, " rows"] | None = None
+    yaw_rate: Float[Array, " rows"] | None = None
     current_other: Float[Array, " rows"] | None = None
     linear: bool = eqx.field(default=False, static=True)
     cycles: int = eqx.field(default=1, static=True)
@@ -83,6 +102,11 @@ class Profile(eqx.Module):
     def stated(self) -> tuple[str, ...]:
         """Conditions that it states."""
         return tuple(name for name in CONDITIONS if getattr(self, name) is not None)
+
+    @property
+    def turns(self) -> bool:
+        """Whether it drives the sides apart: the robot is then free to turn."""
+        return any(getattr(self, name) is not None for name in (*PAIRS[0], *PAIRS[1], "yaw_rate"))
 
     @property
     def duration(self) -> Scalar:
@@ -100,7 +124,7 @@ class Profile(eqx.Module):
         def value(x: Array) -> Scalar:
             return x[0] + (x[1] - x[0]) * share if self.linear else x[0]
 
-        given = {name: getattr(self, name) for name in (*CONDITIONS, "current_other")}
+        given = {name: getattr(self, name) for name in (*CONDITIONS, *FURTHER)}
         stated = {name: None if x is None else value(x) for name, x in given.items()}
         return Instant(mode=self.mode[0], demand=value(self.demand), **stated)
 
@@ -144,11 +168,12 @@ def profile(
     for k, name in enumerate(modes):
         if name not in MODES:
             raise UsageError(f"profile, mode, row {k + 1}: got {name}; expected {', '.join(MODES)}")
-    known = (*CONDITIONS, "current_other")
+    known = (*CONDITIONS, *FURTHER)
     unknown = sorted(set(values) - set(known))
     if unknown:
         raise UsageError(f"profile: no field {unknown[0]}; there are {', '.join(known)}")
     given: dict[str, Any] = {"demand": demand, **{name: v for name, v in values.items() if v is not None}}
+    _check_sides(given, modes)
     arrays = {}
     for name, value in given.items():
         x = np.asarray(value, float)
@@ -159,10 +184,29 @@ def profile(
                 f"profile, {name}: row {int(np.argmax(~np.isfinite(np.atleast_1d(x)))) + 1} is not finite"
             )
         arrays[name] = jnp.asarray(np.broadcast_to(x, rows.shape))
-    duty = np.asarray(arrays.get("duty", 0.0))
-    if (np.abs(duty) > 1).any():
-        raise UsageError(f"profile, duty: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
+    for name in ("duty", *PAIRS[0]):
+        duty = np.atleast_1d(np.asarray(arrays.get(name, 0.0)))
+        if (np.abs(duty) > 1).any():
+            raise UsageError(f"profile, {name}: got {duty[np.argmax(np.abs(duty))]:g}; expected -1 to 1")
     if len(modes) != len(rows):
         raise UsageError(f"profile, mode: got {len(modes)} values; expected {len(rows)}")
     index = jnp.asarray([MODES.index(name) for name in modes])
     return Profile(time=jnp.asarray(rows), mode=index, linear=linear, cycles=int(cycles), **arrays)
+
+
+def _check_sides(given: dict[str, Any], modes: list[str]) -> None:
+    """Refuse one side without the other, both kinds at once, and a yaw rate without a demanded speed.
+
+    Raises:
+        UsageError: which.
+    """
+    for pair in PAIRS:
+        stated = [name for name in pair if name in given]
+        if len(stated) == 1:
+            other = pair[1 - pair.index(stated[0])]
+            raise UsageError(f"profile: got {stated[0]} without {other}; expected both")
+    kinds = [name for name in ("duty", PAIRS[0][0], PAIRS[1][0]) if name in given]
+    if len(kinds) > 1:
+        raise UsageError(f"profile: got {kinds[0]} beside {kinds[1]}; expected one of the two")
+    if "yaw_rate" in given and MODES[SPEED] not in modes:
+        raise UsageError("profile, yaw_rate: got one without mode speed; expected a demanded ground speed beside it")

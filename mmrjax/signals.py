@@ -73,6 +73,7 @@ class PlaneMotion(eqx.Module):
         heading: from uphill, to the left [rad]; place_x, place_y: uphill of the start, and to the left of it [m].
         discharge: charge taken from the battery C_b [C].
         memory: of each effect that has one, by its name, shape (2,).
+        temperature: of the windings of each side [°C], shape (2,); None: not followed.
     """
 
     current: Scalar
@@ -85,6 +86,7 @@ class PlaneMotion(eqx.Module):
     place_y: Scalar
     discharge: Scalar
     memory: Mapping[str, Scalar] = eqx.field(default_factory=dict)
+    temperature: Scalar | None = None
 
 
 class Signals(eqx.Module):

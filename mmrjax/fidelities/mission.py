@@ -8,32 +8,19 @@ events that the steps land on, and derivatives pass through the moments at which
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mmrjax import energy
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.mission_steps import (
-    CLOCK,
-    DISCHARGE,
-    EVENTS,
-    FIRST,
-    HOUSING,
-    PEAKS,
-    TOTALS,
-    UNITS,
-    WINDING,
-    Asked,
-    Carry,
-    follow,
-    instant,
-    units,
-)
-from mmrjax.fidelities.rest import status_moving
-from mmrjax.fidelities.result import mask, result, slips, withhold
+from mmrjax.fidelities import mission_straight, mission_turning
+from mmrjax.fidelities.mission_steps import EVENTS, FIRST, Asked, Carry, Law, follow
+from mmrjax.fidelities.result import mask, withhold
 from mmrjax.params import Scalar
 from mmrjax.profile import BRAKE, COAST, MOTOR_SPEED, SPEED, Profile
 from mmrjax.robot import Robot
@@ -45,6 +32,7 @@ from mmrjax.signals import (
     ROLLS_BACK,
     SLIDES,
     STALLED,
+    TIPS,
     Result,
     Signals,
 )
@@ -63,7 +51,8 @@ class Totals(eqx.Module):
 
     Attributes:
         time: that it took [s].
-        of: integrals by the names of `TOTALS`; `drawn` and `returned` are the source's, the rest where it went.
+        of: integrals by the names of the law's `TOTALS`; `drawn` and `returned` are the source's, the rest where it
+            went.
         stored: rise of the energy in motion [J].
         given: by the source on balance [J]: by a battery as its charge at both ends says, by a supply as integrated.
     """
@@ -108,9 +97,9 @@ class Course(eqx.Module):
         time: since the mission began [s]; segment: index of the segment, -1 after the last.
         event: index into `MARKS` of what a step has landed on, -1 for none.
         distance: along the ground, forward less backward [m]; path: either way [m].
-        temperature_winding, temperature_housing: [°C].
+        temperature_winding, temperature_housing: [°C]; of a robot that turns of either side, shape (kept, 2).
         energy: taken from the source on balance [J].
-        signals: every signal.
+        signals: every signal; of a robot that turns of left and right side, shape (kept, 2).
     """
 
     time: Float[Array, " kept"]
@@ -129,13 +118,13 @@ class Mission(eqx.Module):
 
     Attributes:
         total: of the mission; segments: of each segment of each cycle, fields of shape (cycles, segments).
-        peaks: by the names of `PEAKS` (`cell_low` the lowest voltage of a cell); of the segments too.
+        peaks: by the names of the law's `PEAKS` (`cell_low` the lowest voltage of a cell); of the segments too.
         status: of each segment at its end, flags: of each segment; shape (cycles, segments).
         result: the end of the mission, with its status and the flags of all of it. Status is `converged` where the
             profile was followed to its end; `battery_empty`; `cut_off` where the cells stayed below their cut-off;
-            `stalled`, `slides` or `rolls_back` where some segment that asks for motion ends so, the first one;
-            `failed` the integrator gave up.
-        end: unknowns at the end; temperature_winding, temperature_housing: [°C]; discharge: [C].
+            `stalled`, `slides`, `rolls_back` or `tips` where some segment that asks for motion ends so, the first
+            one; `failed` the integrator gave up.
+        temperature_winding, temperature_housing: of the hottest at the end [°C]; discharge: [C].
         steps: that were taken, and how many of them were rejected.
         course: over time, where it was asked for.
     """
@@ -155,22 +144,31 @@ class Mission(eqx.Module):
     course: Course | None
 
 
+def law_of(conditions: Conditions, profile: Profile) -> Law:
+    """How a robot moves: free to turn where the profile or the conditions drive its sides apart, or head it."""
+    return mission_turning if profile.turns or conditions.turns else mission_straight
+
+
 def _ends(
-    robot: Robot, segment: Profile, signals: Signals, asked: Asked, stands: Array, mode: Array
+    law: Law, robot: Robot, otherwise: Conditions, segment: Profile, found: Any, asked: Asked, stands: Array
 ) -> tuple[Array, Array]:
     """Status of a segment at its end, and whether the robot has missed what was demanded."""
-    driven = signals.duty * signals.voltage_source
-    now = dataclasses.replace(asked.conditions, discharge=jnp.asarray(signals.discharge))
-    status = jnp.where(stands, STALLED, status_moving(robot, now, signals, driven))
-    rests = stands | ((jnp.abs(signals.direction) < 1.0) & (jnp.abs(signals.direction_travel) < 1.0))
-    wanted = (mode != BRAKE) & (mode != COAST) & (jnp.abs(driven) > 1e-6)
+    mode, signals = segment.mode[0], law.signals_of(found)
+    driven = jnp.max(jnp.abs(jnp.asarray(signals.duty * signals.voltage_source)))
+    status = jnp.where(stands, STALLED, law.status(robot, asked.conditions, found))
+    slow = [jnp.max(jnp.abs(jnp.asarray(x))) < 1.0 for x in (signals.direction, signals.direction_travel)]
+    rests = stands | (slow[0] & slow[1])
+    wanted = (mode != BRAKE) & (mode != COAST) & (driven > 1e-6)
     status = jnp.where(~wanted & (status == STALLED), CONVERGED, status)  # it stands, as it should
     controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
-    per_speed = robot.gearbox.ratio / robot.chassis(signals.configuration).radius
+    per_speed = robot.gearbox.ratio / robot.chassis(otherwise.configuration).radius
+    demanded = law.demanded(robot, otherwise, segment)
     # A ramp that ends in a stop is measured by where it began.
-    demanded = segment.demand if segment.linear else segment.demand[:1]
-    largest = jnp.max(jnp.abs(demanded)) * jnp.where(mode == SPEED, per_speed, 1.0)
-    missed = controlled & (jnp.abs(asked.error) > MISSED * jnp.maximum(largest, 10.0))
+    largest = jnp.max(jnp.abs(demanded if segment.linear else demanded[:1])) * jnp.where(
+        mode == SPEED, per_speed, 1.0
+    )
+    off = jnp.max(jnp.abs(jnp.asarray(asked.error)))
+    missed = controlled & (off > MISSED * jnp.maximum(largest, 10.0))
     status = jnp.where(controlled & (rests | (status == STALLED)) & ~missed, CONVERGED, status)
     return status, missed
 
@@ -205,17 +203,11 @@ def mission(
         The mission; derivatives are forward (`jax.jvp`, `jax.jacfwd`), by parameters, conditions and values and times
         of the profile, through stops and reversals; at a limit that begins to act they are those of one side.
     """
-    begin = Start() if start is None else start
-    ambient = robot.motor.temperature_ambient
-    winding, housing = (ambient if t is None else t for t in (begin.temperature_winding, begin.temperature_housing))
-    chassis = robot.chassis(conditions.configuration)
+    begin, law = Start() if start is None else start, law_of(conditions, profile)
+    names, highest = list(law.TOTALS), len(law.PEAKS)
     dtype = jnp.result_type(conditions.voltage, profile.time)
-    rest = [
-        begin.current, begin.speed / chassis.radius * robot.gearbox.ratio, begin.speed, conditions.discharge, winding,
-        housing, 0.0, 0.0, *(jnp.zeros(()) for _ in robot.remembering),
-    ]  # fmt: skip
-    y0 = jnp.stack([jnp.asarray(x, dtype) for x in rest]) / units(robot).astype(dtype)
-    q0 = jnp.zeros(len(TOTALS), dtype)
+    y0 = law.begin(robot, conditions, begin).astype(dtype) / law.units(robot).astype(dtype)
+    q0 = jnp.zeros(len(names), dtype)
     whole, false = jnp.asarray(0), jnp.asarray(False)
     buffer = None
     if keep:
@@ -223,62 +215,74 @@ def mission(
         buffer = (blank * y0, blank * q0, jnp.zeros(keep, bool), jnp.full(keep, -1))
     carry = Carry(
         y=y0, q=q0, step=jnp.asarray(FIRST, dtype), stands=jnp.asarray(begin.speed == 0.0), ended=false,
-        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=jnp.full(len(PEAKS), -jnp.inf, dtype),
+        below=false, low=jnp.zeros((), dtype), cut_off=false, peaks=jnp.full(highest, -jnp.inf, dtype),
         flags=whole, events=jnp.full(len(EVENTS), -1.0, dtype), accepted=whole, rejected=whole, failed=false,
         kept=whole, buffer=buffer, slope=jnp.zeros_like(y0),
     )  # fmt: skip
 
+    def charge(y: Array) -> Array:
+        return y[law.DISCHARGE] * law.UNITS[law.DISCHARGE]
+
     def one(carry: Carry, k: Array) -> tuple[Carry, tuple]:
         segment = profile.row(k)
-        fresh = carry._replace(peaks=jnp.full(len(PEAKS), -jnp.inf, dtype), flags=whole)
-        beginning = instant(robot, conditions, segment, carry.y.at[CLOCK].set(0.0), carry.stands)[0]
-        c = follow(robot, conditions, segment, fresh, tolerance, most_steps)
-        signals, _, _, asked = instant(robot, conditions, segment, c.y, c.stands)
-        status, missed = _ends(robot, segment, signals, asked, c.stands, segment.mode[0])
+        fresh = carry._replace(peaks=jnp.full(highest, -jnp.inf, dtype), flags=whole)
+        beginning = law.instant(robot, conditions, segment, carry.y.at[law.CLOCK].set(0.0), carry.stands)[0]
+        c = follow(law, robot, conditions, segment, fresh, tolerance, most_steps)
+        found, _, _, asked = law.instant(robot, conditions, segment, c.y, c.stands)
+        status, missed = _ends(law, robot, conditions, segment, found, asked, c.stands)
         status = jnp.where(c.ended, _ending(c), status)
-        flags = c.flags | mask({"demand_missed": missed & ~c.ended, "slips": slips(robot, signals) & ~c.stands})
-        rise = energy.stored(robot, signals) - energy.stored(robot, beginning)
-        drawn, returned = (c.q[list(TOTALS).index(name)] for name in ("drawn", "returned"))
-        before, after = (robot.battery.energy(x.y[DISCHARGE] * UNITS[DISCHARGE]) for x in (carry, c))
+        slips = law.over(robot, found)["slips"] & ~c.stands
+        flags = c.flags | mask({"demand_missed": missed & ~c.ended, "slips": slips})
+        rise = law.stored(robot, found) - law.stored(robot, beginning)
+        drawn, returned = (c.q[names.index(name)] for name in ("drawn", "returned"))
+        before, after = (robot.battery.energy(charge(x.y)) for x in (carry, c))
         given = jnp.where(conditions.battery > 0.5, after - before, drawn - returned)
         ran = ~carry.ended
-        time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[CLOCK], rise, given))
-        out = (time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, signals, c.kept)
+        time, rise, given = (jnp.where(ran, x, 0.0) for x in (c.y[law.CLOCK], rise, given))
+        out = (time, jnp.where(ran, c.q, 0.0), rise, given, c.peaks, status, flags, found, c.kept)
         carry = c._replace(peaks=jnp.maximum(carry.peaks, c.peaks), flags=carry.flags | flags)
         return carry, out
 
     order = jnp.tile(jnp.arange(profile.segments), profile.cycles)
-    c, (time, q, rise, given, peaks, status, flags, signals, kept) = jax.lax.scan(one, carry, order)
+    c, (time, q, rise, given, peaks, status, flags, found, kept) = jax.lax.scan(one, carry, order)
     shape = (profile.cycles, profile.segments)
-    names = list(TOTALS)
     of = {n: q[:, i].reshape(shape) for i, n in enumerate(names)}
     each = Totals(time.reshape(shape), of, rise.reshape(shape), given.reshape(shape))
     total = jax.tree.map(jnp.sum, each)
-    bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK)
+    bad = (status == STALLED) | (status == SLIDES) | (status == ROLLS_BACK) | (status == TIPS)
     first = jnp.argmax(bad)
     outcome = jnp.where(jnp.any(bad), status[first], CONVERGED)
     outcome = jnp.where(c.ended, _ending(c), outcome)
-    end = jax.tree.map(lambda x: x[-1], signals)
-    answer = withhold(result(robot, end, outcome), outcome != FAILED, outcome != FAILED)
+    end = jax.tree.map(lambda x: x[-1], found)
+    answer = withhold(law.result_of(robot, end, outcome), outcome != FAILED, outcome != FAILED)
     answer = dataclasses.replace(answer, flags=c.flags)
 
     def named(x: Array) -> dict[str, Array]:
         signs = {"cell_low": -1.0}
-        return {name: signs.get(name, 1.0) * x[..., i] for i, name in enumerate(PEAKS)}
+        return {name: signs.get(name, 1.0) * x[..., i] for i, name in enumerate(law.PEAKS)}
 
     course = None
     if buffer is not None:
-        course = _course(robot, conditions, profile, c, each, kept)
+        course = _course(law, robot, conditions, profile, c, each, kept)
+    winding, housing = _temperatures(law, c.y)
     return Mission(
         total=total, segments=each, peaks=named(c.peaks), segment_peaks=named(peaks.reshape(*shape, -1)),
         status=status.reshape(shape), flags=flags.reshape(shape), result=answer,
-        temperature_winding=c.y[WINDING] * UNITS[WINDING], temperature_housing=c.y[HOUSING] * UNITS[HOUSING],
-        discharge=c.y[DISCHARGE] * UNITS[DISCHARGE], steps=c.accepted + c.rejected, rejected=c.rejected,
+        temperature_winding=jnp.max(winding), temperature_housing=jnp.max(housing), discharge=charge(c.y),
+        steps=c.accepted + c.rejected, rejected=c.rejected,
         course=course,
     )  # fmt: skip
 
 
-def _course(robot: Robot, conditions: Conditions, profile: Profile, c: Carry, each: Totals, kept: Array) -> Course:
+def _temperatures(law: Law, y: Array) -> tuple[Array, Array]:
+    """Of windings and housings [°C]."""
+    winding, housing = (np.asarray(law.UNITS)[k] * y[..., k] for k in (law.WINDING, law.HOUSING))
+    return winding, housing
+
+
+def _course(
+    law: Law, robot: Robot, conditions: Conditions, profile: Profile, c: Carry, each: Totals, kept: Array
+) -> Course:
     assert c.buffer is not None
     ys, qs, stood, marks = c.buffer
     at = jnp.arange(len(ys))
@@ -288,25 +292,26 @@ def _course(robot: Robot, conditions: Conditions, profile: Profile, c: Carry, ea
     begun = jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.time.ravel())])[of]
     so_far = {
         name: jnp.concatenate([jnp.zeros(1), jnp.cumsum(each.of[name].ravel())])[of] + qs[:, i]
-        for i, name in enumerate(TOTALS)
+        for i, name in enumerate(law.TOTALS)
     }
 
     def signals(y: Array, stands: Array, k: Array) -> Signals:
-        return instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0]
+        return law.signals_of(law.instant(robot, conditions, profile.row(k % profile.segments), y, stands)[0])
 
-    every = jax.vmap(signals)(ys, stood, of)
+    every = law.at_places(jax.vmap(signals)(ys, stood, of), so_far)
+    winding, housing = _temperatures(law, ys)
 
     def shown(x: Array) -> Array:
-        return jnp.where(there, x, jnp.nan)
+        return jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, jnp.nan)
 
     return Course(
-        time=shown(begun + ys[:, CLOCK]),
+        time=shown(begun + ys[:, law.CLOCK]),
         segment=jnp.where(there, of, -1),
         event=jnp.where(there, marks, -1),
         distance=shown(so_far["distance"]),
         path=shown(so_far["path"]),
         energy=shown(so_far["drawn"] - so_far["returned"]),
-        temperature_winding=shown(ys[:, WINDING] * UNITS[WINDING]),
-        temperature_housing=shown(ys[:, HOUSING] * UNITS[HOUSING]),
+        temperature_winding=shown(winding),
+        temperature_housing=shown(housing),
         signals=jax.tree.map(shown, every),
     )

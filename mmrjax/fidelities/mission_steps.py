@@ -1,43 +1,25 @@
-"""Steps of a mission: what acts at an instant, its rates and integrals, events, and one segment of the profile."""
+"""Steps of a mission: events that they land on, and one segment of the profile. What acts at an instant is the law's
+of its motion: `mission_straight` or `mission_turning`."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Float
 
-from mmrjax import balances, energy
-from mmrjax.compiling import compiled
 from mmrjax.conditions import Conditions
-from mmrjax.fidelities.rest import current_at_rest, firmness
-from mmrjax.fidelities.result import exceeded, mask
+from mmrjax.fidelities.rest import least
+from mmrjax.fidelities.result import mask
 from mmrjax.fidelities.rosenbrock import stages
 from mmrjax.params import Scalar
-from mmrjax.profile import MOTOR_SPEED, SPEED, Instant, Profile
+from mmrjax.profile import Profile
 from mmrjax.rarely import rarely
 from mmrjax.robot import Robot
-from mmrjax.signals import Signals, State
-
-#: Of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
-#: controller and time in the segment; all are then of the order of one. The memories of effects follow.
-UNITS = (10.0, 1000.0, 1.0, 100.0, 50.0, 50.0, 10.0, 1.0)
-CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len(UNITS))
-
-#: What is integrated beside them: name, and unit of a total.
-TOTALS: dict[str, str] = {
-    "distance": "m", "path": "m", "drawn": "J", "returned": "J", "current_squared": "A²·s",
-    "torque_squared": "N²·m²·s", **dict.fromkeys(energy.SINKS, "J"),
-}  # fmt: skip
-
-#: Largest values of a mission, of any instant: name, and unit.
-PEAKS: dict[str, str] = {
-    "current": "A", "torque": "N·m", "temperature": "°C", "motor_speed": "rad/s", "speed": "m/s", "cell_low": "V",
-}  # fmt: skip
+from mmrjax.signals import Result, Signals
 
 #: The first step of a segment [s], and the shortest.
 FIRST, SHORTEST = 1e-4, 1e-9
@@ -58,29 +40,10 @@ RECOVERED = 1e-6
 FIRMLY = 1e-3
 
 
-def units(robot: Robot) -> Float[Array, " unknowns"]:
-    """What the unknowns are measured in."""
-    return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
-
-
-def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> State:
-    x = y * units(robot).astype(y.dtype)
-    memory = {effect.name: x[len(UNITS) + k] for k, effect in enumerate(robot.remembering)}
-    motor, speed = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND))
-    return State(x[CURRENT], motor, speed, x[DISCHARGE], memory, x[WINDING])
-
-
-def _error(robot: Robot, asked: Instant, conditions: Conditions, state: State) -> tuple[Scalar, Scalar]:
-    """Demanded motor speed, and how much of it is lacking [rad/s]; a ground speed as the motor speed it takes."""
-    per_speed = robot.gearbox.ratio / robot.chassis(conditions.configuration).radius
-    on_ground = asked.mode == SPEED
-    demanded = asked.demand * jnp.where(on_ground, per_speed, 1.0)
-    return demanded, demanded - jnp.where(on_ground, state.speed * per_speed, state.speed_motor)
-
-
 class Asked(NamedTuple):
     """What acts on the robot at an instant: the robot with its other consumers, conditions with the duty that the
-    controller gives, rate of the controller's integral [rad/s], and the error of the demand [rad/s]."""
+    controller gives, rate of the controller's integral [rad/s], and the error of the demand [rad/s]; of a robot that
+    turns the duties, integrals and errors of either side."""
 
     robot: Robot
     conditions: Conditions
@@ -88,77 +51,115 @@ class Asked(NamedTuple):
     error: Scalar
 
 
-def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
-    asked = segment.at(y[CLOCK])
-    if asked.current_other is not None:
-        battery = dataclasses.replace(robot.battery, current_other=asked.current_other)
-        robot = dataclasses.replace(robot, battery=battery)
-    conditions = asked.conditions(otherwise)
-    state = state_of(robot, y, stands)
-    demanded, error = _error(robot, asked, conditions, state)
-    controlled = (asked.mode == MOTOR_SPEED) | (asked.mode == SPEED)
-    source = jnp.where(
-        conditions.battery > 0.5, robot.battery.voltage(0.0, state.discharge), jnp.abs(conditions.voltage)
-    )
-    voltage = robot.driver.demand(error, y[INTEGRAL] * UNITS[INTEGRAL], demanded, robot.motor.torque_constant)
-    wanted = voltage / jnp.maximum(source, 1e-3)
-    limited = robot.driver.duty_limited(jnp.clip(wanted, -1.0, 1.0), state.current)
-    # What the limits take away, the integral gives back: it does not wind up.
-    excess = (wanted - limited) * source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
-    duty = jnp.where(controlled, wanted, conditions.duty)
-    sign = jnp.where(conditions.battery > 0.5, 1.0, jnp.sign(conditions.voltage))
-    conditions = dataclasses.replace(conditions, duty=jnp.clip(jnp.where(controlled, sign * duty, duty), -1.0, 1.0))
-    return Asked(robot, conditions, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0))
+class Law(Protocol):
+    """How a robot moves through a mission: unknowns, what acts at an instant, and what is read of it.
+
+    `found` is what `instant` gives of an instant: signals, and whatever else of a robot that turns.
+
+    Attributes:
+        TOTALS: what is integrated, and its unit; PEAKS: largest values of any instant, and their unit.
+        CLOCK, DISCHARGE, WINDING, HOUSING: places among the unknowns of the time in the segment [s], the charge taken
+            [C], and the temperatures [°C], of a robot that turns those of both sides.
+        UNITS: of the unknowns before the memories of effects.
+    """
+
+    TOTALS: Mapping[str, str]
+    PEAKS: Mapping[str, str]
+    CLOCK: int
+    DISCHARGE: int
+    WINDING: Any
+    HOUSING: Any
+    UNITS: tuple[float, ...]
+
+    def units(self, robot: Robot) -> Float[Array, " unknowns"]:
+        """What the unknowns are measured in."""
+        ...
+
+    def begin(self, robot: Robot, conditions: Conditions, start: Any) -> Float[Array, " unknowns"]:
+        """The unknowns at the beginning of a mission."""
+        ...
+
+    def asked_at(self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
+        """What acts on the robot."""
+        ...
+
+    def instant(
+        self, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
+    ) -> tuple[Any, Array, Array, Asked]:
+        """What there is of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
+        ...
+
+    def firmness(self, asked: Asked, y: Array, stands: Array) -> Scalar:
+        """How firmly friction would hold the robot [-], see `rest.firmness`."""
+        ...
+
+    def settled_at_rest(self, asked: Asked, y: Array, stands: Array) -> Array:
+        """The unknowns, the currents those that will flow once the robot stands."""
+        ...
+
+    def slowness(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+        """By how much shafts, and what slides, are slower than friction at rest is resolved [-]."""
+        ...
+
+    def at_rest(self, y: Array) -> Array:
+        """The unknowns of a robot that has come to rest."""
+        ...
+
+    def drawn(self, asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+        """What the motors take from the source [A], and the charge taken [C]."""
+        ...
+
+    def stored(self, robot: Robot, found: Any) -> Scalar:
+        """Energy in the motion [J]."""
+        ...
+
+    def peaks(self, robot: Robot, found: Any) -> dict[str, Scalar]:
+        """Values of which `PEAKS` are the largest, of the cells' voltage the negative."""
+        ...
+
+    def peaks_within(self, robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
+        """Those of currents and temperatures, of the sizes of the unknowns within a step."""
+        ...
+
+    def over(self, robot: Robot, found: Any) -> dict[str, Scalar]:
+        """What an instant exceeds."""
+        ...
+
+    def norm(self, error: Array) -> Scalar:
+        """Of an error of the unknowns over what is allowed [-]."""
+        ...
+
+    def demanded(self, robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
+        """What is demanded of each row [rad/s or m/s]."""
+        ...
+
+    def status(self, robot: Robot, conditions: Conditions, found: Any) -> Array:
+        """Status of a robot that friction does not hold, by its last instant."""
+        ...
+
+    def signals_of(self, found: Any) -> Signals:
+        """Signals of an instant; of a robot that turns of left and right side."""
+        ...
+
+    def at_places(self, signals: Signals, so_far: dict[str, Array]) -> Signals:
+        """Signals over time, with what follows from the totals so far."""
+        ...
+
+    def result_of(self, robot: Robot, found: Any, status: Array) -> Result:
+        """What there is of a run that ends so."""
+        ...
 
 
-@compiled
-def instant(
-    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
-) -> tuple[Signals, Array, Array, Asked]:
-    """Signals of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
-    asked = asked_at(robot, otherwise, segment, y, stands)
-    state = state_of(robot, y, stands)
-    signals = balances.moving(asked.robot, asked.conditions, state)
-    winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
-    copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
-    heating = robot.motor.heating(copper, winding, housing)
-    drawn = asked.robot.battery.current(signals.total_current) * (asked.conditions.battery > 0.5)  # eq. (11)
-    still = jnp.where(stands, 0.0, 1.0)
-    rates = [
-        signals.voltage_left / signals.inductance,
-        still * signals.acceleration_wheel * robot.gearbox.ratio,
-        still * signals.acceleration,
-        drawn,
-        *heating,
-        asked.integral_rate,
-        1.0,
-        *(effect.rate(robot, signals) for effect in robot.remembering),
-    ]
-    power = energy.source(asked.robot, asked.conditions, signals)
-    current, torque = robot.sides * signals.current, signals.torque_gear
-    goes = energy.sinks(asked.robot, asked.conditions, signals)
-    totals = [
-        signals.speed, jnp.abs(signals.speed), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0), current**2,
-        torque**2, *goes.values(),
-    ]  # fmt: skip
-    dtype = y.dtype
-    return (
-        signals,
-        jnp.stack([jnp.asarray(r, dtype) for r in rates]) / units(robot).astype(dtype),
-        jnp.stack([jnp.asarray(x, dtype) for x in totals]),
-        asked,
-    )
-
-
-def _firmly(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> tuple[Array, Array]:
+def _firmly(
+    law: Law, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
+) -> tuple[Array, Array]:
     """How firmly friction would hold the robot now, and with what current will flow then too: a controller asks for
     less once there is no error."""
-    asked = asked_at(robot, otherwise, segment, y, stands)
-    at_rest = asked_at(robot, otherwise, segment, y, jnp.asarray(True))
-    state = state_of(robot, y, stands)
-    settled = dataclasses.replace(state, current=current_at_rest(at_rest.robot, at_rest.conditions, state))
-    firm = firmness(asked.robot, asked.conditions, state)
-    return jnp.asarray(firm), jnp.minimum(firm, firmness(at_rest.robot, at_rest.conditions, settled))
+    asked = law.asked_at(robot, otherwise, segment, y, stands)
+    at_rest = law.asked_at(robot, otherwise, segment, y, jnp.asarray(True))
+    settled = law.settled_at_rest(at_rest, y, stands)
+    firm = law.firmness(asked, y, stands)
+    return jnp.asarray(firm), least(firm, law.firmness(at_rest, settled, stands))
 
 
 class Carry(NamedTuple):
@@ -181,15 +182,6 @@ class Carry(NamedTuple):
     buffer: tuple[Array, ...] | None
 
 
-def _peaks_of(robot: Robot, signals: Signals) -> Array:
-    cell = jnp.where(signals.battery > 0.5, signals.voltage_source / robot.battery.cells, jnp.inf)
-    of = [
-        jnp.abs(robot.sides * signals.current), jnp.abs(signals.torque_gear), signals.temperature,
-        jnp.abs(signals.speed_motor), jnp.abs(signals.speed), -cell,
-    ]  # fmt: skip
-    return jnp.stack([jnp.asarray(x, jnp.result_type(signals.current)) for x in of])
-
-
 def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
     """Largest size of a curve between two values, on the cubic with the slopes `rise` and `fall` at its ends."""
     sign = jnp.sign(after)
@@ -205,37 +197,34 @@ def _top(before: Array, after: Array, rise: Array, fall: Array) -> Array:
     return jnp.where(bends, jnp.maximum(top, jnp.maximum(x0, x1)), jnp.maximum(x0, x1))
 
 
-def _cell_above(asked: Asked, state: State) -> Scalar:
+def _cell_above(law: Law, asked: Asked, y: Array, stands: Array) -> Scalar:
     """By how much a cell is above its cut-off [V]; on an external supply far."""
-    motors = asked.robot.sides * state.current * asked.robot.driver.duty_limited(asked.conditions.duty, state.current)
     battery = asked.robot.battery
-    cell = battery.voltage_cell(motors, state.discharge)
+    cell = battery.voltage_cell(*law.drawn(asked, y, stands))
     return jnp.where(asked.conditions.battery > 0.5, cell - battery.voltage_cutoff, 10.0)
 
 
 def events_of(
-    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
+    law: Law, robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array, below: Array
 ) -> Float[Array, " events"]:
     """Functions that are positive once their event of `EVENTS` has happened [-]."""
-    asked = asked_at(robot, otherwise, segment, y, stands)
-    state = state_of(robot, y, stands)
-    load = robot.chassis(asked.conditions.configuration)
-    rolling = load.radius * state.speed_motor / robot.gearbox.ratio
-    slow = 1 - jnp.abs(rolling) / load.speed_still
-    grips = 1 - jnp.abs(rolling - state.speed) / load.speed_grip
+    asked = law.asked_at(robot, otherwise, segment, y, stands)
+    slow, grips = law.slowness(asked, y, stands)
     near = stands | ((slow > -1) & (grips > -1))
 
     none = -jnp.ones_like(slow)
-    firm, stays = rarely(near, _firmly, (robot, otherwise, segment, y, stands), (none, none))
-    standing = jnp.minimum(jnp.minimum(slow, grips), stays - FIRMLY)
-    battery = asked.robot.battery
-    empty = jnp.where(asked.conditions.battery > 0.5, (state.discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
-    above = _cell_above(asked, state)
+    here = (robot, otherwise, segment, y, stands)
+    firm, stays = rarely(near, functools.partial(_firmly, law), here, (none, none))
+    standing = least(slow, grips, stays - FIRMLY)
+    battery, discharge = asked.robot.battery, law.drawn(asked, y, stands)[1]
+    empty = jnp.where(asked.conditions.battery > 0.5, (discharge / battery.capacity - 1) / OF_CHARGE, -1.0)
+    above = _cell_above(law, asked, y, stands)
     falls, recovers = jnp.where(below, -1.0, -above / OF_CELL), jnp.where(below, (above - RECOVERED) / OF_CELL, -1.0)
     return jnp.stack([jnp.where(stands, -1.0, standing), jnp.where(stands, -firm, -1.0), empty, falls, recovers])
 
 
 def _onto(
+    law: Law,
     robot: Robot,
     otherwise: Conditions,
     segment: Profile,
@@ -253,25 +242,26 @@ def _onto(
         Unknowns, integrals, whether the robot stands, whether the cells are below their cut-off; the event, and the
         step in time [s].
     """
-    _, dy, dq, _ = instant(robot, otherwise, segment, y, stands)
-    steep = jax.jvp(lambda y: events_of(robot, otherwise, segment, y, stands, below), (y,), (dy,))[1]
+    _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
+    steep = jax.jvp(lambda y: events_of(law, robot, otherwise, segment, y, stands, below), (y,), (dy,))[1]
     back = jnp.where(steep > 1e-9, -after / jnp.where(steep > 1e-9, steep, 1.0), 0.0)
     back = jnp.where(jnp.abs(back) < h, back, 0.0)
     which = jnp.argmin(jnp.where(after > 0, back, jnp.inf))
     back = back[which]
     y, q = y + back * dy, q + back * dq
     # To rest: what is left of the motion is lost where it slid.
-    rest = y.at[MOTOR].set(0.0).at[GROUND].set(0.0)
-    moved, parked = (instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
+    rest = law.at_rest(y)
+    moved, parked = (law.instant(robot, otherwise, segment, x, stands)[0] for x in (y, rest))
     halts = which == STANDS
-    lost = jnp.where(halts, energy.stored(robot, moved) - energy.stored(robot, parked), 0.0)
-    q = q.at[list(TOTALS).index("sliding")].add(lost)
+    lost = jnp.where(halts, law.stored(robot, moved) - law.stored(robot, parked), 0.0)
+    q = q.at[list(law.TOTALS).index("sliding")].add(lost)
     stands = (stands | halts) & (which != BREAKS_AWAY)
     below = (below | (which == FALLS)) & (which != RECOVERS)
     return jnp.where(halts, rest, y), q, stands, below, which, back
 
 
 def follow(
+    law: Law,
     robot: Robot,
     otherwise: Conditions,
     segment: Profile,
@@ -280,12 +270,13 @@ def follow(
     most: int,
 ) -> Carry:
     """One segment: steps until its end, or until the mission has."""
+    clock = law.CLOCK
     length = (segment.time[1] - segment.time[0]).astype(carry.y.dtype)
     first, nearly = carry.accepted + carry.rejected, length * (1 - 1e-12 if carry.y.dtype == float else 1 - 1e-6)
     longest = _step_longest(robot, otherwise)
 
     def rates(y: Array, stands: Array) -> tuple[Array, Array]:
-        _, dy, dq, _ = instant(robot, otherwise, segment, y, stands)
+        _, dy, dq, _ = law.instant(robot, otherwise, segment, y, stands)
         return dy, dq
 
     def left_below(c: Carry) -> Array:
@@ -293,22 +284,22 @@ def follow(
         return jnp.where(c.below, robot.battery.delay_cutoff - c.low, jnp.inf)
 
     def going(c: Carry) -> Array:
-        return (c.y[CLOCK] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
+        return (c.y[clock] < nearly) & ~c.ended & (c.accepted + c.rejected - first < most)
 
     def turn(c: Carry) -> Carry:
-        to_end, to_trip = length - c.y[CLOCK], left_below(c)
+        to_end, to_trip = length - c.y[clock], left_below(c)
         left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
         last = c.step >= left * (1 - 1e-9)
         h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
         y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, inverted=True)
-        y = y.at[CLOCK].set(jnp.where(last & ~trips, length, y[CLOCK]))
+        y = y.at[clock].set(jnp.where(last & ~trips, length, y[clock]))
         scale = tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
-        size = optx.rms_norm(u[-1] / scale) * (y.shape[0] / len(UNITS)) ** 0.5
+        size = law.norm(u[-1] / scale)
         size = jax.lax.stop_gradient(jnp.where(jnp.isfinite(size), size, 1e6))
         good = size <= 1
         grown = h * jnp.clip(0.9 * jnp.maximum(size, 1e-12) ** -0.25, 0.1, 6.0)
         # Events: steps land on the first of them.
-        after = events_of(robot, otherwise, segment, y, c.stands, c.below)
+        after = events_of(law, robot, otherwise, segment, y, c.stands, c.below)
         happened = after > 0
         between = happened & (c.events < 0)
         # The next one is to end a little beyond it.
@@ -318,7 +309,7 @@ def follow(
         event = taken & jnp.any(happened)
         here = (robot, otherwise, segment, y, q, c.stands, c.below, after, h)
         none = (y, q, c.stands, c.below, jnp.asarray(-1, jnp.argmin(after).dtype), jnp.zeros_like(h))
-        y, q, stands, below, which, back = rarely(event, _onto, here, none)
+        y, q, stands, below, which, back = rarely(event, functools.partial(_onto, law), here, none)
         y, q = jnp.where(taken, y, c.y), jnp.where(taken, q, c.q)
         stands = jnp.where(taken, stands, c.stands)
         low = jnp.where(below & c.below, c.low + jnp.where(taken, h + back, 0.0), 0.0)
@@ -328,22 +319,19 @@ def follow(
         step = jnp.where(good & far, h * jnp.clip(jnp.min(share), 0.02, 0.99), step)
         step = jnp.where(event, FIRST, step)
         step = jnp.clip(jax.lax.stop_gradient(step), SHORTEST, longest)
-        signals, dy, _, _ = instant(robot, otherwise, segment, y, stands)
+        found, dy, _, _ = law.instant(robot, otherwise, segment, y, stands)
         # Current and heat may be largest within the step. Not so speeds: at the end of a long step their slopes are
         # those of what is stiff in them, and a cubic would swing.
         tops = _top(c.y, y, h * c.slope, h * dy)
-        within = {
-            "current": robot.sides * UNITS[CURRENT] * tops[CURRENT],
-            "temperature": jnp.where(y[WINDING] > 0, UNITS[WINDING] * tops[WINDING], -jnp.inf),
-        }
-        highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in PEAKS])
-        peaks = jnp.maximum(jnp.maximum(c.peaks, _peaks_of(robot, signals)), highest)
+        within = law.peaks_within(robot, y, tops)
+        highest = jnp.stack([jnp.where(taken, within.get(name, -jnp.inf), -jnp.inf) for name in law.PEAKS])
+        peaks = jnp.maximum(jnp.maximum(c.peaks, _peaks_of(law, robot, found)), highest)
         hot = taken & (within["temperature"] > robot.motor.temperature_limit)
-        flags = _flags(robot, signals, cut_off) | mask({"too_hot": hot})
+        flags = _flags(law, robot, found, cut_off) | mask({"too_hot": hot})
         failed = c.failed | (~good & (h <= SHORTEST))
         ended = c.ended | cut_off | (which == EMPTY) | failed
         now = (robot, otherwise, segment, y, stands, below)
-        events_now = rarely(event, events_of, now, jnp.where(taken, after, c.events))
+        events_now = rarely(event, functools.partial(events_of, law), now, jnp.where(taken, after, c.events))
         kept, buffer = c.kept, c.buffer
         if buffer is not None:
             at = jnp.where(taken, kept, buffer[0].shape[0])  # beyond the end: dropped
@@ -357,22 +345,22 @@ def follow(
         )  # fmt: skip
 
     # The segment's beginning may have taken away what held the robot.
-    y = carry.y.at[CLOCK].set(0.0)
-    asked = asked_at(robot, otherwise, segment, y, carry.stands)
-    stands = carry.stands & (firmness(asked.robot, asked.conditions, state_of(robot, y, carry.stands)) >= 0)
+    y = carry.y.at[clock].set(0.0)
+    asked = law.asked_at(robot, otherwise, segment, y, carry.stands)
+    stands = carry.stands & (law.firmness(asked, y, carry.stands) >= 0)
     # And it may have lifted the cells above their cut-off, or pressed them below.
-    below = jnp.asarray(_cell_above(asked, state_of(robot, y, stands)) < 0)
+    below = jnp.asarray(_cell_above(law, asked, y, stands) < 0)
     low = jnp.where(below & carry.below, carry.low, 0.0)
     step = jnp.minimum(jnp.asarray(FIRST, y.dtype), longest)
-    events = events_of(robot, otherwise, segment, y, stands, below)
+    events = events_of(law, robot, otherwise, segment, y, stands, below)
     cut_off = carry.cut_off | _stayed_below(robot, below, low)
     begin = carry._replace(
         y=y, q=jnp.zeros_like(carry.q), step=step, stands=stands, below=below, low=low, cut_off=cut_off,
         ended=carry.ended | cut_off, events=events,
     )  # fmt: skip
-    begin = begin._replace(slope=instant(robot, otherwise, segment, y, stands)[1])
+    begin = begin._replace(slope=law.instant(robot, otherwise, segment, y, stands)[1])
     c = jax.lax.while_loop(going, turn, begin)
-    failed = c.failed | ((c.y[CLOCK] < nearly) & ~c.ended)
+    failed = c.failed | ((c.y[clock] < nearly) & ~c.ended)
     return c._replace(failed=failed, ended=c.ended | failed)
 
 
@@ -388,12 +376,16 @@ def _step_longest(robot: Robot, conditions: Conditions) -> Scalar:
     return jax.lax.stop_gradient(jnp.min(jnp.stack([*limits, jnp.asarray(jnp.inf)])))
 
 
-def _flags(robot: Robot, signals: Signals, cut_off: Array) -> Array:
+def _peaks_of(law: Law, robot: Robot, found: Any) -> Array:
+    each = law.peaks(robot, found)
+    return jnp.stack([jnp.asarray(each[name]) * jnp.ones(()) for name in law.PEAKS])
+
+
+def _flags(law: Law, robot: Robot, found: Any, cut_off: Array) -> Array:
     """What an instant exceeds.
 
     A start draws more than the cells bear for an instant; only what lasts counts.
     """
-    over = exceeded(robot, signals)
+    over = law.over(robot, found)
     over.pop("slips")  # every start slips for an instant; of a segment it counts at its end
-    hot = jnp.asarray(signals.temperature) > robot.motor.temperature_limit
-    return mask({**over, "cut_off": cut_off, "too_hot": hot})
+    return mask({**over, "cut_off": cut_off})

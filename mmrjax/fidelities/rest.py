@@ -23,6 +23,18 @@ SHARE, TIME = 1e-3, 0.1
 GAIN, STARTS = 1e-3, 1e-2
 
 
+def least(*values: Scalar) -> Array:
+    """The smallest of some numbers, its derivative that of one of them.
+
+    That of `jnp.minimum` is nothing wherever XLA computes an argument twice and rounds it in two ways: it asks which
+    argument equals the answer.
+    """
+    found = jnp.asarray(values[0])
+    for value in values[1:]:
+        found = jnp.where(value < found, value, found)
+    return found
+
+
 def direction(robot: Robot, conditions: Conditions) -> Array:
     """Direction in which a robot can travel, 1 forward or -1 backward: of the torque on its shafts at rest.
 
@@ -77,7 +89,7 @@ def holds(robot: Robot, conditions: Conditions) -> Array:
 
 def _ground_margin(forward: Signals, backward: Signals) -> Scalar:
     """Adhesion less what gravity asks of it beyond rolling resistance [-], negative where a robot slides down."""
-    along = jnp.maximum(backward.demand, -forward.demand)
+    along = -least(-backward.demand, forward.demand)
     return (forward.adhesion_limit - along) / forward.normal
 
 
@@ -90,8 +102,8 @@ def firmness(robot: Robot, conditions: Conditions, state: State) -> Scalar:
     """
     still = _still(state)
     forward, backward = (_carried(robot, conditions, still, sense) for sense in (1.0, -1.0))
-    shafts = jnp.minimum(-forward.torque_net, backward.torque_net) / TORQUE
-    return jnp.minimum(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
+    shafts = least(-forward.torque_net, backward.torque_net) / TORQUE
+    return least(shafts, _ground_margin(forward, backward)) if robot.has_ground else shafts
 
 
 def slides_in_place(robot: Robot, conditions: Conditions) -> Array:

@@ -35,6 +35,7 @@ from mmrjax.signals import (
     PlaneMotion,
     Result,
     Signals,
+    State,
 )
 from mmrjax.turning import SIDES
 
@@ -296,16 +297,37 @@ def norm(error: Float[Array, " unknowns"]) -> Scalar:
     return jnp.sqrt(jnp.sum(weight * error**2) / OF_STRAIGHT)
 
 
-def holds(robot: Robot, conditions: Conditions) -> Array:
-    """Whether friction at rest holds a robot that stands: each side against its motors and its share of gravity, the
-    ground against all of gravity."""
-    heading = 0.0 if conditions.heading_deg is None else jnp.radians(conditions.heading_deg)
+def _of_sides(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> tuple[Conditions, State]:
+    """Conditions of either side, the slope that along its heading, and its state."""
     own = conditions.of_sides()
-    along = jnp.degrees(jnp.arcsin(jnp.sin(own.slope) * jnp.cos(heading)))
-    sides = jax.vmap(lambda c: rest.holds(robot, c))(dataclasses.replace(own, slope_deg=along, heading_deg=None))
+    along = jnp.degrees(jnp.arcsin(jnp.sin(own.slope) * jnp.cos(motion.heading)))
+    return (
+        dataclasses.replace(own, slope_deg=along, heading_deg=None),
+        balances.states_of_sides(robot, conditions, motion),
+    )
+
+
+def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Float[Array, " 2"]:
+    """Currents to which those of a standing robot settle [A]."""
+    own, state = _of_sides(robot, conditions, motion)
+    return jnp.asarray(jax.vmap(lambda c, s: rest.current_at_rest(robot, c, s))(own, state))
+
+
+def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
+    """How firmly friction would hold the robot at rest, headed as it is, negative where it cannot [-]: each side
+    against its motors and its share of gravity, the ground against all of gravity."""
+    sides = jax.vmap(lambda c, s: rest.firmness(robot, c, s))(*_of_sides(robot, conditions, motion))
     chassis = robot.chassis(conditions.configuration)
-    level, aside = chassis.ground.friction.static * conditions.adhesion, jnp.tan(conditions.slope) * jnp.sin(heading)
-    return jnp.all(sides) & (jnp.abs(aside) < level * chassis.turning.lateral)
+    level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
+    aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
+    return rest.least(*sides, jnp.where(aside > 0, level - aside, jnp.inf))
+
+
+def holds(robot: Robot, conditions: Conditions) -> Array:
+    """Whether friction at rest holds a robot that stands, at the currents that flow a millisecond after the start."""
+    motion = motion_of(robot, start(robot, conditions))
+    settled = dataclasses.replace(motion, current=current_at_rest(robot, conditions, motion))
+    return jnp.asarray(jax.lax.stop_gradient(firmness(robot, conditions, settled)) >= 0)
 
 
 def tips(robot: Robot, travel: balances.Travel) -> Array:

@@ -1,0 +1,238 @@
+"""A mission of a robot whose sides are alike: its unknowns, what acts at an instant, rates and integrals."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from mmrjax import balances, energy
+from mmrjax.compiling import compiled
+from mmrjax.conditions import Conditions
+from mmrjax.fidelities import rest, result
+from mmrjax.fidelities.mission_steps import Asked
+from mmrjax.fidelities.rest import current_at_rest
+from mmrjax.params import Scalar
+from mmrjax.profile import MOTOR_SPEED, SPEED, Instant, Profile
+from mmrjax.robot import Robot
+from mmrjax.signals import Result, Signals, State
+
+#: Of the unknowns current, motor speed, speed, discharge, temperatures of winding and housing, integral of the
+#: controller and time in the segment; all are then of the order of one. The memories of effects follow.
+UNITS = (10.0, 1000.0, 1.0, 100.0, 50.0, 50.0, 10.0, 1.0)
+CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len(UNITS))
+
+#: What is integrated beside them: name, and unit of a total.
+TOTALS: dict[str, str] = {
+    "distance": "m", "path": "m", "drawn": "J", "returned": "J", "current_squared": "A²·s",
+    "torque_squared": "N²·m²·s", **dict.fromkeys(energy.SINKS, "J"),
+}  # fmt: skip
+
+#: Largest values of a mission, of any instant: name, and unit.
+PEAKS: dict[str, str] = {
+    "current": "A", "torque": "N·m", "temperature": "°C", "motor_speed": "rad/s", "speed": "m/s", "cell_low": "V",
+}  # fmt: skip
+
+
+def units(robot: Robot) -> Float[Array, " unknowns"]:
+    """What the unknowns are measured in."""
+    return jnp.asarray(UNITS + tuple(effect.memory_size or 1.0 for effect in robot.remembering))
+
+
+def begin(robot: Robot, conditions: Conditions, start: Any) -> Float[Array, " unknowns"]:
+    """The unknowns at the beginning, see `mission.Start`; in SI."""
+    turning = start.speed / robot.chassis(conditions.configuration).radius * robot.gearbox.ratio
+    first = [start.current, turning, start.speed, conditions.discharge, *temperatures(robot, start), 0.0, 0.0]
+    return jnp.stack([jnp.asarray(x, float) for x in (*first, *(jnp.zeros(()) for _ in robot.remembering))])
+
+
+def temperatures(robot: Robot, start: Any) -> tuple[Scalar, Scalar]:
+    """Of winding and housing at the beginning [°C]."""
+    ambient = robot.motor.temperature_ambient
+    winding, housing = (ambient if t is None else t for t in (start.temperature_winding, start.temperature_housing))
+    return winding, housing
+
+
+def state_of(robot: Robot, y: Float[Array, " unknowns"], stands: Array) -> State:
+    x = y * units(robot).astype(y.dtype)
+    memory = {effect.name: x[len(UNITS) + k] for k, effect in enumerate(robot.remembering)}
+    motor, speed = (jnp.where(stands, 0.0, x[k]) for k in (MOTOR, GROUND))
+    return State(x[CURRENT], motor, speed, x[DISCHARGE], memory, x[WINDING])
+
+
+def with_consumers(robot: Robot, asked: Instant) -> Robot:
+    """The robot with what its other consumers draw at an instant."""
+    if asked.current_other is None:
+        return robot
+    battery = dataclasses.replace(robot.battery, current_other=asked.current_other)
+    return dataclasses.replace(robot, battery=battery)
+
+
+def source(robot: Robot, conditions: Conditions, discharge: Scalar) -> Scalar:
+    """Voltage of which the driver gives the motors a share [V]: of a battery that of no load."""
+    battery = robot.battery.voltage(0.0, discharge)
+    return jnp.where(conditions.battery > 0.5, battery, jnp.abs(conditions.voltage))
+
+
+def forward(conditions: Conditions) -> Scalar:
+    """Sign of a duty that drives forward."""
+    return jnp.where(conditions.battery > 0.5, 1.0, jnp.sign(conditions.voltage))
+
+
+def driven(
+    robot: Robot, mode: Array, demand: Scalar, conditions: Conditions, state: State, integral: Scalar
+) -> tuple[Array, Array, Array]:
+    """What drives a motor at an instant.
+
+    Args:
+        mode: of the profile; demand: what it demands, of this side [rad/s or m/s].
+        conditions: of this side; state: of it; integral: of its controller [rad].
+
+    Returns:
+        The duty [-], the rate of the controller's integral, and the error of the demand, a ground speed as the motor
+        speed that it takes [rad/s].
+    """
+    per_speed = robot.gearbox.ratio / robot.chassis(conditions.configuration).radius
+    on_ground = mode == SPEED
+    demanded = demand * jnp.where(on_ground, per_speed, 1.0)
+    error = demanded - jnp.where(on_ground, state.speed * per_speed, state.speed_motor)
+    controlled = (mode == MOTOR_SPEED) | (mode == SPEED)
+    voltage_source = source(robot, conditions, state.discharge)
+    voltage = robot.driver.demand(error, integral, demanded, robot.motor.torque_constant)
+    wanted = voltage / jnp.maximum(voltage_source, 1e-3)
+    limited = robot.driver.duty_limited(jnp.clip(wanted, -1.0, 1.0), state.current)
+    # What the limits take away, the integral gives back: it does not wind up.
+    excess = (wanted - limited) * voltage_source / (robot.driver.gain * robot.motor.torque_constant + 1e-12)
+    duty = jnp.clip(jnp.where(controlled, forward(conditions) * wanted, conditions.duty), -1.0, 1.0)
+    return duty, jnp.where(controlled, error - excess, 0.0), jnp.where(controlled, error, 0.0)
+
+
+def asked_at(robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array) -> Asked:
+    asked = segment.at(y[CLOCK])
+    robot, conditions = with_consumers(robot, asked), asked.conditions(otherwise)
+    state, integral = state_of(robot, y, stands), y[INTEGRAL] * UNITS[INTEGRAL]
+    duty, rate, error = driven(robot, asked.mode, asked.demand, conditions, state, integral)
+    return Asked(robot, dataclasses.replace(conditions, duty=duty), rate, error)
+
+
+@compiled
+def instant(
+    robot: Robot, otherwise: Conditions, segment: Profile, y: Array, stands: Array
+) -> tuple[Signals, Array, Array, Asked]:
+    """Signals of an instant, rates of the unknowns in their units, and of the totals [1/s]."""
+    asked = asked_at(robot, otherwise, segment, y, stands)
+    state = state_of(robot, y, stands)
+    signals = balances.moving(asked.robot, asked.conditions, state)
+    winding, housing = (y[k] * UNITS[k] for k in (WINDING, HOUSING))
+    copper = robot.motor.voltage_winding(signals.current, winding) * signals.current
+    heating = robot.motor.heating(copper, winding, housing)
+    drawn = asked.robot.battery.current(signals.total_current) * (asked.conditions.battery > 0.5)  # eq. (11)
+    still = jnp.where(stands, 0.0, 1.0)
+    rates = [
+        signals.voltage_left / signals.inductance,
+        still * signals.acceleration_wheel * robot.gearbox.ratio,
+        still * signals.acceleration,
+        drawn,
+        *heating,
+        asked.integral_rate,
+        1.0,
+        *(effect.rate(robot, signals) for effect in robot.remembering),
+    ]
+    power = energy.source(asked.robot, asked.conditions, signals)
+    current, torque = robot.sides * signals.current, signals.torque_gear
+    goes = energy.sinks(asked.robot, asked.conditions, signals)
+    totals = [
+        signals.speed, jnp.abs(signals.speed), jnp.maximum(power, 0.0), jnp.maximum(-power, 0.0), current**2,
+        torque**2, *goes.values(),
+    ]  # fmt: skip
+    dtype = y.dtype
+    return (
+        signals,
+        jnp.stack([jnp.asarray(r, dtype) for r in rates]) / units(robot).astype(dtype),
+        jnp.stack([jnp.asarray(x, dtype) for x in totals]),
+        asked,
+    )
+
+
+def firmness(asked: Asked, y: Array, stands: Array) -> Scalar:
+    return rest.firmness(asked.robot, asked.conditions, state_of(asked.robot, y, stands))
+
+
+def settled_at_rest(asked: Asked, y: Array, stands: Array) -> Array:
+    current = current_at_rest(asked.robot, asked.conditions, state_of(asked.robot, y, stands))
+    return y.at[CURRENT].set(current / UNITS[CURRENT])
+
+
+def slowness(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    load, state = asked.robot.chassis(asked.conditions.configuration), state_of(asked.robot, y, stands)
+    rolling = load.radius * state.speed_motor / asked.robot.gearbox.ratio
+    return 1 - jnp.abs(rolling) / load.speed_still, 1 - jnp.abs(rolling - state.speed) / load.speed_grip
+
+
+def at_rest(y: Array) -> Array:
+    return y.at[MOTOR].set(0.0).at[GROUND].set(0.0)
+
+
+def drawn(asked: Asked, y: Array, stands: Array) -> tuple[Scalar, Scalar]:
+    robot, state = asked.robot, state_of(asked.robot, y, stands)
+    motors = robot.sides * state.current * robot.driver.duty_limited(asked.conditions.duty, state.current)
+    return motors, state.discharge
+
+
+def stored(robot: Robot, found: Signals) -> Scalar:
+    return energy.stored(robot, found)
+
+
+def peaks(robot: Robot, found: Signals) -> dict[str, Scalar]:
+    cell = jnp.where(found.battery > 0.5, found.voltage_source / robot.battery.cells, jnp.inf)
+    assert found.temperature is not None
+    return {
+        "current": jnp.abs(robot.sides * found.current),
+        "torque": jnp.abs(found.torque_gear),
+        "temperature": found.temperature,
+        "motor_speed": jnp.abs(found.speed_motor),
+        "speed": jnp.abs(found.speed),
+        "cell_low": -cell,
+    }
+
+
+def peaks_within(robot: Robot, y: Array, tops: Array) -> dict[str, Scalar]:
+    return {
+        "current": robot.sides * UNITS[CURRENT] * tops[CURRENT],
+        "temperature": jnp.where(y[WINDING] > 0, UNITS[WINDING] * tops[WINDING], -jnp.inf),
+    }
+
+
+def over(robot: Robot, found: Signals) -> dict[str, Scalar]:
+    hot = jnp.asarray(found.temperature) > robot.motor.temperature_limit
+    return {**result.exceeded(robot, found), "too_hot": hot}
+
+
+def norm(error: Array) -> Scalar:
+    """Root mean square of the drive's own unknowns; memories add to it and never dilute it."""
+    return optx.rms_norm(error) * (error.shape[0] / len(UNITS)) ** 0.5
+
+
+def demanded(robot: Robot, otherwise: Conditions, segment: Profile) -> Array:
+    return segment.demand
+
+
+def status(robot: Robot, conditions: Conditions, found: Signals) -> Array:
+    now = dataclasses.replace(conditions, discharge=jnp.asarray(found.discharge))
+    return rest.status_moving(robot, now, found, found.duty * found.voltage_source)
+
+
+def signals_of(found: Signals) -> Signals:
+    return found
+
+
+def result_of(robot: Robot, found: Signals, status: Array) -> Result:
+    return result.result(robot, found, status)
+
+
+def at_places(signals: Signals, so_far: dict[str, jax.Array]) -> Signals:
+    return signals
