@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -53,6 +54,7 @@ def _wh(name: str, label: str) -> Output:
     return Output(name, f"{name}_Wh", "Wh", JOULE_PER_WH, label, 3)
 
 
+_SIDES = ("left", "right")
 #: Numbers of a mission in the order of columns, in SI by `numbers`.
 OUTPUTS: tuple[Output, ...] = (
     Output("duration", "duration_s", "s", 1.0, "duration", 1),
@@ -79,11 +81,21 @@ OUTPUTS: tuple[Output, ...] = (
     _wh("energy_stored", "rise of the energy in motion"),
     Output("unaccounted_share", "unaccounted_share", "-", 1.0, "energy unaccounted for, of that turned over", 9),
 )
+#: Numbers of a mission with sides beside those.
+OF_TURNS: tuple[Output, ...] = (
+    Output("turned", "turned_deg", "deg", math.pi / 180, "turned by, positive to the left", 1),
+    Output("place_x", "place_x_m", "m", 1.0, "moved uphill, or ahead of the start", 2),
+    Output("place_y", "place_y_m", "m", 1.0, "moved to the left of that", 2),
+    Output("peak_yaw_rate", "peak_yaw_rate_rad_s", "rad/s", 1.0, "peak yaw rate", 3),
+    *(Output(f"rms_current_{s}", f"rms_current_{s}_A", "A", 1.0, f"rms current, {s} motor", 3) for s in _SIDES),
+    *(Output(f"peak_current_{s}", f"peak_current_{s}_A", "A", 1.0, f"peak current, {s} motor", 2) for s in _SIDES),
+    *(Output(f"winding_peak_{s}", f"winding_peak_{s}_C", "°C", 1.0, f"hottest winding, {s}", 1) for s in _SIDES),
+)
 
 
-def names() -> tuple[str, ...]:
-    """Columns of a mission's numbers, in order."""
-    return tuple(output.column for output in OUTPUTS)
+def names(turns: bool = False) -> tuple[str, ...]:
+    """Columns of a mission's numbers, in order; of one with sides."""
+    return tuple(output.column for output in (*OUTPUTS, *(OF_TURNS if turns else ())))
 
 
 #: Columns that a sweep over a profile stores where none are named.
@@ -131,6 +143,16 @@ def totals(found: Totals, peaks: Mapping[str, Array]) -> dict[str, Array]:
         "energy_stored": found.stored,
         "unaccounted_share": _quotient(found.unaccounted, turned),
     }
+    if "turned" in of:
+        numbers |= {name: of[name] for name in ("turned", "place_x", "place_y")} | {
+            "peak_yaw_rate": peaks["yaw_rate"]
+        }
+        for side in _SIDES:
+            numbers |= {
+                f"rms_current_{side}": _root(_quotient(of[f"current_squared_{side}"], found.time)),
+                f"peak_current_{side}": peaks[f"current_{side}"],
+                f"winding_peak_{side}": peaks[f"temperature_{side}"],
+            }
     return {name: jnp.where(ran, value, jnp.nan) for name, value in numbers.items()}
 
 
@@ -173,7 +195,9 @@ def begins_below(robot: Robot, conditions: Conditions, profile: Profile, start: 
 
 def columns(found: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers [SI] by the columns of tables, in the columns' units."""
-    return {output.column: found[output.name] / output.factor for output in OUTPUTS if output.name in found}
+    return {
+        output.column: found[output.name] / output.factor for output in (*OUTPUTS, *OF_TURNS) if output.name in found
+    }
 
 
 def batch(

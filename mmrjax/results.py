@@ -138,7 +138,7 @@ class Results:
         columns |= {of[name]: nan for name in self.stated if name in of}
         found = outputs.columns(self.result, self.channels, self.further)
         if self.mission is not None:
-            found = {name: found[name] for name in (*missions.names(), *CODES)}
+            found = {name: found[name] for name in (*missions.names("turned" in self.mission.total.of), *CODES)}
         return {
             "configuration": self.configuration,
             "supply_voltage_V": columns["supply_voltage_V"],
@@ -156,7 +156,9 @@ class Results:
             rows: most that are shown.
         """
         content = {name: np.ravel(values) for name, values in self.to_dict().items()}
-        rows_of: tuple[outputs.Output | missions.Output, ...] = (*outputs.table(self.channels), *missions.OUTPUTS)
+        rows_of: tuple[outputs.Output | missions.Output, ...] = (
+            *outputs.table(self.channels), *missions.OUTPUTS, *missions.OF_TURNS,
+        )  # fmt: skip
         about = {**_CONDITIONS, **_WORDS, **{o.column: (o.label, o.unit, o.resolution) for o in rows_of}}
         if columns is None and self.mission is not None:
             columns = ["configuration", *missions.USUAL, "status"]

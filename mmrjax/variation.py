@@ -242,7 +242,7 @@ def check_outputs(
     if profile is not None:
         from mmrjax import missions  # which imports an integrator
 
-        _known(names, missions.names())
+        _known(names, missions.names(profile.turns))
         return
     if set(names) <= {*table_of_outputs.names(variation.robot.channels), FLAGS}:
         return

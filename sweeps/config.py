@@ -330,7 +330,8 @@ class ProfilePart(FidelityPart):
     profile: Annotated[str, Field(min_length=1)] | None = about(
         None,
         "A mission over time: a CSV with time_s (s) and any of speed_mm_s, motor_speed_rpm, duty, mode, "
-        "supply_voltage_V, slope_deg, payload_kg, surface, current_other_A, or stair, stop_and_go, shuttle, patrol "
+        "supply_voltage_V, slope_deg, payload_kg, surface, current_other_A; with sides duty_left and duty_right, "
+        "voltage_left_V and voltage_right_V, or yaw_rate_rad_s beside speed; or stair, stop_and_go, shuttle, patrol "
         "(docs/missions.md)",
     )
 

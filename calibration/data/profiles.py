@@ -7,20 +7,22 @@ import hashlib
 import math
 import re
 import tomllib
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from calibration.data import delimited, units
 from calibration.data.errors import BadConfiguration, BadData, choices, is_number, number
 from calibration.data.units import Quantity
 from mmrjax import channels
 from mmrjax.fidelities.mission import Start
-from mmrjax.profile import MODES, MOTOR_SPEED, VOLTAGE, profile
-from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio
+from mmrjax.profile import MODES, MOTOR_SPEED, PAIRS, SPEED, VOLTAGE, profile
+from mmrjax.tables import CONDITION_LIMITS, SURFACES, adhesion_ratio, lateral_ratio
 
 if TYPE_CHECKING:
     from mmrjax.conditions import Conditions
@@ -56,12 +58,20 @@ QUANTITIES: dict[str, Quantity] = {
     "voltage": Quantity("supply_voltage", units.VOLTAGE, _range("voltage")),
     "duty": Quantity("duty", units.SHARE, _range("duty")),
     **{name: _speed(name) for name in CONTROLLED},
+    **{name: Quantity(name, units.SHARE, _range("duty")) for name in PAIRS[0]},
+    **{name: Quantity(name, units.VOLTAGE, _range("voltage")) for name in PAIRS[1]},
+    "yaw_rate": _speed("yaw_rate"),
     "slope_deg": Quantity("slope", units.ANGLE, _range("slope_deg"), slope=True),
     "payload": Quantity("payload", units.MASS, _range("payload")),
     "current_other": Quantity("current_other", units.CURRENT, _CURRENT_OTHER),
 }
 #: Columns of which a row has at most one, and the mode that each means.
-DEMANDS = {"duty": MODES[VOLTAGE], **{mode: mode for mode in CONTROLLED}}
+DEMANDS = {
+    **dict.fromkeys(("duty", *(name for pair in PAIRS for name in pair)), MODES[VOLTAGE]),
+    **{mode: mode for mode in CONTROLLED},
+}
+#: Demanded beside a speed.
+YAW_RATE = "yaw_rate"
 #: What a row may not leave empty where the file has the column.
 HELD = ("voltage", "slope_deg", "payload", "current_other")
 MODE, SURFACE = "mode", "surface"
@@ -120,6 +130,11 @@ class ProfileTable:
         return self.cycles * float(self.time[-1] - self.time[0])
 
     @property
+    def turns(self) -> bool:
+        """Whether it drives the sides apart."""
+        return any(name in self.values for name in (YAW_RATE, *(name for pair in PAIRS for name in pair)))
+
+    @property
     def stated(self) -> tuple[str, ...]:
         """Columns of conditions that it states, as a table of runs names them."""
         of = {"voltage": "supply_voltage_V", "slope_deg": "slope_deg", "payload": "payload_kg"}
@@ -144,6 +159,11 @@ class ProfileTable:
         Raises:
             BadConfiguration: it states a supply voltage, and the battery is to feed the motors.
         """
+        if self.turns and battery and PAIRS[1][0] in self.values:
+            raise BadConfiguration(
+                f"--battery: got it beside {self.source}, which states voltage_left_V; a battery's voltage falls, so "
+                "state duty_left and duty_right"
+            )
         if battery and "voltage" in self.values:
             raise BadConfiguration(
                 f"--battery: got it beside {self.source}, which states supply_voltage_V; expected one of the two"
@@ -169,9 +189,14 @@ class ProfileTable:
         if self.surface is None:
             return made
         tracks = np.array([float(c.on_tracks) > 0.5 for c in robot.configurations.members])
-        by_kind = np.array([[adhesion_ratio(s, kind) for s in self.surface] for kind in (False, True)])
         which = tracks[np.asarray(conditions.configuration)].astype(int)
-        return dataclasses.replace(made, adhesion=jnp.asarray(by_kind[which]))
+
+        def of(ratio: Callable[[str, bool], float]) -> Array:
+            assert self.surface is not None
+            return jnp.asarray(np.array([[ratio(s, kind) for s in self.surface] for kind in (False, True)])[which])
+
+        lateral = of(lateral_ratio) if self.turns else None
+        return dataclasses.replace(made, adhesion=of(adhesion_ratio), adhesion_lateral=lateral)
 
 
 def known_columns() -> dict[str, tuple[str, str]]:
@@ -224,10 +249,10 @@ def _parsed(content: bytes, name: str) -> ProfileTable:
             raise BadData(f"{name} row {k}: got {len(row)} cells; the header has {len(header)} columns")
     cells = _Cells(name, columns, {c: [row[j] for row in body] for j, c in enumerate(header)}, settings["linear"])
     time = _time(cells)
-    modes, demand, duty = _driven(cells)
-    values = {field: cells.held(field) for field in HELD if field in columns}
-    if duty is not None:
-        values["duty"] = duty
+    _check_sides(cells)
+    modes, driven = _driven(cells)
+    demand = driven.pop("demand")
+    values = {field: cells.held(field) for field in HELD if field in columns} | driven
     if len(time) * settings["cycles"] > LONGEST:
         raise BadData(f"{name}: got {len(time)} rows times {settings['cycles']} cycles; expected at most {LONGEST}")
     return ProfileTable(
@@ -376,14 +401,37 @@ def _time(cells: _Cells) -> np.ndarray:
     return time
 
 
-def _driven(cells: _Cells) -> tuple[tuple[str, ...], np.ndarray, np.ndarray | None]:
-    """Mode, demand and duty of each row; duty None where the file states none.
+def _check_sides(cells: _Cells) -> None:
+    """Refuse columns of one side, two kinds of them, and a yaw rate without a speed."""
+    for pair in PAIRS:
+        stated = [name for name in pair if cells.has(name)]
+        if len(stated) == 1:
+            other = pair[1 - pair.index(stated[0])]
+            raise BadData(
+                f"{cells.source}: got the column {cells.columns[stated[0]][0]} without one of the other side; "
+                f"expected {next(iter(QUANTITIES[other].columns()))} beside it"
+            )
+    kinds = [cells.columns[name][0] for name in ("duty", *(pair[0] for pair in PAIRS)) if cells.has(name)]
+    if len(kinds) > 1:
+        raise BadData(f"{cells.source}: got the columns {kinds[0]} and {kinds[1]}; expected one kind of the two")
+    if cells.has(YAW_RATE) and not cells.has(MODES[SPEED]):
+        raise BadData(
+            f"{cells.source}: got the column {cells.columns[YAW_RATE][0]} without a speed; expected speed_mm_s "
+            "beside it"
+        )
+
+
+def _driven(cells: _Cells) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
+    """Mode of each row, and by field of `Profile` its demand, and the duties, voltages and yaw rates that are stated.
 
     A cell of a demand column in a row of another mode ends the ramp that leads to this row, where values are linear
     between rows; else it is a second demand.
     """
     modes: list[str] = []
-    demand, duty = np.zeros(len(cells)), np.ones(len(cells))
+    shares = [field for field in DEMANDS if DEMANDS[field] == MODES[VOLTAGE] and cells.has(field)]
+    wholes = ["demand", *([YAW_RATE] if cells.has(YAW_RATE) else [])]
+    full = {name: 1.0 if name == "duty" else 0.0 for name in shares}
+    found = {name: np.full(len(cells), full.get(name, 0.0)) for name in (*shares, *wholes)}
     for row in range(len(cells)):
         before = modes[-1] if modes else ""
         filled = [field for field in DEMANDS if cells.text(field, row)]
@@ -393,11 +441,27 @@ def _driven(cells: _Cells) -> tuple[tuple[str, ...], np.ndarray, np.ndarray | No
         _check_demands(cells, row, before, mode, own, [f for f in filled if f not in own and f not in ends])
         modes.append(mode)
         if row and cells.linear:  # what the ramp that leads here ends at, where this row does not say
-            demand[row] = 0.0 if mode in CONTROLLED else demand[row - 1]
-            duty[row] = 1.0 if mode == MODES[VOLTAGE] else duty[row - 1]
+            for name in wholes:
+                found[name][row] = 0.0 if mode in CONTROLLED else found[name][row - 1]
+            for name in shares:
+                found[name][row] = full[name] if mode == MODES[VOLTAGE] else found[name][row - 1]
         for field in (*(f for f in ends if f not in own), *own):
-            (duty if field == "duty" else demand)[row] = cells.value(field, row)
-    return tuple(modes), demand, duty if cells.has("duty") else None
+            found["demand" if field in CONTROLLED else field][row] = cells.value(field, row)
+        if _demands_yaw(cells, row, before, mode):
+            found[YAW_RATE][row] = cells.value(YAW_RATE, row)
+    return tuple(modes), found
+
+
+def _demands_yaw(cells: _Cells, row: int, before: str, mode: str) -> bool:
+    """Whether a row states a yaw rate, which a demanded speed has beside it and nothing else."""
+    speed, stated = MODES[SPEED], bool(cells.text(YAW_RATE, row))
+    if stated and mode != speed and not (cells.linear and before == speed):
+        cells.refuse(
+            YAW_RATE, row, f"an empty cell: a yaw rate goes with a demanded speed, and this row has mode {mode}"
+        )
+    if cells.has(YAW_RATE) and not stated and mode == speed and (cells.linear or row < len(cells) - 1):
+        cells.refuse(YAW_RATE, row, "the yaw rate demanded beside the speed, 0 for straight travel")
+    return stated
 
 
 def _mode(cells: _Cells, row: int, before: str, filled: list[str]) -> str:
@@ -426,6 +490,11 @@ def _check_demands(cells: _Cells, row: int, before: str, mode: str, own: list[st
             f"{cells.source} row {row + 1}, {where}: got {cells.text(others[0], row)} beside {beside}; expected one "
             "demand in a row"
         )
+    pair = next((pair for pair in PAIRS if cells.has(pair[0])), ())
+    ends = row == len(cells) - 1 and not cells.linear
+    for field in pair:
+        if mode == MODES[VOLTAGE] and field not in own and not ends:
+            cells.refuse(field, row, "a value for either side")
     if mode not in CONTROLLED:
         return
     if not cells.has(mode):

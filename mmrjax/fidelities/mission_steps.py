@@ -60,7 +60,7 @@ class Law(Protocol):
         TOTALS: what is integrated, and its unit; PEAKS: largest values of any instant, and their unit.
         CLOCK, DISCHARGE, WINDING, HOUSING: places among the unknowns of the time in the segment [s], the charge taken
             [C], and the temperatures [°C], of a robot that turns those of both sides.
-        UNITS: of the unknowns before the memories of effects.
+        UNITS: of the unknowns before the memories of effects; LONG: whether an instant takes long to compile.
     """
 
     TOTALS: Mapping[str, str]
@@ -70,6 +70,7 @@ class Law(Protocol):
     WINDING: Any
     HOUSING: Any
     UNITS: tuple[float, ...]
+    LONG: bool
 
     def units(self, robot: Robot) -> Float[Array, " unknowns"]:
         """What the unknowns are measured in."""
@@ -291,7 +292,7 @@ def follow(
         left, trips = jnp.minimum(to_end, to_trip), to_trip < to_end
         last = c.step >= left * (1 - 1e-9)
         h = jnp.where(last, left, jax.lax.stop_gradient(c.step))
-        y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, inverted=True)
+        y, q, u, _ = stages(functools.partial(rates, stands=c.stands), c.y, c.q, h, inverted=True, looped=law.LONG)
         y = y.at[clock].set(jnp.where(last & ~trips, length, y[clock]))
         scale = tolerance * (1 + jnp.maximum(jnp.abs(c.y), jnp.abs(y)))
         size = law.norm(u[-1] / scale)

@@ -26,6 +26,8 @@ from mmrjax.signals import Result, Signals, State
 UNITS = (10.0, 1000.0, 1.0, 100.0, 50.0, 50.0, 10.0, 1.0)
 CURRENT, MOTOR, GROUND, DISCHARGE, WINDING, HOUSING, INTEGRAL, CLOCK = range(len(UNITS))
 
+LONG = False
+
 #: What is integrated beside them: name, and unit of a total.
 TOTALS: dict[str, str] = {
     "distance": "m", "path": "m", "drawn": "J", "returned": "J", "current_squared": "A²·s",

@@ -39,6 +39,8 @@ UNITS = (*(unit for unit in _EACH for _ in SIDES), 1.0, 1.0, 1.0, 1.0, straight.
 CURRENT, MOTOR, WINDING, HOUSING, INTEGRAL = (slice(2 * k, 2 * k + 2) for k in range(len(_EACH)))
 GROUND, LATERAL, YAW, HEADING, DISCHARGE, CLOCK = range(2 * len(_EACH), len(UNITS))
 
+LONG = True
+
 #: What is integrated beside them: name, and unit of a total; of current and torque the mean over both sides.
 OF_SIDES = tuple(f"current_squared_{side}" for side in ("left", "right"))
 TOTALS: dict[str, str] = {

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
@@ -95,7 +96,8 @@ def stages(
     q0: Float[Array, " m"],
     h: Array,
     inverted: bool = False,
-) -> tuple[Array, Array, list[Array], list[Array]]:
+    looped: bool = False,
+) -> tuple[Array, Array, Array | list[Array], Array | list[Array]]:
     """One step over `h`, with integrals that do not act back on what they are integrals of.
 
     The equations of the integrals q' = g(y) need no system to be solved: their part of the matrix is triangular.
@@ -104,6 +106,7 @@ def stages(
         rates: f(y) and g(y).
         inverted: invert the matrix without exchanging rows: half the time for one run alone. A pivot that vanishes
             spoils the step, which the control of the error then rejects: a shorter one makes the diagonal dominate.
+        looped: hold `rates` once for all stages but the first: a program that compiles in less time.
 
     Returns:
         y and q at the end of the step, and the stages of both; the last stage estimates the error.
@@ -118,6 +121,8 @@ def stages(
     solve = inverse(matrix)[0] if inverted else _solver(matrix)
     u, v, y, q = [solve(f)], [], y0, q0
     v.append(h * _GAMMA * (g + jacobian_q @ u[0]))
+    if looped:
+        return _looped(rates, solve, jacobian_q, y0, q0, h, u[0], v[0])
     for stage in range(1, 6):
         y = y + u[-1] if stage == 5 else y0 + sum(a * x for a, x in zip(_A[stage - 1], u, strict=True))
         q = q + v[-1] if stage == 5 else q0 + sum(a * x for a, x in zip(_A[stage - 1], v, strict=True))
@@ -127,6 +132,37 @@ def stages(
             h * _GAMMA * (g + sum(c * x for c, x in zip(_C[stage - 1], v, strict=True)) / h + jacobian_q @ u[-1])
         )
     return y + u[-1], q + v[-1], u, v
+
+
+def _looped(
+    rates: Callable[[Array], tuple[Array, Array]],
+    solve: Callable[[Array], Array],
+    jacobian_q: Array,
+    y0: Array,
+    q0: Array,
+    h: Array,
+    first: Array,
+    first_q: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """The stages after the first, see `stages`, one after the other by one loop."""
+    reach = np.zeros((5, 6))  # of the second stage to the sixth, which begins where the fifth ends
+    for row, weights in enumerate((*_A, (*_A[-1], 1.0))):
+        reach[row, : len(weights)] = weights
+    turns = np.zeros((5, 6))
+    for row, weights in enumerate(_C):
+        turns[row, : len(weights)] = weights
+
+    def stage(k: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        u, v = found
+        a, c = jnp.asarray(reach)[k], jnp.asarray(turns)[k]
+        f, g = rates(y0 + a @ u)
+        now = solve(f + (c @ u) / h)
+        return u.at[k + 1].set(now), v.at[k + 1].set(h * _GAMMA * (g + (c @ v) / h + jacobian_q @ now))
+
+    begun = [jnp.zeros((6, *x.shape), x.dtype).at[0].set(x) for x in (first, first_q)]
+    u, v = jax.lax.fori_loop(0, 5, stage, (begun[0], begun[1]))
+    last = jnp.asarray(reach)[4].at[5].set(1.0)
+    return y0 + last @ u, q0 + last @ v, u, v
 
 
 def _solver(matrix: Float[Array, "n n"]) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:

@@ -316,11 +316,12 @@ def current_at_rest(robot: Robot, conditions: Conditions, motion: PlaneMotion) -
 def firmness(robot: Robot, conditions: Conditions, motion: PlaneMotion) -> Scalar:
     """How firmly friction would hold the robot at rest, headed as it is, negative where it cannot [-]: each side
     against its motors and its share of gravity, the ground against all of gravity."""
-    sides = jax.vmap(lambda c, s: rest.firmness(robot, c, s))(*_of_sides(robot, conditions, motion))
+    own, state = _of_sides(robot, conditions, motion)
+    sides = jnp.asarray(jax.vmap(lambda c, s: rest.firmness(robot, c, s))(own, state))
     chassis = robot.chassis(conditions.configuration)
     level = chassis.ground.friction.static * conditions.adhesion * balances.lateral_friction(conditions, chassis)
     aside = jnp.abs(jnp.tan(conditions.slope) * jnp.sin(motion.heading))
-    return rest.least(*sides, jnp.where(aside > 0, level - aside, jnp.inf))
+    return rest.least(sides[0], sides[1], jnp.where(aside > 0, level - aside, jnp.inf))
 
 
 def holds(robot: Robot, conditions: Conditions) -> Array:

@@ -26,7 +26,7 @@ from sweeps.results.climb import VERDICTS
 Line = tuple[str, str]
 WIDTH, INDENT = 80, 16
 #: Of a run, solved for, and of a mission.
-EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *missions.OUTPUTS)
+EVERY_OUTPUT: tuple[Any, ...] = (*outputs.FURTHER, *derived.TABLE, *missions.OUTPUTS, *missions.OF_TURNS)
 
 
 def explain(name: str | None, files: tuple[str, ...] = ()) -> int:
@@ -186,7 +186,7 @@ def _output(name: str, library: dict[str, type[Effect]]) -> Iterator[Line]:
         yield "is", f"{o.label} [{o.unit}]"
         if (said := _attribute(Result, o.name)) and o in outputs.FURTHER:
             yield "equation", said
-        where = "missions (--profile)" if o in missions.OUTPUTS else "every run"
+        where = "missions (--profile)" if o in (*missions.OUTPUTS, *missions.OF_TURNS) else "every run"
         yield "column", f"{o.column}, of {'--outputs' if o in derived.TABLE else where}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -12,16 +13,21 @@ from rich.table import Table
 
 from calibration.data import profiles
 from calibration.data import runs as records
+from calibration.data.columns import SUPPLY
+from calibration.data.contradictions import cannot_turn
 from calibration.data.errors import BadConfiguration
 from calibration.data.profiles import ProfileTable
 from mmrjax import balances, channels, ground, missions, outputs
 from mmrjax.conditions import Conditions
+from mmrjax.fidelities import turning
 from mmrjax.fidelities.mission import Mission
 from mmrjax.fidelities.mission_steps import MARKS
 from mmrjax.missions import JOULE_PER_WH
 from mmrjax.power import COULOMB_PER_MAH
+from mmrjax.profile import PAIRS
 from mmrjax.robot import Robot
 from mmrjax.signals import FLAGS, STATUSES
+from mmrjax.tables import lateral_ratio
 from sweeps import capabilities
 from sweeps import config as configuration
 from sweeps.console import progress, say, tell
@@ -40,6 +46,7 @@ _LASTING = MARKS.index("battery_empty")  # events from here on are kept in histo
 _PRINTED = (
     "energy_Wh", "energy_per_metre_Wh", "distance_m", "duration_s", "rms_current_A", "peak_current_A",
     "rms_torque_Nm", "winding_peak_C", "housing_end_C", "state_of_charge", "endurance_s", "range_m",
+    *(output.column for output in missions.OF_TURNS),
 )  # fmt: skip
 
 
@@ -84,6 +91,7 @@ def simulate(
             tell(f"{runs.source}, {column}: not used, {source.source} states it")
     if "current_other" in source.values and not config.battery:
         tell(f"{source.source}, current_other_A: not used, other consumers are on the battery")
+    _check_turning(robot, runs, source)
     _check_cutoff(robot, runs, source, config)
     with open_folder("simulate", config, robot, out, force, runs) as folder:
         found = simulated(robot, runs, source, config)
@@ -124,6 +132,32 @@ def _check_acting(robot: Robot, source: ProfileTable) -> None:
         )
 
 
+def _check_turning(robot: Robot, runs: records.Runs, source: ProfileTable) -> None:
+    """Refuse a robot that cannot turn where the profile drives its sides apart, and more than the supply has."""
+    if not source.turns:
+        return
+    if why := cannot_turn(robot, sorted({str(name) for name in runs.configurations_named(robot)})):
+        raise BadConfiguration(f"{source.source} drives the sides apart: {why}")
+    most = max((float(np.abs(source.values[name]).max()) for name in PAIRS[1] if name in source.values), default=0.0)
+    supply = np.min(np.abs(source.values["voltage"] if "voltage" in source.values else runs[SUPPLY]))
+    if most > supply:
+        raise BadConfiguration(
+            f"{source.source}, voltage_left_V and voltage_right_V: got {most:g} V; the supply has {supply:g} V "
+            "(--voltage, or a column supply_voltage_V)"
+        )
+
+
+def _commanded(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Conditions:
+    """Conditions of the runs; of robots that turn with the lateral adhesion of a stated surface."""
+    conditions = run.commanded(robot, runs, config)
+    if not source.turns or not runs.has(profiles.SURFACE) or source.surface is not None:
+        return conditions
+    members = robot.configurations.members
+    tracks = [float(members[int(k)].on_tracks) > 0.5 for k in np.asarray(conditions.configuration)]
+    lateral = [lateral_ratio(str(s), t) for s, t in zip(runs[profiles.SURFACE], tracks, strict=True)]
+    return dataclasses.replace(conditions, adhesion_lateral=jax.numpy.asarray(lateral))
+
+
 def _check_charge(robot: Robot, config: configuration.Simulate) -> None:
     capacity = float(robot.battery.capacity) / COULOMB_PER_MAH
     if config.battery and config.discharge_mAh >= capacity:
@@ -149,7 +183,7 @@ def _check_cutoff(robot: Robot, runs: records.Runs, source: ProfileTable, config
 
 def simulated(robot: Robot, runs: records.Runs, source: ProfileTable, config: configuration.Simulate) -> Missions:
     """Runs over a profile."""
-    conditions = run.commanded(robot, runs, config)
+    conditions = _commanded(robot, runs, source, config)
     profile = source.profile(robot, conditions)
     names = runs["run_id"] if runs.has("run_id") else np.array([f"run-{k + 1}" for k in range(len(runs))])
     rows = max(LEAST_ROWS, min(MOST_ROWS, ALL_ROWS // len(runs)))
@@ -204,7 +238,8 @@ def _segments(
     last = np.stack([np.searchsorted(_segment_of(found, k), np.arange(count), side="right") - 1 for k in range(runs)])
     whole = np.stack([_segment_of(found, k)[np.maximum(last[k], 0)] == np.arange(count) for k in range(runs)])
     assert found.course is not None  # it was asked for
-    discharge = np.take_along_axis(np.asarray(found.course.signals.discharge), np.maximum(last, 0), 1)
+    discharge = np.asarray(found.course.signals.discharge).reshape(*found.course.time.shape, -1)[..., 0]
+    discharge = np.take_along_axis(discharge, np.maximum(last, 0), 1)
     on_battery = np.asarray(conditions.battery)[:, None] > 0.5
     charge = np.where(on_battery & whole, 1 - discharge / float(robot.battery.capacity), np.nan)
     of = np.tile(np.arange(segments), cycles)
@@ -218,7 +253,7 @@ def _segments(
         "state_of_charge": charge.ravel(),
         **outputs.codes(found.status.ravel(), found.flags.ravel()),
     }
-    order = ["run_id", "cycle", "segment", "time_s", "mode", *(c for c in missions.names() if c in rows)]
+    order = ["run_id", "cycle", "segment", "time_s", "mode", *(c for c in missions.names(source.turns) if c in rows)]
     reached = time.ravel() > 0
     return {column: rows[column][reached] for column in (*order, "status", "flags")}
 
@@ -258,9 +293,19 @@ def _course(
     there = course.segment >= 0
     signals = course.signals
     marked = course.event[there] >= _LASTING
-    picked = np.flatnonzero(there)[thinned(course.segment[there], signals.current[there], most, marked)]
+    largest = np.abs(signals.current).reshape(len(there), -1).max(1)  # of either side
+    picked = np.flatnonzero(there)[thinned(course.segment[there], largest[there], most, marked)]
     course = jax.tree.map(lambda x: x[picked], course)
-    signals, reading = course.signals, balances.sensor(robot, course.signals)
+    signals, of_sides = course.signals, {}
+    winding, housing = course.temperature_winding, course.temperature_housing
+    if source.turns:
+        reading, signals = turning.shown(robot, signals), turning.together(signals)
+        of_sides = {c.column: np.asarray(reading[c.name]) / c.factor for c in channels.OF_TURNS}
+        for side, duty, hot in zip(("left", "right"), course.signals.duty.T, winding.T, strict=True):
+            of_sides |= {f"duty_{side}": duty, f"winding_temperature_{side}_C": hot}
+        winding, housing = winding.max(1), housing.max(1)
+    else:
+        reading = balances.sensor(robot, signals)
     # What the profile demands acts this much later than its rows say, and all that is written beside it with it.
     late = float(robot.rig.delay)
     segment = course.segment % source.segments
@@ -271,9 +316,9 @@ def _course(
     battery = float(np.asarray(conditions.battery)[k]) > 0.5
     left = 1 - signals.discharge / float(robot.battery.capacity)
     demanded = source.demanded(segment, elapsed, per_speed)
-    turning = {}
+    of_shaft = {}
     if not robot.has_ground:
-        turning = {
+        of_shaft = {
             "motor_speed_rpm": np.asarray(reading["motor_speed"]) / channels.RPM,
             "demanded_motor_speed_rpm": demanded * per_speed / channels.RPM,
         }
@@ -288,17 +333,18 @@ def _course(
         "voltage_V": signals.voltage,
         "traction_N": float(robot.sides) * signals.traction,
         "demanded_speed_mm_s": demanded / channels.MM,
-        **turning,
+        **of_shaft,
         "duty": signals.duty,
         "source_voltage_V": signals.voltage_source,
         "motor_current_A": np.asarray(reading["motor_current"]),
         "slope_deg": np.degrees(signals.slope),
-        "winding_temperature_C": np.asarray(reading["winding_temperature"]),
-        "housing_temperature_C": course.temperature_housing,
+        "winding_temperature_C": winding if source.turns else np.asarray(reading["winding_temperature"]),
+        "housing_temperature_C": housing,
         "energy_Wh": course.energy / JOULE_PER_WH,
         "state_of_charge": left if battery else np.full(len(picked), np.nan),
         "cycle": course.segment // source.segments + 1,
         "segment": segment + 1,
+        **of_sides,
         "event": np.array([*MARKS, ""])[course.event],
     }
 
@@ -314,7 +360,7 @@ def _charge_left(table: dict[str, np.ndarray], status: str) -> str:
 
 def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
     """What missions come to, one a column, without `idle` columns; statuses and flags in words."""
-    about = {output.column: output for output in missions.OUTPUTS}
+    about = {output.column: output for output in (*missions.OUTPUTS, *missions.OF_TURNS)}
     table, source = found.table, found.source
     count = len(table["status"])
     cycles = f", {source.cycles} cycles" if source.cycles > 1 else ""
@@ -323,7 +369,7 @@ def print_missions(found: Missions, idle: Collection[str] = ()) -> None:
     shown.add_row("configuration", *table["configuration"][:_SHOWN])
     for key in _PRINTED:
         heading, form = f"{about[key].label} [{about[key].unit}]", f".{about[key].resolution}f"
-        if np.isfinite(table[key]).any() and key not in idle:
+        if key in table and np.isfinite(table[key]).any() and key not in idle:
             shown.add_row(heading, *("-" if v != v else format(v, form) for v in table[key][:_SHOWN]))
     shown.add_row("status", *table["status"][:_SHOWN])
     say(shown)

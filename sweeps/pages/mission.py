@@ -10,7 +10,7 @@ import numpy as np
 from mmrjax import missions
 from mmrjax.signals import FLAGS
 from sweeps import capabilities
-from sweeps.pages import mission_figures, words
+from sweeps.pages import mission_figures, turn, words
 from sweeps.pages.page import ROWS, Album, named, render, statuses
 from sweeps.pages.runs import labels, warmed
 from sweeps.points.imposed import UNLIMITED
@@ -44,6 +44,10 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
     on_battery = bool(np.isfinite(first["state_of_charge"]))
     album.add("course", lambda: mission_figures.course(rows, cycle, limit, source.linear, float(robot.sides)))
     album.add("energy", lambda: mission_figures.energy(first, on_battery))
+    if source.turns:
+        x, y, yaw = rows["x_mm"] / 1e3, rows["y_mm"] / 1e3, np.radians(rows["yaw_deg"])
+        album.add("path", lambda: turn.path(robot, first, x, y, yaw))
+        album.add("sides", lambda: mission_figures.of_sides(rows))
     names = _names(runs)
     return render(
         folder,
@@ -68,6 +72,7 @@ def write(folder: Path, file: RobotFile, found: Missions) -> Path:
         whole=found.whole,
         heat=capabilities.thermal(robot),
         travels="distance_m" not in idle,
+        turns=source.turns,
         **named(file),
     )  # fmt: skip
 
@@ -181,16 +186,21 @@ def _demand(found: Missions, k: int) -> str:
         unit = unit if unit == "°" else f"\u00a0{unit}"
         return f"{begin:g}{unit}" if abs(begin - end) < 1e-9 else f"{begin:g} to {end:g}{unit}"
 
-    from calibration.data.profiles import CONTROLLED
+    from calibration.data.profiles import CONTROLLED, YAW_RATE
     from mmrjax import channels
+    from mmrjax.profile import PAIRS
 
     mode = source.modes[k]
     said = []
     if mode in CONTROLLED:
         channel = channels.of(mode)
         said.append(span(source.demand, channel.factor, channel.unit))
+        if mode == "speed" and YAW_RATE in source.values:
+            said.append(span(source.values[YAW_RATE], 1.0, channels.of(YAW_RATE).unit))
     elif mode == "voltage":
-        said.append(span(source.values["duty"], 0.01, "% duty") if "duty" in source.values else "100 % duty")
+        shares = [(name, 0.01, "% duty") for name in ("duty", *PAIRS[0])] + [(name, 1.0, "V") for name in PAIRS[1]]
+        of = [span(source.values[name], one, unit) for name, one, unit in shares if name in source.values]
+        said.append(" and ".join(of) or "100 % duty")
     units = {"voltage": "V", "slope_deg": "°", "payload": "kg", "current_other": "A"}
     said += [span(source.values[name], 1.0, unit) for name, unit in units.items() if name in source.values]
     return ", ".join([*said, *([source.surface[k]] if source.surface else [])])

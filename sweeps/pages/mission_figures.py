@@ -57,6 +57,26 @@ def course(rows: Mapping[str, np.ndarray], cycle: float | None, limit: float, li
     return fig
 
 
+def of_sides(rows: Mapping[str, np.ndarray]) -> Figure:
+    """Current and duty of either side, and the yaw rate, over time.
+
+    Args:
+        rows: of history.csv, of one run with sides.
+    """
+    fig, grid = figure(3, 1, 6.4, sharex=True)
+    _, size, unit = next(t for t in _TIMES if float(rows["time_s"][-1]) >= t[0])
+    time = rows["time_s"] / size
+    for side, color in (("left", BLUE), ("right", VERMILION)):
+        grid[0, 0].plot(time, rows[f"motor_current_{side}_A"], color=color, lw=1.0, label=side)
+        grid[1, 0].plot(time, 100 * rows[f"duty_{side}"], color=color, lw=1.0)
+    grid[2, 0].plot(time, rows["yaw_rate_rad_s"], color=INK, lw=1.2)
+    for axes, label in zip(grid[:, 0], ("current of a motor [A]", "duty [%]", "yaw rate [rad/s]"), strict=True):
+        axes.set_ylabel(label)
+    grid[0, 0].legend(ncols=2, fontsize=8)
+    grid[-1, 0].set(xlabel=f"time [{unit}]", xlim=(0, time[-1]))
+    return fig
+
+
 def _beside(axes: Axes, label: str, colour: str) -> Axes:
     """Axes with a scale of their own at the right."""
     other = axes.twinx()

@@ -128,7 +128,7 @@ def laid_out(config: Campaign, job: scale.Job) -> Layout:
     if job.profile is not None:
         from mmrjax import missions
 
-        rows |= {row.column: row for row in missions.OUTPUTS}
+        rows |= {row.column: row for row in (*missions.OUTPUTS, *missions.OF_TURNS)}
     variables = []
     for name in job.outputs:
         if name == "flags":

@@ -42,7 +42,7 @@ class Missions:
 
     def _one(self, row: int) -> dict[str, Any]:
         to = {name: f"energy_to_{name}_Wh" for name in SINKS}
-        numbers = {c: float(self.table[c][row]) for c in missions.names() if c not in to.values()}
+        numbers = {c: float(self.table[c][row]) for c in missions.names(self.source.turns) if c not in to.values()}
         flags = str(self.table["flags"][row])
         return {
             **numbers,
