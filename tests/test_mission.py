@@ -13,8 +13,8 @@ from scipy.integrate import solve_ivp
 from mmrjax import energy, params, robots
 from mmrjax.conditions import Conditions
 from mmrjax.errors import UsageError
-from mmrjax.fidelities import mission as missions
-from mmrjax.fidelities.mission import Start, mission
+from mmrjax.fidelities import mission_straight, mission_turning
+from mmrjax.fidelities.mission import TOLERANCE, Start, mission
 from mmrjax.motor import ALPHA
 from mmrjax.profile import MODES, Profile, profile
 from mmrjax.signals import FLAGS, STATUSES
@@ -24,7 +24,7 @@ ROWS = 8
 _run = eqx.filter_jit(mission)
 
 
-def run(robot, conditions, profile, start=None, tolerance=missions.TOLERANCE):
+def run(robot, conditions, profile, start=None, tolerance=TOLERANCE):
     """A mission with its course; all that is stated here is a number of the program, so that most tests share one."""
     ambient = robot.motor.temperature_ambient
     start = start or Start(temperature_winding=ambient, temperature_housing=ambient)
@@ -461,6 +461,12 @@ WRONG = {
     "voltage: row 2 is not finite": dict(time=[0, 1], voltage=[1, np.nan]),
     "duty: got 1.5; expected -1 to 1": dict(time=[0, 1], duty=1.5),
     "mode: got 1 values; expected 2": dict(time=[0, 1], mode=["brake"]),
+    "got duty_left without duty_right; expected both": dict(time=[0, 1], duty_left=1.0),
+    "got duty_left beside voltage_left; expected one": dict(
+        time=[0, 1], duty_left=1.0, duty_right=1.0, voltage_left=9.0, voltage_right=9.0
+    ),
+    "duty_right: got 1.5; expected -1 to 1": dict(time=[0, 1], duty_left=1.0, duty_right=1.5),
+    "yaw_rate: got one without mode speed": dict(time=[0, 1], yaw_rate=1.0),
 }
 
 
@@ -472,4 +478,5 @@ def test_wrong_profiles_are_said(message):
 
 
 def test_every_unit_and_name_of_totals_is_integrated():
-    assert set(energy.SINKS) < set(missions.TOTALS) and isinstance(rows([0, 1]), Profile)
+    assert all(set(energy.SINKS) < set(law.TOTALS) for law in (mission_straight, mission_turning))
+    assert isinstance(rows([0, 1]), Profile)

@@ -112,6 +112,18 @@ def test_mode_is_that_of_the_demand_that_is_filled_in(read):
     assert table.values["duty"][0] == 0.5
 
 
+def test_sides_and_yaw_rates_are_read(read):
+    found = read("time_s,voltage_left_V,voltage_right_V\n0,10,-5\n2,12,12\n4,,\n")
+    assert found.turns and set(found.modes) == {"voltage"}
+    assert found.values["voltage_right"].tolist()[:2] == [-5.0, 12.0]
+    found = read(
+        "# between_rows = 'linear'\ntime_s,speed_mm_s,yaw_rate_deg_s,mode\n0,0,0,\n1,300,90,\n2,0,0,brake\n3,,,\n"
+    )
+    assert found.modes == ("speed", "speed", "brake", "brake") and "duty" not in found.values
+    np.testing.assert_allclose(found.values["yaw_rate"], [0, np.pi / 2, 0, 0])
+    assert not read("time_s,speed_mm_s\n0,300\n5,300\n").turns
+
+
 def test_ramp_ends_at_the_cell_of_the_row_that_brakes_or_else_is_held(read):
     head = "# between_rows = 'linear'\ntime_s,speed_mm_s,mode\n0,0,\n1,400,\n"
     np.testing.assert_allclose(read(head + "2,0,brake\n3,,brake\n").demand[:3], [0, 0.4, 0])
@@ -186,6 +198,15 @@ WRONG = {
     "unknown way between rows": ("# between_rows = 'spline'\ntime_s,duty\n0,1\n5,1\n", r"between_rows: got 'spline'; expected held or linear"),
     "unknown setting": ("# cycle = 4\ntime_s,duty\n0,1\n5,1\n", r"got the setting cycle; .*cycles"),
     "setting that is no TOML": ("# between_rows = held\ntime_s,duty\n0,1\n5,1\n", r"got the line # between_rows = held; expected TOML"),
+    "one side's duty": ("time_s,duty_left\n0,1\n5,1\n", r"mission.csv: got the column duty_left without one of the other side; expected duty_right beside it"),
+    "one side's voltage": ("time_s,voltage_right_V\n0,1\n5,1\n", r"got the column voltage_right_V without one of the other side; expected voltage_left_V"),
+    "duties and voltages": ("time_s,duty_left,duty_right,voltage_left_V,voltage_right_V\n0,1,1,,\n5,1,1,,\n", r"got the columns duty_left and voltage_left_V; expected one kind of the two"),
+    "duty beside duties": ("time_s,duty,duty_left,duty_right\n0,,1,1\n5,,1,1\n", r"got the columns duty and duty_left; expected one kind"),
+    "gap in a side": ("time_s,duty_left,duty_right\n0,1,\n5,1,1\n", r"row 1, duty_right: got an empty cell; expected a value for either side"),
+    "duties beside a speed": ("time_s,duty_left,duty_right,speed_mm_s\n0,1,1,300\n5,1,1,\n", r"row 1, speed_mm_s: got 300 beside duty_left; expected one demand in a row"),
+    "yaw rate without a speed": ("time_s,yaw_rate_rad_s,duty\n0,1,1\n5,1,1\n", r"got the column yaw_rate_rad_s without a speed; expected speed_mm_s beside it"),
+    "gap in the yaw rate": ("time_s,speed_mm_s,yaw_rate_deg_s\n0,300,\n5,300,10\n", r"row 1, yaw_rate_deg_s: got an empty cell; expected the yaw rate demanded beside the speed, 0 for straight travel"),
+    "yaw rate of a braked robot": ("time_s,speed_mm_s,yaw_rate_rad_s,mode\n0,,1,brake\n5,,,\n", r"row 1, yaw_rate_rad_s: got 1; expected an empty cell: a yaw rate goes with a demanded speed, and this row has mode brake"),
     "setting twice": ("# cycles = 4\n# cycles = 4\ntime_s,duty\n0,1\n5,1\n", r"cycles is set twice"),
 }  # fmt: skip
 

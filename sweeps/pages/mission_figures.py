@@ -64,7 +64,8 @@ def of_sides(rows: Mapping[str, np.ndarray]) -> Figure:
         rows: of history.csv, of one run with sides.
     """
     fig, grid = figure(3, 1, 6.4, sharex=True)
-    _, size, unit = next(t for t in _TIMES if float(rows["time_s"][-1]) >= t[0])
+    span = float(rows["time_s"][-1])
+    _, size, unit = next(t for t in _TIMES if span >= t[0])
     time = rows["time_s"] / size
     for side, color in (("left", BLUE), ("right", VERMILION)):
         grid[0, 0].plot(time, rows[f"motor_current_{side}_A"], color=color, lw=1.0, label=side)
