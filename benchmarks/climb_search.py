@@ -53,7 +53,7 @@ def run(
     )
 
 
-def begun(random: np.random.Generator, path: str, stretch: float, n: int) -> np.ndarray:
+def begotten(random: np.random.Generator, path: str, stretch: float, n: int) -> np.ndarray:
     """Angles of a first generation: those of a file of time and angles, made slower, and moved in all but one."""
     time, *angles = np.loadtxt(path, delimiter=",", skiprows=1).T
     own = np.stack([np.interp(KNOTS, stretch * time, a) for a in angles])
@@ -111,7 +111,7 @@ def main() -> None:
             # half of them stay for a while where they are
             angles = bounded(np.where(random.random(held.shape) < 0.5, np.roll(held, 1, axis=2), held))
             if told.begin:
-                angles = begun(random, told.begin, told.stretch, n)
+                angles = begotten(random, told.begin, told.stretch, n)
             heights = random.uniform(low, high, n)
         else:
             parents = np.array([angles for _, angles, _ in best])
