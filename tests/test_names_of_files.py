@@ -83,6 +83,7 @@ MORE = {
     # missions
     "energy_by_where_Wh": "energy that goes to each sink",
     # climbs
+    "largest_mm": "largest obstacle that a search got over",
     "z_mm": "middle of the robot above the ground before the obstacle",
     "nose_mm": "radius of rounded noses", "time_step_s": "step of a climb",
     "front_deg": "front levers", "rear_deg": "rear levers", "belt_mm_s": "of the main belt",
