@@ -175,7 +175,7 @@ def _numbers(found: Climb) -> dict[str, np.ndarray]:
         VERDICT: found.verdict,
         "time_s": np.take_along_axis(np.asarray(r.time), last, 1)[:, 0],
         "furthest_mm": 1000 * np.asarray(found.furthest),
-        "pitch_most_deg": -np.degrees(-most(-np.asarray(r.motion.q)[..., PITCH])),
+        "pitch_most_deg": np.degrees(most(-np.asarray(r.motion.q)[..., PITCH])),
         "energy_J": np.take_along_axis(energy, last, 1)[:, 0],
         "traction_current_most_A": most(np.abs(r.current)),
         "front_current_most_A": most(np.abs(r.lever_current[..., 0])),
