@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -183,22 +184,30 @@ def _sequence(config: configuration.Climb, robot: Robot, name: str) -> Sequence:
             f"--levers-front, --levers-rear, --sequence: {name} has no levers"
             + (f"; expected --configuration {' or '.join(with_levers)}" if with_levers else "")
         )
-    if config.sequence is not None:
-        found = terrains.read_sequence(config.sequence, robot)
-    else:
-        own = float(np.degrees(np.asarray(gear.lever_front))), 180 - float(np.degrees(np.asarray(gear.lever_rear)))
-        angles = []
-        for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):
-            angle = usual if given is None else given
-            if given is not None and (why := terrains.beyond(robot, angle)):
-                raise BadConfiguration(f"{option}: {why}")
-            angles.append(float(np.radians(angle)))
+    own = float(np.degrees(np.asarray(gear.lever_front))), 180 - float(np.degrees(np.asarray(gear.lever_rear)))
+    angles = []
+    for option, given, usual in zip(("--levers-front", "--levers-rear"), stated[1:], own, strict=True):
+        angle = usual if given is None else given
+        if given is not None and (why := terrains.beyond(robot, angle)):
+            raise BadConfiguration(f"{option}: {why}")
+        angles.append(float(np.radians(angle)))
+    if config.sequence is None:
         found = fidelity.still(*angles)
+    else:
+        found = terrains.read_sequence(config.sequence, robot, (angles[0], angles[1]))
+        if found.begins is None and stated[1:] != (None, None):
+            raise BadConfiguration(
+                f"--levers-front, --levers-rear: {config.sequence.name} states all angles; expected them beside a "
+                "sequence of voltages alone (front_V, rear_V)"
+            )
+    if config.levers_voltage_V is not None:
+        found = dataclasses.replace(found, supply=jnp.asarray(config.levers_voltage_V))
     if tracked:
         axle = float(np.asarray(robot.radius_pulley + gear.grouser_height))
         reach, roller = (float(np.asarray(x)) for x in (gear.lever_length, gear.levers.roller))
         least = -float(np.arcsin((axle - roller) / reach))
-        for option, angle in (("front", float(found.front[0])), ("rear", float(found.rear[0]))):
+        first = (float(found.first[0]), float(np.pi - found.first[1]))
+        for option, angle in zip(("front", "rear"), first, strict=True):
             below = axle + reach * np.sin(angle) - roller
             if below < -_ON_GROUND * reach:
                 raise BadConfiguration(
