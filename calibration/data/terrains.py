@@ -20,6 +20,8 @@ from mmrjax.terrain import Terrain
 LARGEST = 50.0
 #: Voltage of a motor that nothing here has [V].
 HIGHEST = 1000.0
+#: The part of a lever's angle that lies within this of the ground at the start is on it [rad].
+ON_GROUND = 2e-3
 #: Metres of one.
 _LENGTHS = {"m": 1.0, "mm": 1e-3}
 
@@ -132,6 +134,25 @@ def read_sequence(path: Path, robot: Robot, begins: tuple[float, float]) -> Sequ
                 raise BadData(f"{path.name} row {k + 2}, {name}: {why}")
     front, rear = (jnp.asarray(np.radians(columns[name])) for name in angles)
     return Sequence(jnp.asarray(at), front, rear, over_time=over_time)
+
+
+def below(robot: Robot, angle: float) -> str:
+    """Why levers cannot begin at an angle [deg] on level ground; empty where they can."""
+    gear = robot.running_gear
+    axle, reach, roller = (
+        float(np.asarray(x))
+        for x in (robot.radius_pulley + gear.grouser_height, gear.lever_length, gear.levers.roller)
+    )
+    under = axle + reach * np.sin(np.radians(angle)) - roller
+    least = -float(np.degrees(np.arcsin((axle - roller) / reach)))
+    return (
+        ""
+        if under >= -ON_GROUND * reach
+        else (
+            f"at {angle:.4g} deg they begin {-1000 * under:.0f} mm below the ground; expected at least {least:.1f} "
+            "deg there, where they lie on it (a sequence may press them down later)"
+        )
+    )
 
 
 def beyond(robot: Robot, angle: float) -> str:

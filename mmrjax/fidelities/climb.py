@@ -566,19 +566,29 @@ class Climb(eqx.Module):
         return [NAMES[k] for k in self.verdict]
 
 
+def _alike(robot: Robot) -> int | None:
+    """Axis of the runs in a robot's parameters; None where one robot runs them all."""
+    return 0 if jnp.ndim(robot.sides) else None
+
+
 @compiled
 def _begin(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, step: float) -> Any:
-    return jax.vmap(lambda c, t, s: begin(system(robot, c, t, s, step)))(conditions, terrain, sequence)
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence) -> Any:
+        return begin(system(robot, conditions, terrain, sequence, step))
+
+    return jax.vmap(one, in_axes=(_alike(robot), 0, 0, 0))(robot, conditions, terrain, sequence)
 
 
 def _part(
     robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any, first: Scalar,
     step: float, steps: int, samples: int,
 ) -> tuple[Any, Passed]:  # fmt: skip
-    def one(conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> tuple[Any, Passed]:
+    def one(robot: Robot, conditions: Conditions, terrain: Terrain, sequence: Sequence, state: Any) -> Any:
         return sampled(system(robot, conditions, terrain, sequence, step), state, first, steps, samples)
 
-    return jax.vmap(one)(conditions, terrain, sequence, state)
+    each = (_alike(robot), 0, 0, 0, 0)
+    found: tuple[Any, Passed] = jax.vmap(one, in_axes=each)(robot, conditions, terrain, sequence, state)
+    return found
 
 
 _compiled = compiled(_part, options=SMALL)
@@ -600,6 +610,7 @@ def climb_batch(
     """Climb over a batch of conditions, terrains and sequences (leading axis of every field), until all have ended.
 
     Args:
+        robot: of all runs, or every parameter of it with a leading axis too.
         duration: of the longest run [s]; step, sample: intervals of integration and of the record [s].
         part: length of run between two looks at whether all have ended [s].
         record: whether samples are kept; else the record is the last sample.
