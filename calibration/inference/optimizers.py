@@ -127,11 +127,6 @@ def informing(data: Data) -> np.ndarray:
     return np.r_[: held.start, held.stop : held.stop + data.centre.size]
 
 
-def _signed(problem: Problem, seen: Observation, data: Data) -> Array:
-    """Residuals of readings and penalties; that of a row which leaves some of its adhesion's margin is negative."""
-    return jnp.concatenate([problem.whitened(seen, data)[: data.measured.size], problem.excess(seen, data)])
-
-
 def counted(r: Array, jacobian: Array, held: slice) -> tuple[Array, Array]:
     """Residuals and Jacobian as they count: penalties only where they are positive."""
     counts = jnp.ones(r.shape, bool).at[held].set(r[held] > 0)
@@ -183,15 +178,10 @@ def _evaluated(problem: Problem, data: Data, pin: Pin) -> Callable[[Z], tuple[Ar
     """Residuals (readings, penalties with their signs, then prior), their Jacobian, and what the model says of every
     row, as a function of z: one evaluation serves all three."""
 
-    def function(x: Z) -> tuple[Array, tuple[Array, Observation]]:
-        seen = problem.observation(pin.apply(x))
-        prior = jnp.where(pin.held, x - pin.at, x - data.centre)
-        r = jnp.concatenate([_signed(problem, seen, data), prior])
-        return r, (r, seen)
-
     def at(z: Z) -> tuple[Array, Array, Observation]:
-        jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
-        return r, jacobian, seen
+        r, jacobian, seen, _ = problem.linearised(lambda x: problem.robot(pin.apply(x)), z, data)
+        prior = jnp.where(pin.held, z - pin.at, z - data.centre)
+        return jnp.concatenate([r, prior]), jnp.concatenate([jacobian, jnp.eye(z.size)]), seen
 
     return at
 
@@ -516,12 +506,7 @@ def linearised_signed(problem: Problem, z: Z, data: Data) -> tuple[Array, Array,
     derivative grows without limit; such a reading, if it counts, counts as one that could not be computed.
     """
 
-    def function(z: Z) -> tuple[Array, tuple[Array, Observation]]:
-        seen = problem.observation(z)
-        r = jnp.concatenate([_signed(problem, seen, data), z - data.centre])
-        return r, (r, seen)
-
-    jacobian, (r, seen) = jax.jacfwd(function, has_aux=True)(z)
+    r, jacobian, seen = _evaluated(problem, data, no_pin(z.size))(z)
     return *_known(r, jacobian, data), seen
 
 
